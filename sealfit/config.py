@@ -1,0 +1,237 @@
+"""Rig configs: `configs/*.toml`, checked on load, unknown keys refused.
+
+A config says what one rig's files look like; the default, inside the package, reads exactly the table of the README.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from sealfit.errors import ConfigError
+from sealfit.tables import Units
+
+AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TraceFormat(_Strict):
+    """How one trace file is written."""
+
+    encoding: str = Field("auto", description="utf-8, latin-1, utf-16, or auto (byte-order mark, then UTF-8, then Latin-1)")
+    delimiter: str = Field(",", description="one character, 'tab' or 'whitespace'")
+    decimal: Literal[".", ","] = "."
+    header_lines: int | None = Field(None, ge=0, description="lines before the first data row, column names included")
+    header_ends_at: str | None = Field(None, description="regular expression; the header ends with the line it matches")
+    names: Literal["header", "none"] = Field("header", description="'none': no line of names, columns are by position")
+    names_line: int | None = Field(None, description="line of names counted back from the header's end: 1 = the last")
+    units_row: bool = Field(False, description="a row of units follows the names")
+    trailing_separator: bool = Field(False, description="lines end in stray separators; strip them")
+    drop_first_rows: int = Field(0, ge=0)
+    columns: dict[str, str | int] = Field(
+        default_factory=lambda: {"time_s": "time_s", "displacement_mm": "displacement_mm", "force_N": "force_N"},
+        description="our name = the file's column name, or its position from 1",
+    )
+    optional: list[str] = Field(default_factory=list, description="of `columns`, those a file may lack")
+    other_columns: Literal["channels", "ignore"] = Field("channels", description="columns not listed above")
+    header_fields: dict[str, str] = Field(
+        default_factory=dict, description="channel = regular expression with one group, searched in the header lines"
+    )
+    keep: str | None = Field(None, description="row filter, e.g. 'load_N > 4.9'")
+    compute: dict[str, str] = Field(
+        default_factory=dict, description="column = safe expression over columns, file-name parts and constants"
+    )
+    constants: dict[str, float] = Field(default_factory=dict)
+    integrate_displacement: str | None = Field(None, description="speed column whose time integral is displacement")
+    integrate_per: Literal["s", "min"] = Field("s", description="time unit of that speed: rpm is per min")
+
+
+class Files(_Strict):
+    """Where the trace files are when runs.csv does not list them, and what their names say."""
+
+    glob: str | None = Field(None, description="e.g. 'raw/**/*.csv'; then runs.csv is not needed")
+    exclude: list[str] = Field(default_factory=list, description="globs of files that are not traces")
+    name_pattern: str | None = Field(
+        None, description="regular expression with named groups, matched against the whole relative path"
+    )
+    values: dict[str, dict[str, float | str]] = Field(
+        default_factory=dict, description="value map per named part: sign = {'' = 1, n = -1}"
+    )
+    columns: dict[str, str] = Field(
+        default_factory=dict, description="our column = template over parts, e.g. run_id = '{rig}_{bar}bar'"
+    )
+    runs_columns: dict[str, str] = Field(default_factory=dict, description="our name = runs.csv's column name")
+
+
+class Quantity(_Strict):
+    """Another quantity and unit in a slot: `[quantities] force = {quantity = "torque", unit = "mN m"}`."""
+
+    quantity: str
+    unit: str
+
+
+class Strokes(_Strict):
+    """How strokes and their steady windows are found."""
+
+    smooth_samples: int = Field(7, ge=1, description="displacement is smoothed over this many samples to find turns")
+    min_travel_mm: float | None = Field(None, description="shorter strokes are not strokes; default: 5 % of the range")
+    min_samples: int = Field(20, ge=4, description="fewer samples in the steady window: too short")
+    speed_tolerance: float = Field(0.1, gt=0, description="steady: smoothed speed within this share of its plateau")
+    min_steady_share: float = Field(0.2, gt=0, lt=1, description="a steady window shorter than this share is too short")
+    whole_file: bool = Field(False, description="every file is one steady stroke; no pre-sliding, no ramps")
+
+
+class Bins(_Strict):
+    """How the steady window is cut along displacement."""
+
+    per_stroke: int = Field(40, ge=1)
+    min_samples: int = Field(4, ge=1)
+
+
+class Quality(_Strict):
+    """When a row, file or repeat is left out."""
+
+    max_bad_rows: float = Field(0.05, ge=0, le=1, description="share of rows a file may lose before it is left out")
+    outlier_p: float = Field(0.001, gt=0, lt=1, description="family-wise level at which a repeat is flagged")
+    drop_outliers: bool = False
+    max_gap_factor: float = Field(10.0, gt=1, description="a time step this many times the median is a gap")
+    max_gap_share: float = Field(0.2, gt=0, le=1, description="gaps that hide more of the time leave the stroke out")
+    saturated_share: float = Field(0.05, gt=0, le=1, description="share of samples at the very extreme")
+    stuck_samples: int = Field(50, ge=3, description="this many equal force samples in a row are stuck")
+    spike_sigma: float = Field(12.0, gt=3, description="a sample this many robust SDs off its neighbours is a spike")
+    speed_disagreement: float = Field(0.2, gt=0, description="share by which speed x time may miss displacement")
+
+
+class Sensor(_Strict):
+    """The force sensor's accuracy: type B, one unknown shared by all samples."""
+
+    accuracy: float = Field(0.2, ge=0, description="half-width in the force slot's unit")
+    distribution: Literal["rectangular", "normal"] = "rectangular"
+
+    @property
+    def u(self) -> float:
+        """Standard uncertainty: half-width / sqrt 3 (rectangular), half-width / 1.96 (normal)."""
+        return self.accuracy / (3**0.5 if self.distribution == "rectangular" else 1.959964)
+
+
+class Loop(_Strict):
+    """How the loop is closed."""
+
+    family_error: float = Field(0.005, gt=0, lt=0.5, description="chance of any false effect per campaign")
+    max_rounds: int = Field(8, ge=1)
+    folds: int = Field(5, ge=2)
+    seed: int = 1
+    ignore_channels: list[str] = Field(default_factory=list)
+    effects_folder: str | None = Field(None, description="folder of the user's own effects; Python is run from it")
+
+
+class Config(_Strict):
+    """One rig: what its files look like and which columns make a condition."""
+
+    name: str = "default"
+    condition: list[str] = Field(default_factory=lambda: list(AGING_CONDITION))
+    rubber: list[str] = Field(default_factory=list, description="columns that tell rubbers apart")
+    position_origin: Literal["rig", "file"] = "rig"
+    trace: TraceFormat = TraceFormat()
+    files: Files = Files()
+    quantities: dict[Literal["force", "displacement", "speed", "load", "time"], Quantity] = Field(default_factory=dict)
+    column_units: dict[str, str] = Field(default_factory=dict, description="units of the campaign's own channels")
+    strokes: Strokes = Strokes()
+    bins: Bins = Bins()
+    quality: Quality = Quality()
+    sensor: Sensor = Sensor()
+    loop: Loop = Loop()
+
+    @field_validator("condition")
+    @classmethod
+    def _some_condition(cls, value: list[str]) -> list[str]:
+        if not value or len(set(value)) != len(value):
+            raise ValueError("name at least one column, each once")
+        return value
+
+    @model_validator(mode="after")
+    def _patterns_compile(self) -> Config:
+        for place, pattern in (
+            ("files.name_pattern", self.files.name_pattern),
+            ("trace.header_ends_at", self.trace.header_ends_at),
+            *((f"trace.header_fields.{k}", v) for k, v in self.trace.header_fields.items()),
+        ):
+            if pattern is not None:
+                try:
+                    re.compile(pattern)
+                except re.error as error:
+                    raise ValueError(f"{place} is not a regular expression: {error}") from None
+        return self
+
+    @property
+    def units(self) -> Units:
+        """True unit of every slot."""
+        return Units({slot: (q.quantity, q.unit) for slot, q in self.quantities.items()}, self.column_units)
+
+    @property
+    def aging(self) -> bool:
+        """Whether `aging_days` is one of the condition columns."""
+        return "aging_days" in self.condition
+
+    @property
+    def series_columns(self) -> list[str]:
+        """Condition columns without the days."""
+        return [name for name in self.condition if name != "aging_days"]
+
+
+ConfigPath = Annotated[Path | None, "path of a TOML config, or None for the default inside the package"]
+
+
+def load_config(path: ConfigPath = None) -> Config:
+    """Return the config at `path`, or the default that ships inside the package.
+
+    Raises
+    ------
+    ConfigError
+        If the file is missing, is not TOML, or has a key or value that is not allowed; one line per fault.
+    """
+    if path is None:
+        text, name = files("sealfit").joinpath("configs/default.toml").read_text("utf-8"), "default.toml"
+    else:
+        try:
+            text, name = Path(path).read_text("utf-8"), str(path)
+        except OSError as error:
+            raise ConfigError(f"cannot be read ({error.strerror}).", file=path, mend="Check --config.") from error
+        except UnicodeDecodeError as error:
+            raise ConfigError("is not UTF-8.", file=path, mend="Save it as UTF-8.") from error
+    return parse_config(text, name)
+
+
+def parse_config(text: str, name: str) -> Config:
+    """Return the config written in `text`; `name` is what messages call it.
+
+    Raises
+    ------
+    ConfigError
+        As `load_config`.
+    """
+    try:
+        return Config.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"is not TOML: {error}.", file=name, mend="See configs/ for examples.") from error
+    except ValidationError as error:
+        raise ConfigError(_explain(error), file=name, mend="See the README for every key.") from error
+
+
+def _explain(error: ValidationError) -> str:
+    lines = []
+    for fault in error.errors():
+        key = ".".join(str(part) for part in fault["loc"]) or "the file"
+        if fault["type"] == "extra_forbidden":
+            lines.append(f"unknown key '{key}'.")
+        else:
+            lines.append(f"key '{key}': {fault['msg']}.")
+    return " ".join(lines)

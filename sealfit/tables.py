@@ -1,0 +1,389 @@
+"""Every column of every table, once: name, unit, type and meaning.
+
+Column names are fixed (design: "Units"): a name such as `force_N` is a slot. A config may declare that the slot holds
+another quantity and unit; `Units.of` gives the true unit, and that is what the Parquet metadata and every label show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import pyarrow as pa
+
+FLOAT, INT, TEXT, BOOL = pa.float64(), pa.int64(), pa.string(), pa.bool_()
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column: its name, true unit at default (empty for ratios and labels), type and meaning."""
+
+    name: str
+    unit: str
+    dtype: pa.DataType
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """One table: its fixed columns and, if `open_`, whatever condition columns and channels the campaign adds."""
+
+    name: str
+    columns: tuple[Column, ...]
+    open_: bool = False
+
+    def names(self) -> list[str]:
+        """Return the fixed column names in order."""
+        return [column.name for column in self.columns]
+
+
+_DEFAULT = {
+    "force": ("friction force", "N"),
+    "displacement": ("displacement", "mm"),
+    "speed": ("sliding speed", "mm/s"),
+    "load": ("normal load", "N"),
+    "time": ("time", "s"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Units:
+    """The true unit of each slot: `Units({"force": ("torque", "mN m")})` when a config declares one.
+
+    Keys are quantities (`force`, `displacement`, `speed`, `load`, `time`); values are (quantity name, unit).
+    """
+
+    declared: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    channels: Mapping[str, str] = field(default_factory=dict)  # units of the campaign's own channels
+
+    def quantity(self, slot: str) -> str:
+        """Return the true name of a slot's quantity, e.g. "torque" for `force`."""
+        return {**_DEFAULT, **self.declared}[slot][0]
+
+    def unit(self, slot: str) -> str:
+        """Return the true unit of `force`, `displacement`, `speed`, `load` or `time`."""
+        return {**_DEFAULT, **self.declared}[slot][1]
+
+    def of(self, column: str) -> str:
+        """Return the true unit of a column by its name; "" if it has none that we know."""
+        if column in self.channels:
+            return self.channels[column]
+        if column.startswith(("displacement", "distance")) and column.endswith("_mm"):
+            return self.unit("displacement")
+        if column.startswith("speed") and column.endswith("_mm_s"):
+            return self.unit("speed")
+        if column.startswith("load") and column.endswith("_N"):
+            return self.unit("load")
+        if column.endswith("_N"):
+            return self.unit("force")
+        if column in _KNOWN:
+            return _KNOWN[column]
+        for ending, unit in _ENDINGS.items():
+            if column.endswith(ending):
+                return unit
+        return ""
+
+    def label(self, column: str) -> str:
+        """Return an axis label with the true quantity and unit, e.g. "torque (mN m)"."""
+        slots = {
+            "force_N": "force",
+            "displacement_mm": "displacement",
+            "speed_mm_s": "speed",
+            "load_N": "load",
+            "time_s": "time",
+        }
+        if column in slots:
+            return f"{self.quantity(slots[column])} ({self.unit(slots[column])})"
+        unit = self.of(column)
+        words = _MEANING.get(column, column if not unit else _without_unit(column)).replace("_", " ")
+        return f"{words} ({unit})" if unit else words
+
+
+_ENDINGS = {"_C": "°C", "_pct": "%", "_days": "d", "_h": "h", "_s": "s", "_mm": "mm", "_N": "N", "_bar": "bar"}
+_KNOWN = {"aging_days": "d", "temperature_C": "°C", "compression_ratio_pct": "%", "elapsed_h": "h", "time_s": "s"}
+_MEANING = {
+    "distance_mm": "sliding distance",
+    "run_order": "run order",
+    "elapsed_h": "time since first run",
+    "aging_days": "aging time",
+    "temperature_C": "aging temperature",
+    "compression_ratio_pct": "compression ratio",
+    "speed_set_mm_s": "commanded speed",
+}
+
+
+def _without_unit(column: str) -> str:
+    for ending in ("_mm_s", *_ENDINGS):
+        if column.endswith(ending):
+            return column.removesuffix(ending)
+    return column
+
+
+# ---------------------------------------------------------------- keys that several tables share
+FILE = Column("file", "", TEXT, "trace file, relative to the campaign folder")
+RUN = Column("run_id", "", TEXT, "run: one condition at one speed and direction")
+REPEAT = Column("repeat", "", INT, "number of the repeat within its run")
+STROKE = Column("stroke", "", INT, "stroke within the file, from 1")
+DIRECTION = Column("direction", "", INT, "+1 where displacement rises, -1 where it falls")
+SPECIMEN = Column("specimen_id", "", TEXT, "piece of rubber; one per condition where not given")
+CONDITION = Column("condition", "", TEXT, "condition: the condition columns in words; 'unaged' for day 0")
+SERIES = Column("series", "", TEXT, "aging series: the condition without days; 'unaged' for day 0")
+RUBBER = Column("rubber", "", TEXT, "rubber, from the config's rubber columns; 'rubber' if there is one")
+SPEED = Column("speed_mm_s", "mm/s", FLOAT, "measured sliding speed, signed")
+SPEED_SET = Column("speed_set_mm_s", "mm/s", FLOAT, "commanded speed, magnitude; null if not given")
+LOAD = Column("load_N", "N", FLOAT, "normal load; null if not given")
+FORCE = Column("force_N", "N", FLOAT, "friction force, with the sign of the motion where it opposes it")
+DISPLACEMENT = Column("displacement_mm", "mm", FLOAT, "displacement in the rig's own coordinate")
+DISTANCE = Column("distance_mm", "mm", FLOAT, "distance slid since the stroke's start")
+TIME = Column("time_s", "s", FLOAT, "time in the file; from the stroke's first row in a file of several strokes")
+RUN_ORDER = Column("run_order", "", FLOAT, "place of the file in the order of started_at; null if not given")
+ELAPSED = Column("elapsed_h", "h", FLOAT, "time since the campaign's first file; null if not given")
+
+KEYS = (FILE, RUN, REPEAT, STROKE, DIRECTION, SPECIMEN, CONDITION, SERIES, RUBBER)
+
+# ---------------------------------------------------------------- ingest
+INPUTS = Schema(
+    "inputs",
+    (
+        FILE,
+        Column("size", "byte", INT, "size of the file"),
+        Column("mtime_ns", "ns", INT, "time of last change"),
+        Column("sha256", "", TEXT, "hash of the content"),
+        Column("rows", "", INT, "data rows read"),
+        Column("strokes", "", INT, "strokes found"),
+        Column("status", "", TEXT, "used | left out | not matched"),
+    ),
+)
+RUNS = Schema(
+    "runs",
+    (
+        *KEYS,
+        SPEED,
+        SPEED_SET,
+        LOAD,
+        RUN_ORDER,
+        ELAPSED,
+        Column("started_at", "", TEXT, "start as given, ISO 8601; null if not given"),
+        Column("used", "", BOOL, "false where the stroke was left out; quality says why"),
+    ),
+    open_=True,
+)
+QUALITY = Schema(
+    "quality",
+    (
+        FILE,
+        Column("stroke", "", INT, "stroke, null for the whole file"),
+        Column("line", "", INT, "line in the file, null if not one line"),
+        Column("column", "", TEXT, "column concerned, null if none"),
+        Column("check", "", TEXT, "name of the rule"),
+        Column("value", "", TEXT, "what was found"),
+        Column("severity", "", TEXT, "info | warning | error"),
+        Column("action", "", TEXT, "kept | row left out | stroke left out | file left out"),
+        Column("reason", "", TEXT, "in a sentence"),
+        Column("mend", "", TEXT, "what to do about it"),
+    ),
+)
+TRACES = Schema(
+    "traces",
+    (
+        FILE,
+        STROKE,
+        TIME,
+        DISPLACEMENT,
+        FORCE,
+        Column("steady", "", BOOL, "true inside the steady window"),
+    ),
+    open_=True,  # channels measured along the trace
+)
+TRACES_MEAN = Schema(
+    "traces_mean",
+    (
+        RUN,
+        DIRECTION,
+        CONDITION,
+        DISPLACEMENT,
+        Column("force_N", "N", FLOAT, "mean force of the repeats at this displacement"),
+        Column("force_se_N", "N", FLOAT, "standard error of that mean, from the repeats; null for one repeat"),
+        Column("n", "", INT, "strokes averaged"),
+        Column("steady", "", BOOL, "true where every stroke averaged is in its steady window"),
+    ),
+)
+STEADY = Schema(
+    "steady",
+    (
+        *KEYS,
+        SPEED,
+        SPEED_SET,
+        LOAD,
+        Column("force_N", "N", FLOAT, "mean force over the steady window"),
+        Column("force_sd_N", "N", FLOAT, "standard deviation of the samples in the window"),
+        Column("force_se_N", "N", FLOAT, "standard error of the mean, autocorrelation counted in"),
+        Column("n", "", INT, "samples in the window"),
+        DISPLACEMENT,
+        Column("displacement_from_mm", "mm", FLOAT, "start of the steady window"),
+        Column("displacement_to_mm", "mm", FLOAT, "end of the steady window"),
+        DISTANCE,
+        TIME,
+        RUN_ORDER,
+        ELAPSED,
+        Column("outlier", "", BOOL, "true where this repeat disagrees with its run beyond pooled scatter"),
+        Column("used", "", BOOL, "false where the config leaves an outlier out of the fits"),
+    ),
+    open_=True,
+)
+BINS = Schema(
+    "bins",
+    (
+        *KEYS,
+        Column("bin", "", INT, "number of the bin along its stroke, from 0"),
+        SPEED,
+        SPEED_SET,
+        LOAD,
+        FORCE,
+        Column("force_sd_N", "N", FLOAT, "standard deviation of the samples in the bin"),
+        Column("n", "", INT, "samples in the bin"),
+        DISPLACEMENT,
+        DISTANCE,
+        TIME,
+        RUN_ORDER,
+        ELAPSED,
+    ),
+    open_=True,
+)
+
+# ---------------------------------------------------------------- fits (long: one row per parameter)
+_FIT = (
+    Column("quantity", "", TEXT, "what was fitted, e.g. steady, mu_s, mu_c, statistics"),
+    Column("parameter", "", TEXT, "parameter or statistic, in the field's symbol"),
+    Column("value", "", FLOAT, "estimate"),
+    Column("se", "", FLOAT, "standard error (type A)"),
+    Column("lo95", "", FLOAT, "lower end of the 95 % interval (type A)"),
+    Column("hi95", "", FLOAT, "upper end of the 95 % interval (type A)"),
+    Column("u_sys", "", FLOAT, "standard uncertainty from the sensor's accuracy (type B)"),
+    Column("unit", "", TEXT, "unit of value, se, lo95, hi95 and u_sys"),
+    Column("identified", "", BOOL, "false where these data do not determine it"),
+    Column("reason", "", TEXT, "why it is not determined, or a remark such as mu_s < mu_c"),
+)
+STEADY_FIT = Schema("steady_fit", (CONDITION, SERIES, RUBBER, *_FIT), open_=True)
+AGING_FIT = Schema("aging_fit", (SERIES, RUBBER, *_FIT), open_=True)
+
+# ---------------------------------------------------------------- the loop
+EFFECTS = Schema(
+    "effects",
+    (
+        Column("round", "", INT, "round of the loop in which it was added"),
+        Column("id", "", TEXT, "name in the catalogue, or smooth, levels, ..."),
+        Column("label", "", TEXT, "in words"),
+        Column("channels", "", TEXT, "channels it reads, separated by spaces"),
+        Column("acts_on", "", TEXT, "force, mu or a parameter of the declared model"),
+        Column("operation", "", TEXT, "add | multiply"),
+        Column("form", "", TEXT, "equation"),
+        Column("named", "", BOOL, "false where no form does as well as the free shape"),
+        Column("parameter", "", TEXT, "parameter, in the field's symbol"),
+        Column("value", "", FLOAT, "estimate"),
+        Column("lo95", "", FLOAT, "lower end of the 95 % interval"),
+        Column("hi95", "", FLOAT, "upper end of the 95 % interval"),
+        Column("unit", "", TEXT, "unit of value, lo95 and hi95"),
+        Column("p_value", "", FLOAT, "adjusted over the whole search"),
+    ),
+)
+_RESIDUALS = (
+    *BINS.columns,
+    Column("model_N", "N", FLOAT, "force of the model, fitted to all rows"),
+    Column("residual_N", "N", FLOAT, "measured minus model"),
+    Column("heldout_model_N", "N", FLOAT, "force of the model fitted without this row's unit"),
+    Column("heldout_residual_N", "N", FLOAT, "measured minus held-out model"),
+    Column("weight", "", FLOAT, "weight in the errors: each file weighs the same"),
+)
+RESIDUALS_BEFORE = Schema("residuals_before", _RESIDUALS, open_=True)
+RESIDUALS_AFTER = Schema("residuals_after", _RESIDUALS, open_=True)
+
+# ---------------------------------------------------------------- what the report draws of the loop
+LEVELS = Schema(
+    "levels",
+    (
+        Column("stage", "", TEXT, "before | after"),
+        Column("level", "", TEXT, "sample | stroke | file | run | specimen"),
+        Column("channel", "", TEXT, "null for the whole level; else the channel tested within it"),
+        Column("sd_N", "N", FLOAT, "standard deviation of the residual at this level (or that the channel orders)"),
+        Column("share", "", FLOAT, "share of the residual's variance"),
+        Column("df", "", FLOAT, "degrees of freedom"),
+        Column("p_value", "", FLOAT, "that the channel orders the residual, adjusted over the search; null for a level"),
+    ),
+)
+CHANNELS = Schema(
+    "channels",
+    (
+        Column("channel", "", TEXT, "channel"),
+        Column("x", "", FLOAT, "middle of the group of channel values; null for a category"),
+        Column("label", "", TEXT, "the category, or null"),
+        Column("n", "", INT, "bins rows in the group"),
+        Column("before_N", "N", FLOAT, "mean residual before"),
+        Column("before_se_N", "N", FLOAT, "its standard error, from whole units"),
+        Column("after_N", "N", FLOAT, "mean residual after"),
+        Column("after_se_N", "N", FLOAT, "its standard error, from whole units"),
+    ),
+)
+SHAPES = Schema(
+    "shapes",
+    (
+        Column("effect", "", INT, "row in closure.json's effects, from 0"),
+        Column("id", "", TEXT, "effect"),
+        Column("channel", "", TEXT, "channel drawn along"),
+        Column("x", "", FLOAT, "channel value; null for a category"),
+        Column("label", "", TEXT, "the category, or null"),
+        Column("value", "", FLOAT, "added force, factor minus one, or change of the parameter"),
+        Column("lo95", "", FLOAT, "lower end of the 95 % band"),
+        Column("hi95", "", FLOAT, "upper end of the 95 % band"),
+        Column("free", "", FLOAT, "the free smooth shape at x, null where none was fitted"),
+        Column("unit", "", TEXT, "unit of value, lo95, hi95 and free"),
+    ),
+)
+CURVES = Schema(
+    "curves",
+    (
+        CONDITION,
+        SERIES,
+        SPEED,
+        LOAD,
+        Column("force_before_N", "N", FLOAT, "declared model"),
+        Column("force_after_N", "N", FLOAT, "model with its effects, other channels at their means"),
+        Column("force_after_lo95_N", "N", FLOAT, "lower end of the mean's 95 % interval"),
+        Column("force_after_hi95_N", "N", FLOAT, "upper end of the mean's 95 % interval"),
+    ),
+    open_=True,
+)
+AGING_CURVES = Schema(
+    "aging_curves",
+    (
+        SERIES,
+        Column("quantity", "", TEXT, "mu_s or mu_c"),
+        Column("aging_days", "d", FLOAT, "aging time"),
+        Column("value", "", FLOAT, "the law's value"),
+        Column("lo95", "", FLOAT, "lower end of its 95 % interval"),
+        Column("hi95", "", FLOAT, "upper end of its 95 % interval"),
+    ),
+)
+
+SCHEMAS = {
+    schema.name: schema
+    for schema in (
+        INPUTS,
+        RUNS,
+        QUALITY,
+        TRACES,
+        TRACES_MEAN,
+        STEADY,
+        BINS,
+        STEADY_FIT,
+        AGING_FIT,
+        EFFECTS,
+        RESIDUALS_BEFORE,
+        RESIDUALS_AFTER,
+        LEVELS,
+        CHANNELS,
+        SHAPES,
+        CURVES,
+        AGING_CURVES,
+    )
+}
