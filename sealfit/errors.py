@@ -90,6 +90,9 @@ class CampaignError(SealfitError):
         self.faults = tuple(faults)
         super().__init__("\n".join(str(fault) for fault in self.faults))
 
+    def __reduce__(self):
+        return type(self), (self.faults,)  # so that it comes back whole from a worker process
+
     def as_dicts(self) -> list[dict]:
         """Return one dict per fault."""
         return [fault.as_dict() for fault in self.faults]
@@ -117,3 +120,7 @@ class ParameterError(SealfitError):
 
 class FitError(SealfitError):
     """A fit that cannot be done with these data, with the condition and the parameter."""
+
+
+class WorkerError(SealfitError):
+    """A worker process died (killed, or out of memory) before it had answered."""

@@ -1,0 +1,134 @@
+"""Map work over the cores of this computer, in order; the only file that knows processes."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
+from typing import TypeVar
+
+from sealfit.errors import WorkerError
+
+Given = TypeVar("Given")
+Made = TypeVar("Made")
+
+CHUNKS_PER_WORKER = 4  # enough to even out items of different cost, few enough to keep the cost of sending low
+MAX_CHUNK = 32  # so that progress is shown often
+WAITING_PER_WORKER = 2  # chunks sent ahead of the one awaited: bounds the memory of results not yet taken
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def cores() -> int:
+    """Return the number of cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def run_map(
+    function: Callable[[Given], Made], items: Iterable[Given], *, workers: int = 1, few: int = 1
+) -> Iterator[Made]:
+    """Yield `function(item)` for every item, in the order of the items.
+
+    With one worker, with at most `few` items, or inside a worker, the work is done here; otherwise in `workers` new
+    processes, several items at a time. Results do not depend on `workers`.
+
+    Parameters
+    ----------
+    function : callable
+        A pure function at the top level of a module: processes find it by its name. An exception it raises ends the
+        map and is raised here.
+    items : iterable
+        What to map over; each item is sent to a process, so keep it small.
+    workers : int
+        Processes to use, at least 1.
+    few : int
+        Up to this many items are not worth a process (starting one takes about a second).
+
+    Raises
+    ------
+    WorkerError
+        If a process dies before it has answered (killed, or out of memory).
+    """
+    waiting = list(items)
+    if workers <= 1 or len(waiting) <= few or multiprocessing.parent_process() is not None:
+        return map(function, waiting)
+    return _in_processes(function, waiting, min(workers, len(waiting)))
+
+
+def _in_processes(function: Callable[[Given], Made], items: Sequence[Given], workers: int) -> Iterator[Made]:
+    size = max(1, min(MAX_CHUNK, len(items) // (workers * CHUNKS_PER_WORKER)))
+    chunks = (items[start : start + size] for start in range(0, len(items), size))
+    # Spawn, not fork: a fork copies the locks of pyarrow's and BLAS's threads without the threads that free them.
+    executor = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
+    sent: deque[Future[list[Made]]] = deque()
+
+    def send(count: int) -> None:
+        with _no_interrupt_for_children():
+            sent.extend(executor.submit(_apply, function, chunk) for chunk in islice(chunks, count))
+
+    finished = False
+    try:
+        send(workers * WAITING_PER_WORKER)
+        while sent:
+            made = sent.popleft().result()
+            send(1)
+            yield from made
+        finished = True
+    except BrokenProcessPool as error:
+        raise WorkerError(
+            "a worker process died before it had answered.",
+            mend="If memory ran out, use fewer workers (--workers 1).",
+        ) from error
+    finally:
+        processes = list((executor._processes or {}).values())
+        executor.shutdown(wait=finished, cancel_futures=True)
+        if not finished:  # interrupted, failed, or no longer wanted: nobody waits for what is still being computed
+            for process in processes:
+                process.terminate()
+            for process in processes:
+                process.join()
+
+
+def _apply(function: Callable[[Given], Made], chunk: Sequence[Given]) -> list[Made]:
+    return [function(item) for item in chunk]
+
+
+@contextlib.contextmanager
+def _no_interrupt_for_children() -> Iterator[None]:
+    """Start processes that do not see Ctrl-C: the parent stops them, so none prints a traceback of its own.
+
+    A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not lost.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker() -> None:
+    if sys.platform == "win32":
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in ONE_THREAD:  # read when numpy loads, which is later: the processes share the cores, not the threads
+        os.environ.setdefault(name, "1")
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is gone, or a killed run would leave its workers waiting forever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

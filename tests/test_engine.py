@@ -1,0 +1,156 @@
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sealfit.engine import cores, run_map
+from sealfit.errors import CampaignError, Fault, RequestError, WorkerError
+
+HERE = Path(__file__).resolve().parent
+
+
+def square(number):
+    return number * number
+
+
+def process_id(_):
+    return os.getpid()
+
+
+def nested(number):
+    return list(run_map(square, range(number), workers=4))
+
+
+def fail_on_three(number):
+    if number == 3:
+        raise RequestError("three is wrong.", file="p.csv", line=4, mend="Use another.")
+    return number
+
+
+def fail_with_faults(number):
+    raise CampaignError([Fault("rule", f"{number} is wrong.", file="runs.csv", line=2)])
+
+
+def die(number):
+    if number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def wait_long(number):
+    time.sleep(60)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_come_in_the_order_of_the_items(workers):
+    assert list(run_map(square, range(37), workers=workers)) == [n * n for n in range(37)]
+
+
+def test_one_worker_or_few_items_stay_in_this_process():
+    assert set(run_map(process_id, range(5), workers=1)) == {os.getpid()}
+    assert set(run_map(process_id, range(5), workers=2, few=5)) == {os.getpid()}
+
+
+def test_more_items_go_to_other_processes():
+    used = set(run_map(process_id, range(5), workers=2))
+    assert os.getpid() not in used
+    assert 1 <= len(used) <= 2
+
+
+def test_no_items_give_nothing():
+    assert list(run_map(square, [], workers=3)) == []
+
+
+def test_a_map_inside_a_worker_needs_no_further_processes():
+    assert list(run_map(nested, [2, 3], workers=2)) == [[0, 1], [0, 1, 4]]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_of_the_function_comes_back_whole(workers):
+    with pytest.raises(RequestError, match="three is wrong") as caught:
+        list(run_map(fail_on_three, range(8), workers=workers))
+    assert (caught.value.file, caught.value.line, caught.value.mend) == ("p.csv", 4, "Use another.")
+
+
+def test_faults_of_a_campaign_come_back_whole():
+    with pytest.raises(CampaignError, match=r"^runs.csv:2: 0 is wrong\.$") as caught:
+        list(run_map(fail_with_faults, range(2), workers=2))
+    assert caught.value.faults[0].line == 2
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+
+def test_a_dead_worker_is_a_clear_error():
+    with pytest.raises(WorkerError, match=r"worker process died.*--workers 1"):
+        list(run_map(die, range(4), workers=2))
+
+
+def test_cores_is_what_this_process_may_use():
+    assert 1 <= cores() <= (os.cpu_count() or 1)
+
+
+PROGRAM = """
+import sys
+sys.path.insert(0, {tests!r})
+from sealfit.engine import run_map
+from test_engine import wait_long
+
+if __name__ == "__main__":
+    print("begun", flush=True)
+    try:
+        list(run_map(wait_long, range(4), workers=2))
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+"""
+
+
+def children_of(pid):
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = entry.read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid:
+            found.append(int(entry.parent.name))
+    return found
+
+
+def alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc to see the processes")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill -9"])
+def test_no_worker_outlives_its_parent(tmp_path, how):
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM.format(tests=str(HERE)))
+    with subprocess.Popen(
+        [sys.executable, program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as run:
+        assert run.stdout.readline() == "begun\n"
+        until = time.monotonic() + 20
+        while len(children_of(run.pid)) < 3 and time.monotonic() < until:  # two workers and the resource tracker
+            time.sleep(0.05)
+        children = children_of(run.pid)
+        assert len(children) >= 2
+        if how == signal.SIGINT:
+            os.killpg(run.pid, how)  # as a terminal does: to the whole group
+        else:
+            os.kill(run.pid, how)
+        _, stderr = run.communicate(timeout=20)
+    if how == signal.SIGINT:
+        assert run.returncode == 130
+        assert stderr == "interrupted\n"
+    until = time.monotonic() + 20
+    while any(map(alive, children)) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not any(map(alive, children))
