@@ -26,7 +26,9 @@ class _Strict(BaseModel):
 class TraceFormat(_Strict):
     """How one trace file is written."""
 
-    encoding: str = Field("auto", description="utf-8, latin-1, utf-16, or auto (byte-order mark, then UTF-8, then Latin-1)")
+    encoding: str = Field(
+        "auto", description="utf-8, latin-1, utf-16, or auto (byte-order mark, then UTF-8, then Latin-1)"
+    )
     delimiter: str = Field(",", description="one character, 'tab' or 'whitespace'")
     decimal: Literal[".", ","] = "."
     header_lines: int | None = Field(None, ge=0, description="lines before the first data row, column names included")
@@ -50,6 +52,9 @@ class TraceFormat(_Strict):
         default_factory=dict, description="column = safe expression over columns, file-name parts and constants"
     )
     constants: dict[str, float] = Field(default_factory=dict)
+    drop_columns: list[str] = Field(
+        default_factory=list, description="columns that `compute`, `keep` or the integral read and that are no channels"
+    )
     integrate_displacement: str | None = Field(None, description="speed column whose time integral is displacement")
     integrate_per: Literal["s", "min"] = Field("s", description="time unit of that speed: rpm is per min")
 
@@ -60,13 +65,18 @@ class Files(_Strict):
     glob: str | None = Field(None, description="e.g. 'raw/**/*.csv'; then runs.csv is not needed")
     exclude: list[str] = Field(default_factory=list, description="globs of files that are not traces")
     name_pattern: str | None = Field(
-        None, description="regular expression with named groups, matched against the whole relative path"
+        None,
+        description="regular expression with named groups, matched against the whole relative path; "
+        "every part is a channel but those whose name starts with '_'",
     )
     values: dict[str, dict[str, float | str]] = Field(
         default_factory=dict, description="value map per named part: sign = {'' = 1, n = -1}"
     )
     columns: dict[str, str] = Field(
         default_factory=dict, description="our column = template over parts, e.g. run_id = '{rig}_{bar}bar'"
+    )
+    compute: dict[str, str] = Field(
+        default_factory=dict, description="column = safe expression over parts, e.g. speed_mm_s = 'sign * rpm'"
     )
     runs_columns: dict[str, str] = Field(default_factory=dict, description="our name = runs.csv's column name")
 
@@ -169,6 +179,21 @@ class Config(_Strict):
                     re.compile(pattern)
                 except re.error as error:
                     raise ValueError(f"{place} is not a regular expression: {error}") from None
+        return self
+
+    @model_validator(mode="after")
+    def _expressions_are_safe(self) -> Config:
+        from sealfit.ingest.expression import parse  # here, so that commands that read no config start quickly
+
+        rows = {f"trace.compute.{k}": (v, False) for k, v in self.trace.compute.items()}
+        rows |= {f"files.compute.{k}": (v, False) for k, v in self.files.compute.items()}
+        if self.trace.keep is not None:
+            rows["trace.keep"] = (self.trace.keep, True)
+        for place, (text, condition) in rows.items():
+            try:
+                parse(text, condition=condition)
+            except ConfigError as error:
+                raise ValueError(f"{place}: {error}") from None
         return self
 
     @property

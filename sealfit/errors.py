@@ -98,6 +98,23 @@ class CampaignError(SealfitError):
         return [fault.as_dict() for fault in self.faults]
 
 
+class BadFile(SealfitError):
+    """A trace file that must be left out; the run goes on without it. `faults` says why, the deciding one last."""
+
+    def __init__(self, *faults: Fault):
+        self.faults = faults
+        super().__init__("\n".join(str(fault) for fault in faults))
+
+    @property
+    def fault(self) -> Fault:
+        """The fault that decided."""
+        return self.faults[-1]
+
+    def as_dicts(self) -> list[dict]:
+        """Return one dict per fault."""
+        return [fault.as_dict() for fault in self.faults]
+
+
 class ConfigError(SealfitError):
     """A config file that cannot be used: unknown key, wrong type, unsafe expression."""
 
