@@ -36,11 +36,11 @@ def test_odd_in_speed_and_between_static_and_coulomb(speed, load, mu_s, mu_c, v_
         assert low - 1e-9 <= abs(forward) <= high + 1e-9
 
 
-@given(load=st.floats(0, 1e3), factor=st.floats(0.1, 10))
+@given(load=st.floats(0, 1e3, allow_subnormal=False), factor=st.floats(0.1, 10))
 def test_proportional_to_load_without_viscosity(load, factor):
     model = PAPER | {"sigma_2": 0.0}
     npt.assert_allclose(
-        stribeck_force(3.0, factor * load, **model), factor * stribeck_force(3.0, load, **model), rtol=1e-12
+        stribeck_force(3.0, factor * load, **model), factor * stribeck_force(3.0, load, **model), rtol=1e-12, atol=1e-300
     )
 
 
