@@ -1,4 +1,5 @@
-"""The keys `condition`, `series` and `rubber` of a table, built from its condition columns; the one place that spells them."""
+"""The keys `condition`, `series` and `rubber` of a table, built from its condition columns; the one place that spells
+them."""
 
 from __future__ import annotations
 
@@ -21,10 +22,10 @@ def condition_columns(config: Config) -> list[str]:
 def add_keys(table: pd.DataFrame, config: Config) -> pd.DataFrame:
     """Return `table` with `condition`, `series` and `rubber`.
 
-    A condition is spelled "temperature_C=60, compression_ratio_pct=80, aging_days=4"; a series is the condition without days
-    ("all" when no other column is left). Rows with aging_days = 0 are "unaged" in both ("unaged, <rubber>" where the config
-    names rubber columns), whatever stands in their other condition cells. Without days, series and condition are equal. A
-    row with an empty condition cell has null for both, unless it is unaged.
+    A condition is spelled "temperature_C=60, compression_ratio_pct=80, aging_days=4"; a series is the condition
+    without days ("all" when no other column is left). Rows with aging_days = 0 are "unaged" in both ("unaged,
+    <rubber>" where the config names rubber columns), whatever stands in their other condition cells. Without days,
+    series and condition are equal. A row with an empty condition cell has null for both, unless it is unaged.
 
     Parameters
     ----------

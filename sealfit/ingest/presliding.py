@@ -1,0 +1,92 @@
+"""Where the pre-sliding rise of the force ends and sliding is steady, from the force over distance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+SETTLED = np.log(5000.0)  # the rise is over when 1/5000 of it is left: below what the mean over a campaign could show
+AFTER_RAMP = 3.0  # rise lengths after the speed ramp: the bristles follow the changing speed over one rise length
+EARLY = (0.05, 0.5)  # share of the distance in which the plateau is read: near the rise, past any ordinary rise
+
+
+def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> float:
+    """Return the distance from which the force is past its pre-sliding rise; 0 where there is none.
+
+    A bristle at constant speed follows dz/dx = 1 - z / z_ss (LuGre, Eq. 2 divided by v), so the force comes up as
+    F(x) = A + B x - C exp(-x / x_0); A + B x stands for whatever changes slowly beside it. For every x_0 on a grid
+    the rest is linear least squares; the x_0 with the smallest sum of squares is taken, and the rise ends where
+    1/5000 of it is left. A rig that comes up along a straight line (its own elasticity) is over well before.
+
+    Only a force that begins below everything the plateau later shows is a rise: the trough of a ripple, or a force
+    that warming lets fall, is not.
+
+    Parameters
+    ----------
+    distance_mm : ndarray, shape (n,)
+        Distance from standstill, never falling.
+    force_N : ndarray, shape (n,)
+        Force, positive against the motion.
+    ramp_end : int
+        Row at which the speed has reached its plateau.
+
+    Returns
+    -------
+    float
+        Distance in mm.
+
+    Notes
+    -----
+    Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10.1109/9.376053.
+
+    Examples
+    --------
+    >>> x = np.linspace(0.0, 40.0, 1001)
+    >>> end = rise_end_mm(x, 30.0 * (1.0 - np.exp(-x / 0.5)), 0)  # 0.5 mm * ln(5000) = 4.26 mm
+    >>> 4.0 < end < 4.6
+    True
+    """
+    length = float(distance_mm[-1])
+    low, high = np.searchsorted(distance_mm, [EARLY[0] * length, EARLY[1] * length])
+    low = max(low, ramp_end)
+    plateau = force_N[low:high]
+    if len(plateau) < 8:
+        return 0.0
+    level = float(np.median(plateau))
+    noise = float(np.median(np.abs(np.diff(plateau)))) / (0.6745 * np.sqrt(2.0))
+    begin = float(force_N[0])
+    band = float(np.percentile(plateau, 1)) - 4.0 * noise
+    if begin >= band or level - begin <= 0.02 * abs(level):
+        return 0.0
+    scale = _scale_mm(distance_mm[:high], force_N[:high], begin, level)
+    if scale <= 0.0:
+        return 0.0
+    fitted = _rise_length_mm(distance_mm, force_N, scale)
+    ramp = float(distance_mm[min(ramp_end, len(distance_mm) - 1)])
+    return float(max(fitted * SETTLED, ramp + AFTER_RAMP * fitted if ramp > 0.0 else 0.0))
+
+
+def _scale_mm(distance_mm: np.ndarray, force_N: np.ndarray, begin: float, level: float) -> float:
+    """Return the distance over which the force first comes up by 63 %, between samples; counted from where it begins
+    to."""
+    target = begin + (1.0 - np.exp(-1.0)) * (level - begin)
+    above = np.flatnonzero(force_N >= target)
+    if not len(above) or above[0] == 0:
+        return 0.0
+    after = int(above[0])
+    share = (target - force_N[after - 1]) / (force_N[after] - force_N[after - 1])
+    return float(distance_mm[after - 1] + share * (distance_mm[after] - distance_mm[after - 1]))
+
+
+def _rise_length_mm(distance_mm: np.ndarray, force_N: np.ndarray, scale_mm: float) -> float:
+    """Return x_0 of F = A + B x - C exp(-x / x_0), by least squares on a grid around `scale_mm`."""
+    rows = int(np.searchsorted(distance_mm, 12.0 * scale_mm))
+    rows = min(max(rows, 16), len(distance_mm))
+    x, y = distance_mm[:rows], force_N[:rows]
+    lengths = scale_mm * np.geomspace(0.3, 3.0, 25)
+    design = np.stack(
+        [np.broadcast_to(1.0, (25, rows)), np.broadcast_to(x / x[-1], (25, rows)), np.exp(-x / lengths[:, None])],
+        axis=2,
+    )
+    basis, _ = np.linalg.qr(design)
+    explained = np.einsum("kij,i->kj", basis, y)
+    return float(lengths[np.argmax((explained**2).sum(axis=1))])

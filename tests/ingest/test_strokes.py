@@ -1,0 +1,235 @@
+import numpy as np
+import numpy.testing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sealfit.config import Strokes
+from sealfit.ingest.presliding import rise_end_mm
+from sealfit.ingest.strokes import find_strokes, slope, turning_rows
+
+
+def stroke(
+    v=5.0, length=40.0, n=1000, *, rise=0.3, force=30.0, lag=0.05, lead=0.0, noise=0.1, blur=0.002, seed=0, **more
+):
+    """A stroke of a rig whose speed lags by `lag` s: time, displacement, force, and the force without rise and noise."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0.0, length / v + lead, n)
+    since = np.maximum(time - lead, 0.0)
+    x = v * (since - lag * (1.0 - np.exp(-since / lag))) if lag else v * since
+    level = force * (1.0 + more.get("warm", 0.0) * np.exp(-since / more.get("tau", 3.0)))
+    level += more.get("ripple", 0.0) * np.sin(2.0 * np.pi * x / more.get("wavelength", 7.0) + more.get("phase", 0.0))
+    level += more.get("drift", 0.0) * since
+    measured = level * (1.0 - np.exp(-x / rise)) + rng.normal(0.0, noise, n)
+    return time, x + rng.normal(0.0, blur, n), measured, level
+
+
+def only(time, x, force, **settings):
+    found = find_strokes(time, x, force, Strokes(**settings))
+    assert len(found) == 1
+    assert found[0].short is None
+    return found[0]
+
+
+def there_and_back(turns=4, v=5.0, length=40.0, rest=0.0, dt=0.01, noise=0.05, blur=0.002, seed=1):
+    """Strokes to and fro at +-v with a rest of `rest` s at each turn; the force swings over within about 1 mm."""
+    rng = np.random.default_rng(seed)
+    x, force, onsets = [0.0], [0.0], []
+    for i in range(turns):
+        sign = 1 if i % 2 == 0 else -1
+        onsets.append(len(x) - 1)
+        way = np.arange(1, round(length / v / dt) + 1) * v * dt
+        begin = force[-1]
+        x.extend(x[-1] + sign * way)
+        force.extend(sign * 20.0 + (begin - sign * 20.0) * np.exp(-way / 0.25))
+        x.extend([x[-1]] * round(rest / dt))
+        force.extend([force[-1]] * round(rest / dt))
+    x, force = np.array(x), np.array(force)
+    time = np.arange(len(x)) * dt
+    return time, x + rng.normal(0, blur, len(x)), force + rng.normal(0, noise, len(x)), onsets
+
+
+def test_the_window_begins_where_the_rise_and_the_ramp_are_over_and_no_later_than_needed():
+    time, x, force, level = stroke()
+    found = only(time, x, force)
+    first, last = found.rows[[0, -1]]
+    # 1/5000 of the rise is left 0.3 mm * ln(5000) = 2.56 mm from the start.
+    assert 2.0 < x[first] < 3.5
+    assert last == len(x) - 1
+    assert found.speed_mm_s == pytest.approx(5.0, rel=1e-3)
+    kept = force[found.rows] - level[found.rows]
+    assert abs(kept[:50].mean()) < 4 * 0.1 / np.sqrt(50)
+
+
+@pytest.mark.parametrize("rise", [0.01, 0.05, 0.2, 0.5, 1.0])
+def test_what_is_left_of_the_rise_in_the_window_is_below_a_thousandth(rise):
+    time, x, force, level = stroke(rise=rise, noise=0.0, blur=0.0, lag=0.01)
+    rows = only(time, x, force).rows
+    assert np.abs(force[rows] / level[rows] - 1.0).max() < 1e-3
+    assert x[rows[0]] < 0.5 + 14 * rise
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"warm": 0.2, "tau": 1.0},
+        {"warm": 0.2, "tau": 4.0},
+        {"warm": -0.15, "tau": 2.0},
+        {"drift": 0.5},
+        {"drift": -0.5},
+        {"ripple": 2.0, "wavelength": 7.0, "phase": 0.0},
+        {"ripple": 2.0, "wavelength": 12.0, "phase": -np.pi / 2},
+        {"ripple": 0.5, "wavelength": 1.0, "phase": 1.0},
+    ],
+)
+def test_slow_effects_stay_inside_the_window(more, seed):
+    time, x, force, _ = stroke(seed=seed, **more)
+    found = only(time, x, force)
+    assert x[found.rows[0]] < 4.5
+    assert found.rows[-1] == len(x) - 1
+    npt.assert_array_equal(np.diff(found.rows), 1)
+
+
+@pytest.mark.parametrize("phase", np.linspace(0, 2 * np.pi, 9))
+def test_a_file_that_begins_in_steady_sliding_is_steady_from_its_first_row_wherever_its_ripple_begins(phase):
+    time = np.linspace(0.0, 8.0, 800)
+    x = 5.0 * time
+    rng = np.random.default_rng(3)
+    force = 30.0 + 2.0 * np.sin(2 * np.pi * x / 7.0 + phase) + rng.normal(0.0, 0.1, 800)
+    assert only(time, x, force).steady.all()
+
+
+@pytest.mark.parametrize(("blur", "step"), [(0.0, 0.0), (0.05, 0.0), (0.2, 0.0), (0.0, 0.1), (0.0, 0.5)])
+def test_noise_and_resolution_of_the_displacement_neither_split_a_stroke_nor_bias_its_speed(blur, step):
+    time, x, force, _ = stroke(blur=blur)
+    if step:
+        x = np.round(x / step) * step
+    found = only(time, x, force)
+    assert found.speed_mm_s == pytest.approx(5.0, rel=5e-3)
+    assert found.steady.sum() > 800
+
+
+def test_gaps_do_not_bias_the_speed():
+    time, x, force, _ = stroke()
+    keep = np.ones(1000, bool)
+    keep[300:390] = keep[600:650] = keep[960:970] = False
+    found = only(time[keep], x[keep], force[keep])
+    assert found.speed_mm_s == pytest.approx(5.0, rel=1e-3)
+
+
+def test_a_rest_before_the_motion_and_a_stop_after_it_are_outside_the_window():
+    time, x, force, _ = stroke(lead=1.0, n=1100)
+    x = np.concatenate([x, np.full(200, x[-1])])
+    time = np.concatenate([time, time[-1] + 0.008 * np.arange(1, 201)])
+    force = np.concatenate([force, np.linspace(force[-1], 0.7 * force[-1], 200)])
+    found = only(time, x, force)
+    assert time[found.origin] == pytest.approx(1.0, abs=0.05)
+    assert x[found.rows[0]] > 2.0
+    assert found.rows[-1] <= 1100
+    assert found.rows[-1] > 1080
+
+
+def test_a_rest_within_a_stroke_and_the_rise_after_it_are_left_out():
+    one = stroke(length=20.0, n=500)
+    two = stroke(length=20.0, n=500, seed=5)
+    time = np.concatenate([one[0], one[0][-1] + 2.0 + two[0]])
+    x = np.concatenate([one[1], one[1][-1] + two[1]])
+    force = np.concatenate([one[2], two[2]])
+    time = np.concatenate([time[:500], one[0][-1] + np.arange(1, 200) * 0.01, time[500:]])
+    x = np.concatenate([x[:500], np.full(199, x[499]), x[500:]])
+    force = np.concatenate([force[:500], np.full(199, 15.0), force[500:]])
+    found = only(time, x, force)
+    inside = found.steady
+    assert not inside[500:700].any()
+    assert not inside[699:730].any()
+    assert inside[80:480].all()
+    assert inside[800:].all()
+    assert found.speed_mm_s == pytest.approx(5.0, rel=2e-3)
+
+
+@pytest.mark.parametrize("rest", [0.0, 0.5, 3.0])
+@pytest.mark.parametrize("blur", [0.0, 0.002, 0.05])
+def test_strokes_to_and_fro_are_split_where_they_turn(rest, blur):
+    time, x, force, onsets = there_and_back(rest=rest, blur=blur)
+    found = find_strokes(time, x, force, Strokes())
+    assert [s.direction for s in found] == [1, -1, 1, -1]
+    assert [s.number for s in found] == [1, 2, 3, 4]
+    assert [s.stop for s in found[:-1]] == [s.start for s in found[1:]]
+    assert (found[0].start, found[-1].stop) == (0, len(x))
+    for one, onset in zip(found, onsets, strict=True):
+        assert abs(one.origin - onset) <= 12
+        assert one.speed_mm_s == pytest.approx(5.0 * one.direction, rel=5e-3)
+        assert abs(force[one.rows].mean() - 20.0 * one.direction) < 0.02
+        assert len(one.rows) > 600
+
+
+def test_a_backlash_at_the_turn_is_not_a_stroke():
+    time, x, force, _ = there_and_back(turns=2)
+    middle = len(x) // 2
+    x = x.copy()
+    x[middle - 5 : middle + 15] += 0.3 * np.sin(np.arange(20))
+    assert len(find_strokes(time, x, force, Strokes())) == 2
+
+
+def test_min_travel_says_what_a_stroke_is():
+    time, x, force, _ = there_and_back(turns=3)
+    assert find_strokes(time, x, force, Strokes(min_travel_mm=50.0)) == []
+
+
+def test_nothing_moving_is_no_stroke_and_a_short_one_says_so():
+    rng = np.random.default_rng(0)
+    time = np.arange(500) * 0.01
+    assert find_strokes(time, rng.normal(0.0, 0.01, 500), np.ones(500), Strokes()) == []
+    assert find_strokes(time, np.zeros(500), np.ones(500), Strokes()) == []
+    t, x, force, _ = stroke(n=22)
+    assert "at least 20 are needed" in find_strokes(t, x, force, Strokes())[0].short
+
+
+def test_a_whole_file_is_one_steady_stroke_when_the_config_says_so():
+    time, x, force, _ = stroke()
+    found = find_strokes(time, -x, -force, Strokes(whole_file=True))
+    assert len(found) == 1
+    assert found[0].steady.all()
+    assert found[0].direction == -1
+
+
+@given(
+    v=st.floats(0.01, 100.0),
+    length=st.floats(5.0, 200.0),
+    n=st.integers(200, 1500),
+    origin=st.floats(-1e3, 1e3),
+    sign=st.sampled_from([-1, 1]),
+)
+def test_the_window_does_not_depend_on_the_rig_s_origin_or_direction(v, length, n, origin, sign):
+    time, x, force, _ = stroke(v, length, n, rise=length / 100, lag=0.005 * length / v, noise=0.1, blur=1e-5 * length)
+    one = find_strokes(time, x, force, Strokes())
+    two = find_strokes(time, np.round(origin) + sign * x, sign * force, Strokes())
+    assert len(one) == len(two) == 1
+    npt.assert_array_equal(one[0].steady, two[0].steady)
+    assert two[0].speed_mm_s == pytest.approx(sign * one[0].speed_mm_s, rel=1e-6)
+    assert one[0].speed_mm_s == pytest.approx(v, rel=5e-3)
+
+
+@given(st.lists(st.floats(-100, 100), min_size=2, max_size=40), st.floats(0.5, 20.0))
+def test_neighbouring_turns_alternate_and_are_at_least_the_travel_apart(values, travel):
+    x = np.array(values)
+    turns = turning_rows(x, travel)
+    assert len(turns) != 1
+    assert turns == sorted(turns)
+    steps = np.diff(x[turns])
+    assert (np.abs(steps) >= travel).all()
+    assert (steps[1:] * steps[:-1] < 0).all()
+    assert len(turns) > 0 or np.ptp(x) < travel + 1e-9
+
+
+def test_slope_of_two_pieces_ignores_the_rest_between_them():
+    time = np.arange(10.0)
+    x = np.array([0, 2, 4, 6, 8, 8, 8, 10, 12, 14.0])
+    assert slope(time, x, np.array([1, 1, 1, 1, 0, 0, 1, 1, 1, 1], bool)) == pytest.approx(2.0)
+
+
+def test_no_rise_is_found_in_a_force_that_falls_or_begins_within_its_later_band():
+    x = np.linspace(0.0, 40.0, 1000)
+    assert rise_end_mm(x, 30.0 + 5.0 * np.exp(-x / 3.0), 0) == 0.0
+    assert rise_end_mm(x, np.full(1000, 30.0), 0) == 0.0
