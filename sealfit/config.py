@@ -223,16 +223,25 @@ def load_config(path: ConfigPath = None) -> Config:
     ConfigError
         If the file is missing, is not TOML, or has a key or value that is not allowed; one line per fault.
     """
+    return parse_config(read_config(path), "default.toml" if path is None else str(path))
+
+
+def read_config(path: ConfigPath = None) -> str:
+    """Return the text of the config at `path`, or of the default that ships inside the package.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or is not UTF-8.
+    """
     if path is None:
-        text, name = files("sealfit").joinpath("configs/default.toml").read_text("utf-8"), "default.toml"
-    else:
-        try:
-            text, name = Path(path).read_text("utf-8"), str(path)
-        except OSError as error:
-            raise ConfigError(f"cannot be read ({error.strerror}).", file=path, mend="Check --config.") from error
-        except UnicodeDecodeError as error:
-            raise ConfigError("is not UTF-8.", file=path, mend="Save it as UTF-8.") from error
-    return parse_config(text, name)
+        return files("sealfit").joinpath("configs/default.toml").read_text("utf-8")
+    try:
+        return Path(path).read_text("utf-8-sig")  # Windows editors begin with a byte-order mark
+    except OSError as error:
+        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, mend="Check --config.") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError("is not UTF-8.", file=path, mend="Save it as UTF-8.") from error
 
 
 def parse_config(text: str, name: str) -> Config:
