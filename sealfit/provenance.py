@@ -1,0 +1,40 @@
+"""What results were made from and with, as provenance.json and the report say it."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+from sealfit import __version__
+from sealfit.state import State
+
+PACKAGES = ("numpy", "pandas", "scipy", "pyarrow", "matplotlib", "pydantic", "jinja2", "typer", "rich")
+
+
+def provenance(state: State) -> dict:
+    """Return versions, campaign, config, every input with its hash, and when each step was done."""
+    return {
+        "program": "sealfit",
+        "version": __version__,
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "packages": {name: found for name in PACKAGES if (found := _version(name)) is not None},
+        "campaign": str(state.campaign),
+        "config": {
+            "name": state.config.name,
+            "path": str(state.config.path) if state.config.path else None,
+            "text": state.config.text,
+        },
+        "inputs": [{"file": name, "size": mark.size, "sha256": mark.sha256} for name, mark in state.inputs.items()],
+        "steps": [
+            {"step": name, "version": done.version, "finished_at": done.finished_at, "seconds": done.seconds}
+            for name, done in state.steps.items()
+        ],
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,95 @@
+"""Files written beside their final place, then moved there: nobody ever sees half a file in OUT."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sealfit.errors import OutError
+from sealfit.fingerprint import Fingerprint
+from sealfit.state import to_json
+from sealfit.tables import SCHEMAS, Units
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+STAGING = ".staging-"
+PLOT_DPI = 150  # a half-page plot stays sharp in print
+
+
+class Staged:
+    """Files of one step, written beside their final place and moved there together when the step is complete."""
+
+    def __init__(self, out: Path, units: Units):
+        self._out, self._units = out, units
+        self._folder = out / f"{STAGING}{os.getpid()}"
+        self.files: dict[str, int] = {}
+        self.inputs: dict[str, Fingerprint] | None = None  # set by ingest: what it read
+
+    def table(self, name: str, frame: pd.DataFrame) -> None:
+        """Write table `name` of `tables.SCHEMAS`; ValueError if the frame does not have its columns and types."""
+        from sealfit import parquet
+
+        self._write(f"{name}.parquet", lambda path: parquet.write(frame, SCHEMAS[name], self._units, path))
+
+    def json(self, name: str, document: Mapping) -> None:
+        """Write `document` as `<name>.json`; numbers that are not finite become null."""
+        self.text(f"{name}.json", to_json(document))
+
+    def text(self, name: str, text: str) -> None:
+        """Write a text file."""
+        self._write(name, lambda path: path.write_bytes(text.encode("utf-8")))
+
+    def figure(self, name: str, figure: Figure) -> None:
+        """Write a figure as `plots/<name>.png` and `.svg`."""
+        for kind, about in (("png", {"Software": None}), ("svg", {"Date": None})):
+            drawn = io.BytesIO()
+            figure.savefig(drawn, format=kind, dpi=PLOT_DPI, metadata=about)
+            self._write(f"plots/{name}.{kind}", lambda path, drawn=drawn: path.write_bytes(drawn.getbuffer()))
+
+    def _write(self, name: str, write: Callable[[Path], object]) -> None:
+        path = self._folder / name
+        with disk(self._out):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(path)
+            sync(path)
+            self.files[name] = path.stat().st_size
+
+    def move(self, name: str, to: str | None = None) -> None:
+        """Move a staged file to its final place in one step of the file system."""
+        target = self._out / (to or name)
+        target.parent.mkdir(exist_ok=True)
+        os.replace(self._folder / name, target)
+
+    def clear(self) -> None:
+        """Remove what is staged."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def disk(out: Path) -> Iterator[None]:
+    """Say in one line what the file system refused."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        mend = "Mend the rights of the folder, or choose another --out."
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            mend = "Free some space and run the command again; the results that were there are untouched."
+        raise OutError(f"cannot be written ({reason}).", file=out, mend=mend) from error
+
+
+def sync(path: Path) -> None:
+    """Wait until `path`, a file or a folder, is on the disk itself."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

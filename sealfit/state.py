@@ -1,0 +1,146 @@
+"""What OUT knows of itself: its campaign, its config, its inputs, and the key under which each step was made."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from sealfit.config import Config, parse_config, read_config
+from sealfit.errors import ConfigError, OutError
+from sealfit.fingerprint import Fingerprint
+
+STATE = "state.json"
+FORMAT = 1
+DEFAULT = "default"
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigCopy:
+    """A config as text, and where it came from: `path` is None for the default inside the package."""
+
+    path: Path | None
+    text: str
+
+    @classmethod
+    def at(cls, path: Path | None) -> ConfigCopy:
+        """Return the config file at `path`, or the default.
+
+        Raises
+        ------
+        ConfigError
+            If it cannot be read.
+        """
+        return cls(path.resolve() if path else None, read_config(path))
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return self.path.name if self.path else DEFAULT
+
+    def now(self) -> ConfigCopy:
+        """Return the config as it stands now: read again if its file is still there, else this copy."""
+        if self.path is None or self.path.is_file():
+            return ConfigCopy.at(self.path)
+        return self
+
+    def parse(self) -> Config:
+        """Return the checked config; a folder of the users' effects is taken relative to the config's own folder.
+
+        Raises
+        ------
+        ConfigError
+            If the text is not a config, or the folder of effects does not exist.
+        """
+        config = parse_config(self.text, str(self.path or DEFAULT))
+        if config.loop.effects_folder is None:
+            return config
+        folder = ((self.path.parent if self.path else Path()) / config.loop.effects_folder).resolve()
+        if not folder.is_dir():
+            raise ConfigError(
+                f"key 'loop.effects_folder': there is no folder {folder}.", file=self.path, mend="Mend the path."
+            )
+        return config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": str(folder)})})
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """One step as it was last completed."""
+
+    key: str
+    version: str
+    finished_at: str  # ISO 8601, UTC
+    seconds: float
+    files: dict[str, int]  # what it wrote, relative to OUT, and the size of each in bytes
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """The content of state.json."""
+
+    campaign: Path
+    config: ConfigCopy
+    inputs: dict[str, Fingerprint] = field(default_factory=dict)
+    steps: dict[str, Done] = field(default_factory=dict)
+
+    def as_dict(self) -> dict:
+        """Return the state as it is written."""
+        return {
+            "program": "sealfit",
+            "format": FORMAT,
+            "campaign": str(self.campaign),
+            "config": {"path": str(self.config.path) if self.config.path else None, "text": self.config.text},
+            "inputs": {name: asdict(mark) for name, mark in self.inputs.items()},
+            "steps": {name: asdict(done) for name, done in self.steps.items()},
+        }
+
+    @classmethod
+    def read(cls, out: Path) -> State | None:
+        """Return the state kept in `out`, or None if it has none.
+
+        Raises
+        ------
+        OutError
+            If state.json is not one that this version of sealfit wrote.
+        """
+        path = out / STATE
+        try:
+            kept = json.loads(path.read_text("utf-8"))
+            if kept["program"] != "sealfit" or kept["format"] != FORMAT:
+                raise ValueError
+            at = kept["config"]["path"]
+            return cls(
+                Path(kept["campaign"]),
+                ConfigCopy(Path(at) if at else None, kept["config"]["text"]),
+                {name: Fingerprint(**mark) for name, mark in kept["inputs"].items()},
+                {name: Done(**done) for name, done in kept["steps"].items()},
+            )
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except OSError as error:
+            raise OutError(f"cannot be read ({error.strerror}).", file=path, mend="Mend its rights.") from error
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise OutError(
+                "is not a state that this version of sealfit can read.", file=path, mend="Choose another --out."
+            ) from error
+
+
+def to_json(document: object) -> str:
+    """Return `document` as JSON text: numbers that are not finite become null, numpy's become Python's."""
+    return json.dumps(_plain(document), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(inner) for inner in value]
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "tolist"):  # numpy scalars and arrays, whatever they hold
+        return _plain(value.tolist())
+    return None if type(value).__name__ in ("NAType", "NaTType") else str(value)  # pandas's missing values

@@ -1,0 +1,268 @@
+"""The OUT folder: every table written whole or not at all, and every step either current or known to be stale."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sealfit import __version__
+from sealfit.config import Config
+from sealfit.errors import ConfigError, OutError, StaleError
+from sealfit.fingerprint import STEPS, fingerprint, fingerprints, seen_config, step_keys
+from sealfit.lock import LOCK, only_writer
+from sealfit.provenance import provenance
+from sealfit.staging import STAGING, Staged, disk, sync
+from sealfit.state import STATE, ConfigCopy, Done, State, to_json
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PROVENANCE = "provenance.json"
+
+
+class Store:
+    """One OUT folder with the campaign and the config it belongs to."""
+
+    def __init__(self, out: Path, state: State, *, known: bool):
+        self.out, self.state = out, state
+        self.known = known  # false for a folder that holds no results yet
+        self.config: Config = state.config.parse()
+        self.warnings: list[str] = []
+        if state.campaign.is_dir():
+            self._now = fingerprints(state.campaign, state.inputs, self.config)
+        else:
+            self._now = dict(state.inputs)
+            if known:
+                self.warnings.append(
+                    f"the campaign folder {state.campaign} is not there: whether it has changed cannot be told."
+                )
+
+    # ------------------------------------------------------------ opening
+    @classmethod
+    def open(cls, out: Path) -> Store:
+        """Return the results in `out`, for reading.
+
+        Raises
+        ------
+        OutError
+            If `out` holds no results of sealfit.
+        """
+        state = State.read(out)
+        if state is None:
+            what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
+            raise OutError(what, file=out, mend=f"Make them with: sealfit run CAMPAIGN --out {shlex.quote(str(out))}")
+        return cls(out, replace(state, config=state.config.now()), known=True)
+
+    @classmethod
+    @contextlib.contextmanager
+    def writing(cls, out: Path, campaign: Path | None = None, source: ConfigCopy | None = None) -> Iterator[Store]:
+        """Hold `out` as its only writer and give the store; without `campaign`, one that holds results already.
+
+        Raises
+        ------
+        OutError
+            If `out` is a file, a folder that sealfit did not make, the results of another campaign, in use by another
+            process, or cannot be written.
+        """
+        if campaign is None or source is None:
+            cls.open(out)  # raises if there is nothing to go on from
+        made = _make_folder(out)
+        try:
+            with only_writer(out):
+                for left in out.glob(f"{STAGING}*"):  # of a run that was killed
+                    shutil.rmtree(left, ignore_errors=True)
+                if campaign is None or source is None:
+                    store = cls.open(out)
+                else:
+                    store = cls._of_campaign(out, campaign.resolve(), source)
+                store._keep_what_moved()
+                yield store
+        finally:
+            if made:
+                with contextlib.suppress(OSError):  # stays if it holds anything
+                    out.rmdir()
+
+    @classmethod
+    def _of_campaign(cls, out: Path, campaign: Path, source: ConfigCopy) -> Store:
+        kept = State.read(out)
+        if kept is None or (kept.campaign != campaign and not kept.steps):
+            return cls(out, State(campaign, source), known=False)
+        store_inputs, moved = kept.inputs, kept.campaign != campaign
+        if moved:
+            store_inputs = {name: fingerprint(campaign / name) for name in kept.inputs}
+            if any(mark.sha256 != kept.inputs[name].sha256 for name, mark in store_inputs.items()):
+                raise OutError(
+                    f"belongs to the campaign {kept.campaign}, and {campaign} holds other data.",
+                    file=out,
+                    mend="Choose another --out.",
+                )
+        store = cls(out, replace(kept, campaign=campaign, config=source, inputs=store_inputs), known=True)
+        if moved:
+            store.warnings.append(
+                f"{out} was made from {kept.campaign}; {campaign} holds the same data and takes over."
+            )
+        return store
+
+    def _keep_what_moved(self) -> None:
+        """Keep the campaign's new place, new times of unchanged files and a config that says the same, if any."""
+        kept = State.read(self.out)
+        if kept is None:
+            return
+        same = {n: now if (now := self._now.get(n, m)).sha256 == m.sha256 else m for n, m in self.state.inputs.items()}
+        self.state = replace(self.state, inputs=same)
+        source = self.state.config if _same_config(kept.config, self.config) else kept.config
+        tidy = replace(self.state, config=source)
+        if tidy != kept:
+            staged = Staged(self.out, self.config.units)
+            try:
+                staged.text(STATE, to_json(tidy.as_dict()))
+                with disk(self.out):
+                    staged.move(STATE)
+            finally:
+                staged.clear()
+
+    # ------------------------------------------------------------ current or stale
+    def why_stale(self, step: str) -> str:
+        """Return in words why `step` has to be done, or "" if it is current."""
+        keys = step_keys(self._now, self.config)
+        for name in STEPS[: STEPS.index(step) + 1]:
+            done = self.state.steps.get(name)
+            if done is None:
+                return f"{name} has not been done"
+            if done.key != keys[name]:
+                return f"{name} is stale: {self._what_changed(done)}"
+            for file, size in done.files.items():
+                path = self.out / file
+                if not path.is_file() or path.stat().st_size != size:
+                    return f"{name} is stale: its {file} is missing or was changed"
+        return ""
+
+    def _what_changed(self, done: Done) -> str:
+        if done.version != __version__:
+            return f"it was made by sealfit {done.version}, this is {__version__}"
+        known = self.state.inputs
+        changed = [name for name, mark in self._now.items() if name not in known or mark.sha256 != known[name].sha256]
+        if changed:
+            more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+            return f"inputs changed ({', '.join(changed[:3])}{more})"
+        return f"the config ({self.state.config.name}) changed"
+
+    def require(self, step: str) -> None:
+        """Raise StaleError, naming the command to run, unless `step` and all before it are current."""
+        for name in STEPS[: STEPS.index(step) + 1]:
+            why = self.why_stale(name)
+            if why:
+                raise StaleError(f"{why}.", file=self.out, mend=f"Run: {self.command(name)}")
+
+    def command(self, step: str) -> str:
+        """Return the command line that does `step`."""
+        out = shlex.quote(str(self.out))
+        if step != "ingest":
+            return f"sealfit {step} {out}"
+        config = f" --config {shlex.quote(str(self.state.config.path))}" if self.state.config.path else ""
+        return f"sealfit ingest {shlex.quote(str(self.state.campaign))} --out {out}{config}"
+
+    # ------------------------------------------------------------ reading
+    def read(self, table: str) -> pd.DataFrame:
+        """Return a table."""
+        from sealfit import parquet
+
+        return parquet.read(self.out / f"{table}.parquet")
+
+    def read_json(self, name: str) -> dict:
+        """Return `<name>.json`."""
+        import json
+
+        return json.loads((self.out / f"{name}.json").read_text("utf-8"))
+
+    def seen_config(self, step: str) -> Config:
+        """Return the config as `step` may see it."""
+        return seen_config(step, self.config)
+
+    def provenance(self) -> dict:
+        """Return what the results were made from and with."""
+        return provenance(self.state)
+
+    # ------------------------------------------------------------ writing
+    @contextlib.contextmanager
+    def step(self, name: str) -> Iterator[Staged]:
+        """Give a place for the files of step `name`; they all take their places when the block ends without an error.
+
+        Raises
+        ------
+        OutError
+            If the disk is full or refuses; OUT then holds what it held before.
+        """
+        began = time.monotonic()
+        staged = Staged(self.out, self.config.units)
+        try:
+            yield staged
+            self._commit(name, staged, time.monotonic() - began)
+        finally:
+            staged.clear()
+
+    def _commit(self, name: str, staged: Staged, seconds: float) -> None:
+        inputs = self.state.inputs if staged.inputs is None else staged.inputs
+        files = dict(staged.files)
+        done = Done(
+            step_keys(inputs, self.config)[name],
+            __version__,
+            datetime.now(UTC).isoformat(timespec="seconds"),
+            round(seconds, 3),
+            files,
+        )
+        # Until every file is in its place the step counts as not done: a kill in between cannot pass a mixture of old
+        # and new tables as current. All is on the disk before the first move, so a full disk changes nothing in OUT.
+        earlier = {step: self.state.steps[step] for step in STEPS[: STEPS.index(name)] if step in self.state.steps}
+        begun = replace(self.state, inputs=inputs, steps=earlier)
+        ended = replace(begun, steps={**earlier, name: done})
+        staged.text("begun.json", to_json(begun.as_dict()))
+        staged.text("ended.json", to_json(ended.as_dict()))
+        staged.text(PROVENANCE, to_json(provenance(ended)))
+        old = self.state.steps[name].files if name in self.state.steps else {}
+        with disk(self.out):
+            staged.move("begun.json", STATE)
+            sync(self.out)
+            for file in files:
+                staged.move(file)
+            for file in old.keys() - files.keys():
+                (self.out / file).unlink(missing_ok=True)
+            staged.move(PROVENANCE)
+            sync(self.out)
+            staged.move("ended.json", STATE)
+            sync(self.out)
+        self.state, self.known = ended, True
+        if staged.inputs is not None:
+            self._now = dict(inputs)
+
+
+def _make_folder(out: Path) -> bool:
+    """Make `out` if it is not there, and return whether it was made; refuse a folder that sealfit did not make."""
+    if out.exists() and not out.is_dir():
+        raise OutError("is a file.", file=out, mend="Give --out a folder.")
+    if out.is_dir():
+        strangers = [p.name for p in out.iterdir() if p.name != LOCK and not p.name.startswith(STAGING)]
+        if strangers and STATE not in strangers:
+            raise OutError(
+                f"is not empty (it holds {sorted(strangers)[0]}) and was not made by sealfit.",
+                file=out,
+                mend="Choose another --out.",
+            )
+        return False
+    with disk(out):
+        out.mkdir(parents=True)
+    return True
+
+
+def _same_config(kept: ConfigCopy, config: Config) -> bool:
+    try:
+        return kept.parse() == config
+    except ConfigError:
+        return False

@@ -1,0 +1,579 @@
+import errno
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from store_helpers import small
+
+from sealfit import parquet, staging
+from sealfit.config import parse_config
+from sealfit.errors import ConfigError, OutError, StaleError
+from sealfit.fingerprint import STEPS, fingerprint, seen_config
+from sealfit.lock import LOCK
+from sealfit.state import ConfigCopy, State, to_json
+from sealfit.store import Store
+from sealfit.tables import BINS, INPUTS, QUALITY, RUNS, Units
+
+HERE = Path(__file__).resolve().parent
+OUTPUTS = {  # table that stands for each step in these tests
+    "ingest": "steady",
+    "fit-steady": "steady_fit",
+    "fit-aging": "aging_fit",
+    "close-loop": "effects",
+    "report": "channels",
+}
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    folder = tmp_path / "campaign"
+    folder.mkdir()
+    (folder / "runs.csv").write_text("file\na.csv\n")
+    (folder / "a.csv").write_text("time_s,displacement_mm,force_N\n0,0,1\n")
+    return folder
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out"
+
+
+def do(store, step, rows=2):
+    with store.step(step) as staged:
+        if step == "ingest":
+            campaign = store.state.campaign
+            staged.inputs = {p.name: fingerprint(p) for p in sorted(campaign.iterdir())}
+        staged.table(OUTPUTS[step], small(OUTPUTS[step], rows))
+
+
+def do_all(out, campaign, source=None, rows=2):
+    with Store.writing(out, campaign, source or ConfigCopy.at(None)) as store:
+        for step in STEPS:
+            do(store, step, rows)
+
+
+def stale(out, campaign=None, source=None):
+    if campaign is None:
+        store = Store.open(out)
+        return [step for step in STEPS if store.why_stale(step)]
+    with Store.writing(out, campaign, source or ConfigCopy.at(None)) as store:
+        return [step for step in STEPS if store.why_stale(step)]
+
+
+def rig(folder, text):
+    path = folder / "rig.toml"
+    path.write_text(text)
+    return ConfigCopy.at(path)
+
+
+def content(folder):
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+# ---------------------------------------------------------------- tables
+numbers = st.one_of(st.none(), st.floats(allow_nan=False))
+words = st.one_of(st.none(), st.text(st.characters(codec="utf-8"), max_size=8))
+
+
+@given(st.lists(st.tuples(words, st.one_of(st.none(), st.integers(-(2**53), 2**53)), numbers, words), max_size=6))
+def test_a_table_survives_parquet(tmp_path_factory, rows):
+    path = tmp_path_factory.mktemp("t") / "quality.parquet"
+    frame = small("quality", len(rows))
+    frame["file"] = [row[0] for row in rows]
+    frame["line"] = pd.array([row[1] for row in rows], dtype="Int64")
+    frame["value"] = [row[3] for row in rows]
+    parquet.write(frame, QUALITY, Units(), path)
+    back = parquet.read(path)
+    assert list(back.columns) == QUALITY.names()
+    assert [None if pd.isna(v) else v for v in back["file"]] == [row[0] for row in rows]
+    assert [None if pd.isna(v) else int(v) for v in back["line"]] == [row[1] for row in rows]
+    assert [None if pd.isna(v) else v for v in back["value"]] == [row[3] for row in rows]
+
+
+@given(st.lists(numbers, min_size=1, max_size=6))
+def test_a_number_that_is_missing_is_null_and_stays_missing(tmp_path_factory, values):
+    path = tmp_path_factory.mktemp("t") / "bins.parquet"
+    frame = small("bins", len(values)).assign(load_N=pd.Series(values, dtype=float))
+    parquet.write(frame, BINS, Units(), path)
+    assert pq.read_table(path)["load_N"].null_count == sum(value is None for value in values)
+    np.testing.assert_array_equal(parquet.read(path)["load_N"], np.array(values, dtype=float))
+
+
+def test_columns_come_in_the_order_of_the_schema_and_channels_after_them(tmp_path):
+    frame = small("bins", humidity_pct=40.0, batch="b1")
+    parquet.write(frame[sorted(frame.columns)], BINS, Units(), tmp_path / "bins.parquet")
+    assert list(parquet.read(tmp_path / "bins.parquet").columns) == [*BINS.names(), "batch", "humidity_pct"]
+
+
+def test_types_are_those_of_the_schema(tmp_path):
+    frame = small("runs").assign(repeat=[1.0, np.nan], run_id=[7, 8], load_N=[49, 50])
+    table = parquet.to_arrow(frame, RUNS, Units())
+    assert [field.type for field in table.schema] == [column.dtype for column in RUNS.columns]
+    assert table["repeat"].to_pylist() == [1, None]
+    assert table["run_id"].to_pylist() == ["7", "8"]
+
+
+def test_a_channel_of_words_and_numbers_is_words():
+    table = parquet.to_arrow(small("runs").assign(batch=["x", 2], empty=[None, None]), RUNS, Units())
+    assert table["batch"].to_pylist() == ["x", "2"]
+    assert table["empty"].null_count == 2
+
+
+def test_metadata_holds_true_units_and_meaning():
+    units = parse_config(
+        '[quantities]\nforce = {quantity = "torque", unit = "mN m"}\n[column_units]\nhumidity = "g/kg"', "rig"
+    ).units
+    schema = parquet.to_arrow(small("bins", humidity=40.0), BINS, units).schema
+    assert schema.field("force_N").metadata[b"unit"] == b"mN m"
+    assert schema.field("force_N").metadata[b"meaning"].startswith(b"friction force")
+    assert schema.field("displacement_mm").metadata[b"unit"] == b"mm"
+    assert schema.field("humidity").metadata[b"unit"] == b"g/kg"
+    assert json.loads(schema.metadata[b"units"])["force_sd_N"] == "mN m"
+    assert json.loads(schema.metadata[b"sealfit"])["table"] == "bins"
+    assert parquet.to_arrow(small("inputs"), INPUTS, units).schema.field("size").metadata[b"unit"] == b"byte"
+
+
+@pytest.mark.parametrize(
+    ("frame", "words"),
+    [
+        (small("inputs").drop(columns="rows"), "missing columns .'rows'"),
+        (small("inputs", more=1), "does not know .'more'"),
+        (small("inputs").assign(rows="x"), "table inputs, column 'rows'"),
+        (small("inputs").assign(rows=1.5), "table inputs, column 'rows'"),
+        (pd.concat([small("inputs"), small("inputs")[["rows"]]], axis=1), "doubled columns .'rows'"),
+    ],
+    ids=["missing", "unknown", "words", "fractions", "doubled"],
+)
+def test_a_frame_that_is_not_its_table_is_refused(frame, words):
+    with pytest.raises(ValueError, match=words):
+        parquet.to_arrow(frame, INPUTS, Units())
+
+
+def test_json_has_neither_nan_nor_infinity_nor_numpy():
+    text = to_json({"a": math.nan, "b": [np.float64("inf"), np.int64(3)], "c": np.array([1.5, np.nan]), "d": pd.NA})
+    assert json.loads(text, parse_constant=pytest.fail) == {"a": None, "b": [None, 3], "c": [1.5, None], "d": None}
+
+
+# ---------------------------------------------------------------- current and stale
+def test_everything_is_current_after_it_was_done(out, campaign):
+    do_all(out, campaign)
+    assert stale(out) == []
+    assert stale(out, campaign) == []
+
+
+def test_a_touched_input_is_still_current_and_a_changed_one_is_not(out, campaign):
+    do_all(out, campaign)
+    os.utime(campaign / "a.csv", ns=(1, 1))
+    assert stale(out) == []
+    (campaign / "a.csv").write_text("time_s,displacement_mm,force_N\n0,0,2\n")
+    assert stale(out) == list(STEPS)
+    assert "inputs changed (a.csv)" in Store.open(out).why_stale("report")
+
+
+def test_a_lost_input_and_one_that_appears_make_everything_stale(out, campaign):
+    source = rig(campaign.parent, "[files]\nglob = '*.csv'\nexclude = ['x_*']")
+    do_all(out, campaign, source)
+    (campaign / "x_1.csv").write_text("not a trace")
+    assert stale(out) == []
+    (campaign / "b.csv").write_text("0")
+    assert stale(out) == list(STEPS)
+    (campaign / "b.csv").unlink()
+    assert stale(out) == []
+    (campaign / "a.csv").unlink()
+    assert stale(out) == list(STEPS)
+
+
+@pytest.mark.parametrize(
+    ("change", "first"),
+    [
+        ("[bins]\nper_stroke = 7", "ingest"),
+        ("[sensor]\naccuracy = 0.3", "fit-steady"),
+        ("[loop]\nseed = 2", "close-loop"),
+        ("# only a remark", None),
+    ],
+)
+def test_a_changed_config_makes_stale_what_can_see_it(out, campaign, change, first):
+    do_all(out, campaign, rig(campaign.parent, "name = 'default'"))
+    rig(campaign.parent, f"name = 'default'\n{change}")
+    expected = list(STEPS[STEPS.index(first) :]) if first else []
+    assert stale(out) == expected
+    assert stale(out, campaign, ConfigCopy.at(campaign.parent / "rig.toml")) == expected
+    if first:
+        with pytest.raises(StaleError, match=r"config \(rig.toml\) changed"):
+            Store.open(out).require(first)
+
+
+def test_a_step_is_not_given_what_its_key_does_not_hold():
+    config = parse_config("[loop]\nseed = 9\n[sensor]\naccuracy = 0.7", "rig")
+    assert seen_config("ingest", config) == parse_config("", "rig")
+    assert seen_config("fit-steady", config).sensor.accuracy == 0.7
+    assert seen_config("fit-steady", config).loop.seed == 1
+    assert seen_config("close-loop", config) == config
+
+
+def test_another_version_makes_everything_stale(out, campaign, monkeypatch):
+    do_all(out, campaign)
+    for module in ("fingerprint", "store"):
+        monkeypatch.setattr(f"sealfit.{module}.__version__", "99.0")
+    assert stale(out) == list(STEPS)
+    with pytest.raises(StaleError, match=r"made by sealfit .*, this is 99.0"):
+        Store.open(out).require("report")
+
+
+def test_a_user_s_effect_that_changed_makes_the_loop_stale(out, campaign):
+    effects = campaign.parent / "mine"
+    effects.mkdir()
+    (effects / "one.py").write_text("A = 1")
+    do_all(out, campaign, rig(campaign.parent, "[loop]\neffects_folder = 'mine'"))
+    assert stale(out) == []
+    (effects / "one.py").write_text("A = 2")
+    assert stale(out) == ["close-loop", "report"]
+
+
+def test_a_missing_folder_of_effects_is_a_fault_of_the_config(campaign):
+    with pytest.raises(ConfigError, match=r"rig.toml: key 'loop.effects_folder': there is no folder"):
+        rig(campaign.parent, "[loop]\neffects_folder = 'mine'").parse()
+
+
+def test_a_redone_step_makes_those_after_it_stale(out, campaign):
+    do_all(out, campaign)
+    with Store.writing(out) as store:
+        do(store, "fit-steady")
+    assert stale(out) == ["fit-aging", "close-loop", "report"]
+
+
+def test_a_table_that_is_missing_or_was_cut_makes_its_step_stale(out, campaign):
+    do_all(out, campaign)
+    path = out / "aging_fit.parquet"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert stale(out) == ["fit-aging", "close-loop", "report"]
+    path.unlink()
+    with pytest.raises(StaleError, match=r"aging_fit.parquet is missing.*Run: sealfit fit-aging"):
+        Store.open(out).require("close-loop")
+
+
+def test_a_missing_predecessor_names_the_command_to_run(out, campaign):
+    with Store.writing(out, campaign, rig(campaign.parent, "")) as store:
+        do(store, "ingest")
+        with pytest.raises(StaleError, match=r"fit-steady has not been done\. Run: sealfit fit-steady .*out$"):
+            store.require("close-loop")
+    (campaign / "a.csv").write_text("new")
+    with pytest.raises(StaleError, match=r"Run: sealfit ingest \S*campaign --out \S*out --config \S*rig.toml$"):
+        Store.open(out).require("close-loop")
+
+
+def test_without_results_there_is_nothing_to_go_on_from(tmp_path):
+    for folder in (tmp_path, tmp_path / "no"):
+        with pytest.raises(OutError, match="sealfit run CAMPAIGN --out"):
+            Store.open(folder)
+        with pytest.raises(OutError, match="sealfit run CAMPAIGN --out"), Store.writing(folder):
+            pytest.fail("was opened")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---------------------------------------------------------------- whose OUT
+def test_a_moved_campaign_keeps_its_results(out, campaign):
+    do_all(out, campaign)
+    moved = campaign.rename(campaign.with_name("moved"))
+    assert "cannot be told" in Store.open(out).warnings[0]
+    assert stale(out) == []
+    with Store.writing(out, moved, ConfigCopy.at(None)) as store:
+        assert "holds the same data" in store.warnings[0]
+        assert not store.why_stale("report")
+    assert Store.open(out).state.campaign == moved
+    assert Store.open(out).warnings == []
+
+
+def test_a_moved_out_keeps_its_results(out, campaign):
+    do_all(out, campaign)
+    moved = out.rename(out.with_name("elsewhere"))
+    assert stale(moved) == []
+    assert stale(moved, campaign) == []
+
+
+def test_another_campaign_is_refused_and_nothing_is_touched(out, campaign):
+    do_all(out, campaign)
+    before = content(out)
+    other = campaign.with_name("other")
+    other.mkdir()
+    (other / "runs.csv").write_text("file\na.csv\n")
+    (other / "a.csv").write_text("other data")
+    with pytest.raises(
+        OutError, match=r"belongs to the campaign .*campaign, and .*other holds other data.*another --out"
+    ):
+        stale(out, other)
+    assert content(out) == before
+
+
+def test_a_changed_campaign_in_its_place_is_the_same_campaign(out, campaign):
+    do_all(out, campaign)
+    (campaign / "a.csv").write_text("all new")
+    assert stale(out, campaign) == list(STEPS)
+
+
+def test_a_folder_that_sealfit_did_not_make_is_refused(out, campaign):
+    out.mkdir()
+    (out / "thesis.doc").write_text("precious")
+    with pytest.raises(OutError, match=r"not empty \(it holds thesis.doc\)"):
+        do_all(out, campaign)
+    assert content(out) == {"thesis.doc": b"precious"}
+    with pytest.raises(OutError, match="is a file"):
+        do_all(out / "thesis.doc", campaign)
+    with pytest.raises(OutError, match="not empty"):
+        do_all(campaign, campaign)
+
+
+def test_a_state_that_cannot_be_read_is_refused(out, campaign):
+    out.mkdir()
+    (out / "state.json").write_text('{"program": "else"}')
+    with pytest.raises(OutError, match="is not a state that this version"):
+        do_all(out, campaign)
+
+
+def test_a_folder_that_was_made_for_nothing_goes_again(out, campaign):
+    def fail():
+        with Store.writing(out, campaign, ConfigCopy.at(None)) as store, store.step("ingest") as staged:
+            staged.table("steady", small("steady"))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert not out.exists()
+
+
+def test_what_a_step_no_longer_writes_is_removed(out, campaign):
+    with Store.writing(out, campaign, ConfigCopy.at(None)) as store:
+        with store.step("ingest") as staged:
+            staged.inputs = {}
+            staged.text("plots/old.svg", "old")
+            staged.text("plots/both.svg", "one")
+        with store.step("ingest") as staged:
+            staged.inputs = {}
+            staged.text("plots/both.svg", "two")
+    assert sorted(p.name for p in (out / "plots").iterdir()) == ["both.svg"]
+    assert (out / "plots/both.svg").read_text() == "two"
+
+
+def test_provenance_names_config_inputs_and_steps(out, campaign):
+    do_all(out, campaign, rig(campaign.parent, "# ours"))
+    found = json.loads((out / "provenance.json").read_text())
+    assert found["campaign"] == str(campaign)
+    assert found["config"]["text"] == "# ours"
+    assert [entry["file"] for entry in found["inputs"]] == ["a.csv", "runs.csv"]
+    assert found["inputs"][1]["sha256"] == fingerprint(campaign / "runs.csv").sha256
+    assert [entry["step"] for entry in found["steps"]] == list(STEPS)
+    assert set(found["packages"]) >= {"numpy", "scipy"}
+
+
+# ---------------------------------------------------------------- one writer
+WRITER = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+from sealfit.state import ConfigCopy
+from sealfit.store import Store
+
+with Store.writing(Path({out!r}), Path({campaign!r}), ConfigCopy.at(None)) as store:
+    print("holds", flush=True)
+    time.sleep(60)
+"""
+
+
+@contextmanager
+def writer(out, campaign):
+    program = WRITER.format(tests=str(HERE), out=str(out), campaign=str(campaign))
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as run:
+        try:
+            assert run.stdout.readline() == "holds\n"
+            yield run
+        finally:
+            run.kill()
+
+
+def test_a_second_writer_is_told_host_and_process_at_once(out, campaign):
+    import socket
+
+    with writer(out, campaign) as run:
+        began = time.monotonic()
+        with pytest.raises(OutError, match=rf"host {socket.gethostname()}, process {run.pid}\) is writing"):
+            do_all(out, campaign)
+        assert time.monotonic() - began < 2
+        assert run.poll() is None
+
+
+def test_the_lock_of_a_dead_process_is_taken_over(out, campaign):
+    with writer(out, campaign) as run:
+        run.kill()
+        run.wait()
+    assert (out / LOCK).exists()
+    do_all(out, campaign)
+    assert stale(out) == []
+    assert not (out / LOCK).exists()
+
+
+def test_a_lock_of_another_host_is_not_taken_over(out, campaign):
+    do_all(out, campaign)
+    (out / LOCK).write_text('{"host": "elsewhere.example", "pid": 12}')
+    with pytest.raises(OutError, match=r"host elsewhere.example, process 12.*delete .*\.lock"):
+        do_all(out, campaign)
+    assert Store.open(out).read("steady").shape[0] == 2  # reading needs no lock
+
+
+# ---------------------------------------------------------------- kills and full disks
+KILLED = """
+import os, signal, sys
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+import test_store
+from sealfit import staging, store
+
+real_replace, real_write, calls = os.replace, staging.sync, 0
+
+def count(real):
+    def counted(*args):
+        global calls
+        calls += 1
+        if calls == {at}:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*args)
+    return counted
+
+os.replace = count(real_replace)
+store.sync = staging.sync = count(real_write)
+test_store.do_all(Path({out!r}), Path({campaign!r}), rows=5)
+"""
+MOMENTS_PER_STEP = 11  # files written and moved, folders synced
+
+
+def test_a_kill_at_any_moment_leaves_complete_tables(out, campaign):
+    do_all(out, campaign, rows=2)
+    reached_end = []
+    for at in range(1, MOMENTS_PER_STEP * len(STEPS) + 2, 4):
+        (campaign / "a.csv").write_text(f"changed before kill {at}")
+        program = KILLED.format(tests=str(HERE), out=str(out), campaign=str(campaign), at=at)
+        run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+        reached_end.append(run.returncode == 0)
+        assert run.returncode in (0, -signal.SIGKILL), run.stderr
+        store = Store.open(out)
+        for step in STEPS:
+            rows = len(store.read(OUTPUTS[step]))  # reads whole, or this raises
+            assert rows in (2, 5)
+            if not store.why_stale(step):
+                assert rows == 5
+        do_all(out, campaign, rows=2)
+        assert stale(out) == []
+        assert sorted(p.name for p in out.iterdir()) == sorted(
+            [*(f"{table}.parquet" for table in OUTPUTS.values()), "state.json", "provenance.json"]
+        )
+    assert not reached_end[0]
+    assert not reached_end[len(reached_end) // 2]
+
+
+def full(*_args, **_kwargs):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("place", ["parquet.write", "staging.sync"])
+@pytest.mark.parametrize("step", STEPS)
+def test_a_full_disk_is_one_line_and_leaves_out_as_it_was(out, campaign, monkeypatch, step, place):
+    do_all(out, campaign)
+    before = content(out)
+    monkeypatch.setattr(f"sealfit.{place}", full)
+    with (
+        pytest.raises(OutError, match=r"No space left on device\)\. Free some space") as caught,
+        Store.writing(out, campaign, ConfigCopy.at(None)) as store,
+    ):
+        do(store, step, rows=5)
+    assert "\n" not in str(caught.value)
+    assert content(out) == before
+    monkeypatch.undo()
+    assert stale(out) == []
+
+
+@contextmanager
+def mounted(folder, options):
+    folder.mkdir(exist_ok=True)
+    mount = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], capture_output=True, check=False
+    )
+    if mount.returncode != 0:
+        pytest.skip("a small file system cannot be mounted here (needs root)")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.mark.skipif(not Path("/bin/mount").exists(), reason="no mount command")
+def test_a_disk_that_is_really_full(tmp_path, campaign):
+    disk = tmp_path / "disk"
+    with mounted(disk, "size=256k"):
+        out = disk / "out"
+        do_all(out, campaign)
+        before = content(out)
+        noise = np.random.default_rng(1).normal(size=100_000)
+        large = small("bins", len(noise)).assign(force_N=noise)
+        with (
+            pytest.raises(OutError, match=r"No space left on device"),
+            Store.writing(out, campaign, ConfigCopy.at(None)) as store,
+            store.step("fit-steady") as staged,
+        ):
+            staged.table("bins", large)
+        assert content(out) == before
+        (disk / "filler").write_bytes(b"0" * 150_000)
+        for _ in range(200):  # the last free blocks too
+            try:
+                with (disk / "filler").open("ab") as file:
+                    file.write(b"0" * 4096)
+            except OSError:
+                break
+        with pytest.raises(OutError, match=r"No space left on device"):
+            do_all(out, campaign)
+        assert {name: data for name, data in content(out).items() if name != LOCK} == before
+        (disk / "filler").unlink()
+        do_all(out, campaign)
+        assert stale(out) == []
+
+
+@pytest.mark.skipif(not Path("/bin/mount").exists(), reason="no mount command")
+def test_a_folder_that_may_only_be_read(tmp_path, campaign):
+    disk = tmp_path / "disk"
+    with mounted(disk, "size=4m"):
+        out = disk / "out"
+        do_all(out, campaign)
+        subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+        assert stale(out) == []  # reading goes on
+        assert len(Store.open(out).read("steady")) == 2
+        with pytest.raises(OutError, match=r"Read-only file system\).*another --out"):
+            do_all(out, campaign)
+        with pytest.raises(OutError, match=r"Read-only file system\)"):
+            do_all(disk / "new", campaign)
+
+
+def test_a_file_in_the_way_of_the_staging_is_one_line(out, campaign, monkeypatch):
+    def refuse(*_args, **_kwargs):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    do_all(out, campaign)
+    monkeypatch.setattr(staging.Path, "mkdir", refuse)
+    with pytest.raises(OutError, match=r"Permission denied\)\. Mend the rights"), Store.writing(out) as store:
+        do(store, "report")
+
+
+def test_the_state_is_read_back_as_it_was_written(out, campaign):
+    do_all(out, campaign, rig(campaign.parent, "# ümlaut"))
+    state = State.read(out)
+    assert json.loads(to_json(state.as_dict())) == json.loads((out / "state.json").read_text())
+    assert state.config.text == "# ümlaut"
