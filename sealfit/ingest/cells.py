@@ -1,0 +1,201 @@
+"""Data lines of a trace file to columns of numbers: Arrow's CSV reader, and a patient one for what it cannot read.
+
+Both give the same columns and the line number of every row; the patient one also names what stands in the way: text
+where a number belongs, remarks typed beside a number, lines with too few or too many cells.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
+
+from sealfit.config import TraceFormat
+from sealfit.errors import Fault
+from sealfit.ingest.text import Layout, as_number, split_line, without_strays
+
+LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
+_REMARK = re.compile(r"\s*([-+]?[\d.,]+(?:[eE][-+]?\d+)?)[\s,;]+(?P<remark>.*[^\W\d_].*?)[\s,;]*$")
+
+
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """Columns by position from 0: float64 arrays, or object arrays of text (None where empty).
+
+    `line` is the 1-based line number of every row; `bad` marks rows with a cell that is not a number; `faults` names
+    what was found in them.
+    """
+
+    columns: dict[int, np.ndarray]
+    line: np.ndarray
+    bad: np.ndarray
+    faults: tuple[Fault, ...]
+
+
+def listed(rows: np.ndarray, make: Callable[[int], Fault], rest: Callable[[int], Fault]) -> list[Fault]:
+    """Return a fault for each of the first rows, and one that counts the others: nothing floods, all is counted."""
+    faults = [make(int(row)) for row in rows[:LISTED]]
+    return [*faults, rest(len(rows) - LISTED)] if len(rows) > LISTED else faults
+
+
+def read_cells(text: bytes, layout: Layout, settings: TraceFormat, numeric: dict[int, str], file: str) -> Cells:
+    """Return the data of a trace file.
+
+    Parameters
+    ----------
+    text : bytes
+        The whole file as clean UTF-8 (`text.as_utf8`).
+    layout : Layout
+        Where its data begin.
+    numeric : dict of int to str
+        Positions (from 0) that must hold numbers, and the names that messages call them.
+    """
+    body = text[layout.start :].rstrip(b"\n \t" if settings.delimiter == "whitespace" else b"\n")
+    if not body.strip(b"\n \t,;"):
+        return Cells({}, np.empty(0, np.int64), np.empty(0, bool), ())
+    return _fast(body, layout, settings, numeric) or _patient(body, layout, settings, numeric, file)
+
+
+def _fast(body: bytes, layout: Layout, settings: TraceFormat, numeric: dict[int, str]) -> Cells | None:
+    """Return the cells as Arrow reads them, or None where a cell, a line or the delimiter is beyond it."""
+    delimiter = settings.delimiter
+    if delimiter == "whitespace":
+        body, delimiter = _single_tabs(body), "tab"
+    mark = "\t" if delimiter == "tab" else delimiter
+    first = body[: body.find(b"\n")] if b"\n" in body else body
+    width = len(split_line(first.decode("utf-8", "replace"), delimiter))
+    if width <= max(numeric, default=0) or len(mark.encode()) != 1:
+        return None
+    names = [str(i) for i in range(width)]
+    try:
+        table = pacsv.read_csv(
+            pa.BufferReader(body),
+            read_options=pacsv.ReadOptions(column_names=names, use_threads=False, block_size=max(len(body) + 1, 1024)),
+            parse_options=pacsv.ParseOptions(delimiter=mark),
+            convert_options=pacsv.ConvertOptions(
+                decimal_point=settings.decimal, column_types={str(i): pa.float64() for i in numeric}
+            ),
+        )
+    except pa.ArrowInvalid:
+        return None
+    rows = body.count(b"\n") + 1
+    if table.num_rows != rows:  # blank lines, or line ends inside quotes: the line numbers would be wrong
+        return None
+    columns = {i: _column(table.column(i)) for i in range(width)}
+    if not all(np.isfinite(columns[i]).all() for i in numeric):
+        return None  # empty cells, NaN and inf are to be named as they stand in the file
+    extra = [i for i in range(len(layout.names), width)] if layout.names else []
+    if any(columns[i].dtype.kind != "f" or not np.isnan(columns[i]).all() for i in extra):
+        return None  # something stands beyond the last named column
+    for i in extra:
+        del columns[i]
+    line = np.arange(layout.first_line, layout.first_line + rows)
+    return Cells(columns, line, np.zeros(rows, bool), ())
+
+
+def _column(column: pa.ChunkedArray) -> np.ndarray:
+    if pa.types.is_floating(column.type) or pa.types.is_integer(column.type) or pa.types.is_null(column.type):
+        return column.cast(pa.float64()).to_numpy()
+    text = np.array(column.cast(pa.string()).to_pylist(), dtype=object)
+    text[text == ""] = None
+    return text
+
+
+def _single_tabs(body: bytes) -> bytes:
+    if b" " in body or b"\t\t" in body or body.startswith(b"\t") or b"\n\t" in body or b"\t\n" in body:
+        body = re.sub(rb"[ \t]+", b"\t", body)
+        body = re.sub(rb"(?m)^\t|\t$", b"", body)
+    return body
+
+
+def _patient(body: bytes, layout: Layout, settings: TraceFormat, numeric: dict[int, str], file: str) -> Cells:
+    """Return the cells line by line, with a fault for everything that is not as it should be."""
+    lines = body.decode("utf-8", "replace").split("\n")
+    rows, number = [], []
+    for i, line in enumerate(lines):
+        if line.strip():
+            rows.append(split_line(without_strays(line, settings), settings.delimiter))
+            number.append(layout.first_line + i)
+    line = np.array(number, dtype=np.int64)
+    width = len(layout.names) or max(len(row) for row in rows)
+    columns: dict[int, np.ndarray] = {}
+    bad = np.zeros(len(rows), bool)
+    faults: list[Fault] = []
+    for i, name in numeric.items():
+        cells = [row[i] if i < len(row) else None for row in rows]
+        values = np.array([_float(cell, settings.decimal) for cell in cells])
+        wrong = ~np.isfinite(values)
+        bad |= wrong
+        faults += _cell_faults(np.flatnonzero(wrong), cells, rows, line, name, settings.decimal, file)
+        columns[i] = values
+    beyond = np.array([any(cell.strip() for cell in row[width:]) for row in rows])
+    faults += _beyond_faults(np.flatnonzero(beyond & ~bad), rows, line, width, file)
+    bad |= beyond
+    for i in range(width):
+        if i not in columns:
+            columns[i] = np.array([(row[i].strip() or None) if i < len(row) else None for row in rows], dtype=object)
+            if all(cell is None or as_number(cell, settings.decimal) is not None for cell in columns[i]):
+                columns[i] = np.array([_float(cell, settings.decimal) for cell in columns[i]])
+    return Cells(columns, line, bad, tuple(faults))
+
+
+def _float(cell: str | None, decimal: str) -> float:
+    number = as_number(cell, decimal) if cell is not None else None
+    return np.nan if number is None else number
+
+
+def _cell_faults(at, cells, rows, line, name, decimal, file) -> list[Fault]:
+    def make(i: int) -> Fault:
+        cell = cells[i]
+        place = {"file": file, "line": int(line[i]), "column": name, "action": "row left out"}
+        if cell is None:
+            reason = f"the line ends after {len(rows[i])} cells."
+            return Fault("too_few_cells", reason, mend="Complete or delete the line.", **place)
+        if not cell.strip():
+            return Fault("empty_cell", "the cell is empty.", mend="Fill it or delete the line.", value="", **place)
+        if as_number(cell, decimal) is not None:
+            return Fault("not_finite", "is not a finite number.", value=cell.strip(), mend="Delete the line.", **place)
+        if match := _REMARK.match(cell):
+            remark = match["remark"]
+            reason = f"a remark stands beside the number: {remark!r}."
+            mend = "Put the right number alone in the cell."
+            return Fault("remark", reason, value=cell.strip(), mend=mend, **place)
+        mend = decimal_mend(cell, decimal) or "Put a number there or delete the line."
+        return Fault("not_a_number", "is not a number.", value=cell.strip(), mend=mend, **place)
+
+    def rest(count: int) -> Fault:
+        reason = f"and {count} more cells of this column that are not numbers."
+        return Fault("not_a_number", reason, file=file, column=name, value=float(count), action="row left out")
+
+    return listed(at, make, rest)
+
+
+def decimal_mend(cell: str, decimal: str) -> str:
+    """Return the mend for a number written with the other decimal mark; "" if that is not what is wrong."""
+    if decimal == "." and as_number(cell, ",") is not None:
+        return 'Use a decimal point, or set decimal = "," in the rig config.'
+    if decimal == "," and as_number(cell, ".") is not None:
+        return 'Use a decimal comma, or set decimal = "." in the rig config.'
+    return ""
+
+
+def _beyond_faults(at, rows, line, width, file) -> list[Fault]:
+    def make(i: int) -> Fault:
+        value = " ".join(cell.strip() for cell in rows[i][width:] if cell.strip())
+        words = f"a remark stands beside the numbers: {value!r}." if as_number(value) is None else ""
+        reason = words or f"the line has {len(rows[i])} cells where {width} are named."
+        mend = "Move it to a column with a name of its own, or delete the line."
+        if not words and len(rows[i]) == 2 * width:
+            mend = "Decimal commas between commas? Export with another separator, or with decimal points."
+        check = "remark" if words else "too_many_cells"
+        return Fault(check, reason, file=file, line=int(line[i]), value=value, action="row left out", mend=mend)
+
+    def rest(count: int) -> Fault:
+        reason = f"and {count} more lines with cells beyond the last named column."
+        return Fault("too_many_cells", reason, file=file, value=float(count), action="row left out")
+
+    return listed(at, make, rest)

@@ -1,0 +1,174 @@
+"""What runs.csv leaves out: conditions in words, runs, repeats, specimens, the order of the campaign.
+
+Everything here works on what is already known of each file, and reads none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+
+from sealfit.config import Config
+from sealfit.errors import Fault
+from sealfit.ingest.runs_csv import Entry
+
+Channels = dict[str, float | str]
+SAME_SPEED = 0.05  # measured speeds closer than this share are one commanded speed; rigs repeat within a few percent
+
+
+def condition_key(channels: Mapping[str, float | str], config: Config) -> str:
+    """Return the condition in words: "temperature_C=60, aging_days=4", or "unaged" (with the rubber, if told apart).
+
+    Examples
+    --------
+    >>> condition_key({"temperature_C": 60.0, "compression_ratio_pct": 80.0, "aging_days": 4.0}, Config())
+    'temperature_C=60, compression_ratio_pct=80, aging_days=4'
+    >>> condition_key({"aging_days": 0.0}, Config())
+    'unaged'
+    """
+    if config.aging and channels.get("aging_days") == 0:
+        return ", ".join(["unaged", *(_text(channels.get(name, "")) for name in config.rubber)])
+    return ", ".join(f"{name}={_text(channels.get(name, ''))}" for name in config.condition)
+
+
+def _text(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def add_order(entries: Sequence[Entry], files: Sequence[Channels]) -> list[Fault]:
+    """Add `run_order` and `elapsed_h` to the files that say when they were started; return faults of bad times.
+
+    Equal times share the order of the first of them. A time without a zone is taken as UTC, so that one campaign
+    with and without zones keeps one order.
+    """
+    faults, times = [], {}
+    for i, (entry, channels) in enumerate(zip(entries, files, strict=True)):
+        if "started_at" not in channels:
+            continue
+        text = str(channels["started_at"]).strip()
+        try:
+            time = datetime.fromisoformat(text)
+            times[i] = time if time.tzinfo else time.replace(tzinfo=UTC)
+        except ValueError:
+            mend = "Write it as 2024-03-01T09:30:00."
+            faults.append(entry.fault("not_a_time", "is no ISO 8601 time.", "started_at", value=text, mend=mend))
+    ordered = sorted(times.values())
+    for i, time in times.items():
+        files[i]["run_order"] = float(ordered.index(time) + 1)
+        files[i]["elapsed_h"] = (time - ordered[0]).total_seconds() / 3600
+    return faults
+
+
+def add_specimens(files: Sequence[Channels], config: Config) -> set[int]:
+    """Add the default `specimen_id`, one per condition; return the indices of the files that name their own."""
+    own = {i for i, channels in enumerate(files) if "specimen_id" in channels}
+    for channels in files:
+        channels.setdefault("specimen_id", condition_key(channels, config))
+    return own
+
+
+def add_runs(
+    files: Sequence[Channels], speeds: Sequence[float | None], measured: Sequence[float], own: set[int], config: Config
+) -> list[Fault]:
+    """Add `run_id` where it is missing: one per condition, commanded speed and (named) specimen.
+
+    Parameters
+    ----------
+    files : sequence of dict
+        Channels of each file, with `specimen_id`.
+    speeds : sequence of float or None
+        Commanded speeds, signed where a sign was given.
+    measured : sequence of float
+        Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run.
+    own : set of int
+        Files whose specimen was named, and so tells runs apart.
+    """
+    missing = [i for i, channels in enumerate(files) if "run_id" not in channels]
+    unit = config.units.unit("speed")
+    groups = defaultdict(list)
+    for i in missing:
+        words = [condition_key(files[i], config)]
+        if i in own:
+            words.append(str(files[i]["specimen_id"]))
+        if speeds[i] is not None:
+            files[i]["run_id"] = ", ".join([*words, f"{speeds[i]:g} {unit}"])
+        else:
+            groups[", ".join(words)].append(i)
+    for words, members in groups.items():
+        members.sort(key=lambda i: measured[i])
+        cluster: list[int] = []
+        for place, i in enumerate(members):
+            cluster.append(i)
+            after = members[place + 1] if place + 1 < len(members) else None
+            if after is None or not measured[after] <= measured[i] * (1 + SAME_SPEED):
+                middle = measured[cluster[len(cluster) // 2]]
+                name = words if math.isnan(middle) else f"{words}, about {middle:.3g} {unit}"
+                for j in cluster:
+                    files[j]["run_id"] = name
+                cluster = []
+    if not groups:
+        return []
+    reason = "neither run_id nor a commanded speed is given; files of one condition share a run within 5 % of speed."
+    return [Fault("run_id_derived", reason, severity="info", action="kept", mend="Give run_id or speed_mm_s.")]
+
+
+def add_repeats(files: Sequence[Channels]) -> None:
+    """Add `repeat` where it is missing: by `started_at` if the whole run has it, else by file order."""
+    runs = defaultdict(list)
+    for i, channels in enumerate(files):
+        runs[channels["run_id"]].append(i)
+    for members in runs.values():
+        if all("elapsed_h" in files[i] for i in members):
+            members.sort(key=lambda i: (files[i]["elapsed_h"], i))
+        used = {files[i]["repeat"] for i in members if "repeat" in files[i]}
+        free = (number for number in range(1, len(members) + len(used) + 1) if number not in used)
+        for i in members:
+            if "repeat" not in files[i]:
+                files[i]["repeat"] = next(free)
+
+
+def disagreements(
+    entries: Sequence[Entry], files: Sequence[Channels], speeds: Sequence[float | None], config: Config
+) -> list[Fault]:
+    """Return faults of runs: a repeat that stands twice, or differs from its run in condition, speed or load."""
+    faults = []
+    first: dict[object, int] = {}
+    seen: dict[tuple, int] = {}
+    for i, (entry, channels) in enumerate(zip(entries, files, strict=True)):
+        run, repeat = channels["run_id"], channels["repeat"]
+        if (run, repeat) in seen:
+            other = entries[seen[run, repeat]]
+            reason = f"repeat {repeat} of run '{run}' is there already: {_place(other)}."
+            mend = "Give every file of a run its own repeat number."
+            faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat, mend=mend))
+        seen.setdefault((run, repeat), i)
+        j = first.setdefault(run, i)
+        pairs = [
+            ("speed_mm_s", speeds[i], speeds[j]),
+            ("load_N", channels.get("load_N"), files[j].get("load_N")),
+            ("condition", condition_key(channels, config), condition_key(files[j], config)),
+        ]
+        for column, mine, theirs in pairs:
+            if not _same(mine, theirs):
+                there = "none" if theirs is None else _text(theirs)
+                reason = f"differs from the other repeats of run '{run}', {_place(entries[j])}: {there}."
+                mend = "One run is one condition, speed and load: give it another run_id, or correct the cell."
+                value = "none" if mine is None else mine
+                faults.append(entry.fault("run_disagrees", reason, column, value=value, mend=mend))
+        if channels["specimen_id"] != files[j]["specimen_id"] and _same(speeds[i], speeds[j]):
+            reason = f"run '{run}' has repeats on several specimens; their scatter counts as that of repeats."
+            place = {"severity": "warning", "action": "kept", "mend": "Give each specimen a run_id of its own."}
+            faults.append(entry.fault("run_specimens", reason, "specimen_id", value=channels["specimen_id"], **place))
+    return faults
+
+
+def _place(entry: Entry) -> str:
+    return f"line {entry.line}" if entry.line is not None else entry.file
+
+
+def _same(a: float | str | None, b: float | str | None) -> bool:
+    if isinstance(a, int | float) and isinstance(b, int | float):
+        return math.isclose(a, b, rel_tol=1e-9)
+    return a == b

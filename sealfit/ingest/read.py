@@ -1,0 +1,267 @@
+"""One trace file to one clean table: read, computed, filtered, checked; every fault named with its place and mend."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sealfit.config import Config, TraceFormat
+from sealfit.errors import BadFile, ConfigError, Fault
+from sealfit.ingest.cells import Cells, listed, read_cells
+from sealfit.ingest.channels import channel_columns
+from sealfit.ingest.columns import RESERVED, SLOTS, beside, locate, numeric_names, required
+from sealfit.ingest.expression import evaluate, parse
+from sealfit.ingest.names import name_parts
+from sealfit.ingest.refs import TraceRef
+from sealfit.ingest.speed_check import check_speed
+from sealfit.ingest.text import Layout, as_utf8, find_layout, header_fields, read_bytes, split_line
+
+MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One trace as it was measured, in our columns and units.
+
+    `table` holds time_s, displacement_mm and force_N (and load_N, where it was measured) as float64 and any further
+    channel as float64 or text; bad rows are left out. `line` is the 1-based line in the file of every row of `table`,
+    `rows_read` the number of data rows in the file, and `faults` what was found in it.
+    """
+
+    ref: TraceRef
+    table: pd.DataFrame
+    line: np.ndarray
+    rows_read: int
+    faults: tuple[Fault, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Columns of equal length on their way through the checks, and the lines they come from."""
+
+    columns: dict[str, np.ndarray]
+    line: np.ndarray
+
+    def where(self, mask: np.ndarray) -> _Rows:
+        if mask.all():
+            return self
+        return _Rows({name: values[mask] for name, values in self.columns.items()}, self.line[mask])
+
+
+def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
+    """Return one trace, with bad rows left out and named.
+
+    Parameters
+    ----------
+    campaign : Path
+        Campaign folder; `ref.file` is relative to it and never outside it.
+    ref : TraceRef
+        The file and what runs.csv and its name say.
+    config : Config
+        How the file is written.
+
+    Raises
+    ------
+    BadFile
+        If the file must be left out: missing, empty, binary, a column missing, too many bad rows, a speed that
+        contradicts the commanded one. It carries every fault found, the deciding one last.
+    """
+    settings, file = config.trace, ref.file
+    text = as_utf8(read_bytes(campaign, file), settings.encoding, file)
+    layout = find_layout(text, settings, file)
+    rows, cells = _named(text, layout, settings, file)
+    known = {**ref.channels, **name_parts(file, config.files).values, **header_fields(layout.header, settings)}
+    faults = list(cells.faults)
+    good = ~cells.bad
+    first = settings.drop_first_rows
+    counted = max(len(good) - first, 1)
+    columns, dropped, found = channel_columns(rows.columns, SLOTS, good, rows.line, config, file)
+    faults += found
+    good &= ~dropped
+    bad = int((~good[first:]).sum())
+    rows = _Rows(columns, rows.line).where(good & (np.arange(len(good)) >= first))
+    rows, wrong, found = _derive(rows, known, settings, layout, file)
+    faults += found
+    bad += wrong
+    faults += _too_many(bad, counted, faults, config, file)
+    rows = rows.where(_kept(rows, known, settings, file))
+    if len(rows.line) < MIN_ROWS:
+        reason = f"{len(rows.line)} of {len(good)} data rows are left; a trace needs {MIN_ROWS}."
+        raise BadFile(*faults, _bad_file("no_rows", reason, file, "Check drop_first_rows, keep and the export."))
+    table = _table(rows, ref, settings)
+    if fault := check_speed(table, ref, config):
+        if fault.action == "file left out":
+            raise BadFile(*faults, fault)
+        faults.append(fault)
+    return Trace(ref, table, rows.line, len(good), tuple(faults))
+
+
+def _named(text: bytes, layout: Layout, settings: TraceFormat, file: str) -> tuple[_Rows, Cells]:
+    """Return the file's columns under our names, and the cells they come from."""
+    end = text.find(b"\n", layout.start)
+    first = text[layout.start : end if end >= 0 else len(text)].decode("utf-8", "replace")
+    if not text[layout.start :].strip(b"\n \t,;"):
+        raise BadFile(_bad_file("no_rows", "has a header but no data.", file, "Export it again."))
+    width = len(layout.names) or len(split_line(first, settings.delimiter))
+    ours = locate(layout, width, settings, file)
+    must = numeric_names(settings)
+    cells = read_cells(text, layout, settings, {i: name for i, name in ours.items() if name in must}, file)
+    return _Rows({name: cells.columns[i] for i, name in ours.items() if i in cells.columns}, cells.line), cells
+
+
+def _derive(
+    rows: _Rows, known: Mapping[str, object], settings: TraceFormat, layout: Layout, file: str
+) -> tuple[_Rows, int, list[Fault]]:
+    """Return the rows with computed columns and integrated displacement, the number of bad ones, and the faults."""
+    speed = settings.integrate_displacement
+    compute = {name: parse(text) for name, text in settings.compute.items()}
+    later = _after_integral(compute) if speed else []
+    rows = _computed(rows, {n: e for n, e in compute.items() if n not in later}, known, settings, file)
+    if speed:
+        # The integral needs its time and speed clean first: one bad row would shift every displacement after it.
+        if speed not in rows.columns or "time_s" not in rows.columns:
+            missing = speed if speed not in rows.columns else "time_s"
+            raise BadFile(_missing(missing, layout, file))
+        rows, bad, faults = _clean(rows, ["time_s", speed, "force_N"], file)
+        rows = _Rows({**rows.columns, "displacement_mm": _integral(rows, speed, settings)}, rows.line)
+        rows = _computed(rows, {name: compute[name] for name in later}, known, settings, file)
+        required(rows.columns, layout, file)
+        return rows, bad, faults
+    required(rows.columns, layout, file)
+    rows, bad, faults = _clean(rows, [name for name in SLOTS if name in rows.columns], file)
+    return rows, bad, faults
+
+
+def _missing(name: str, layout: Layout, file: str) -> Fault:
+    mend = "Name it under [trace.columns], or compute it under [trace.compute]."
+    return replace(
+        _bad_file("missing_column", "there is no such column.", file, mend), column=name, line=layout.names_line
+    )
+
+
+def _after_integral(compute: Mapping[str, object]) -> list[str]:
+    """Return the computed columns that need the displacement, directly or through another one."""
+    later: list[str] = []
+    for name, expression in compute.items():
+        if expression.names & {"displacement_mm", *later}:
+            later.append(name)
+    return later
+
+
+def _computed(rows: _Rows, compute: Mapping, known: Mapping[str, object], settings: TraceFormat, file: str) -> _Rows:
+    columns = dict(rows.columns)
+    for name, expression in compute.items():
+        value = _evaluate(expression, {**known, **settings.constants, **columns}, file)
+        columns[name] = np.broadcast_to(value, rows.line.shape).astype(float)
+    return _Rows(columns, rows.line)
+
+
+def _evaluate(expression, values: Mapping[str, object], file: str) -> np.ndarray:
+    try:
+        return evaluate(expression, values)
+    except ConfigError as error:
+        raise BadFile(replace(_bad_file("expression", error.message, file, error.mend), column=error.column)) from error
+
+
+def _kept(rows: _Rows, known: Mapping[str, object], settings: TraceFormat, file: str) -> np.ndarray:
+    if settings.keep is None:
+        return np.ones(len(rows.line), bool)
+    values = {**known, **settings.constants, **rows.columns}
+    return np.broadcast_to(_evaluate(parse(settings.keep, condition=True), values, file), rows.line.shape)
+
+
+def _clean(rows: _Rows, names: list[str], file: str) -> tuple[_Rows, int, list[Fault]]:
+    """Return the rows whose slots are finite and whose time rises, the number left out, and the faults."""
+    faults: list[Fault] = []
+    finite = np.ones(len(rows.line), bool)
+    for name in names:
+        if name not in rows.columns:
+            continue
+        wrong = ~np.isfinite(rows.columns[name])
+        finite &= ~wrong
+        faults += _row_faults("not_finite", "the computed value is not a finite number.", name, rows, wrong, file)
+    good = rows.where(finite)
+    back = _out_of_order(good.columns["time_s"])
+    faults += _row_faults("time_order", "time repeats or runs backwards.", "time_s", good, back, file)
+    return good.where(~back), int((~finite).sum() + back.sum()), faults
+
+
+def _row_faults(check: str, reason: str, name: str, rows: _Rows, wrong: np.ndarray, file: str) -> list[Fault]:
+    place = {"file": file, "column": name, "action": "row left out"}
+    mend = "Check the recorder's clock, or delete the line." if check == "time_order" else "Check [trace.compute]."
+
+    def make(i: int) -> Fault:
+        return Fault(check, reason, line=int(rows.line[i]), value=float(rows.columns[name][i]), mend=mend, **place)
+
+    def rest(count: int) -> Fault:
+        return Fault(check, f"and {count} more rows: {reason}", value=float(count), **place)
+
+    return listed(np.flatnonzero(wrong), make, rest)
+
+
+def _out_of_order(time_s: np.ndarray) -> np.ndarray:
+    """Return a mask of the fewest rows whose removal leaves a time that rises from row to row.
+
+    They are the rows outside a longest rising subsequence (patience sorting), so one wrong time that lies far ahead
+    costs one row and not all that follow.
+    """
+    if len(time_s) < 2 or (np.diff(time_s) > 0).all():
+        return np.zeros(len(time_s), bool)
+    tails: list[float] = []
+    at: list[int] = []
+    before = np.full(len(time_s), -1)
+    for i, t in enumerate(time_s.tolist()):
+        place = bisect_left(tails, t)
+        if place < len(tails) and tails[place] == t:
+            continue  # of two equal times the first stays
+        before[i] = at[place - 1] if place else -1
+        tails[place : place + 1], at[place : place + 1] = [t], [i]
+    bad = np.ones(len(time_s), bool)
+    i = at[-1]
+    while i >= 0:
+        bad[i] = False
+        i = before[i]
+    return bad
+
+
+def _integral(rows: _Rows, speed: str, settings: TraceFormat) -> np.ndarray:
+    """Return the displacement, trapezoid rule over time, 0 at the first row; a speed per minute is divided by 60."""
+    time_s, v = rows.columns["time_s"], rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
+    return np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(time_s))]) if len(v) else v
+
+
+def _too_many(bad: int, counted: int, faults: list[Fault], config: Config, file: str) -> list[Fault]:
+    """Raise `BadFile` if more rows are bad than the config allows."""
+    if bad <= config.quality.max_bad_rows * counted:
+        return []
+    mends = Counter(fault.mend for fault in faults if fault.action == "row left out" and fault.mend)
+    mend = mends.most_common(1)[0][0] if mends else ""
+    reason = f"{bad} of {counted} rows are bad, more than {100 * config.quality.max_bad_rows:g} %."
+    raise BadFile(*faults, replace(_bad_file("too_many_bad_rows", reason, file, mend), value=float(bad)))
+
+
+def _table(rows: _Rows, ref: TraceRef, settings: TraceFormat) -> pd.DataFrame:
+    """Return slots first, then channels, without helper columns.
+
+    A channel that `ref` has too is left out where it is constant (`ref` says it); one that varies is another quantity
+    than the one set for the whole file, and is renamed, `temperature_file_C` beside `temperature_C`; so is one whose
+    name a table of ours makes itself.
+    """
+    columns = {name: rows.columns[name] for name in SLOTS if name in rows.columns}
+    for name, values in rows.columns.items():
+        if name in SLOTS or name in settings.drop_columns:
+            continue
+        if name in ref.channels and (values == values[0]).all():
+            continue
+        columns[beside(name, RESERVED.union(columns, ref.channels))] = values
+    return pd.DataFrame(columns, copy=False)
+
+
+def _bad_file(check: str, reason: str, file: str, mend: str) -> Fault:
+    return Fault(check, reason, file=file, action="file left out", mend=mend)

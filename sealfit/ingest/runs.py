@@ -1,0 +1,288 @@
+"""The trace files of a campaign and everything that is known of each before it is fitted to anything.
+
+What runs.csv, the file name, the header lines and the constant columns of the trace say is put together here, in this
+order of precedence; runs, repeats, specimens and the order of the campaign are derived where they are not given.
+"""
+
+from __future__ import annotations
+
+import codecs
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from sealfit.config import Config
+from sealfit.errors import BadFile, CampaignError, ConfigError, Fault
+from sealfit.ingest.columns import suggestion
+from sealfit.ingest.derive import Channels, add_order, add_repeats, add_runs, add_specimens, disagreements
+from sealfit.ingest.names import TEXT_COLUMNS, NameParts, name_parts
+from sealfit.ingest.read import read_trace
+from sealfit.ingest.refs import TraceRef
+from sealfit.ingest.runs_csv import Entry, list_entries
+from sealfit.ingest.speed_check import measured_speed
+from sealfit.ingest.speed_unit import speed_factor
+from sealfit.ingest.text import as_number, as_utf8, find_layout, header_fields, read_bytes
+
+__all__ = ["TraceRef", "list_traces"]
+
+NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
+_MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
+_MOSTLY = 0.8  # a column with this share of numbers is one of numbers, and the rest of its cells are slips
+
+
+def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fault]]:
+    """Return every trace file of a campaign with its channels, and what was found that does not stop the run.
+
+    Parameters
+    ----------
+    campaign : Path
+        Folder with runs.csv, or with files that the config's glob finds.
+    config : Config
+        What makes a condition, and what file names and header lines say.
+
+    Raises
+    ------
+    CampaignError
+        With every fault of the campaign at once: a missing folder or column, a path outside, cells that are no
+        numbers, doubled files or repeats, repeats that differ from their run, a config that cannot be meant.
+    """
+    if faults := _config_faults(config):
+        raise CampaignError(faults)
+    entries, faults = list_entries(campaign, config)
+    if any(fault.check in ("path_outside", "missing_file") for fault in faults):
+        raise CampaignError(faults)  # nothing can be said of files that are not there, and none outside is opened
+    entries, parts, found = _matched(entries, config)
+    faults += found
+    files = [
+        {**_header(campaign, entry.file, config), **named.channels, **_cells(entry)}
+        for entry, named in zip(entries, parts, strict=True)
+    ]
+    faults += _numbers(entries, files, config)
+    measured, left_out, found = _from_traces(campaign, entries, files, config)
+    keep = [i for i in range(len(entries)) if i not in left_out]
+    entries, files, measured = ([rows[i] for i in keep] for rows in (entries, files, measured))
+    faults += found + _missing(entries, files, config) + _ranges(entries, files)
+    faults += add_order(entries, files)
+    _stop_at_errors(faults)
+    speeds = [channels.pop("speed_mm_s", None) for channels in files]
+    own = add_specimens(files, config)
+    faults += add_runs(files, speeds, measured, own, config)
+    add_repeats(files)
+    faults += disagreements(entries, files, speeds, config)
+    _stop_at_errors(faults)
+    for channels, speed in zip(files, speeds, strict=True):
+        if speed is not None:
+            channels["speed_set_mm_s"] = abs(speed)
+    return [TraceRef(entry.file, channels) for entry, channels in zip(entries, files, strict=True)], faults
+
+
+def _stop_at_errors(faults: Sequence[Fault]) -> None:
+    errors = [fault for fault in faults if fault.severity == "error" and fault.action == "stopped"]
+    if errors:
+        raise CampaignError(errors)
+
+
+def _config_faults(config: Config) -> list[Fault]:
+    """Return what is wrong with the config by itself, before any file is opened."""
+    settings, faults = config.trace, []
+
+    def add(column: str, value: str, reason: str, mend: str) -> None:
+        faults.append(Fault("config", reason, file=f"config '{config.name}'", column=column, value=value, mend=mend))
+
+    if settings.encoding != "auto":
+        try:
+            codecs.lookup(settings.encoding)
+        except LookupError:
+            add("trace.encoding", settings.encoding, "is no encoding.", "Use auto, utf-8, latin-1 or utf-16.")
+    if settings.delimiter not in ("tab", "whitespace") and (
+        len(settings.delimiter) != 1 or settings.delimiter in '"\n\r ' or settings.delimiter.isalnum()
+    ):
+        add("trace.delimiter", settings.delimiter, "is no delimiter.", "Use one character, 'tab' or 'whitespace'.")
+    if settings.delimiter == settings.decimal:
+        add("trace.delimiter", settings.delimiter, "is the decimal mark too.", "Set trace.delimiter or trace.decimal.")
+    if settings.names == "none":
+        for ours, theirs in settings.columns.items():
+            if isinstance(theirs, str):
+                mend = "Give its position, counted from 1, or names = 'header'."
+                add(f"trace.columns.{ours}", theirs, "is a name, but the files have none.", mend)
+    try:
+        speed_factor(config.units)
+        if config.files.name_pattern is None:
+            name_parts("", config.files)
+    except ConfigError as error:
+        add("files", error.column or "", error.message, error.mend)
+    return faults
+
+
+def _matched(entries: list[Entry], config: Config) -> tuple[list[Entry], list[NameParts], list[Fault]]:
+    """Return the entries and what their names say; a file found by the glob whose name says nothing is left out."""
+    kept, parts, faults = [], [], []
+    for entry in entries:
+        try:
+            named = name_parts(entry.file, config.files)
+        except ConfigError as error:
+            raise CampaignError([entry.fault("file_name", error.message, error.column, mend=error.mend)]) from error
+        if not named.matched:
+            listed = entry.line is not None
+            reason = f"the name '{entry.file}' does not match files.name_pattern."
+            mend = "Rename it, widen the pattern, or list it under files.exclude."
+            place = {"severity": "warning", "action": "kept" if listed else "file left out", "mend": mend}
+            faults.append(Fault("not_matched", reason, file=entry.file, **place))
+            if not listed:
+                continue
+        kept.append(entry)
+        parts.append(named)
+    if entries and not kept:
+        raise CampaignError([*faults[:3], Fault("not_matched", f"none of {len(entries)} file names is matched.")])
+    return kept, parts, faults
+
+
+def _header(campaign: Path, file: str, config: Config) -> Channels:
+    """Return what the header lines say; nothing of a file that cannot be read: reading it will say why."""
+    if not config.trace.header_fields:
+        return {}
+    try:
+        text = as_utf8(read_bytes(campaign, file, head=True), config.trace.encoding, file, head=True)
+        found = header_fields(find_layout(text, config.trace, file).header, config.trace)
+    except BadFile:
+        return {}
+    return {name: value for name, value in found.items() if not name.startswith("_") and value != ""}
+
+
+def _cells(entry: Entry) -> Channels:
+    return {name: cell for name, cell in entry.cells.items() if cell.lower() not in _MISSING}
+
+
+def _numbers(entries: Sequence[Entry], files: Sequence[Channels], config: Config) -> list[Fault]:
+    """Turn the cells of every column of numbers into numbers, in place; return faults of cells that are none."""
+    faults = []
+    for name in dict.fromkeys(name for channels in files for name in channels):
+        rows = [i for i, channels in enumerate(files) if name in channels]
+        if name in TEXT_COLUMNS:
+            for i in rows:
+                value = files[i][name]
+                files[i][name] = f"{value:g}" if isinstance(value, float) else value
+            continue
+        numbers = {i: v if isinstance(v := files[i][name], float) else as_number(v) for i in rows}
+        wrong = [i for i, number in numbers.items() if number is None or not math.isfinite(number)]
+        known = name in NUMBERS or name == "repeat"
+        mostly = len(wrong) < (1 - _MOSTLY) * len(rows)
+        if wrong and not known and not mostly:
+            continue  # a column of labels
+        if wrong and not known and name not in config.condition:
+            i = wrong[0]
+            reason = f"{len(wrong)} of {len(rows)} cells are no numbers; the column is kept as labels."
+            mend = "Empty the cell, or put a number there."
+            place = {"severity": "warning", "action": "kept", "value": str(files[i][name]), "mend": mend}
+            faults.append(entries[i].fault("not_a_number", reason, name, **place))
+            continue
+        for i in wrong:
+            mend = "Put a number there."
+            faults.append(
+                entries[i].fault("not_a_number", "is not a number.", name, value=str(files[i][name]), mend=mend)
+            )
+        for i, number in numbers.items():
+            files[i][name] = number if number is not None else math.nan
+    for entry, channels in zip(entries, files, strict=True):
+        repeat = channels.get("repeat")
+        if repeat is not None and math.isfinite(repeat):
+            if repeat != int(repeat):
+                mend = "Number the repeats 1, 2, 3."
+                faults.append(entry.fault("not_a_number", "is no whole number.", "repeat", value=repeat, mend=mend))
+            channels["repeat"] = int(repeat)
+    return faults
+
+
+def _ranges(entries: Sequence[Entry], files: Sequence[Channels]) -> list[Fault]:
+    """Return faults of values that cannot be: negative days, a load that does not press, a speed of zero."""
+    rules = (
+        ("aging_days", lambda value: value < 0, "is below 0 days.", "Days count from 0, unaged."),
+        (
+            "load_N",
+            lambda value: value <= 0,
+            "does not press.",
+            "The normal load is above 0; leave it empty if unknown.",
+        ),
+        ("speed_mm_s", lambda value: value == 0, "is no speed to slide at.", "Leave it empty if it is unknown."),
+    )
+    return [
+        entry.fault("out_of_range", reason, name, value=channels[name], mend=mend)
+        for entry, channels in zip(entries, files, strict=True)
+        for name, wrong, reason, mend in rules
+        if name in channels and wrong(channels[name])
+    ]
+
+
+def _wanted(channels: Channels, config: Config) -> list[str]:
+    """Return the condition columns that are missing; of unaged rubber only the days and the rubber are needed."""
+    unaged = config.aging and channels.get("aging_days") == 0
+    needed = ["aging_days", *config.rubber] if unaged else [*config.condition, *config.rubber]
+    return [name for name in dict.fromkeys(needed) if name not in channels]
+
+
+def _from_traces(
+    campaign: Path, entries: Sequence[Entry], files: Sequence[Channels], config: Config
+) -> tuple[list[float], set[int], list[Fault]]:
+    """Add what is missing from constant columns of the traces, in place, reading only files that lack something.
+
+    Returns the measured speed of each file read (nan of the others), the files to leave out, and their faults.
+    """
+    measured, left_out, faults = [math.nan] * len(entries), set(), []
+    for i, (entry, channels) in enumerate(zip(entries, files, strict=True)):
+        speed_known = "run_id" in channels or "speed_mm_s" in channels
+        if speed_known and not _wanted(channels, config):
+            continue
+        try:
+            table = read_trace(campaign, TraceRef(entry.file, {}), config).table
+        except BadFile as error:
+            if _wanted(channels, config):  # otherwise it is left out, and said why, when it is read for good
+                left_out.add(i)
+                faults += error.faults
+            continue
+        _, plateau = measured_speed(table["time_s"].to_numpy(), table["displacement_mm"].to_numpy())
+        measured[i] = plateau * speed_factor(config.units)
+        sources = {"run_id": "run_id_file", "repeat": "repeat_file", "specimen_id": "specimen_id_file"}
+        sources |= {"started_at": "started_at_file", "speed_mm_s": "speed_file_mm_s"}
+        for name in (*_wanted(channels, config), *sources):
+            column = sources.get(name, name)
+            if name in channels or column not in table:
+                continue
+            values = table[column]
+            if (values == values.iloc[0]).all():
+                channels[name] = _constant(name, values.iloc[0])
+            elif name in _wanted(channels, config):
+                reason = f"varies within the file, {values.min()} to {values.max()}; a condition is one value."
+                mend = "Write the value that was set into runs.csv."
+                place = {"file": entry.file, "column": name, "action": "file left out", "mend": mend}
+                faults.append(Fault("condition_varies", reason, **place))
+                left_out.add(i)
+    return measured, left_out, faults
+
+
+def _constant(name: str, value: float | str) -> float | str:
+    if name == "repeat" and not isinstance(value, str):
+        return int(value)
+    if name in TEXT_COLUMNS and not isinstance(value, str):
+        return f"{value:g}"
+    return value if isinstance(value, str) else float(value)
+
+
+def _missing(entries: Sequence[Entry], files: Sequence[Channels], config: Config) -> list[Fault]:
+    """Return faults of condition columns that no source gives: one per column, or one per cell."""
+    faults = []
+    lacking: dict[str, list[int]] = {}
+    for i, channels in enumerate(files):
+        for name in _wanted(channels, config):
+            lacking.setdefault(name, []).append(i)
+    known = list(dict.fromkeys(name for channels in files for name in channels))
+    for name, rows in lacking.items():
+        if any(name in channels for channels in files):
+            for i in rows:
+                mend = "Fill it: it is one of the config's condition columns."
+                faults.append(entries[i].fault("empty_cell", "the cell is empty.", name, value="", mend=mend))
+        else:
+            reason = "there is no such column in runs.csv, file names, header lines or traces."
+            mend = suggestion(name, known) + " Add it, or take it out of the config's condition."
+            place = {"file": "runs.csv" if entries[0].line is not None else None, "column": name, "mend": mend.strip()}
+            faults.append(Fault("missing_column", reason, **place))
+    return faults
