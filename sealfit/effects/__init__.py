@@ -1,0 +1,1 @@
+"""Physical effects, one file each, and the list of them."""

@@ -1,0 +1,203 @@
+"""The rows that the joint model is fitted to: the `bins` table as sorted arrays, with the groups they nest in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from sealfit.fit.mixed import Groups
+from sealfit.tables import BINS
+
+LEVELS = ("stroke", "file", "run", "specimen")
+"""Grouping levels, finest first; a row of `bins` stands for samples below the stroke."""
+
+NOT_CHANNELS = {
+    "file",
+    "run_id",
+    "bin",
+    "n",
+    "force_N",
+    "force_sd_N",
+    "specimen_id",
+    "condition",
+    "series",
+    "rubber",
+    "speed_set_mm_s",
+}
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Sorted rows of `bins` as arrays.
+
+    `table` holds them with a fresh index; `order` takes a row here back to its place in the table it came from. Files
+    that hold strokes both ways belong to two runs; they nest in the run without its sign, so that groups are nested.
+    """
+
+    table: pd.DataFrame
+    order: np.ndarray
+    groups: Groups
+    force: np.ndarray  # (n,) measured
+    speed: np.ndarray  # (n,) signed
+    load: np.ndarray  # (n,) 1 where no load is known
+    days: np.ndarray  # (n,) 0 where there is no aging
+    condition: np.ndarray  # (n,) number in `conditions`
+    conditions: pd.DataFrame  # (c,) condition, series, rubber, aging_days
+    has_load: bool
+    has_aging: bool
+    weight: np.ndarray  # (n,) sums to 1; each file weighs the same
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the columns that may order a residual."""
+        return [name for name in self.table.columns if name not in NOT_CHANNELS]
+
+    def values(self, channel: str) -> np.ndarray:
+        """Return one channel as floats, or as strings if it is a category."""
+        column = self.table[channel]
+        if pd.api.types.is_numeric_dtype(column):
+            return column.to_numpy(dtype=float, na_value=np.nan)
+        return column.astype(str).to_numpy()
+
+    def codes(self, level: str) -> np.ndarray:
+        """Return each row's group number at a level."""
+        return self.groups.codes[level]
+
+    def subset(self, mask: np.ndarray) -> Rows:
+        """Return the rows where `mask` is true; conditions keep their numbers, so that a model fits both."""
+        weight = self.weight[mask]
+        return replace(
+            self,
+            table=self.table[mask].reset_index(drop=True),
+            order=self.order[mask],
+            groups=Groups.of({level: code[mask] for level, code in self.groups.codes.items()}),
+            force=self.force[mask],
+            speed=self.speed[mask],
+            load=self.load[mask],
+            days=self.days[mask],
+            condition=self.condition[mask],
+            weight=weight / weight.sum(),
+        )
+
+
+def make_rows(bins: pd.DataFrame, *, has_aging: bool) -> Rows:
+    """Return `bins` as sorted arrays with nested groups.
+
+    Parameters
+    ----------
+    bins : DataFrame
+        Table `bins`, shape (n, columns).
+    has_aging : bool
+        Whether the config's condition has `aging_days`.
+    """
+    table = bins.reset_index(drop=True)
+    base_run = nesting_run(table)
+    keys = pd.DataFrame(
+        {
+            "specimen": pd.factorize(table["specimen_id"], sort=True)[0],
+            "run": pd.factorize(base_run, sort=True)[0],
+            "file": pd.factorize(table["file"], sort=True)[0],
+            "stroke": table["stroke"].to_numpy(),
+        }
+    )
+    order = np.lexsort([keys[name].to_numpy() for name in ("stroke", "file", "run", "specimen")])
+    table = table.iloc[order].reset_index(drop=True)
+    keys = keys.iloc[order]
+    stroke = pd.factorize(keys["file"] * (int(keys["stroke"].max()) + 1) + keys["stroke"])[0]
+    groups = Groups.of(
+        {
+            "stroke": stroke,
+            "file": keys["file"].to_numpy(),
+            "run": keys["run"].to_numpy(),
+            "specimen": keys["specimen"].to_numpy(),
+        }
+    )
+    has_load = "load_N" in table and bool(table["load_N"].notna().all())
+    days = table["aging_days"].to_numpy(dtype=float) if has_aging else np.zeros(len(table))
+    condition, names = pd.factorize(table["condition"], sort=True)
+    first = table.drop_duplicates("condition").set_index("condition").loc[names]
+    conditions = first[["series", "rubber"]].reset_index()
+    conditions["aging_days"] = first["aging_days"].to_numpy(dtype=float) if has_aging else 0.0
+    files = groups.codes["file"]
+    per_file = np.bincount(files)[files]
+    return Rows(
+        table=table,
+        order=order,
+        groups=groups,
+        force=table["force_N"].to_numpy(dtype=float),
+        speed=table["speed_mm_s"].to_numpy(dtype=float),
+        load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(len(table)),
+        days=days,
+        condition=condition,
+        conditions=conditions,
+        has_load=has_load,
+        has_aging=has_aging,
+        weight=1.0 / per_file / (files.max() + 1),
+    )
+
+
+def thin(bins: pd.DataFrame, most: int) -> pd.DataFrame:
+    """Return `bins` with neighbouring bins of a stroke merged until at most about `most` rows are left.
+
+    Means of means: for shapes that are smooth over a few bins nothing is lost, and the cost no longer grows with how
+    finely the strokes were cut. A ripple needs the bins as they are.
+    """
+    merged = int(np.ceil(len(bins) / most))
+    if merged <= 1:
+        return bins
+    place = bins.groupby(["file", "stroke"], sort=False).cumcount() // merged
+    keys = [bins["file"], bins["stroke"], place.rename("place")]
+    numeric = [c for c in bins.columns if pd.api.types.is_float_dtype(bins[c])]
+    first = [c for c in bins.columns if c not in numeric and c not in ("file", "stroke", "n")]
+    grouped = bins.groupby(keys, sort=False)
+    table = pd.concat([grouped[numeric].mean(), grouped[first].first(), grouped["n"].sum()], axis=1)
+    return table.reset_index(level="place", drop=True).reset_index()[list(bins.columns)]
+
+
+def nesting_run(table: pd.DataFrame) -> pd.Series:
+    """Return each row's run, without the sign that a file with strokes both ways adds to it."""
+    both_ways = table.groupby("file")["run_id"].transform("nunique") > 1
+    return table["run_id"].where(~both_ways, table["run_id"].str.replace(r"[+-]$", "", regex=True))
+
+
+def open_columns(table: pd.DataFrame) -> list[str]:
+    """Return the channels that the campaign added to `bins`."""
+    fixed = set(BINS.names())
+    return [name for name in table.columns if name not in fixed]
+
+
+def point_rows(
+    table: pd.DataFrame, condition: np.ndarray, conditions: pd.DataFrame, *, has_load: bool, has_aging: bool
+) -> Rows:
+    """Return points to predict at as `Rows`, each its own group.
+
+    Parameters
+    ----------
+    table : DataFrame, shape (n, ...)
+        `speed_mm_s` and every channel the model reads.
+    condition : ndarray, shape (n,)
+        Number of each point's condition in `conditions`.
+    conditions : DataFrame
+        condition, series, rubber and aging_days.
+    has_load, has_aging : bool
+        As in the rows the model was fitted to.
+    """
+    n = len(table)
+    every = np.arange(n)
+    days = conditions["aging_days"].to_numpy(dtype=float)[condition] if has_aging else np.zeros(n)
+    return Rows(
+        table=table,
+        order=every,
+        groups=Groups.of({level: every for level in LEVELS}),
+        force=np.zeros(n),
+        speed=table["speed_mm_s"].to_numpy(dtype=float),
+        load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(n),
+        days=days,
+        condition=np.asarray(condition),
+        conditions=conditions,
+        has_load=has_load,
+        has_aging=has_aging,
+        weight=np.full(n, 1.0 / max(n, 1)),
+    )
