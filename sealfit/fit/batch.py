@@ -21,7 +21,7 @@ TURNS = 80
 
 
 # ---------------------------------------------------------------- the linear part
-def _solve(gram, moment, keep):
+def solve_kept(gram, moment, keep):
     """Coefficients of the kept columns, the rest zero; gram (..., p, p) with unit diagonal, moment and keep (..., p).
 
     Cholesky written out over the few columns, so that all problems go together; a dependent column gets zero.
@@ -62,7 +62,7 @@ def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
     """
     nonnegative = np.asarray(nonnegative, bool)
     keep = np.ones(moment.shape, bool)
-    coefficients = _solve(gram, moment, keep)
+    coefficients = solve_kept(gram, moment, keep)
     bad = np.any((coefficients < 0) & nonnegative, axis=-1)
     if not bad.any():
         return coefficients, keep
@@ -73,7 +73,7 @@ def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
     for zeros in product((False, True), repeat=held.size):
         subset = np.ones(m.shape[-1], bool)
         subset[held] = ~np.array(zeros)
-        tried = _solve(g, m, np.broadcast_to(subset, m.shape))
+        tried = solve_kept(g, m, np.broadcast_to(subset, m.shape))
         gain = np.einsum("...p,...p", tried, m)
         better = ~np.any((tried < 0) & nonnegative, axis=-1) & (gain > explained)
         best[better], support[better], explained[better] = tried[better], subset, gain[better]
@@ -101,7 +101,7 @@ def project(columns, y, nonnegative, refine: int = 2) -> Point:
     c, support = least_squares_of(gram, moment, nonnegative)
     rest = y - (scaled @ c[..., None])[..., 0]
     for _ in range(refine):  # normal equations square the condition number; refining on the true residual undoes it
-        c = c + _solve(gram, (transposed @ rest[..., None])[..., 0], support)
+        c = c + solve_kept(gram, (transposed @ rest[..., None])[..., 0], support)
         rest = y - (scaled @ c[..., None])[..., 0]
     c = np.where(nonnegative, np.maximum(c, 0.0), c)
     return Point(c / np.where(norm > 0, norm, 1.0), support, rest, np.einsum("...n,...n->...", rest, rest))
