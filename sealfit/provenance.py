@@ -25,7 +25,11 @@ def provenance(state: State) -> dict:
             "path": str(state.config.path) if state.config.path else None,
             "text": state.config.text,
         },
-        "inputs": [{"file": name, "size": mark.size, "sha256": mark.sha256} for name, mark in state.inputs.items()],
+        "inputs": [
+            {"file": name, "size": mark.size, "sha256": mark.sha256}
+            for name, mark in state.inputs.items()
+            if mark.sha256 is not None
+        ],
         "steps": [
             {"step": name, "version": done.version, "finished_at": done.finished_at, "seconds": done.seconds}
             for name, done in state.steps.items()

@@ -1,0 +1,42 @@
+# Needs only Python 3.11 or newer; everything else goes into .venv. PYTHON=... chooses another Python.
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
+BIN := .venv/bin
+NO_NETWORK = echo "make: the packages that sealfit needs could not be installed; pip says why above." >&2
+CODE := $(wildcard sealfit tests benchmarks)
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint check clean
+
+help: ## list these targets
+	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
+
+demo: .venv/.installed ## analyse the simulated campaign in sample_data, and say where the report is
+	@$(BIN)/sealfit run sample_data/simulated --out demo-out
+
+test: lint ## lint and run every test
+	$(BIN)/python -m pytest
+
+lint: .venv/.installed-test ## check style and formatting
+	$(BIN)/ruff check $(CODE)
+	$(BIN)/ruff format --check $(CODE)
+
+check: test ## what the continuous integration runs: the same as test
+
+clean: ## remove everything that make made, .venv too
+	rm -rf .venv demo-out build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find sealfit tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.venv/.installed: pyproject.toml
+	@test -n "$(PYTHON)" || { echo "make: sealfit needs Python 3.11 or newer, and here is $$(python3 --version 2>&1 || echo no python3)." \
+		"Install one, or name it: make PYTHON=/path/to/python3.11 demo" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "make: this Python cannot make virtual environments." \
+		"On Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@echo "installing sealfit into .venv ..." >&2
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -e . || { $(NO_NETWORK); exit 1; }
+	@touch $@
+
+.venv/.installed-test: .venv/.installed
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[test]' || { $(NO_NETWORK); exit 1; }
+	@touch $@

@@ -1,0 +1,258 @@
+"""The commands: paths in, messages out. Everything heavy is imported by the command that needs it."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sealfit import __version__
+from sealfit.errors import SealfitError
+
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+
+app = typer.Typer(
+    help="From a friction rig's CSV files to the LuGre model of an aging rubber seal, and to what that model lacks.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # plain help: rich takes longer to load than all the rest
+)
+
+Campaign = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder: runs.csv and the trace files.")]
+Results = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results that `ingest` or `run` made.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder of results; made if it is not there.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Rig config (TOML); default: as the README's table.")]
+Workers = Annotated[
+    int | None, typer.Option("--workers", min=1, help="Processes that read files. [default: all cores]")
+]
+Force = Annotated[bool, typer.Option("--force", help="Do it again even if it is current.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
+Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"sealfit {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _sealfit(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def ingest(
+    campaign: Campaign,
+    out: Out,
+    config: ConfigFile = None,
+    workers: Workers = None,
+    force: Force = False,
+    strict: Strict = False,
+    as_json: Json = False,
+) -> None:
+    """Read a campaign into tables of traces."""
+    _run(("ingest",), campaign, out, config, workers, force, strict, as_json)
+
+
+@app.command("fit-steady")
+def fit_steady(out: Results, force: Force = False, as_json: Json = False) -> None:
+    """Fit steady LuGre to each condition."""
+    _single("fit-steady", out, force, as_json)
+
+
+@app.command("fit-aging")
+def fit_aging(out: Results, force: Force = False, as_json: Json = False) -> None:
+    """Fit the aging law across days."""
+    _single("fit-aging", out, force, as_json)
+
+
+@app.command("close-loop")
+def close_loop(out: Results, force: Force = False, as_json: Json = False) -> None:
+    """Find, name and add what the model lacks."""
+    _single("close-loop", out, force, as_json)
+
+
+@app.command()
+def report(out: Results, force: Force = False, as_json: Json = False) -> None:
+    """Write report.html and its plots."""
+    _single("report", out, force, as_json)
+
+
+@app.command()
+def run(
+    campaign: Campaign,
+    out: Out,
+    config: ConfigFile = None,
+    workers: Workers = None,
+    force: Force = False,
+    strict: Strict = False,
+    as_json: Json = False,
+) -> None:
+    """Do every step that is not current, in order."""
+    from sealfit.fingerprint import STEPS
+
+    _run(STEPS, campaign, out, config, workers, force, strict, as_json)
+
+
+@app.command()
+def predict(
+    out: Results,
+    points: Annotated[Path, typer.Option("--points", help="CSV of points: condition columns, speed, channels.")],
+    output: Annotated[Path, typer.Option("--output", help="CSV to write: the points and their answers.")],
+    as_json: Json = False,
+) -> None:
+    """Answer the force at new points."""
+    from sealfit import progress, steps, summary
+
+    made = steps.predict(out, points, output, progress=progress.to_stderr())
+    _end("predict", made, summary.predict_lines, as_json)
+
+
+@app.command()
+def effects(
+    out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="Results, for their units and effects.")] = None,
+    as_json: Json = False,
+) -> None:
+    """List the catalogue of effects."""
+    from sealfit import steps, summary
+
+    _end("effects", steps.effects(out), summary.effects_lines, as_json)
+
+
+@app.command()
+def simulate(
+    spec: Annotated[Path, typer.Argument(metavar="SPEC.toml", help="What to simulate (TOML).")],
+    out: Annotated[Path, typer.Option("--out", help="Campaign folder to write; the truth goes beside it.")],
+    force: Annotated[bool, typer.Option("--force", help="Replace an earlier simulated campaign.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Write a campaign with known truth."""
+    from sealfit import steps
+
+    made = steps.simulate(spec, out, force=force)
+    _end("simulate", made, lambda m: [f"{m['files']} trace files in {m['campaign']}", f"truth: {m['truth']}"], as_json)
+
+
+@app.command()
+def check(campaign: Campaign, config: ConfigFile = None, workers: Workers = None, as_json: Json = False) -> None:
+    """List every fault of a campaign, write nothing."""
+    from sealfit import engine, progress, steps, summary
+
+    found, faults = steps.check(campaign, config, workers=workers or engine.cores(), progress=progress.to_stderr())
+    if as_json:
+        _print_json({"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]})
+    else:
+        for fault in faults:
+            typer.echo(f"{fault.severity}: {fault}")
+        for line in summary.ingest_lines(found) if found["files"] else ():
+            typer.echo(line)
+        typer.echo(
+            f"{len(faults)} {'fault' if len(faults) == 1 else 'faults'} found." if faults else "No faults found."
+        )
+    if faults:
+        raise typer.Exit(1)
+
+
+# ---------------------------------------------------------------- what the commands share
+def _run(
+    names: tuple[str, ...],
+    campaign: Path,
+    out: Path,
+    config: Path | None,
+    workers: int | None,
+    force: bool,
+    strict: bool,
+    as_json: bool,
+) -> None:
+    from sealfit import engine, progress, steps, summary
+
+    made = steps.run(
+        campaign,
+        out,
+        config,
+        steps=names,
+        workers=workers or engine.cores(),
+        force=force,
+        strict=strict,
+        progress=progress.to_stderr(),
+    )
+    _end("ingest" if len(names) == 1 else "run", made, summary.lines, as_json)
+
+
+def _single(step: str, out: Path, force: bool, as_json: bool) -> None:
+    from sealfit import progress, steps, summary
+
+    _end(step, steps.single(step, out, force=force, progress=progress.to_stderr()), summary.lines, as_json)
+
+
+def _end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: bool) -> None:
+    if as_json:
+        _print_json({"ok": True, "command": command, **made})
+    else:
+        typer.echo("\n".join(lines(made)))
+
+
+def _print_json(document: dict) -> None:
+    from sealfit.state import to_json
+
+    typer.echo(to_json(document), nl=False)
+
+
+def _fail(message: str, errors: list[dict], code: int) -> int:
+    if "--json" in sys.argv[1:]:
+        print(json.dumps({"ok": False, "errors": errors}, indent=1, ensure_ascii=False, allow_nan=False))
+    print(message, file=sys.stderr)
+    return code
+
+
+def _interrupted() -> int:
+    text = "interrupted; what was complete before is kept."
+    return _fail(f"sealfit: {text}", [_error(text)], INTERRUPTED)
+
+
+def _error(reason: str) -> dict:
+    return {"file": None, "line": None, "column": None, "value": None, "mend": "", "reason": reason}
+
+
+def main() -> None:
+    """Run the command line; the exit code is 0, 1 (input or request), 2 (usage) or 130 (Ctrl-C)."""
+    sys.exit(_exit_code())
+
+
+def _exit_code() -> int:
+    try:
+        code = app(standalone_mode=False, prog_name="sealfit") or 0
+        return _interrupted() if code == INTERRUPTED else code
+    except SealfitError as error:
+        return _fail(f"sealfit: {error}", error.as_dicts(), 1)
+    except (KeyboardInterrupt, typer.Abort):  # typer hands on a Ctrl-C as one of these or as the code, by version
+        return _interrupted()
+    except BrokenPipeError:  # `sealfit effects | head`: the reader has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they can do.
+        if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):
+            raise
+        text = error.format_message()
+        if "NoArgs" in type(error).__name__:  # `sealfit` alone: its message is the help
+            return _fail(text, [_error("no command was given.")], error.exit_code)
+        usage = error.ctx.get_usage() if getattr(error, "ctx", None) else ""
+        hint = f"Try: {error.ctx.command_path} --help" if usage else ""
+        shown = "\n".join(part for part in (usage, hint, f"sealfit: {text}") if part)
+        return _fail(shown, [_error(text)], error.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,286 @@
+"""One function per command: read tables from OUT, call the pure functions, write what they return."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sealfit.errors import CampaignError, Fault, OutError
+from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, glob_names
+from sealfit.places import RUNS, campaign_folder, existing_file, existing_out, refuse_effects_in
+from sealfit.progress import Silent
+from sealfit.staging import Staged, disk
+from sealfit.state import ConfigCopy
+from sealfit.store import Store
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
+CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
+FITTED = ("steady_fit", "aging_fit", "aging_curves")
+FAULTY = ("warning", "error")  # severities that count as a fault
+
+
+def run(
+    campaign: Path,
+    out: Path,
+    config: Path | None = None,
+    *,
+    steps: tuple[str, ...] = STEPS,
+    workers: int = 1,
+    force: bool = False,
+    strict: bool = False,
+    progress: Silent | None = None,
+) -> dict:
+    """Do every step of `steps` that is not current, in order, and return the summary of all of them.
+
+    Parameters
+    ----------
+    campaign, out : Path
+        The campaign's folder and the folder of results.
+    config : Path or None
+        A rig config, or None for the default.
+    workers : int
+        Processes that read trace files.
+    force : bool
+        Do current steps too.
+    strict : bool
+        Stop at any fault of the campaign, after the first step.
+
+    Raises
+    ------
+    SealfitError
+        CampaignError, ConfigError, OutError, FitError: whatever the user has to mend.
+    """
+    progress = progress or Silent()
+    source = ConfigCopy.at(config)
+    checked = source.parse()
+    refuse_effects_in(campaign, checked)
+    with Store.writing(out, campaign_folder(campaign, checked), source) as store:
+        return _do_steps(store, steps, workers=workers, force=force, strict=strict, progress=progress)
+
+
+def ingest(campaign: Path, out: Path, config: Path | None = None, **options) -> dict:
+    """Read the campaign into OUT and return the summary; arguments as `run`."""
+    return run(campaign, out, config, steps=("ingest",), **options)
+
+
+def single(step: str, out: Path, *, force: bool = False, progress: Silent | None = None) -> dict:
+    """Do one step after the first in an OUT whose earlier steps are current, and return its summary.
+
+    Raises
+    ------
+    StaleError
+        If a step before it is missing or stale; it names the command to run.
+    """
+    with Store.writing(existing_out(out)) as store:
+        store.require(STEPS[STEPS.index(step) - 1])
+        return _do_steps(store, (step,), workers=1, force=force, strict=False, progress=progress or Silent())
+
+
+def _do_steps(
+    store: Store, steps: tuple[str, ...], *, workers: int, force: bool, strict: bool, progress: Silent
+) -> dict:
+    from sealfit import summary
+
+    for warning in store.warnings:
+        progress.warn(warning)
+    done = []
+    for step in steps:
+        why = store.why_stale(step)
+        if why or force:
+            if why and step in store.state.steps:
+                progress.say(why)
+            with store.step(step) as staged:
+                _WORK[step](store, staged, workers, progress)
+            done.append(step)
+        else:
+            progress.say(f"{step}: current, not redone")
+        if step == "ingest" and strict:
+            _refuse_faults(store.read("quality"))
+    return {"out": str(store.out), "done": done, **summary.of_steps(store, steps)}
+
+
+def _refuse_faults(quality: pd.DataFrame) -> None:
+    faults = faults_of(quality)
+    if faults:
+        raise CampaignError(faults)
+
+
+def faults_of(quality: pd.DataFrame) -> list[Fault]:
+    """Return the faults that a quality table holds; rows of severity "info" are none."""
+    rows = quality[quality["severity"].isin(FAULTY)].astype(object)
+    rows = rows.where(rows.notna(), None)
+    whole = {name: rows[name].map(lambda n: None if n is None else int(n)) for name in ("stroke", "line")}
+    return [Fault(**row) for row in rows.assign(**whole).to_dict("records")]
+
+
+# ---------------------------------------------------------------- the work of each step
+def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+    from sealfit.ingest.campaign import ingest_campaign
+
+    campaign, config = store.state.campaign, store.seen_config("ingest")
+    runs_before = fingerprint(campaign / RUNS)  # as it was when the reading began
+    with progress.counting("reading trace files") as on_file:
+        ingested = ingest_campaign(campaign, config, workers=workers, on_file=on_file)
+    progress.faults(ingested.faults)
+    for name in INGESTED:
+        staged.table(name, ingested.tables[name])
+    marks = _as_read(ingested.tables["inputs"])
+    named = {fault.file for fault in ingested.faults if fault.file} | set(glob_names(campaign, config.files))
+    for name in sorted(named - marks.keys()):  # missing or unreadable: if that changes, the campaign has changed
+        marks[name] = fingerprint(campaign / name)
+    staged.inputs = {**marks, RUNS: runs_before}
+
+
+def _as_read(inputs: pd.DataFrame) -> dict[str, Fingerprint]:
+    rows = inputs[inputs["sha256"].notna() & inputs["size"].notna() & inputs["mtime_ns"].notna()]
+    marks = zip(rows["file"], rows["size"], rows["mtime_ns"], rows["sha256"], strict=True)
+    return {name: Fingerprint(int(size), int(mtime_ns), sha256) for name, size, mtime_ns, sha256 in marks}
+
+
+def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+    from sealfit.fit.steady import fit_conditions
+
+    steady = store.read("steady")
+    progress.say(f"fitting {steady['condition'].nunique()} conditions")
+    staged.table("steady_fit", fit_conditions(steady, store.seen_config("fit-steady")))
+
+
+def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+    from sealfit.fit.aging import aging_curves, fit_series
+
+    config = store.seen_config("fit-aging")
+    if config.aging:
+        progress.say("fitting the aging law")
+    else:
+        progress.say("no aging_days in the condition: there is no aging law to fit")
+    fitted = fit_series(store.read("steady_fit"), config)
+    staged.table("aging_fit", fitted)
+    staged.table("aging_curves", aging_curves(fitted))
+
+
+def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+    from sealfit.closure.loop import close_loop
+
+    closure = close_loop(
+        store.read("bins"), store.read("traces"), store.seen_config("close-loop"), on_progress=progress.say
+    )
+    for name in CLOSED:
+        staged.table(name, closure.tables[name])
+    staged.json("model", closure.model)
+    staged.json("closure", closure.document)
+
+
+def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+    from sealfit.report.page import build_report
+
+    progress.say("drawing the report")
+    tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED)}
+    report = build_report(tables, store.read_json("closure"), store.provenance(), store.seen_config("report"))
+    for name, figure in report.figures.items():
+        staged.figure(name, figure)
+    staged.text("report.html", report.html)
+
+
+_WORK: dict[str, Callable[[Store, Staged, int, Silent], None]] = {
+    "ingest": _ingest,
+    "fit-steady": _fit_steady,
+    "fit-aging": _fit_aging,
+    "close-loop": _close_loop,
+    "report": _report,
+}
+
+
+# ---------------------------------------------------------------- commands that keep nothing in OUT
+def check(
+    campaign: Path, config: Path | None = None, *, workers: int = 1, progress: Silent | None = None
+) -> tuple[dict, list[Fault]]:
+    """Read everything, write nothing, and return what was found and every fault.
+
+    Raises
+    ------
+    ConfigError
+        If the config cannot be used.
+    """
+    from sealfit import summary
+    from sealfit.ingest.campaign import ingest_campaign
+
+    checked = ConfigCopy.at(config).parse()
+    refuse_effects_in(campaign, checked)
+    try:
+        with (progress or Silent()).counting("reading trace files") as on_file:
+            ingested = ingest_campaign(campaign_folder(campaign, checked), checked, workers=workers, on_file=on_file)
+    except CampaignError as error:
+        return {"files": None}, list(error.faults)
+    faults = [fault for fault in ingested.faults if fault.severity in FAULTY]
+    return summary.of_ingest(ingested.tables), faults
+
+
+def predict(out: Path, points: Path, output: Path, *, progress: Silent | None = None) -> dict:
+    """Write the answers to `points` (CSV) to `output` (CSV) and return how many rows were answered.
+
+    Raises
+    ------
+    StaleError
+        If the loop has not been closed on the campaign as it stands.
+    RequestError
+        If the points cannot be read, lack a column that the model needs, or the answers cannot be written.
+    """
+    from sealfit.closure.predict import predict as answer
+    from sealfit.points import read_points, write_answers
+
+    store = Store.open(existing_out(out))
+    for warning in store.warnings:
+        (progress or Silent()).warn(warning)
+    store.require("close-loop")
+    asked = read_points(points)
+    answers = answer(store.read_json("model"), asked.values)
+    return {"out": str(store.out), "output": str(output), **write_answers(asked, answers, output)}
+
+
+def effects(out: Path | None = None) -> dict:
+    """Return the catalogue; with OUT, in its units, with the users' own effects and those that its loop added."""
+    from sealfit import summary
+    from sealfit.effects import EFFECTS
+
+    if out is None:
+        return {"effects": summary.of_effects(EFFECTS.values(), None)}
+    store = Store.open(existing_out(out))
+    closed = not store.why_stale("close-loop")
+    added = [effect["id"] for effect in store.read_json("closure")["effects"]] if closed else None
+    return {"effects": summary.of_effects(EFFECTS.values(), store.config.units), "added": added}
+
+
+def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:
+    """Write a campaign with known truth to `out`, and the truth beside it, both whole or not at all.
+
+    Raises
+    ------
+    OutError
+        If `out` exists and `force` is not given, or if it is not a simulated campaign; or if the disk refuses.
+    """
+    from sealfit.simulate import load_spec
+    from sealfit.simulate import simulate as make
+
+    loaded = load_spec(existing_file(spec, "spec"))
+    truth = out.parent / f"{out.name}.truth.json"
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        if not truth.is_file() or not out.is_dir():
+            raise OutError("exists and is no simulated campaign.", file=out, mend="Choose another --out.")
+        if not force:
+            raise OutError("exists already.", file=out, mend="Choose another --out, or replace it with --force.")
+    with disk(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
+            made = Path(folder) / out.name
+            make(loaded, made)
+            if out.exists():
+                out.rename(Path(folder) / "replaced")
+            made.rename(out)
+            (Path(folder) / truth.name).replace(truth)
+    files = sum(1 for path in out.rglob("*") if path.is_file() and path.name != RUNS)
+    return {"campaign": str(out), "truth": str(truth), "files": files}

@@ -1,0 +1,241 @@
+"""What a command ends with: the main figures as plain values (for --json), and the same in a few lines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+from sealfit.tables import Units
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from sealfit.effects.contract import Effect
+    from sealfit.store import Store
+
+NOT_PARAMETERS = ("statistics",)  # `quantity` of the rows of a fit that describe the fit itself
+
+
+# ---------------------------------------------------------------- plain values
+def of_steps(store: Store, steps: Iterable[str]) -> dict:
+    """Return the summaries of `steps`, all of them current."""
+    make = {
+        "ingest": lambda: of_ingest({name: store.read(name) for name in ("inputs", "runs", "quality", "steady")}),
+        "fit-steady": lambda: of_fit(store.read("steady_fit"), "condition"),
+        "fit-aging": lambda: of_fit(store.read("aging_fit"), "series"),
+        "close-loop": lambda: of_closure(store.read_json("closure"), store.config.units),
+        "report": lambda: {"file": str(store.out / "report.html")},
+    }
+    return {step.replace("-", "_"): make[step]() for step in steps}
+
+
+def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
+    """Return how many files, runs and conditions there are, and how many faults."""
+    inputs, quality, steady = tables["inputs"], tables["quality"], tables["steady"]
+    runs = tables["runs"][tables["runs"]["used"].astype(bool)]
+    return {
+        "files": {
+            "used": int((inputs["status"] == "used").sum()),
+            "left_out": int((inputs["status"] == "left out").sum()),
+            "not_matched": int((inputs["status"] == "not matched").sum()),
+        },
+        "rows_left_out": int((quality["action"] == "row left out").sum()),
+        "strokes_left_out": int((quality["action"] == "stroke left out").sum()),
+        "faults": {severity: int((quality["severity"] == severity).sum()) for severity in ("error", "warning")},
+        "runs": int(runs["run_id"].nunique()),
+        "conditions": int(steady["condition"].nunique()),
+    }
+
+
+def of_fit(fit: pd.DataFrame, of: str) -> dict:
+    """Return the range of every parameter over the conditions or series of `fit` in which it is identified."""
+    rows = fit[~fit["quantity"].isin(NOT_PARAMETERS)]
+    ranges = []
+    for (quantity, parameter, unit), group in rows.groupby(["quantity", "parameter", "unit"], sort=False, dropna=False):
+        known = group.loc[group["identified"].astype(bool), "value"].dropna()
+        ranges.append(
+            {
+                "quantity": quantity,
+                "parameter": parameter,
+                "unit": unit or "",
+                "min": float(known.min()) if len(known) else None,
+                "max": float(known.max()) if len(known) else None,
+                "identified": len(known),
+                "of": len(group),
+            }
+        )
+    return {of: int(fit[of].nunique()), "parameters": ranges}
+
+
+def of_closure(closure: Mapping, units: Units) -> dict:
+    """Return the verdict, the errors before and after, the effects and what is left."""
+    kept = ("verdict", "units", "noise_floor_N", "before", "after", "heldout_unit", "left", "next_runs")
+    effects = [
+        {key: effect[key] for key in ("id", "label", "form", "acts_on", "operation", "channels", "named", "candidate")}
+        for effect in closure["effects"]
+    ]
+    return {**{key: closure[key] for key in kept}, "sentence": verdict_sentence(closure, units), "effects": effects}
+
+
+def verdict_sentence(closure: Mapping, units: Units) -> str:
+    """Return the verdict in one sentence."""
+    count = sum(not effect["candidate"] for effect in closure["effects"])
+    added = {0: "no effect was added", 1: "one effect was missing and is added"}.get(
+        count, f"{count} effects were missing and are added"
+    )
+    if closure["verdict"] == "nothing_missing":
+        return "nothing is missing: the declared model explains these measurements down to their own scatter"
+    if closure["verdict"] == "closed":
+        return f"{added}; no significant structure is left"
+    return f"{added}, and something is left that could not be named{_where(closure['left'], units)}"
+
+
+def _where(left: Mapping, units: Units) -> str:
+    where = f", at the level of the {left['level']}" if left["level"] else ""
+    along = f", along {units.label(left['channel'])}" if left["channel"] else ""
+    return where + along + (f" (p = {left['p_value']:.2g})" if left["p_value"] is not None else "")
+
+
+def of_effects(effects: Iterable[Effect], units: Units | None) -> list[dict]:
+    """Return the catalogue as plain values."""
+    return [
+        {
+            "id": effect.id,
+            "label": effect.label,
+            "form": effect.form,
+            "equation": effect.equation,
+            "reads": list(effect.reads),
+            "acts_on": [{"target": target, "operation": operation} for target, operation in effect.acts_on],
+            "physical": effect.physical,
+            "source": effect.source,
+            "parameters": [
+                {"name": p.name, "unit": _effect_unit(p.unit, effect.reads, units), "meaning": p.meaning}
+                for p in effect.parameters
+            ],
+        }
+        for effect in effects
+    ]
+
+
+def _effect_unit(unit: str, reads: tuple[str, ...], units: Units | None) -> str:
+    """Fill in what the contract leaves open: {x} for the channel's unit, {y} for that of what the effect gives."""
+    if units is not None and len(reads) == 1 and units.of(reads[0]):
+        unit = unit.replace("{x}", units.of(reads[0]))
+    return unit.replace("{x}", "[channel]").replace("{y}", "[target]")
+
+
+# ---------------------------------------------------------------- the same in lines
+def lines(summary: Mapping) -> list[str]:
+    """Return the summary of one step or of all of them, a line for each thing worth knowing."""
+    writers = {
+        "ingest": ingest_lines,
+        "fit_steady": lambda part: _fit_lines("steady fit", "condition", part),
+        "fit_aging": lambda part: _fit_lines("aging", "series", part),
+        "close_loop": closure_lines,
+        "report": lambda part: [_line("report", part["file"])],
+    }
+    return [line for name, write in writers.items() if name in summary for line in write(summary[name])]
+
+
+def ingest_lines(part: Mapping) -> list[str]:
+    """Return the lines of an ingest."""
+    files, faults = part["files"], part["faults"]
+    text = f"{files['used']} used, {files['left_out']} left out"
+    if files["not_matched"]:
+        text += f", {files['not_matched']} not matched by the file-name pattern"
+    found = [_line("files", text)]
+    left_out = [_count(part[f"{what}s_left_out"], what) for what in ("stroke", "row") if part[f"{what}s_left_out"]]
+    if sum(faults.values()):
+        text = f"{_count(faults['error'], 'error')}, {_count(faults['warning'], 'warning')}"
+        more = f"; left out: {', '.join(left_out)}" if left_out else ""
+        found.append(_line("faults", f"{text}{more} (table quality)"))
+    found.append(_line("conditions", f"{part['conditions']} in {_count(part['runs'], 'run')}"))
+    return found
+
+
+def _fit_lines(title: str, of: str, part: Mapping) -> list[str]:
+    ranges = part["parameters"]
+    if not ranges:
+        return [_line(title, "nothing to fit")]
+    quantities = list(dict.fromkeys(entry["quantity"] for entry in ranges))
+    found = []
+    for quantity in quantities:
+        texts = [_range(entry) for entry in ranges if entry["quantity"] == quantity]
+        name = "" if len(quantities) == 1 else f"{quantity}: "
+        found.append(_line(title if not found else "", name + ", ".join(texts)))
+    lacking = [f"{e['parameter']} in {e['of'] - e['identified']}" for e in ranges if e["identified"] < e["of"]]
+    if lacking:
+        found.append(
+            _line("", f"not identified, of {part[of]} {of if of == 'series' else 'conditions'}: {', '.join(lacking)}")
+        )
+    return found
+
+
+def _range(entry: Mapping) -> str:
+    unit = f" {entry['unit']}" if entry["unit"] else ""
+    if entry["min"] is None:
+        return f"{entry['parameter']} not identified"
+    if entry["min"] == entry["max"]:
+        return f"{entry['parameter']} {entry['min']:.4g}{unit}"
+    return f"{entry['parameter']} {entry['min']:.4g} to {entry['max']:.4g}{unit}"
+
+
+def closure_lines(part: Mapping) -> list[str]:
+    """Return the lines of a closed loop."""
+    unit, before, after = part["units"]["force_N"], part["before"], part["after"]
+    found = [_line("verdict", f"{part['verdict']}: {part['sentence']}")]
+    for effect in part["effects"]:
+        status = "candidate, not applied: " if effect["candidate"] else "+ "
+        unnamed = "" if effect["named"] else " (no form in the catalogue does as well)"
+        found.append(_line("", f"{status}{effect['label']}: {effect['form']}, {_acts(effect)}{unnamed}"))
+    rows = (("rmse", "rmse_N"), ("held out", "heldout_rmse_N"), ("run means", "rmse_runs_N"), ("largest", "max_abs_N"))
+    texts = [f"{name} {_number(before[key])} -> {_number(after[key])}" for name, key in rows]
+    found.append(_line(f"error ({unit})", "; ".join(texts)))
+    if part["noise_floor_N"] is not None:
+        found.append(_line("noise floor", f"{_number(part['noise_floor_N'])} {unit}"))
+    left = part["left"]
+    if left["rmse_N"] is not None:
+        found.append(_line("left", f"rmse {_number(left['rmse_N'])} {unit}"))
+    for run in part["next_runs"][:3]:
+        found.append(_line("next runs", run["why"]))
+    return found
+
+
+def _acts(effect: Mapping) -> str:
+    how = {"add": "added to", "multiply": "a factor on"}[effect["operation"]]
+    return f"{how} {'the force' if effect['acts_on'] == 'force' else effect['acts_on']}"
+
+
+def effects_lines(listed: Mapping) -> list[str]:
+    """Return the catalogue, an effect after the other."""
+    found = []
+    for effect in listed["effects"]:
+        mark = "  [in the model of this OUT]" if effect["id"] in (listed.get("added") or ()) else ""
+        found.append(f"{effect['id']}: {effect['label']}{mark}")
+        found.append(f"    {effect['form']}")
+        for p in effect["parameters"]:
+            found.append(f"    {p['name']}{' [' + p['unit'] + ']' if p['unit'] else ''}: {p['meaning']}")
+    if listed.get("added", ()) is None:
+        found.append("The loop of this OUT is not closed, or stale: which effects it added is not known.")
+    return found
+
+
+def predict_lines(part: Mapping) -> list[str]:
+    """Return the lines of a prediction."""
+    text = f"{part['answered']} of {_count(part['rows'], 'row')} answered, {part['extrapolated']} extrapolated"
+    refused = part["rows"] - part["answered"]
+    if refused:
+        text += f"; {_count(refused, 'row')} could not be, and the column note says why"
+    return [_line("points", text), _line("answers", part["output"])]
+
+
+def _line(title: str, text: str) -> str:
+    return f"{title:<12}{text}"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3g}"

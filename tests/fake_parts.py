@@ -1,0 +1,138 @@
+"""Stand-ins for the computing parts, so that the steps and the command line are tested on their own."""
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import pandas as pd
+from matplotlib.figure import Figure
+from store_helpers import small
+
+from sealfit.errors import Fault
+from sealfit.fingerprint import fingerprint
+
+FAULT = Fault(
+    "not_a_number", "is not a number.", "a.csv", None, 3, "force_N", "x", "warning", "row left out", "Mend the cell."
+)
+ERRORS = {
+    "rmse_N": 0.4,
+    "rmse_runs_N": 0.3,
+    "heldout_rmse_N": 0.5,
+    "max_abs_N": 1.5,
+    "mean_abs_pct": 2.0,
+    "lack_of_fit_p": None,
+}
+EFFECT = {
+    "id": "ripple",
+    "label": "lead-screw ripple",
+    "form": "A sin(2 pi x / lambda + phi)",
+    "acts_on": "force",
+    "operation": "add",
+    "channels": ["displacement_mm"],
+    "named": True,
+    "candidate": False,
+}
+CLOSURE = {
+    "schema": 1,
+    "verdict": "closed",
+    "units": {"force_N": "N"},
+    "noise_floor_N": 0.11,
+    "before": ERRORS,
+    "after": {**ERRORS, "rmse_N": 0.2, "heldout_rmse_N": float("nan")},
+    "heldout_unit": "run",
+    "effects": [EFFECT],
+    "scatter": [],
+    "left": {"rmse_N": 0.2, "level": None, "channel": None, "p_value": None},
+    "next_runs": [{"why": "a second load would separate them", "conditions": []}],
+}
+
+
+class Parts:
+    """The stand-ins and what they were called with; set `faults` or `raises` to see a campaign at fault."""
+
+    def __init__(self):
+        self.calls, self.configs, self.faults, self.raises = [], {}, [], {}
+        self.closure = CLOSURE
+
+    def _called(self, name, config=None):
+        self.calls.append(name)
+        self.configs[name] = config
+        if name in self.raises:
+            raise self.raises[name]
+
+    def ingest_campaign(self, campaign, config, *, workers=1, on_file=None):
+        self._called("ingest", config)
+        marks = {path.name: fingerprint(path) for path in sorted(campaign.glob("*.csv")) if path.name != "runs.csv"}
+        on_file(len(marks), len(marks))
+        tables = {name: small(name) for name in ("runs", "traces", "traces_mean", "steady", "bins")}
+        inputs = small("inputs", len(marks)).assign(
+            file=list(marks),
+            size=[m.size for m in marks.values()],
+            mtime_ns=[m.mtime_ns for m in marks.values()],
+            sha256=[m.sha256 for m in marks.values()],
+            status="used",
+        )
+        good = Fault("read", "was read.", "a.csv", severity="info", action="kept")
+        quality = pd.DataFrame([fault.as_dict() for fault in (good, *self.faults)])
+        return SimpleNamespace(tables={**tables, "inputs": inputs, "quality": quality}, faults=[good, *self.faults])
+
+    def fit_conditions(self, steady, config):
+        self._called("fit-steady", config)
+        fit = small("steady_fit", 3).assign(condition=["a", "b", "c"], parameter="mu_s", value=[0.7, 0.8, 9.0], unit="")
+        return fit.assign(identified=[True, True, False])
+
+    def fit_series(self, steady_fit, config):
+        self._called("fit-aging", config)
+        return small("aging_fit", 1).assign(quantity="mu_s", parameter="a", value=0.04, unit="")
+
+    def aging_curves(self, aging_fit, days=None):
+        return small("aging_curves")
+
+    def close_loop(self, bins, traces, config, *, on_progress=None):
+        self._called("close-loop", config)
+        on_progress("trying ripple along displacement_mm")
+        names = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
+        return SimpleNamespace(
+            document=self.closure, model={"ready": True}, tables={name: small(name) for name in names}
+        )
+
+    def build_report(self, tables, closure, provenance, config):
+        self._called("report", config)
+        assert set(tables) >= {"bins", "steady_fit", "aging_curves", "curves"}
+        return SimpleNamespace(html=f"<p>{closure['verdict']}</p>", figures={"one": Figure()})
+
+    def predict(self, model, points):
+        self._called("predict")
+        assert model == {"ready": True}
+        answers = {name: 1.0 for name in ("force_before_N", "force_after_N", "force_after_lo95_N")}
+        answers |= {name: 2.0 for name in ("force_after_hi95_N", "meas_lo95_N", "meas_hi95_N")}
+        made = points.assign(**answers, extrapolated=False, note="")
+        made.loc[made.index[-1], ["force_after_N", "note"]] = [None, "cannot be answered"]
+        return made
+
+    def simulate(self, spec, out):
+        self._called("simulate")
+        out.mkdir()
+        (out / "runs.csv").write_text("file\na.csv\n")
+        (out / "a.csv").write_text(f"{spec}\n")
+        out.with_name(out.name + ".truth.json").write_text("{}")
+
+
+def put_in(monkeypatch):
+    """Put the stand-ins in the place of the computing parts, and return them."""
+    parts = Parts()
+    places = {
+        "sealfit.ingest.campaign": ["ingest_campaign"],
+        "sealfit.fit.steady": ["fit_conditions"],
+        "sealfit.fit.aging": ["fit_series", "aging_curves"],
+        "sealfit.closure.loop": ["close_loop"],
+        "sealfit.closure.predict": ["predict"],
+        "sealfit.report.page": ["build_report"],
+        "sealfit.simulate": ["simulate"],
+    }
+    for place, names in places.items():
+        module = ModuleType(place)
+        for name in names:
+            setattr(module, name, getattr(parts, name))
+        monkeypatch.setitem(sys.modules, place, module)
+    sys.modules["sealfit.simulate"].load_spec = lambda path: path.read_text()
+    return parts

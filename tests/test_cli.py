@@ -1,0 +1,424 @@
+import json
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import fake_parts
+import pandas as pd
+import pytest
+
+from sealfit import cli, steps
+from sealfit.errors import CampaignError, Fault, FitError
+from sealfit.fingerprint import STEPS
+
+ROOT = Path(__file__).resolve().parent.parent
+COMMANDS = sorted(command.name or command.callback.__name__ for command in cli.app.registered_commands)
+
+
+@pytest.fixture
+def parts(monkeypatch):
+    return fake_parts.put_in(monkeypatch)
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    folder = tmp_path / "campaign"
+    folder.mkdir()
+    (folder / "runs.csv").write_text("file\na.csv\n")
+    (folder / "a.csv").write_text("1")
+    return folder
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out"
+
+
+class Ended:
+    def __init__(self, code, captured):
+        self.code, self.stdout, self.stderr = code, captured.out, captured.err
+
+    @property
+    def json(self):
+        return json.loads(self.stdout, parse_constant=pytest.fail)
+
+
+@pytest.fixture
+def sealfit(monkeypatch, capsys):
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["sealfit", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return Ended(ended.value.code or 0, capsys.readouterr())
+
+    return call
+
+
+# ---------------------------------------------------------------- help, documents, start-up
+def test_the_commands_are_those_of_the_design():
+    assert set(COMMANDS) >= {
+        "ingest", "fit-steady", "fit-aging", "close-loop", "report", "run", "predict", "effects", "simulate", "check",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_and_is_in_the_readme(sealfit, command):
+    ended = sealfit(command, "--help")
+    assert ended.code == 0
+    assert "--json" in ended.stdout
+    readme = (ROOT / "README.md").read_text("utf-8")
+    assert re.search(rf"^sealfit {command}\b", readme, re.MULTILINE)
+    for option in re.findall(r"--[a-z]+", ended.stdout):
+        assert option == "--help" or re.search(rf"{option}\b", readme), option
+
+
+def test_help_lists_every_command_whole(sealfit):
+    ended = sealfit("--help")
+    assert all(re.search(rf"^  {command} +\w.*\.$", ended.stdout, re.MULTILINE) for command in COMMANDS)
+    assert "..." not in ended.stdout.split("Commands:")[1]
+
+
+def test_the_command_line_starts_without_the_heavy_libraries():
+    program = "import sys, sealfit.cli; print([m for m in ('numpy', 'pandas', 'pydantic', 'rich') if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert run.stdout == "[]\n"
+
+
+def test_help_answers_at_once():
+    def seconds(*arguments):
+        best = float("inf")
+        for _ in range(4):
+            began = time.perf_counter()
+            subprocess.run([sys.executable, *arguments], capture_output=True, check=True)
+            best = min(best, time.perf_counter() - began)
+        return best
+
+    assert seconds("-m", "sealfit", "--help") < max(0.3, 2 * seconds("-c", "import typer"))
+
+
+def test_version(sealfit):
+    assert re.fullmatch(r"sealfit \d+\.\d+\.\d+\n", sealfit("--version").stdout)
+
+
+# ---------------------------------------------------------------- exit codes
+@pytest.mark.parametrize(
+    "arguments", [[], ["rum"], ["run"], ["run", "c"], ["ingest", "c", "--out", "o", "--workers", "0"], ["run", "--bad"]]
+)
+def test_wrong_usage_is_2(sealfit, arguments):
+    ended = sealfit(*arguments)
+    assert ended.code == 2
+    assert ended.stdout == ""
+    assert "Usage: sealfit" in ended.stderr
+    ended = sealfit(*arguments, "--json")
+    assert ended.code == 2
+    assert ended.json["ok"] is False
+    assert len(ended.json["errors"]) == 1
+
+
+def test_a_campaign_at_fault_is_1_and_leaves_no_out(sealfit, parts, campaign, out):
+    parts.raises["ingest"] = CampaignError([Fault("twice", "is listed twice.", "runs.csv", None, 3, mend="Drop one.")])
+    ended = sealfit("run", campaign, "--out", out)
+    assert (ended.code, ended.stdout) == (1, "")
+    assert "sealfit: runs.csv:3: is listed twice. Drop one.\n" in ended.stderr
+    assert not out.exists()
+    error = sealfit("run", campaign, "--out", out, "--json").json["errors"][0]
+    assert {"file", "line", "column", "value", "mend", "reason"} <= set(error)
+    assert (error["file"], error["line"], error["mend"]) == ("runs.csv", 3, "Drop one.")
+
+
+def test_ctrl_c_is_130_one_line_and_out_is_intact(sealfit, parts, campaign, out):
+    assert sealfit("ingest", campaign, "--out", out).code == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    parts.raises["fit-steady"] = KeyboardInterrupt()
+    ended = sealfit("run", campaign, "--out", out)
+    assert ended.code == 130
+    assert ended.stderr.splitlines()[-1] == "sealfit: interrupted; what was complete before is kept."
+    assert ended.stderr.count("interrupted") == 1
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert sealfit("run", campaign, "--out", out, "--json").json["ok"] is False
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch, parts, campaign, out):
+    parts.raises["fit-steady"] = ZeroDivisionError("a bug")
+    monkeypatch.setattr(sys, "argv", ["sealfit", "run", str(campaign), "--out", str(out)])
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        cli.main()
+
+
+def test_a_reader_that_leaves_early_is_no_fault():
+    program = "import sys; sys.argv = ['sealfit', '--help']; from sealfit.cli import main; main()"
+    read = subprocess.run(["bash", "-c", f'{sys.executable} -c "{program}" | true'], capture_output=True, text=True)
+    assert "Traceback" not in read.stderr
+
+
+# ---------------------------------------------------------------- run and the single steps
+def test_run_does_every_step_and_says_so_in_a_few_lines(sealfit, parts, campaign, out):
+    ended = sealfit("run", campaign, "--out", out)
+    assert ended.code == 0
+    assert parts.calls == list(STEPS)
+    lines = ended.stdout.splitlines()
+    assert 8 <= len(lines) <= 14
+    assert "files       1 used, 0 left out" in lines
+    assert "steady fit  mu_s 0.7 to 0.8" in lines
+    assert "            not identified, of 3 conditions: mu_s in 1" in lines
+    assert "verdict     closed: one effect was missing and is added; no significant structure is left" in lines
+    assert "error (N)   rmse 0.4 -> 0.2; held out 0.5 -> unknown; run means 0.3 -> 0.3; largest 1.5 -> 1.5" in lines
+    assert f"report      {out / 'report.html'}" in lines
+    assert "reading trace files: 1 of 1" in ended.stderr
+    assert "trying ripple" in ended.stderr
+
+
+def test_a_second_run_redoes_nothing_and_prints_the_same(sealfit, parts, campaign, out):
+    first = sealfit("run", campaign, "--out", out)
+    parts.calls.clear()
+    second = sealfit("run", campaign, "--out", out)
+    assert second.stdout == first.stdout
+    assert parts.calls == []
+    assert second.stderr.count("current, not redone") == len(STEPS)
+    assert sealfit("run", campaign, "--out", out, "--json").json["done"] == []
+    assert sealfit("run", campaign, "--out", out, "--json", "--force").json["done"] == list(STEPS)
+
+
+def test_run_redoes_exactly_what_is_stale(sealfit, parts, campaign, out, tmp_path):
+    config = tmp_path / "rig.toml"
+    config.write_text("name = 'rig'")
+    assert sealfit("run", campaign, "--out", out, "--config", config).code == 0
+    config.write_text("name = 'rig'\n[loop]\nseed = 4")
+    ended = sealfit("run", campaign, "--out", out, "--config", config, "--json")
+    assert ended.json["done"] == ["close-loop", "report"]
+    assert "close-loop is stale: the config (rig.toml) changed" in ended.stderr
+    (campaign / "a.csv").write_text("2")
+    assert sealfit("run", campaign, "--out", out, "--config", config, "--json").json["done"] == list(STEPS)
+
+
+def test_each_step_sees_only_what_its_key_holds(sealfit, parts, campaign, out, tmp_path):
+    config = tmp_path / "rig.toml"
+    config.write_text("[loop]\nseed = 4\n[sensor]\naccuracy = 0.9")
+    sealfit("run", campaign, "--out", out, "--config", config)
+    assert parts.configs["ingest"].sensor.accuracy == 0.2
+    assert parts.configs["fit-steady"].sensor.accuracy == 0.9
+    assert [parts.configs[step].loop.seed for step in STEPS] == [1, 1, 1, 4, 4]
+
+
+def test_the_steps_one_by_one_are_the_run(sealfit, parts, campaign, out, tmp_path):
+    whole = sealfit("run", campaign, "--out", tmp_path / "whole")
+    said = sealfit("ingest", campaign, "--out", out).stdout
+    for step in STEPS[1:]:
+        ended = sealfit(step, out)
+        assert ended.code == 0
+        said += ended.stdout
+    assert said == whole.stdout.replace(str(tmp_path / "whole"), str(out))
+
+
+def test_a_step_without_its_predecessor_names_the_command(sealfit, parts, campaign, out):
+    sealfit("ingest", campaign, "--out", out)
+    ended = sealfit("close-loop", out)
+    assert ended.code == 1
+    assert ended.stderr == f"sealfit: {out}: fit-steady has not been done. Run: sealfit fit-steady {out}\n"
+    (campaign / "a.csv").write_text("2")
+    ended = sealfit("fit-steady", out, "--json")
+    assert ended.code == 1
+    assert ended.json["errors"][0]["mend"] == f"Run: sealfit ingest {campaign} --out {out}"
+
+
+def test_a_step_that_fails_keeps_those_before_it(sealfit, parts, campaign, out):
+    parts.raises["fit-steady"] = FitError("condition a: too few speeds.", mend="Measure more.")
+    ended = sealfit("run", campaign, "--out", out)
+    assert (ended.code, ended.stdout) == (1, "")
+    assert ended.stderr.splitlines()[-1] == "sealfit: condition a: too few speeds. Measure more."
+    del parts.raises["fit-steady"]
+    assert sealfit("run", campaign, "--out", out, "--json").json["done"] == list(STEPS[1:])
+
+
+def test_faults_are_said_and_counted_and_strict_stops(sealfit, parts, campaign, out):
+    parts.faults = [fake_parts.FAULT]
+    ended = sealfit("run", campaign, "--out", out)
+    assert ended.code == 0
+    assert "warning: a.csv:3: column 'force_N': 'x': is not a number. Mend the cell. [row left out]" in ended.stderr
+    assert "faults      0 errors, 1 warning; left out: 1 row (table quality)" in ended.stdout
+    parts.calls.clear()
+    for arguments in (["--strict"], ["--strict", "--force"]):
+        ended = sealfit("run", campaign, "--out", out, "--json", *arguments)
+        assert ended.code == 1
+        assert ended.json["errors"][0]["line"] == 3
+    assert parts.calls == ["ingest"]
+    assert sealfit("ingest", campaign, "--out", out, "--strict").code == 1
+
+
+def test_many_faults_are_cut_short(sealfit, parts, campaign, out):
+    parts.faults = [fake_parts.FAULT] * 100
+    ended = sealfit("ingest", campaign, "--out", out)
+    assert ended.stderr.count("is not a number") == 20
+    assert "and 80 more: `sealfit check`" in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("verdict", "effects", "left", "expected"),
+    [
+        ("nothing_missing", [], [None, None, None], "nothing is missing: the declared model explains"),
+        (
+            "unexplained",
+            [],
+            ["run", "elapsed_h", 0.00123],
+            "no effect was added, and something is left that could not be named, at the level of the run,"
+            " along time since first run (h) (p = 0.0012)",
+        ),
+        ("closed", [fake_parts.EFFECT] * 2, [None, None, None], "2 effects were missing and are added; no significant"),
+    ],
+)
+def test_the_verdict_is_a_sentence(sealfit, parts, campaign, out, verdict, effects, left, expected):
+    level, channel, p_value = left
+    left = {"rmse_N": 0.2, "level": level, "channel": channel, "p_value": p_value}
+    parts.closure = {**fake_parts.CLOSURE, "verdict": verdict, "effects": effects, "left": left}
+    assert f"verdict     {verdict}: {expected}" in sealfit("run", campaign, "--out", out).stdout
+
+
+# ---------------------------------------------------------------- check
+def test_check_lists_every_fault_and_writes_nothing(sealfit, parts, campaign, tmp_path):
+    parts.faults = [fake_parts.FAULT] * 30
+    before = sorted(tmp_path.rglob("*"))
+    ended = sealfit("check", campaign)
+    assert ended.code == 1
+    assert ended.stdout.count("warning: a.csv:3: column 'force_N'") == 30
+    assert ended.stdout.endswith("30 faults found.\n")
+    assert sorted(tmp_path.rglob("*")) == before
+    ended = sealfit("check", campaign, "--json")
+    assert ended.code == 1
+    assert len(ended.json["errors"]) == 30
+
+
+def test_check_of_a_sound_campaign_is_0(sealfit, parts, campaign):
+    ended = sealfit("check", campaign)
+    assert ended.code == 0
+    assert ended.stdout.endswith("No faults found.\n")
+    assert sealfit("check", campaign, "--json").json["errors"] == []
+
+
+def test_check_lists_faults_that_would_stop_a_run(sealfit, parts, campaign):
+    parts.raises["ingest"] = CampaignError([Fault("twice", "is listed twice.", "runs.csv")] * 2)
+    ended = sealfit("check", campaign)
+    assert ended.code == 1
+    assert ended.stdout == "error: runs.csv: is listed twice.\n" * 2 + "2 faults found.\n"
+
+
+# ---------------------------------------------------------------- wrong places
+def test_wrong_places_come_with_the_likeliest_right_one(sealfit, parts, campaign, out, tmp_path):
+    def fault(*arguments):
+        ended = sealfit(*arguments)
+        assert (ended.code, ended.stdout) == (1, "")
+        assert ended.stderr.count("\n") == 1
+        return ended.stderr
+
+    assert f"Did you mean {campaign}?" in fault("run", tmp_path / "campain", "--out", out)
+    assert f"Did you mean {campaign}?" in fault("run", tmp_path / "campain" / "deeper", "--out", out)
+    assert f"Give its folder: {campaign}" in fault("run", campaign / "runs.csv", "--out", out)
+    assert f"has no runs.csv. Did you mean {campaign}?" in fault("run", tmp_path, "--out", out)
+    assert "rig.toml: cannot be read" in fault("run", campaign, "--out", out, "--config", tmp_path / "rig.toml")
+    assert not out.exists()
+    sealfit("run", campaign, "--out", out)
+    assert f"Did you mean {out}?" in fault("fit-steady", tmp_path / "oot")
+    assert "sealfit run CAMPAIGN --out" in fault("fit-steady", tmp_path)
+    assert "there is no table of points" in fault("predict", out, "--points", "no.csv", "--output", "q.csv")
+    (tmp_path / "points.csv").write_text("a\n1\n")
+    arguments = ("--points", tmp_path / "point.csv", "--output", tmp_path / "q.csv")
+    assert f"Did you mean {tmp_path / 'points.csv'}?" in fault("predict", out, *arguments)
+
+
+def test_effects_are_never_read_from_a_campaign(sealfit, parts, campaign, out):
+    (campaign / "mine").mkdir()
+    (campaign / "rig.toml").write_text("[loop]\neffects_folder = 'mine'")
+    ended = sealfit("run", campaign, "--out", out, "--config", campaign / "rig.toml")
+    assert ended.code == 1
+    assert "lies in the campaign, and Python is never run from there. Move it" in ended.stderr
+
+
+# ---------------------------------------------------------------- predict
+@pytest.fixture
+def done(sealfit, parts, campaign, out):
+    assert sealfit("run", campaign, "--out", out).code == 0
+    return out
+
+
+def predict(sealfit, done, tmp_path, text, *more):
+    points = tmp_path / "points.csv"
+    points.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return sealfit("predict", done, "--points", points, "--output", tmp_path / "q.csv", *more)
+
+
+def test_predict_gives_back_the_points_as_written_and_their_answers(sealfit, done, tmp_path):
+    ended = predict(sealfit, done, tmp_path, '\ufeffbatch,speed_mm_s\r\n007,1.50\r\n\r\n"a,b",2\r\n')
+    assert ended.code == 0
+    assert ended.stdout.startswith("points      1 of 2 rows answered, 0 extrapolated; 1 row could not be")
+    answers = pd.read_csv(tmp_path / "q.csv", dtype=str, keep_default_na=False)
+    assert list(answers.columns) == [
+        "batch", "speed_mm_s", "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N",
+        "meas_lo95_N", "meas_hi95_N", "extrapolated", "note",
+    ]  # fmt: skip
+    assert list(answers["batch"]) == ["007", "a,b"]
+    assert list(answers["speed_mm_s"]) == ["1.50", "2"]
+    assert list(answers["force_after_N"]) == ["1.0", ""]
+    assert answers["note"][1] == "cannot be answered"
+    assert predict(sealfit, done, tmp_path, "speed_mm_s\n1\n", "--json").json["rows"] == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "is empty"),
+        ("speed_mm_s\n", "has no rows"),
+        ("a;b\n1;2\n", "is not separated by commas"),
+        ("a,a\n1,2\n", "column 'a': appears twice"),
+        ("a,b\n1,2\n1,2,3\n", "points.csv:3: has 3 cells, and there are 2 columns"),
+        ("note\nx\n", "column 'note': is a column of the answer"),
+        (b"a\n\xff\n", "is not UTF-8"),
+    ],
+)
+def test_predict_says_what_is_wrong_with_the_points(sealfit, done, tmp_path, text, expected):
+    ended = predict(sealfit, done, tmp_path, text)
+    assert (ended.code, ended.stdout) == (1, "")
+    assert expected in ended.stderr
+    assert not (tmp_path / "q.csv").exists()
+
+
+def test_predict_needs_a_closed_loop(sealfit, done, campaign, tmp_path):
+    (campaign / "a.csv").write_text("2")
+    ended = predict(sealfit, done, tmp_path, "a\n1\n")
+    assert ended.code == 1
+    assert "ingest is stale: inputs changed (a.csv). Run: sealfit ingest" in ended.stderr
+
+
+def test_predict_never_overwrites_the_points(sealfit, done, tmp_path):
+    points = tmp_path / "points.csv"
+    points.write_text("a\n1\n")
+    ended = sealfit("predict", done, "--points", points, "--output", points)
+    assert ended.code == 1
+    assert points.read_text() == "a\n1\n"
+    assert "there is no folder" in sealfit("predict", done, "--points", points, "--output", tmp_path / "n/q.csv").stderr
+    assert "is a folder" in sealfit("predict", done, "--points", points, "--output", tmp_path).stderr
+
+
+# ---------------------------------------------------------------- simulate
+def test_simulate_writes_campaign_and_truth_and_keeps_what_is_there(sealfit, parts, tmp_path):
+    spec, made = tmp_path / "spec.toml", tmp_path / "deep" / "made"
+    spec.write_text("one")
+    ended = sealfit("simulate", spec, "--out", made)
+    assert ended.code == 0
+    assert f"1 trace files in {made}" in ended.stdout
+    assert sorted(path.name for path in made.parent.iterdir()) == ["made", "made.truth.json"]
+    spec.write_text("two")
+    assert "exists already. Choose another --out, or replace it" in sealfit("simulate", spec, "--out", made).stderr
+    assert (made / "a.csv").read_text() == "one\n"
+    assert sealfit("simulate", spec, "--out", made, "--force").code == 0
+    assert (made / "a.csv").read_text() == "two\n"
+    (tmp_path / "deep" / "made.truth.json").unlink()
+    assert "is no simulated campaign" in sealfit("simulate", spec, "--out", made, "--force").stderr
+
+
+def test_a_simulation_that_fails_leaves_nothing(parts, tmp_path):
+    (tmp_path / "spec.toml").write_text("one")
+    parts.raises["simulate"] = ZeroDivisionError()
+    with pytest.raises(ZeroDivisionError):
+        steps.simulate(tmp_path / "spec.toml", tmp_path / "made")
+    assert [path.name for path in tmp_path.iterdir()] == ["spec.toml"]
