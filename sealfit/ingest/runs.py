@@ -50,7 +50,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fa
         raise CampaignError(faults)
     entries, faults = list_entries(campaign, config)
     if any(fault.check in ("path_outside", "missing_file") for fault in faults):
-        raise CampaignError(faults)  # nothing can be said of files that are not there, and none outside is opened
+        _stop_at_errors(faults)  # nothing can be said of files that are not there, and none outside is opened
     entries, parts, found = _matched(entries, config)
     faults += found
     files = [
@@ -105,12 +105,14 @@ def _config_faults(config: Config) -> list[Fault]:
             if isinstance(theirs, str):
                 mend = "Give its position, counted from 1, or names = 'header'."
                 add(f"trace.columns.{ours}", theirs, "is a name, but the files have none.", mend)
-    try:
-        speed_factor(config.units)
-        if config.files.name_pattern is None:
-            name_parts("", config.files)
-    except ConfigError as error:
-        add("files", error.column or "", error.message, error.mend)
+    checks = {"quantities": lambda: speed_factor(config.units)}
+    if config.files.name_pattern is None:
+        checks["files"] = lambda: name_parts("", config.files)
+    for column, check in checks.items():
+        try:
+            check()
+        except ConfigError as error:
+            add(column, config.name, error.message, error.mend)
     return faults
 
 
@@ -159,22 +161,22 @@ def _numbers(entries: Sequence[Entry], files: Sequence[Channels], config: Config
     for name in dict.fromkeys(name for channels in files for name in channels):
         rows = [i for i, channels in enumerate(files) if name in channels]
         if name in TEXT_COLUMNS:
-            for i in rows:
-                value = files[i][name]
-                files[i][name] = f"{value:g}" if isinstance(value, float) else value
+            _as_labels(files, rows, name)
             continue
         numbers = {i: v if isinstance(v := files[i][name], float) else as_number(v) for i in rows}
         wrong = [i for i, number in numbers.items() if number is None or not math.isfinite(number)]
         known = name in NUMBERS or name == "repeat"
         mostly = len(wrong) < (1 - _MOSTLY) * len(rows)
         if wrong and not known and not mostly:
-            continue  # a column of labels
+            _as_labels(files, rows, name)
+            continue
         if wrong and not known and name not in config.condition:
             i = wrong[0]
             reason = f"{len(wrong)} of {len(rows)} cells are no numbers; the column is kept as labels."
             mend = "Empty the cell, or put a number there."
             place = {"severity": "warning", "action": "kept", "value": str(files[i][name]), "mend": mend}
             faults.append(entries[i].fault("not_a_number", reason, name, **place))
+            _as_labels(files, rows, name)
             continue
         for i in wrong:
             mend = "Put a number there."
@@ -191,6 +193,12 @@ def _numbers(entries: Sequence[Entry], files: Sequence[Channels], config: Config
                 faults.append(entry.fault("not_a_number", "is no whole number.", "repeat", value=repeat, mend=mend))
             channels["repeat"] = int(repeat)
     return faults
+
+
+def _as_labels(files: Sequence[Channels], rows: Sequence[int], name: str) -> None:
+    for i in rows:
+        value = files[i][name]
+        files[i][name] = value if isinstance(value, str) else f"{value:g}"
 
 
 def _ranges(entries: Sequence[Entry], files: Sequence[Channels]) -> list[Fault]:
