@@ -19,6 +19,7 @@ from sealfit.fit.mixed import Component, Scatter, reml, whiten
 from sealfit.fit.rows import LEVELS, Rows
 
 PRIOR_SD = 3.0
+LEAST_NOISE = 1e-6  # of the force: below what any sensor resolves; keeps noise-free data from weights without end
 MAX_STEPS = 60
 TURNS = 3  # of model and scatter; the third moves no estimate by a tenth of its standard error
 
@@ -271,7 +272,7 @@ def _per_condition(speed, load, size, condition, full: bool):
         if cost < best:
             best, answer = cost, (solution, v_s)
     solution, v_s = answer
-    mu_s = solution[: own.size] if full else solution[: own.size]
+    mu_s = solution[: own.size]
     mu_c = solution[own.size : 2 * own.size] if full else solution[: own.size]
     return {int(c): (s, k) for c, s, k in zip(own, mu_s, mu_c, strict=True)}, float(solution[-1]), float(v_s)
 
@@ -364,7 +365,7 @@ def row_noise(rows: Rows, residual: np.ndarray, force: np.ndarray) -> tuple[floa
     if not long.any():
         return max(float(np.std(residual)), 1e-9), 0.0, 1.0
     variance = np.add.reduceat(inside**2, start)[long] / (count[long] - 1)
-    floor = 1e-12 + 1e-6 * float(np.mean(variance))
+    floor = (LEAST_NOISE * float(np.sqrt(np.mean(force**2)))) ** 2 + 1e-300
     columns = np.column_stack([np.ones(long.sum()), size[long] ** 2])
     weight = np.sqrt(count[long])
     guess = np.full(long.sum(), float(np.mean(variance)) + floor)
@@ -381,7 +382,7 @@ def _inflation(inside: np.ndarray, code: np.ndarray, start: np.ndarray, count: n
     """Return 1 + 2 sum of autocorrelations over bins, cut at the first one that is not positive."""
     scale = np.sqrt(np.maximum(np.add.reduceat(inside**2, start) / count, 1e-300))[code]
     unit = inside / scale
-    total, inflation = float((unit**2).mean()), 1.0
+    total, inflation = max(float((unit**2).mean()), 1e-300), 1.0
     for lag in range(1, max(2, int(count.min()) // 3)):
         same = code[lag:] == code[:-lag]
         rho = float((unit[lag:] * unit[:-lag])[same].mean()) / total

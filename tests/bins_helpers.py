@@ -1,0 +1,99 @@
+"""Bins of a small aging campaign, made straight from Eqs. 14 and 15, with scatter at every level."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pandas as pd
+
+LOAD_N = 49.03
+TRUE = {
+    "mu_s0": 0.93,
+    "mu_c0": 0.61,
+    "a_s": 0.0445,
+    "b_s": 0.08,
+    "a_c": 0.033,
+    "b_c": 0.13,
+    "v_s": 15.0,
+    "sigma_2": 0.02,
+}
+SPEEDS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 100.0)
+
+
+def make_bins(
+    seed: int = 0,
+    *,
+    temperatures: Sequence[float] = (60.0, 80.0),
+    days: Sequence[float] = (1.0, 4.0, 8.0, 16.0),
+    speeds: Sequence[float] = SPEEDS,
+    directions: Sequence[int] = (1,),
+    repeats: int = 3,
+    bins: int = 20,
+    noise_N: float = 0.3,
+    gain: float = 0.005,
+    setup: float = 0.0,
+    specimen: float = 0.0,
+    autocorrelation: float = 0.0,
+    effect: Callable[[pd.DataFrame, np.ndarray], np.ndarray] | None = None,
+    run_channels: dict[str, Callable[[np.random.Generator], object]] | None = None,
+) -> pd.DataFrame:
+    """Return `bins` of a campaign; `effect(table, force)` returns the force with what nobody declared."""
+    rng = np.random.default_rng(seed)
+    conditions = [(23.0, 100.0, 0.0), *((t, 80.0, d) for t in temperatures for d in days)]
+    tables = []
+    files = 0
+    for temperature, compression, day in conditions:
+        piece = rng.normal(0, specimen)
+        series = "unaged" if day == 0 else f"temperature_C={temperature:g}, compression_ratio_pct={compression:g}"
+        condition = "unaged" if day == 0 else f"{series}, aging_days={day:g}"
+        mu_s = TRUE["mu_s0"] - TRUE["a_s"] * np.log1p(day / TRUE["b_s"])
+        mu_c = TRUE["mu_c0"] - TRUE["a_c"] * np.log1p(day / TRUE["b_c"])
+        for speed in speeds:
+            for sign in directions:
+                set_up = rng.normal(0, setup)
+                own = {name: draw(rng) for name, draw in (run_channels or {}).items()}
+                for repeat in range(1, repeats + 1):
+                    files += 1
+                    x = (np.arange(bins) + 0.5) * 40.0 / bins
+                    mu = mu_c + (mu_s - mu_c) * np.exp(-((speed / TRUE["v_s"]) ** 2))
+                    force = np.full(bins, sign * (LOAD_N * mu + TRUE["sigma_2"] * speed))
+                    table = pd.DataFrame(
+                        {
+                            "file": f"f{files:04d}.csv",
+                            "run_id": f"{condition}|{sign * speed:g}",
+                            "repeat": repeat,
+                            "stroke": 1,
+                            "direction": sign,
+                            "specimen_id": condition,
+                            "condition": condition,
+                            "series": series,
+                            "rubber": "rubber",
+                            "bin": np.arange(bins),
+                            "speed_mm_s": sign * speed,
+                            "speed_set_mm_s": speed,
+                            "load_N": LOAD_N,
+                            "displacement_mm": x if sign > 0 else 40.0 - x,
+                            "distance_mm": x,
+                            "time_s": x / speed,
+                            "run_order": float(files),
+                            "elapsed_h": 0.1 * files,
+                            "temperature_C": temperature,
+                            "compression_ratio_pct": compression,
+                            "aging_days": day,
+                            **own,
+                        }
+                    )
+                    if effect is not None:
+                        force = effect(table, force)
+                    wave = rng.normal(0, 1, bins)
+                    for k in range(1, bins):
+                        wave[k] = autocorrelation * wave[k - 1] + np.sqrt(1 - autocorrelation**2) * wave[k]
+                    force = force * (1 + piece + set_up + rng.normal(0, gain)) + noise_N * wave
+                    tables.append(table.assign(force_N=force, force_sd_N=2 * noise_N, n=20))
+    return pd.concat(tables, ignore_index=True)
+
+
+def make_traces(bins: pd.DataFrame) -> pd.DataFrame:
+    """Return the bins themselves as steady samples: what the ripple search sees."""
+    return bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(steady=True)

@@ -1,0 +1,120 @@
+import bins_helpers
+import numpy as np
+import numpy.testing as npt
+import pytest
+
+from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
+from sealfit.fit.estimate import fit, fit_declared, start_model
+from sealfit.fit.joint import Model, Term, declare, evaluate, levels_of
+from sealfit.fit.rows import make_rows, thin
+
+WAVE = Effect(
+    id="wave",
+    label="wave along {x}",
+    equation="A sin(k x)",
+    form="A sin(k x)",
+    reads=(CHANNEL,),
+    acts_on=tuple((t, o) for t in TARGETS for o in ("add", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 0.01, (-1.0, 1.0), "amplitude", linear=True),
+        Parameter("k", "1/{x}", 0.3, (0.01, 3.0), "wave number"),
+    ),
+    shape=lambda inputs, A, k: A * np.sin(k * inputs["x"]),
+    source="test",
+    worked=({"x": 0.0}, {"A": 1.0, "k": 1.0}, 0.0),
+)
+
+
+def rows_of(**options):
+    return make_rows(bins_helpers.make_bins(**options), has_aging=True)
+
+
+@pytest.mark.parametrize("acts_on", TARGETS)
+@pytest.mark.parametrize("operation", ["add", "multiply"])
+def test_tangent_agrees_with_differences(acts_on, operation):
+    rows = rows_of(directions=(1, -1), repeats=1, bins=6)
+    term = Term(WAVE, ("displacement_mm",), acts_on, operation)
+    model = start_model(rows).with_term(term, {"A": 0.02, "k": 0.3})
+    vector = model.vector()
+    _, tangent = evaluate(model, rows)
+    for k in range(vector.size):
+        step = np.zeros(vector.size)
+        step[k] = 1e-6
+        up, _ = evaluate(model.at(vector + step), rows, jacobian=False)
+        down, _ = evaluate(model.at(vector - step), rows, jacobian=False)
+        difference = (up - down) / 2e-6
+        npt.assert_allclose(tangent[:, k], difference, atol=2e-6 * max(1.0, np.abs(difference).max()))
+
+
+def test_recovers_the_law_without_noise():
+    rows = rows_of(noise_N=0.0, gain=0.0)
+    fitted = fit_declared(rows)
+    true = bins_helpers.TRUE
+    expected = {"mu_0s": true["mu_s0"], "mu_0c": true["mu_c0"], "a_s": true["a_s"], "a_c": true["a_c"]}
+    expected |= {"b_s": np.log(true["b_s"]), "b_c": np.log(true["b_c"]), "v_s": np.log(true["v_s"]), "sigma_2": 0.02}
+    for parameter, value in zip(fitted.model.declared.parameters, fitted.model.theta, strict=True):
+        assert value == pytest.approx(expected[parameter.quantity], rel=1e-3), parameter
+    assert np.abs(fitted.residual).max() < 1e-3
+
+
+def test_standard_errors_match_the_scatter_of_estimates():
+    values, errors = [], []
+    for seed in range(40):
+        fitted = fit_declared(rows_of(seed=seed, temperatures=(60.0,), gain=0.01, setup=0.01, specimen=0.01, bins=8))
+        values.append(fitted.model.theta)
+        errors.append(np.sqrt(np.diag(fitted.covariance)))
+    names = [p.quantity for p in fitted.model.declared.parameters]
+    spread, claimed = np.std(values, axis=0), np.sqrt(np.mean(np.square(errors), axis=0))
+    for name in ("mu_0s", "mu_0c", "a_s", "a_c", "v_s", "sigma_2"):
+        k = names.index(name)
+        assert 0.65 < claimed[k] / spread[k] < 1.5, name  # 40 estimates: the spread itself is known to 11 %
+
+
+def test_fewer_speeds_carry_fewer_parameters():
+    forms = {n: declare(rows_of(speeds=bins_helpers.SPEEDS[:n], repeats=1, bins=4)).stribeck for n in (1, 3, 4)}
+    assert set(forms[1].values()) == {"constant"}
+    assert set(forms[3].values()) == {"viscous"}
+    assert set(forms[4].values()) == {"full"}
+
+
+def test_law_needs_three_days():
+    declared = declare(rows_of(days=(4.0,), repeats=1, bins=4))
+    assert not any(declared.law.values())
+    assert {p.quantity for p in declared.parameters} == {"mu_0s", "mu_0c", "v_s", "sigma_2"}
+
+
+def test_levels_of_measured_speeds():
+    assert levels_of(np.array([6.7, 7.0, 7.9])) == 1
+    assert levels_of(np.array([6.7, 7.9, 14.0, 16.0])) == 2
+
+
+def test_subset_keeps_conditions_and_fits_the_same_numbers():
+    rows = rows_of(repeats=2, bins=6)
+    fitted = fit_declared(rows)
+    kept = rows.subset(rows.table["repeat"].to_numpy() == 1)
+    force, _ = evaluate(fitted.model, kept, jacobian=False)
+    npt.assert_array_equal(force, fitted.force[rows.table["repeat"].to_numpy() == 1])
+    assert kept.weight.sum() == pytest.approx(1.0)
+    assert kept.groups.starts["file"].size == rows.groups.starts["file"].size // 2
+
+
+def test_thinning_keeps_means_and_counts():
+    bins = bins_helpers.make_bins(repeats=1, bins=20)
+    small = thin(bins, len(bins) // 4)
+    assert len(small) == len(bins) // 4
+    assert list(small.columns) == list(bins.columns)
+    assert small["n"].sum() == bins["n"].sum()
+    npt.assert_allclose(small.groupby("file")["force_N"].mean(), bins.groupby("file")["force_N"].mean())
+
+
+def test_an_effect_that_is_there_is_fitted_with_the_physics():
+    def warm(table, force):
+        return force * (1 + 0.05 * np.sin(0.3 * table["displacement_mm"].to_numpy()))
+
+    rows = rows_of(effect=warm, noise_N=0.1)
+    start = fit_declared(rows).model
+    term = Term(WAVE, ("displacement_mm",), "force", "multiply")
+    fitted = fit(start.with_term(term, {"A": 0.02, "k": 0.29}), rows)
+    assert fitted.model.values[0]["A"] == pytest.approx(0.05, abs=0.002)
+    assert fitted.model.values[0]["k"] == pytest.approx(0.3, abs=0.002)
+    assert isinstance(fitted.model, Model)
