@@ -250,9 +250,14 @@ def effects(out: Path | None = None) -> dict:
     if out is None:
         return {"effects": summary.of_effects(EFFECTS.values(), None)}
     store = Store.open(existing_out(out))
+    known = dict(EFFECTS)
+    if store.config.loop.effects_folder is not None:
+        from sealfit.effects.user import load_user_effects
+
+        known |= load_user_effects(Path(store.config.loop.effects_folder))
     closed = not store.why_stale("close-loop")
     added = [effect["id"] for effect in store.read_json("closure")["effects"]] if closed else None
-    return {"effects": summary.of_effects(EFFECTS.values(), store.config.units), "added": added}
+    return {"effects": summary.of_effects(known.values(), store.config.units), "added": added}
 
 
 def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:
