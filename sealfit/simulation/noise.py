@@ -1,0 +1,214 @@
+"""Scatter and noise of a SPEC: each kind with its size, in any combination."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+import pandas as pd
+from pydantic import Field
+
+from sealfit.simulation.draws import Draws, remembering
+from sealfit.simulation.strict import Strict
+
+
+class White(Strict):
+    """Independent noise on every sample."""
+
+    kind: Literal["white"]
+    sd_N: float = Field(ge=0)
+
+
+class Autocorrelated(Strict):
+    """Noise with a memory (Ornstein-Uhlenbeck; AR(1) where the length is in samples)."""
+
+    kind: Literal["autocorrelated"]
+    sd_N: float = Field(ge=0)
+    length: float = Field(gt=0, description="after which 1/e of the correlation is left")
+    unit: Literal["samples", "s", "mm"] = "samples"
+
+
+class Quantised(Strict):
+    """The force's resolution: it is rounded to multiples of this."""
+
+    kind: Literal["quantised"]
+    resolution_N: float = Field(gt=0)
+
+
+class RepeatGain(Strict):
+    """A random factor on the friction of every file."""
+
+    kind: Literal["repeat_gain"]
+    sd_rel: float = Field(ge=0)
+
+
+class RunSetup(Strict):
+    """A random factor on the friction, and a random offset of the force, of every run: repeats share them."""
+
+    kind: Literal["run_setup"]
+    sd_rel: float = Field(0.0, ge=0)
+    sd_N: float = Field(0.0, ge=0)
+
+
+class SpecimenScatter(Strict):
+    """A random factor on the friction of every specimen."""
+
+    kind: Literal["specimen"]
+    sd_rel: float = Field(ge=0)
+
+
+class Proportional(Strict):
+    """Independent noise whose SD is a share of the force."""
+
+    kind: Literal["proportional"]
+    sd_rel: float = Field(ge=0)
+
+
+class DisplacementNoise(Strict):
+    """Independent noise of the logged displacement."""
+
+    kind: Literal["displacement"]
+    sd_mm: float = Field(ge=0)
+
+
+class SpeedScatter(Strict):
+    """A random factor per file between the real and the commanded speed."""
+
+    kind: Literal["speed"]
+    sd_rel: float = Field(ge=0, lt=0.2)
+
+
+class OutlierRepeats(Strict):
+    """Files, a share of all drawn at random, whose friction is off by a factor 1 + size_rel."""
+
+    kind: Literal["outlier_repeats"]
+    share: float = Field(ge=0, le=1)
+    size_rel: float = 0.3
+
+
+class BadData(Strict):
+    """Files, so many of each kind, that are spoilt as rigs and people spoil them; no file twice."""
+
+    kind: Literal["bad_data"]
+    missing_cells: int = Field(0, ge=0, description="2 % of the force cells are empty")
+    spikes: int = Field(0, ge=0, description="three samples are ten times the largest force")
+    gaps: int = Field(0, ge=0, description="a tenth of the rows is missing in one piece")
+    saturated: int = Field(0, ge=0, description="the force is cut at 97 % of its median")
+    reversed: int = Field(0, ge=0, description="the rows are in reverse order")
+
+
+Noise = Annotated[
+    White
+    | Autocorrelated
+    | Quantised
+    | RepeatGain
+    | RunSetup
+    | SpecimenScatter
+    | Proportional
+    | DisplacementNoise
+    | SpeedScatter
+    | OutlierRepeats
+    | BadData,
+    Field(discriminator="kind"),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Scatter:
+    """What is drawn once per file, shape (files,) each."""
+
+    gain: np.ndarray  # factor on the friction
+    offset_N: np.ndarray  # added to the force
+    speed: np.ndarray  # real speed over commanded speed
+    outlier: np.ndarray  # bool
+
+
+def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, draws: Draws) -> Scatter:
+    """Return the scatter of files, runs and specimens; gains multiply each other.
+
+    Parameters
+    ----------
+    noise : sequence of Noise
+        The SPEC's.
+    files : DataFrame
+        With `file`, `run_id` and `specimen_id`.
+    draws : Draws
+        Source of randomness.
+    """
+    n = len(files)
+    gain, offset, speed, outlier = np.ones(n), np.zeros(n), np.ones(n), np.zeros(n, bool)
+    for number, kind in enumerate(noise):
+        random = draws.stream(*_purpose(noise, number))
+        match kind:
+            case RepeatGain():
+                gain *= 1.0 + kind.sd_rel * random.standard_normal(n)
+            case RunSetup():
+                codes, runs = pd.factorize(files["run_id"])
+                factor, shift = random.standard_normal((2, len(runs)))
+                gain *= 1.0 + kind.sd_rel * factor[codes]
+                offset += kind.sd_N * shift[codes]
+            case SpecimenScatter():
+                codes, specimens = pd.factorize(files["specimen_id"])
+                gain *= 1.0 + kind.sd_rel * random.standard_normal(len(specimens))[codes]
+            case SpeedScatter():
+                speed *= 1.0 + kind.sd_rel * np.clip(random.standard_normal(n), -4.0, 4.0)
+            case OutlierRepeats():
+                chosen = random.random(n) < kind.share
+                gain[chosen] *= 1.0 + kind.size_rel
+                outlier |= chosen
+    return Scatter(gain, offset, speed, outlier)
+
+
+def sample_noise_N(
+    noise: Sequence[Noise], force_N: np.ndarray, time_s: np.ndarray, speed_mm_s: float, file: int, draws: Draws
+) -> np.ndarray:
+    """Return the noise of one trace's samples in N, shape (n,): white, autocorrelated and proportional.
+
+    Parameters
+    ----------
+    force_N, time_s : ndarray, shape (n,)
+        Force without noise; time at equal steps.
+    speed_mm_s : float
+        Speed magnitude, which turns a correlation length in mm into one in s.
+    file : int
+        Number of the file, so that every file has its own noise.
+    """
+    n = len(force_N)
+    total = np.zeros(n)
+    for number, kind in enumerate(noise):
+        random = draws.stream(*_purpose(noise, number), file)
+        match kind:
+            case White():
+                total += kind.sd_N * random.standard_normal(n)
+            case Proportional():
+                total += kind.sd_rel * np.abs(force_N) * random.standard_normal(n)
+            case Autocorrelated():
+                step = {"samples": 1.0, "s": time_s[1] - time_s[0], "mm": (time_s[1] - time_s[0]) * speed_mm_s}[
+                    kind.unit
+                ]
+                total += kind.sd_N * remembering(random.standard_normal(n), np.exp(-step / kind.length))
+    return total
+
+
+def displacement_noise_mm(noise: Sequence[Noise], n: int, file: int, draws: Draws) -> np.ndarray:
+    """Return the noise of one trace's displacement in mm, shape (n,)."""
+    total = np.zeros(n)
+    for number, kind in enumerate(noise):
+        if isinstance(kind, DisplacementNoise):
+            total += kind.sd_mm * draws.stream(*_purpose(noise, number), file).standard_normal(n)
+    return total
+
+
+def quantised(noise: Sequence[Noise], force_N: np.ndarray) -> np.ndarray:
+    """Return the force as a sensor of finite resolution gives it."""
+    for kind in noise:
+        if isinstance(kind, Quantised):
+            force_N = kind.resolution_N * np.round(force_N / kind.resolution_N)
+    return force_N
+
+
+def _purpose(noise: Sequence[Noise], number: int) -> tuple[str, int]:
+    """Return a stream's name: the kind, and which of its kind it is."""
+    return noise[number].kind, sum(other.kind == noise[number].kind for other in noise[:number])
