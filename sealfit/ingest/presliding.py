@@ -6,6 +6,9 @@ import numpy as np
 
 SETTLED = np.log(5000.0)  # the rise is over when 1/5000 of it is left: below what the mean over a campaign could show
 AFTER_RAMP = 3.0  # rise lengths after the speed ramp: the bristles follow the changing speed over one rise length
+ENOUGH = np.log(100.0)  # where 1/5000 would take more than a third of the stroke, 1 % of the rise may stay
+HALF_WAY = 0.75  # a force that begins above this share of its level comes up, if at all, over a short distance:
+SHORT = 0.01  # this share of the stroke; a longer climb is an effect (run-in, warming), and stays inside
 EARLY = (0.05, 0.5)  # share of the distance in which the plateau is read: near the rise, past any ordinary rise
 
 
@@ -61,8 +64,11 @@ def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> 
     if scale <= 0.0:
         return 0.0
     fitted = _rise_length_mm(distance_mm, force_N, scale)
+    if begin > HALF_WAY * level and fitted > SHORT * length:
+        return 0.0
+    settled = min(SETTLED * fitted, max(length / 3.0, ENOUGH * fitted))
     ramp = float(distance_mm[min(ramp_end, len(distance_mm) - 1)])
-    return float(max(fitted * SETTLED, ramp + AFTER_RAMP * fitted if ramp > 0.0 else 0.0))
+    return float(max(settled, ramp + AFTER_RAMP * fitted if ramp > 0.0 else 0.0))
 
 
 def _scale_mm(distance_mm: np.ndarray, force_N: np.ndarray, begin: float, level: float) -> float:

@@ -31,8 +31,8 @@ class Stroke:
 
     `origin` is the row where it begins to move, from which its distance counts (and, in a file of several strokes, its
     time): the first row, unless rows of rest come before the file's first stroke. `speed_mm_s` is in displacement units
-    per time unit, signed. `steady` marks the rows of the window, shape (stop - start,). `short` says why the window is
-    too short to be used; None if it is long enough.
+    per time unit, signed. `steady` marks the rows of the window, `sliding` those in which it moves, both of shape
+    (stop - start,). `short` says why the window is too short to be used; None if it is long enough.
     """
 
     number: int
@@ -42,6 +42,7 @@ class Stroke:
     direction: int
     speed_mm_s: float
     steady: np.ndarray
+    sliding: np.ndarray
     short: str | None = None
 
     @property
@@ -172,7 +173,17 @@ def _whole_file(time_s: np.ndarray, displacement_mm: np.ndarray, settings: Strok
     n = len(time_s)
     speed = slope(time_s, displacement_mm, np.ones(n, bool))
     short = None if n >= settings.min_samples else f"only {n} samples; at least {settings.min_samples} are needed"
-    return Stroke(1, 0, n, 0, 1 if displacement_mm[-1] >= displacement_mm[0] else -1, speed, np.ones(n, bool), short)
+    return Stroke(
+        1,
+        0,
+        n,
+        0,
+        1 if displacement_mm[-1] >= displacement_mm[0] else -1,
+        speed,
+        np.ones(n, bool),
+        np.ones(n, bool),
+        short,
+    )
 
 
 def _stroke(
@@ -189,17 +200,19 @@ def _stroke(
     """Return one stroke from its own rows."""
     n = len(time_s)
     along, force = direction * displacement_mm, direction * force_N
-    speed, half = local_speed(time_s, along, noise_mm, settings.speed_tolerance)
+    # A glitch of one sample is not a rest.
+    speed, half = local_speed(time_s, median_filter(along, 5, mode="nearest"), noise_mm, settings.speed_tolerance)
     plateau = plateau_speed(time_s, speed)
     steady = np.zeros(n, bool)
-    if plateau > 0.0:
-        for first, last in _moving(speed > REST * plateau, origin - start, half):
-            begin = _ramp_end(time_s, speed, plateau, first, last, half, settings.speed_tolerance)
-            end = _stop_begin(time_s, speed, plateau, first, last, half, settings.speed_tolerance)
-            if end - begin < 4:
-                continue
-            begin = _rise_end(along, force, _standstill(speed, plateau, first), begin, end)
+    since = origin - start
+    for first, last in _moving(time_s, along, speed, plateau, since, half):
+        still = _standstill(speed, plateau, since, first)
+        begin = _ramp_end(time_s, speed, plateau, still, first, last, half, settings.speed_tolerance)
+        end = _stop_begin(time_s, speed, plateau, first, last, half, settings.speed_tolerance)
+        if end - begin >= 4:
+            begin = _rise_end(along, force, still, begin, end)
             steady[begin:end] = True
+        since = last
     share = _covered(along, steady) / max(float(np.ptp(along)), 1e-300)
     count = int(steady.sum())
     measured = slope(time_s, displacement_mm, steady)
@@ -208,7 +221,9 @@ def _stroke(
         short = f"the steady window has {count} samples; at least {settings.min_samples} are needed"
     elif share < settings.min_steady_share:
         short = f"the steady window is {share:.0%} of the stroke; at least {settings.min_steady_share:.0%} is needed"
-    return Stroke(number, start, start + n, origin, direction, measured, steady, short)
+    sliding = speed > STANDSTILL * plateau
+    sliding[: origin - start] = False
+    return Stroke(number, start, start + n, origin, direction, measured, steady, sliding, short)
 
 
 def local_speed(time_s: np.ndarray, along_mm: np.ndarray, noise_mm: float, tolerance: float) -> tuple[np.ndarray, int]:
@@ -252,33 +267,56 @@ def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -
     return float(np.dot(t, d) / np.dot(t, t))
 
 
-def _moving(moves: np.ndarray, origin: int, half: int) -> list[tuple[int, int]]:
-    """Return first and last (exclusive) row of every stretch of motion after `origin`."""
-    moves = moves.copy()
+def _moving(
+    time_s: np.ndarray, along_mm: np.ndarray, speed: np.ndarray, plateau: float, origin: int, half: int
+) -> list[tuple[int, int]]:
+    """Return first and last (exclusive) row of every stretch of motion after `origin`.
+
+    Slow samples are a rest only if they cost more time than the width over which the speed is taken: noise does not.
+    """
+    if plateau <= 0.0:
+        return []
+    moves = speed > REST * plateau
     moves[: max(origin, 0)] = False
     edges = np.flatnonzero(np.diff(np.concatenate(([False], moves, [False])).astype(np.int8)))
-    pairs = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-    return [(first, last) for first, last in pairs if last - first > 2 * half + 3]
+    stretches: list[tuple[int, int]] = []
+    step = float(np.median(np.diff(time_s)))
+    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if stretches:
+            a, b = max(stretches[-1][1] - half, 0), min(first + half, len(time_s) - 1)
+            lost = (time_s[b] - time_s[a]) - (along_mm[b] - along_mm[a]) / plateau
+            if lost <= 2.0 * half * step:
+                stretches[-1] = (stretches[-1][0], last)
+                continue
+        stretches.append((first, last))
+    return [(first, last) for first, last in stretches if last - first > 2 * half + 3]
 
 
-def _standstill(speed: np.ndarray, plateau: float, first: int) -> int:
-    """Return the last row before `first` at which the platform still stood."""
-    still = np.flatnonzero(speed[:first] < STANDSTILL * plateau)
-    return int(still[-1]) if len(still) else 0
+def _standstill(speed: np.ndarray, plateau: float, since: int, first: int) -> int:
+    """Return the last row from `since` on, and before `first`, at which the platform still stood; `since` if none."""
+    still = np.flatnonzero(speed[since:first] < STANDSTILL * plateau)
+    return since + int(still[-1]) if len(still) else since
 
 
 def _ramp_end(
-    time_s: np.ndarray, speed: np.ndarray, plateau: float, first: int, last: int, half: int, tolerance: float
+    time_s: np.ndarray,
+    speed: np.ndarray,
+    plateau: float,
+    still: int,
+    first: int,
+    last: int,
+    half: int,
+    tolerance: float,
 ) -> int:
     reached = np.flatnonzero(speed[first:last] >= (1.0 - tolerance) * plateau)
     if not len(reached):
         return last
     arrived = first + int(reached[0])
-    if arrived == 0:
-        return 0
+    if arrived <= still:
+        return arrived
     # The local speed smears a sudden start over 2 half rows, 1.7 of them between standstill and arrival.
     step = (time_s[last - 1] - time_s[first]) / max(last - 1 - first, 1)
-    ramp = max(time_s[arrived] - time_s[_standstill(speed, plateau, first)] - 1.7 * half * step, 0.0)
+    ramp = max(time_s[arrived] - time_s[still] - 1.7 * half * step, 0.0)
     return int(np.searchsorted(time_s, time_s[arrived] + AFTER_RAMP * ramp)) + half // 3 + 1
 
 

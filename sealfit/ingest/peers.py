@@ -1,0 +1,140 @@
+"""What only a comparison of strokes shows: a force of the wrong sign, a dead sensor, a repeat that lies outside."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from sealfit.config import Config
+from sealfit.errors import Fault
+from sealfit.ingest.scatter import outlying_repeats, repeat_means
+
+AGAINST = -0.5  # share of its peers' force by which a force against its motion is of the wrong sign, not an offset
+
+
+def reversed_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
+    """Return which strokes to keep, shape (n,), and findings on force signs that contradict the motion.
+
+    Friction opposes the motion, so force times direction is positive. Where one stroke of a run has it negative
+    against its peers (the other strokes of its run, else those of the same direction), it is left out: a sensor or a
+    sign was turned round. Where most strokes of a direction have it negative, an offset or the sign convention is the
+    cause: said once per file, and kept.
+
+    Parameters
+    ----------
+    strokes : DataFrame
+        One row per stroke: file, stroke, several (more strokes in the file), run, direction, force_N, used.
+    """
+    keep = np.ones(len(strokes), bool)
+    force = (strokes["force_N"] * strokes["direction"]).to_numpy(float)
+    used = strokes["used"].to_numpy(bool) & np.isfinite(force)
+    against = used & (force < 0.0)
+    if not against.any():
+        return keep, []
+    found = []
+    way, run = strokes["direction"].to_numpy(), strokes["run"].to_numpy()
+    for i in np.flatnonzero(against):
+        mates = used & (way == way[i]) & (run == run[i])
+        mates[i] = False
+        peers = mates if mates.sum() >= 2 else used & (way == way[i]) & (np.arange(len(force)) != i)
+        usual = float(np.median(force[peers])) if peers.any() else np.nan
+        wrong = usual > 0.0 and force[i] < AGAINST * usual
+        keep[i] = not wrong
+        found.append(_against(strokes.iloc[i], force[i], bool(wrong)))
+    return keep, found
+
+
+def _against(row: pd.Series, force_N: float, wrong: bool) -> Fault:
+    mend = (
+        "Look for a turned sensor or a turned sign in this file."
+        if wrong
+        else "If the rig counts force the other way round, change its sign in the config: compute.force_N."
+    )
+    return Fault(
+        "reversed",
+        "the mean force has the direction of the motion"
+        + (
+            ", unlike in the other strokes."
+            if wrong
+            else ": an offset larger than the friction, or the sign convention."
+        ),
+        file=row["file"],
+        stroke=int(row["stroke"]) if row["several"] else None,
+        column="force_N",
+        value=float(force_N),
+        severity="error" if wrong else "warning",
+        action="stroke left out" if wrong else "kept",
+        mend=mend,
+    )
+
+
+def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
+    """Return which strokes to keep, shape (n,), and findings on forces that never change in the steady window.
+
+    A sensor is dead where the others show noise; where most strokes are constant, the sensor is coarse, and they are
+    kept.
+
+    Parameters
+    ----------
+    strokes : DataFrame
+        One row per stroke: file, stroke, several, equal (share of samples equal to the one before), force_N, used.
+    """
+    used = strokes["used"].to_numpy(bool)
+    constant = used & (strokes["equal"].to_numpy(float) >= 1.0)
+    keep = np.ones(len(strokes), bool)
+    if not constant.any():
+        return keep, []
+    dead = constant.sum() < 0.5 * used.sum()
+    keep = ~constant if dead else keep
+    reason = "the force never changes in the steady window"
+    found = [
+        Fault(
+            "stuck",
+            f"{reason}, unlike in other strokes." if dead else f"{reason}, as in most strokes: the sensor is coarse.",
+            file=row["file"],
+            stroke=int(row["stroke"]) if row["several"] else None,
+            column="force_N",
+            value=float(row["force_N"]),
+            severity="error" if dead else "warning",
+            action="stroke left out" if dead else "kept",
+            mend="Check the cable and the logger, and measure again." if dead else "Use a finer range.",
+        )
+        for _, row in strokes[constant].iterrows()
+    ]
+    return keep, found
+
+
+def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, list[Fault]]:
+    """Return `steady` with `outlier` and `used`, and a finding per repeat that disagrees with its run.
+
+    Flagged always, left out of the fits only where the config says `quality.drop_outliers`; and never where only two
+    repeats disagree, since which of them is wrong cannot be known.
+    """
+    flagged = outlying_repeats(repeat_means(steady), config.quality.outlier_p)
+    outlier, dropped, found = np.zeros(len(steady), bool), np.zeros(len(steady), bool), []
+    for row in flagged.itertuples(index=False):
+        rows = (steady["file"] == row.file).to_numpy() & (steady["run_id"] == row.run_id).to_numpy()
+        out = config.quality.drop_outliers and not row.alone
+        outlier |= rows
+        dropped |= rows & out
+        found.append(
+            Fault(
+                "outlier",
+                _disagreement(row, config.units.unit("force")),
+                file=row.file,
+                column="force_N",
+                value=float(row.force_N),
+                severity="warning",
+                action="file left out" if out else "kept",
+                mend="Look into the notes of that test; quality.drop_outliers in the config leaves such repeats out.",
+            )
+        )
+    return steady.assign(outlier=outlier, used=steady["used"].to_numpy(bool) & ~dropped), found
+
+
+def _disagreement(row, unit: str) -> str:
+    others = "its only other repeat gives" if row.alone else "the other repeats of its run give"
+    return (
+        f"repeat {row.repeat} of run {row.run_id} is {row.force_N:.4g} {unit}; {others} {row.run_mean_N:.4g} {unit}, "
+        f"their common pattern removed: {abs(row.t):.1f} SDs of the scatter pooled over runs (p = {row.p:.1g})."
+    )

@@ -1,0 +1,209 @@
+"""What is wrong with a stroke by itself, with its mend; and the table of all that was found in a campaign.
+
+Every rule is scaled by the trace itself (its noise, its resolution, its sampling), so a coarse sensor is not taken for
+a stuck one, nor a slow rig for a gappy one. Single samples are judged in `spikes.py`, the commanded speed where the
+file is read (`speed_check.py`), and what needs other traces for comparison in `peers.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from sealfit.config import Config, Quality
+from sealfit.errors import Fault
+from sealfit.ingest.strokes import Stroke
+from sealfit.tables import QUALITY
+
+LOAD_TOLERANCE = 0.1  # dead weights are better than that, and a wrong plate is worse
+FINE = 0.3  # share of equal neighbours below which noise is finer than the sensor's steps
+FEW_LEVELS = 5
+
+
+def stroke_faults(
+    file: str,
+    number: int | None,
+    stroke: Stroke,
+    time_s: np.ndarray,
+    force_N: np.ndarray,
+    line: np.ndarray,
+    config: Config,
+) -> list[Fault]:
+    """Return what is wrong with one stroke by itself: too short, gappy, saturated, stuck.
+
+    Parameters
+    ----------
+    number : int or None
+        What findings call the stroke; None in a file of one stroke.
+    time_s, force_N, line : ndarray, shape (n,)
+        The whole trace, and the line in the file of each of its rows.
+    """
+    if stroke.short is not None:
+        return [
+            Fault(
+                "too_short",
+                f"{stroke.short}.",
+                file=file,
+                stroke=number,
+                value=float(len(stroke.rows)),
+                severity="error",
+                action="stroke left out",
+                mend="Slide further or sample faster; or set strokes.min_samples and min_steady_share in the config.",
+            )
+        ]
+    whole, steady, settings = slice(stroke.start, stroke.stop), stroke.rows, config.quality
+    found = [
+        *_gaps(time_s[whole], line[whole], settings),
+        *(_saturated(force_N[steady], line[steady], settings) or _stuck(force_N[steady], line[steady], settings)),
+    ]
+    return [Fault(**{**fault.as_dict(), "file": file, "stroke": number}) for fault in found]
+
+
+def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault]:
+    steps = np.diff(time_s)
+    usual = float(np.median(steps))
+    gaps = steps > settings.max_gap_factor * usual
+    if not gaps.any():
+        return []
+    hidden = float((steps[gaps] - usual).sum() / (time_s[-1] - time_s[0]))
+    widest, count, out = int(np.argmax(steps)), int(gaps.sum()), hidden > settings.max_gap_share
+    return [
+        Fault(
+            "gaps",
+            f"{count} gap{'s' if count > 1 else ''} in time, {hidden:.1%} of the stroke; the longest, after this line, "
+            f"is {steps[widest]:.3g} where {usual:.3g} is usual.",
+            line=int(line[widest]),
+            column="time_s",
+            value=hidden,
+            severity="error" if out else "warning",
+            action="stroke left out" if out else "kept",
+            mend="Look for lost packets or a full buffer in the logger.",
+        )
+    ]
+
+
+def equal_neighbours(force_N: np.ndarray) -> float:
+    """Return the share of samples that equal the one before: near 0 where noise is finer than the sensor's steps."""
+    return float(np.mean(np.diff(force_N) == 0.0)) if len(force_N) > 1 else 0.0
+
+
+def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault]:
+    """Clipping piles samples up at the extreme, while the samples below still show their noise."""
+    size = np.abs(force_N)
+    top = size == size.max()
+    others = force_N[~top]
+    share = float(top.mean())
+    if share < settings.saturated_share or top.sum() < 5 or len(others) < 20 or len(np.unique(others)) < FEW_LEVELS:
+        return []
+    below = ~top[1:] & ~top[:-1]  # neighbours that are both below the extreme tell how the noise is resolved
+    same = float(np.mean(np.diff(force_N)[below] == 0.0)) if below.sum() >= 20 else 1.0
+    at_next_level = np.count_nonzero(np.abs(others) == np.abs(others).max())
+    if same > FINE or top.sum() <= 2 * at_next_level:
+        return []  # few levels altogether: the sensor is coarse, not at its end
+    value = float(force_N[np.argmax(size)])
+    reason = f"{share:.0%} of the steady samples lie exactly at the extreme {value:g}: the end of the sensor's range."
+    return [_broken("saturated", reason, line[np.argmax(top)], value, "Use a larger range and measure again.")]
+
+
+def _stuck(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault]:
+    place = stuck_samples(force_N, settings.stuck_samples)
+    if place is None:
+        return []
+    first, count = place
+    value = float(force_N[first])
+    reason = f"{count} samples in a row are exactly {value:g} while the platform moves; elsewhere they change."
+    return [_broken("stuck", reason, line[first], value, "Check the cable and the logger, and measure again.")]
+
+
+def _broken(check: str, reason: str, line: int, value: float, mend: str) -> Fault:
+    place = {"line": int(line), "column": "force_N", "value": value}
+    return Fault(check, reason, severity="error", action="stroke left out", mend=mend, **place)
+
+
+def stuck_samples(force_N: np.ndarray, samples: int) -> tuple[int, int] | None:
+    """Return place and length of a run of equal samples that this sensor would not show by itself; None if there is
+    none.
+
+    The run must be `samples` long, five times as long as the long ones among the others, and longer than as many
+    samples with this share of equal neighbours would show by chance (1e-6). So a coarse sensor, whose reading rests
+    on one step for long, is not stuck. A stroke that is constant all along has no others: see
+    `peers.constant_strokes`.
+    """
+    edges = np.concatenate(([0], np.flatnonzero(np.diff(force_N) != 0.0) + 1, [len(force_N)]))
+    lengths = np.diff(edges)
+    longest = int(np.argmax(lengths))
+    run, others = int(lengths[longest]), np.delete(lengths, longest)
+    if run < samples or others.sum() < samples:
+        return None
+    ordered = np.sort(others)
+    usual = float(ordered[np.searchsorted(np.cumsum(ordered), 0.9 * others.sum())])
+    same = 1.0 - len(others) / others.sum()
+    if run <= 5.0 * usual or len(force_N) * same**run > 1e-6:
+        return None
+    return int(edges[longest]), run
+
+
+def speed_column_faults(file: str, number: int | None, measured: float, column: float, config: Config) -> list[Fault]:
+    """Return where a trace's own speed column contradicts its displacement over time; the latter is used."""
+    if not abs(abs(column) - abs(measured)) > config.quality.speed_disagreement * abs(measured):
+        return []
+    unit = config.units.unit("speed")
+    return [
+        Fault(
+            "speed_disagreement",
+            f"the speed column says {column:.4g} {unit}, displacement over time {measured:.4g} {unit}.",
+            file=file,
+            stroke=number,
+            column="speed_mm_s",
+            value=float(column),
+            severity="warning",
+            action="kept",
+            mend="Check the units of both columns; displacement over time is used.",
+        )
+    ]
+
+
+def load_faults(file: str, measured: float, declared: float, unit: str) -> list[Fault]:
+    """Return where the load measured along the trace differs from the declared one by more than a tenth."""
+    if not abs(measured - declared) > LOAD_TOLERANCE * abs(declared):
+        return []
+    return [
+        Fault(
+            "load",
+            f"measured {measured:.4g} {unit}, declared {declared:.4g} {unit}.",
+            file=file,
+            column="load_N",
+            value=float(measured),
+            severity="warning",
+            action="kept",
+            mend="The measured load is used; check runs.csv.",
+        )
+    ]
+
+
+def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame:
+    """Return table `quality`: a row per finding, and one "ok" for every file of `files` without any.
+
+    Parameters
+    ----------
+    faults : sequence of Fault
+        Findings, in any order; those of the campaign come first, then by file, stroke and line.
+    files : sequence of str
+        Every trace file of the campaign, in order.
+    """
+    silent = set(files) - {fault.file for fault in faults}
+    fine = [
+        Fault("ok", "nothing found.", file=file, severity="info", action="kept") for file in files if file in silent
+    ]
+    place = {file: i for i, file in enumerate(files)}
+    ordered = sorted([*faults, *fine], key=lambda f: (place.get(f.file or "", -1), f.stroke or 0, f.line or 0))
+    rows = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in ordered]
+    table = pd.DataFrame(rows, columns=QUALITY.names())
+    whole = {"stroke": "Int64", "line": "Int64"}
+    return table.astype({**{name: "str" for name in QUALITY.names() if name not in whole}, **whole})
+
+
+def _as_text(value: str | float | None) -> str | None:
+    return None if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,105 @@
+"""Single samples that cannot be right: a displacement that jumps away and back, a force far off its neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from sealfit.config import Quality
+from sealfit.errors import Fault
+from sealfit.ingest.strokes import Stroke, displacement_noise_mm
+
+NEIGHBOURS = 5  # a median over five samples is blind to one or two wrong ones, and exact on any slope
+# A spike stands apart, four times as far off as 95 % of the samples (of noise: 7.8 SDs); else it is one of many bursts.
+APART, USUAL = 4.0, 95.0
+MEND = "Correct the cell if the true value is known."
+
+
+def displacement_spikes(
+    file: str, displacement_mm: np.ndarray, line: np.ndarray, settings: Quality
+) -> tuple[np.ndarray, list[Fault]]:
+    """Return which rows to keep, shape (n,): not those whose displacement jumps away and back; a finding for each.
+
+    More than `max_bad_rows` of them are the nature of the signal, and all are kept.
+    """
+    keep = np.ones(len(displacement_mm), bool)
+    if len(displacement_mm) < 4 * NEIGHBOURS:
+        return keep, []
+    off = displacement_mm - median_filter(displacement_mm, NEIGHBOURS, mode="mirror")
+    # At a turn the median lags by one step of the fastest samples around, never by more than a few of the usual ones.
+    step = float(np.median(np.abs(np.diff(displacement_mm))))
+    noise = displacement_noise_mm(displacement_mm)
+    least = max(5.0 * step, APART * float(np.percentile(np.abs(off), USUAL)), 1e-9 * float(np.ptp(displacement_mm)))
+    spikes = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, least))
+    if len(spikes) > settings.max_bad_rows * len(off):
+        return keep, []
+    keep[spikes] = False
+    return keep, [_spike(file, None, "displacement_mm", displacement_mm[i], off[i], line[i]) for i in spikes]
+
+
+def force_spikes(
+    file: str, force_N: np.ndarray, strokes: Sequence[Stroke], line: np.ndarray, settings: Quality
+) -> tuple[np.ndarray, list[Fault]]:
+    """Return which rows to keep, shape (n,): not single samples of force far off their neighbours; a finding for each.
+
+    "Far" is `spike_sigma` robust standard deviations of what the samples of the steady windows are off the median of
+    their neighbours, and apart from the bulk of these. Outside the windows, where a break-away peak may be as sharp,
+    a spike must also reach beyond the rest of the trace by half of its range. More than `max_bad_rows` spikes are the
+    nature of the signal: said, and kept.
+    """
+    keep = np.ones(len(force_N), bool)
+    if len(force_N) < 4 * NEIGHBOURS:
+        return keep, []
+    off = force_N - median_filter(force_N, NEIGHBOURS, mode="mirror")
+    steady = np.zeros(len(force_N), bool)
+    for stroke in strokes:
+        steady[stroke.rows] = True
+    usual = off[steady] if steady.any() else off
+    least = max(0.5 * resolution(force_N), 1e-9 * float(np.median(np.abs(force_N))), 1e-300)
+    noise = max(1.4826 * float(np.median(np.abs(usual))), least)
+    apart = APART * float(np.percentile(np.abs(usual), USUAL))
+    suspects = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, apart))
+    if not len(suspects):
+        return keep, []
+    rest = np.delete(force_N, suspects)
+    low, high = (float(rest.min()), float(rest.max())) if len(rest) else (-np.inf, np.inf)
+    beyond = np.maximum(low - force_N, force_N - high) > 0.5 * (high - low)
+    spikes = suspects[steady[suspects] | beyond[suspects]]
+    if len(spikes) > settings.max_bad_rows * len(force_N):
+        reason = f"{len(spikes)} samples jump away from their neighbours: too many to be single wrong samples."
+        mend = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
+        value = float(len(spikes))
+        return keep, [
+            Fault("spikes", reason, file, None, None, "force_N", value, severity="warning", action="kept", mend=mend)
+        ]
+    keep[spikes] = False
+    starts = np.array([stroke.start for stroke in strokes])
+    several = len(strokes) > 1
+    found = []
+    for i in spikes:
+        number = int(np.searchsorted(starts, i, side="right")) if several else None
+        found.append(_spike(file, number, "force_N", force_N[i], off[i], line[i]))
+    return keep, found
+
+
+def resolution(values: np.ndarray) -> float:
+    """Return the smallest step between different values: the sensor's resolution if coarse, else next to nothing."""
+    different = np.unique(values)
+    return float(np.diff(different).min()) if len(different) > 1 else 0.0
+
+
+def _spike(file: str, stroke: int | None, column: str, value: float, off: float, line: int) -> Fault:
+    return Fault(
+        "spike",
+        f"a single sample, {abs(off):.4g} off its neighbours.",
+        file=file,
+        stroke=stroke,
+        line=int(line),
+        column=column,
+        value=float(value),
+        severity="warning",
+        action="row left out",
+        mend=MEND,
+    )
