@@ -19,6 +19,7 @@ from sealfit.errors import Fault
 from sealfit.ingest.text import Layout, as_number, split_line, without_strays
 
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
+_CLOCK = re.compile(r"(.*\s)?\d+:\d+(:\d+([.,]\d+)?)?")
 _REMARK = re.compile(r"\s*([-+]?[\d.,]+(?:[eE][-+]?\d+)?)[\s,;]+(?P<remark>.*[^\W\d_].*?)[\s,;]*$")
 
 
@@ -165,6 +166,10 @@ def _cell_faults(at, cells, rows, line, name, decimal, file) -> list[Fault]:
             mend = "Put the right number alone in the cell."
             return Fault("remark", reason, value=cell.strip(), mend=mend, **place)
         mend = decimal_mend(cell, decimal) or "Put a number there or delete the line."
+        if i == 0 and len(at) < len(cells) and not any(char.isdigit() for char in cell):
+            mend = "If this is a row of units, set units_row = true in the rig config; otherwise delete the line."
+        elif _CLOCK.fullmatch(cell.strip()):
+            mend = "Export the time as seconds, not as time of day."
         return Fault("not_a_number", "is not a number.", value=cell.strip(), mend=mend, **place)
 
     def rest(count: int) -> Fault:

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 
+import pandas as pd
+
+from sealfit.conditions import add_keys, condition_columns
 from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.runs_csv import Entry
@@ -18,19 +21,19 @@ Channels = dict[str, float | str]
 SAME_SPEED = 0.05  # measured speeds closer than this share are one commanded speed; rigs repeat within a few percent
 
 
-def condition_key(channels: Mapping[str, float | str], config: Config) -> str:
-    """Return the condition in words: "temperature_C=60, aging_days=4", or "unaged" (with the rubber, if told apart).
+def condition_keys(files: Sequence[Channels], config: Config) -> list[str]:
+    """Return the condition of each file in words, as `conditions.add_keys` spells it.
 
     Examples
     --------
-    >>> condition_key({"temperature_C": 60.0, "compression_ratio_pct": 80.0, "aging_days": 4.0}, Config())
-    'temperature_C=60, compression_ratio_pct=80, aging_days=4'
-    >>> condition_key({"aging_days": 0.0}, Config())
-    'unaged'
+    >>> condition_keys([{"temperature_C": 60.0, "compression_ratio_pct": 80.0, "aging_days": 4.0}], Config())
+    ['temperature_C=60, compression_ratio_pct=80, aging_days=4']
+    >>> condition_keys([{"aging_days": 0.0}], Config())
+    ['unaged']
     """
-    if config.aging and channels.get("aging_days") == 0:
-        return ", ".join(["unaged", *(_text(channels.get(name, "")) for name in config.rubber)])
-    return ", ".join(f"{name}={_text(channels.get(name, ''))}" for name in config.condition)
+    names = condition_columns(config)
+    table = pd.DataFrame({name: pd.Series([c.get(name) for c in files], dtype=object) for name in names})
+    return add_keys(table, config)["condition"].tolist()
 
 
 def _text(value: float | str) -> str:
@@ -61,35 +64,43 @@ def add_order(entries: Sequence[Entry], files: Sequence[Channels]) -> list[Fault
     return faults
 
 
-def add_specimens(files: Sequence[Channels], config: Config) -> set[int]:
+def add_specimens(files: Sequence[Channels], conditions: Sequence[str]) -> set[int]:
     """Add the default `specimen_id`, one per condition; return the indices of the files that name their own."""
     own = {i for i, channels in enumerate(files) if "specimen_id" in channels}
-    for channels in files:
-        channels.setdefault("specimen_id", condition_key(channels, config))
+    for channels, condition in zip(files, conditions, strict=True):
+        channels.setdefault("specimen_id", condition)
     return own
 
 
 def add_runs(
-    files: Sequence[Channels], speeds: Sequence[float | None], measured: Sequence[float], own: set[int], config: Config
+    files: Sequence[Channels],
+    conditions: Sequence[str],
+    speeds: Sequence[float | None],
+    measured: Sequence[float],
+    own: set[int],
+    unit: str,
 ) -> list[Fault]:
     """Add `run_id` where it is missing: one per condition, commanded speed and (named) specimen.
 
     Parameters
     ----------
     files : sequence of dict
-        Channels of each file, with `specimen_id`.
+        Channels of each file, with `specimen_id`; changed in place.
+    conditions : sequence of str
+        Condition of each file in words.
     speeds : sequence of float or None
         Commanded speeds, signed where a sign was given.
     measured : sequence of float
         Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run.
     own : set of int
         Files whose specimen was named, and so tells runs apart.
+    unit : str
+        Unit of the speeds.
     """
     missing = [i for i, channels in enumerate(files) if "run_id" not in channels]
-    unit = config.units.unit("speed")
     groups = defaultdict(list)
     for i in missing:
-        words = [condition_key(files[i], config)]
+        words = [conditions[i]]
         if i in own:
             words.append(str(files[i]["specimen_id"]))
         if speeds[i] is not None:
@@ -130,7 +141,7 @@ def add_repeats(files: Sequence[Channels]) -> None:
 
 
 def disagreements(
-    entries: Sequence[Entry], files: Sequence[Channels], speeds: Sequence[float | None], config: Config
+    entries: Sequence[Entry], files: Sequence[Channels], conditions: Sequence[str], speeds: Sequence[float | None]
 ) -> list[Fault]:
     """Return faults of runs: a repeat that stands twice, or differs from its run in condition, speed or load."""
     faults = []
@@ -148,7 +159,7 @@ def disagreements(
         pairs = [
             ("speed_mm_s", speeds[i], speeds[j]),
             ("load_N", channels.get("load_N"), files[j].get("load_N")),
-            ("condition", condition_key(channels, config), condition_key(files[j], config)),
+            ("condition", conditions[i], conditions[j]),
         ]
         for column, mine, theirs in pairs:
             if not _same(mine, theirs):

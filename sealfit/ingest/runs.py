@@ -11,23 +11,29 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from sealfit.conditions import condition_columns
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, ConfigError, Fault
 from sealfit.ingest.columns import suggestion
-from sealfit.ingest.derive import Channels, add_order, add_repeats, add_runs, add_specimens, disagreements
+from sealfit.ingest.derive import (
+    Channels,
+    add_order,
+    add_repeats,
+    add_runs,
+    add_specimens,
+    condition_keys,
+    disagreements,
+)
 from sealfit.ingest.names import TEXT_COLUMNS, NameParts, name_parts
 from sealfit.ingest.read import read_trace
 from sealfit.ingest.refs import TraceRef
+from sealfit.ingest.run_values import MISSING, out_of_range, to_numbers
 from sealfit.ingest.runs_csv import Entry, list_entries
 from sealfit.ingest.speed_check import measured_speed
 from sealfit.ingest.speed_unit import speed_factor
-from sealfit.ingest.text import as_number, as_utf8, find_layout, header_fields, read_bytes
+from sealfit.ingest.text import as_utf8, find_layout, header_fields, read_bytes
 
 __all__ = ["TraceRef", "list_traces"]
-
-NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
-_MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
-_MOSTLY = 0.8  # a column with this share of numbers is one of numbers, and the rest of its cells are slips
 
 
 def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fault]]:
@@ -57,18 +63,19 @@ def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fa
         {**_header(campaign, entry.file, config), **named.channels, **_cells(entry)}
         for entry, named in zip(entries, parts, strict=True)
     ]
-    faults += _numbers(entries, files, config)
+    faults += to_numbers(entries, files, config)
     measured, left_out, found = _from_traces(campaign, entries, files, config)
     keep = [i for i in range(len(entries)) if i not in left_out]
     entries, files, measured = ([rows[i] for i in keep] for rows in (entries, files, measured))
-    faults += found + _missing(entries, files, config) + _ranges(entries, files)
+    faults += found + _missing(entries, files, config) + out_of_range(entries, files)
     faults += add_order(entries, files)
     _stop_at_errors(faults)
     speeds = [channels.pop("speed_mm_s", None) for channels in files]
-    own = add_specimens(files, config)
-    faults += add_runs(files, speeds, measured, own, config)
+    conditions = condition_keys(files, config)
+    own = add_specimens(files, conditions)
+    faults += add_runs(files, conditions, speeds, measured, own, config.units.unit("speed"))
     add_repeats(files)
-    faults += disagreements(entries, files, speeds, config)
+    faults += disagreements(entries, files, conditions, speeds)
     _stop_at_errors(faults)
     for channels, speed in zip(files, speeds, strict=True):
         if speed is not None:
@@ -100,6 +107,9 @@ def _config_faults(config: Config) -> list[Fault]:
         add("trace.delimiter", settings.delimiter, "is no delimiter.", "Use one character, 'tab' or 'whitespace'.")
     if settings.delimiter == settings.decimal:
         add("trace.delimiter", settings.delimiter, "is the decimal mark too.", "Set trace.delimiter or trace.decimal.")
+    for name in ("file", "speed_mm_s"):
+        if name in config.condition:
+            add("condition", name, "is no condition: it differs within one.", "Take it out of condition.")
     if settings.names == "none":
         for ours, theirs in settings.columns.items():
             if isinstance(theirs, str):
@@ -152,80 +162,14 @@ def _header(campaign: Path, file: str, config: Config) -> Channels:
 
 
 def _cells(entry: Entry) -> Channels:
-    return {name: cell for name, cell in entry.cells.items() if cell.lower() not in _MISSING}
-
-
-def _numbers(entries: Sequence[Entry], files: Sequence[Channels], config: Config) -> list[Fault]:
-    """Turn the cells of every column of numbers into numbers, in place; return faults of cells that are none."""
-    faults = []
-    for name in dict.fromkeys(name for channels in files for name in channels):
-        rows = [i for i, channels in enumerate(files) if name in channels]
-        if name in TEXT_COLUMNS:
-            _as_labels(files, rows, name)
-            continue
-        numbers = {i: v if isinstance(v := files[i][name], float) else as_number(v) for i in rows}
-        wrong = [i for i, number in numbers.items() if number is None or not math.isfinite(number)]
-        known = name in NUMBERS or name == "repeat"
-        mostly = len(wrong) < (1 - _MOSTLY) * len(rows)
-        if wrong and not known and not mostly:
-            _as_labels(files, rows, name)
-            continue
-        if wrong and not known and name not in config.condition:
-            i = wrong[0]
-            reason = f"{len(wrong)} of {len(rows)} cells are no numbers; the column is kept as labels."
-            mend = "Empty the cell, or put a number there."
-            place = {"severity": "warning", "action": "kept", "value": str(files[i][name]), "mend": mend}
-            faults.append(entries[i].fault("not_a_number", reason, name, **place))
-            _as_labels(files, rows, name)
-            continue
-        for i in wrong:
-            mend = "Put a number there."
-            faults.append(
-                entries[i].fault("not_a_number", "is not a number.", name, value=str(files[i][name]), mend=mend)
-            )
-        for i, number in numbers.items():
-            files[i][name] = number if number is not None else math.nan
-    for entry, channels in zip(entries, files, strict=True):
-        repeat = channels.get("repeat")
-        if repeat is not None and math.isfinite(repeat):
-            if repeat != int(repeat):
-                mend = "Number the repeats 1, 2, 3."
-                faults.append(entry.fault("not_a_number", "is no whole number.", "repeat", value=repeat, mend=mend))
-            channels["repeat"] = int(repeat)
-    return faults
-
-
-def _as_labels(files: Sequence[Channels], rows: Sequence[int], name: str) -> None:
-    for i in rows:
-        value = files[i][name]
-        files[i][name] = value if isinstance(value, str) else f"{value:g}"
-
-
-def _ranges(entries: Sequence[Entry], files: Sequence[Channels]) -> list[Fault]:
-    """Return faults of values that cannot be: negative days, a load that does not press, a speed of zero."""
-    rules = (
-        ("aging_days", lambda value: value < 0, "is below 0 days.", "Days count from 0, unaged."),
-        (
-            "load_N",
-            lambda value: value <= 0,
-            "does not press.",
-            "The normal load is above 0; leave it empty if unknown.",
-        ),
-        ("speed_mm_s", lambda value: value == 0, "is no speed to slide at.", "Leave it empty if it is unknown."),
-    )
-    return [
-        entry.fault("out_of_range", reason, name, value=channels[name], mend=mend)
-        for entry, channels in zip(entries, files, strict=True)
-        for name, wrong, reason, mend in rules
-        if name in channels and wrong(channels[name])
-    ]
+    return {name: cell for name, cell in entry.cells.items() if cell.lower() not in MISSING}
 
 
 def _wanted(channels: Channels, config: Config) -> list[str]:
     """Return the condition columns that are missing; of unaged rubber only the days and the rubber are needed."""
     unaged = config.aging and channels.get("aging_days") == 0
-    needed = ["aging_days", *config.rubber] if unaged else [*config.condition, *config.rubber]
-    return [name for name in dict.fromkeys(needed) if name not in channels]
+    needed = ["aging_days", *config.rubber] if unaged else condition_columns(config)
+    return [name for name in needed if name not in channels]
 
 
 def _from_traces(

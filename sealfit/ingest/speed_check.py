@@ -12,7 +12,7 @@ from sealfit.errors import Fault
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.speed_unit import speed_factor
 
-BLOCKS = 100  # a file is cut into this many pieces: long enough to average noise out, short beside a stroke
+BLOCKS = 100  # pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke
 GROSS = 1.5  # beyond this factor the file contradicts itself and is left out; below, the commanded speed may be nominal
 
 
@@ -26,9 +26,9 @@ def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[flo
 
     Notes
     -----
-    The trace is cut into 100 pieces. The mean is that of all pieces; the plateau is the median of those faster than
-    half their 90th percentile, so rests, turns and ramps do not count. In stick-slip the speed that was set is
-    the mean, in a stroke with rests it is the plateau; elsewhere the two agree.
+    The trace is cut into 100 pieces, or 50 per stroke. The mean is that of all pieces; the plateau is the median of
+    those faster than half their 90th percentile, so rests, turns and ramps do not count. In stick-slip the speed that
+    was set is the mean, in a stroke with rests it is the plateau; elsewhere the two agree.
 
     Examples
     --------
@@ -37,13 +37,23 @@ def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[flo
     >>> round(mean, 6), round(plateau, 6)
     (1.5, 3.0)
     """
-    at = np.unique(np.linspace(0, len(time_s) - 1, min(len(time_s), BLOCKS + 1)).astype(int))
+    pieces = BLOCKS * max(1, _strokes(displacement_mm) // 2)
+    at = np.unique(np.linspace(0, len(time_s) - 1, min(len(time_s), pieces + 1)).astype(int))
     if len(at) < 2:
         return math.nan, math.nan
     path, time = np.abs(np.diff(displacement_mm[at])), np.diff(time_s[at])
     speeds = path / time
     moving = speeds[speeds > 0.5 * np.quantile(speeds, 0.9)]
     return float(path.sum() / time.sum()), float(np.median(moving)) if len(moving) else math.nan
+
+
+def _strokes(displacement_mm: np.ndarray) -> int:
+    """Return how often the trace goes from its lowest quarter to its highest or back: roughly, its strokes."""
+    low, high = np.quantile(displacement_mm, (0.01, 0.99))
+    ends = displacement_mm[
+        (displacement_mm < low + 0.25 * (high - low)) | (displacement_mm > high - 0.25 * (high - low))
+    ]
+    return int(np.count_nonzero(np.diff(ends > 0.5 * (low + high))))
 
 
 def check_speed(table: pd.DataFrame, ref: TraceRef, config: Config) -> Fault | None:

@@ -66,14 +66,15 @@ def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
     path = inside(campaign, file)
     if path is None:
         raise _bad(file, "path_outside", "lies outside the campaign folder.", "Copy it into the folder of runs.csv.")
+    if path.exists() and not path.is_file():  # a folder; or a pipe, which would be waited for forever
+        raise _bad(file, "unreadable_file", "is no file.", "Check the path.")
     try:
         with path.open("rb") as stream:
             raw = stream.read(HEAD_BYTES) if head else stream.read()
     except FileNotFoundError:
         raise _bad(file, "missing_file", "does not exist.", _similar(path)) from None
     except OSError as error:
-        reason = "is a folder." if path.is_dir() else f"cannot be read ({error.strerror})."
-        raise _bad(file, "unreadable_file", reason, "Check the path and its rights.") from error
+        raise _bad(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.") from error
     if not raw.strip(b"\xef\xbb\xbf\xff\xfe \t\r\n\0"):
         raise _bad(file, "empty_file", "is empty.", "Export it again, or take it out of runs.csv.")
     for magic, what in _PACKED.items():

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import numpy as np
@@ -302,6 +303,30 @@ def test_blank_lines_keep_line_numbers_right(tmp_path):
     trace = read(tmp_path, "\n" + csv_of([*ROWS[:50], "", "  ", *ROWS[50:], "", ""]))
     npt.assert_array_equal(trace.line[[0, 49, 50, 99]], [3, 52, 55, 104])
     assert trace.faults == ()
+
+
+def test_units_rows_and_clocks_are_recognised_for_what_they_are(tmp_path):
+    trace = read(tmp_path, csv_of(["[s],[mm],[N]", *ROWS]))
+    assert len(trace.table) == 100
+    assert all("units_row = true" in fault.mend for fault in trace.faults)
+    assert read(tmp_path, csv_of(["[s],[mm],[N]", *ROWS]), "trace.units_row = true").faults == ()
+    clocks = [f"12:00:0{row}" for row in ROWS]
+    assert "as seconds" in refused(tmp_path, csv_of(clocks)).mend
+
+
+def test_many_short_strokes_with_rests_have_the_speed_of_their_plateaus(tmp_path):
+    t = np.arange(0, 200, 0.02)
+    phase = t % 4  # 1 s forth, 1 s rest, 1 s back, 1 s rest at 0.25 mm/s
+    x = 0.25 * (np.clip(phase, 0, 1) - np.clip(phase - 2, 0, 1)) + np.random.default_rng(0).normal(0, 2e-4, len(t))
+    rows = [f"{a:.2f},{b:.6f},2.0" for a, b in zip(t, x, strict=True)]
+    assert read(tmp_path, csv_of(rows), speed_set_mm_s=0.25).faults == ()
+    assert refused(tmp_path, csv_of(rows), speed_set_mm_s=0.5).check == "speed_disagreement"
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(BadFile, match="is no file"):
+        read_trace(tmp_path, TraceRef("pipe.csv", {}), config())
 
 
 values = st.floats(-1e6, 1e6, allow_subnormal=False).map(lambda x: float(f"{x:.9g}"))

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from sealfit.config import parse_config
 from sealfit.errors import CampaignError
-from sealfit.ingest.derive import condition_key
+from sealfit.ingest.derive import condition_keys
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.runs_csv import natural
 
@@ -142,7 +142,7 @@ def test_unaged_rows_are_one_condition_whatever_their_other_cells_say(tmp_path):
 
 def test_unaged_rubbers_are_told_apart():
     rubbers = config(DAYS + 'rubber = ["compound"]')
-    assert condition_key({"aging_days": 0.0, "compound": "NBR"}, rubbers) == "unaged, NBR"
+    assert condition_keys([{"aging_days": 0.0, "compound": "NBR"}], rubbers) == ["unaged, NBR"]
 
 
 @pytest.mark.parametrize(
@@ -320,6 +320,7 @@ def test_conditions_may_stand_in_the_traces_as_constants(tmp_path):
         ('trace.encoding = "klingon"', "trace.encoding"),
         ('trace.delimiter = "::"', "trace.delimiter"),
         ('trace.decimal = ","', "trace.delimiter"),
+        ('condition = ["speed_mm_s"]', "condition"),
         ('trace.names = "none"', "trace.columns.time_s"),
         ('files.columns.run_id = "{rig}"', "files"),
         ('quantities.speed = {quantity = "speed", unit = "knot"}', "quantities"),
