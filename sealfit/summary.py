@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from sealfit.effects.contract import Effect
     from sealfit.store import Store
 
-NOT_PARAMETERS = ("statistics",)  # `quantity` of the rows of a fit that describe the fit itself
+NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift")  # `quantity` of rows about the fit itself
 
 
 # ---------------------------------------------------------------- plain values
@@ -53,6 +53,7 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
     ranges = []
     for (quantity, parameter, unit), group in rows.groupby(["quantity", "parameter", "unit"], sort=False, dropna=False):
         known = group.loc[group["identified"].astype(bool), "value"].dropna()
+        why = group.loc[~group["identified"].astype(bool), "reason"].dropna().mode()
         ranges.append(
             {
                 "quantity": quantity,
@@ -62,6 +63,7 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
                 "max": float(known.max()) if len(known) else None,
                 "identified": len(known),
                 "of": len(group),
+                "reason": str(why.iloc[0]) if len(why) else "",  # the commonest why not
             }
         )
     return {of: int(fit[of].nunique()), "parameters": ranges}
@@ -163,11 +165,12 @@ def _fit_lines(title: str, of: str, part: Mapping) -> list[str]:
         texts = [_range(entry) for entry in ranges if entry["quantity"] == quantity]
         name = "" if len(quantities) == 1 else f"{quantity}: "
         found.append(_line(title if not found else "", name + ", ".join(texts)))
-    lacking = [f"{e['parameter']} in {e['of'] - e['identified']}" for e in ranges if e["identified"] < e["of"]]
+    lacking = [entry for entry in ranges if entry["identified"] < entry["of"]]
     if lacking:
-        found.append(
-            _line("", f"not identified, of {part[of]} {of if of == 'series' else 'conditions'}: {', '.join(lacking)}")
-        )
+        texts = ", ".join(f"{entry['parameter']} in {entry['of'] - entry['identified']}" for entry in lacking)
+        reasons = " ".join(dict.fromkeys(entry["reason"] for entry in lacking if entry["reason"]))
+        plural = of if of == "series" else f"{of}s"
+        found.append(_line("", f"not identified, of {part[of]} {plural}: {texts}. {reasons}".rstrip(" .") + "."))
     return found
 
 

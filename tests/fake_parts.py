@@ -78,7 +78,7 @@ class Parts:
     def fit_conditions(self, steady, config):
         self._called("fit-steady", config)
         fit = small("steady_fit", 3).assign(condition=["a", "b", "c"], parameter="mu_s", value=[0.7, 0.8, 9.0], unit="")
-        return fit.assign(identified=[True, True, False])
+        return fit.assign(identified=[True, True, False], reason=["", "", "Too few speeds."])
 
     def fit_series(self, steady_fit, config):
         self._called("fit-aging", config)
