@@ -17,17 +17,38 @@ from sealfit.errors import ParameterError
 CHANNEL = "x"
 """In `Effect.reads`: any one numeric channel; `shape` finds it in `inputs["x"]`."""
 
+AMPLITUDE = (-1e6, 1e6)
+"""Bounds of an amplitude that carries units: a free sign, and no size that a rig's numbers could reach."""
+
 Target = Literal["force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b"]
 Operation = Literal["add", "multiply"]
 TARGETS = ("force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b")
+ANYWHERE: tuple[tuple[Target, Operation], ...] = (
+    ("mu", "multiply"),
+    ("force", "add"),
+    ("force", "multiply"),
+    ("mu_s", "multiply"),
+    ("mu_c", "multiply"),
+    ("v_s", "multiply"),
+    ("sigma_2", "add"),
+    ("sigma_2", "multiply"),
+    ("a", "multiply"),
+    ("b", "multiply"),
+    ("mu_0", "multiply"),
+    ("mu", "add"),
+    ("mu_s", "add"),
+    ("mu_c", "add"),
+)
+"""Where a closed or free form of a channel may act, likeliest first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
     """One parameter of an effect.
 
-    In `unit`, `{x}` stands for the unit of the channel and `{y}` for that of what the effect gives: the force's unit for
-    a force that is added, none for a factor, the parameter's own unit for the change of a parameter.
+    In `unit`, `{x}` stands for the unit of the first channel read and `{y}` for that of what the effect gives: the
+    force's unit for a force that is added, none for a factor, the parameter's own unit for the change of a parameter;
+    `fill_unit` puts them in. A name that is a word of Python carries an underscore; `symbol` is what people read.
 
     `linear` marks an amplitude: the shape is proportional to it, or to the vector of all linear ones. `search` says
     where to look for one that is not linear: numbers, or "inside" (quantiles of the channel), "span" (logarithmic,
@@ -49,13 +70,22 @@ class Parameter:
         if not self.meaning:
             raise ParameterError(f"{self.name}: say what it means.")
 
+    @property
+    def symbol(self) -> str:
+        """Return the name as equations and tables print it: `lambda` for `lambda_`."""
+        return self.name.rstrip("_")
+
 
 @dataclass(frozen=True, slots=True)
 class Effect:
     """One physical effect, or one closed form of any channel.
 
     `shape(inputs, **values)` is a pure function of arrays: `inputs` maps each name in `reads` to an array, shape (n,),
-    and it returns the added force, the factor minus one, or the change of the parameter, shape (n,).
+    and it returns the added force, the factor minus one, or the change of the parameter, shape (n,). It is zero where
+    all amplitudes are zero, and NaN (without a warning) where the form says nothing, such as the logarithm of zero.
+
+    `inputs` also holds `<name>_ref`, a fixed reference per channel (its mean over the campaign), so `x_ref` for
+    CHANNEL. A shape asks for it by `reference`.
     """
 
     id: str
@@ -90,3 +120,71 @@ class Effect:
     def start(self) -> dict[str, float]:
         """Return the start value of every parameter."""
         return {p.name: p.start for p in self.parameters}
+
+
+def reference(inputs: Mapping[str, object], name: str, default: float) -> float:
+    """Return the fixed reference value of a channel, or `default` where the caller gives none.
+
+    Parameters
+    ----------
+    inputs : mapping
+        What the shape was given.
+    name : str
+        Channel as in `Effect.reads`.
+    default : float
+        1 where the channel is divided by it (one unit of the channel), 0 where it is subtracted.
+    """
+    return float(inputs.get(f"{name}_ref", default))
+
+
+def positive(values) -> np.ndarray:
+    """Return `values` where they are positive and NaN elsewhere: there a form of their logarithm or power says nothing.
+
+    Examples
+    --------
+    >>> positive([2.0, 0.0, -1.0])
+    array([ 2., nan, nan])
+    """
+    values = np.asarray(values, dtype=float)
+    return np.where(values > 0, values, np.nan)
+
+
+def not_negative(values) -> np.ndarray:
+    """Return `values` where they are not negative and NaN elsewhere: there a form that starts at 0 says nothing.
+
+    Examples
+    --------
+    >>> not_negative([2.0, 0.0, -1.0])
+    array([ 2.,  0., nan])
+    """
+    values = np.asarray(values, dtype=float)
+    return np.where(values >= 0, values, np.nan)
+
+
+def fill_unit(unit: str, x: str, y: str) -> str:
+    """Return a parameter's unit with those of the channel and of what the effect gives put in.
+
+    Parameters
+    ----------
+    unit : str
+        `Parameter.unit`.
+    x, y : str
+        Unit of the channel, and of what the effect gives; empty for none.
+
+    Examples
+    --------
+    >>> fill_unit("{y}/{x}", "mm/s", "N"), fill_unit("{y}/{x}^2", "mm", ""), fill_unit("{y}/{x}", "", "N")
+    ('N/(mm/s)', '1/mm^2', 'N')
+    """
+    known = {"{x}": x, "{y}": y}
+    top, slash, bottom = unit.partition("/")
+    if not slash:
+        return known.get(unit, unit)
+    top = known.get(top, top)
+    base, hat, power = bottom.partition("^")
+    base = known.get(base, base)
+    if not base:
+        return top
+    if any(sign in base for sign in "/ *·"):
+        base = f"({base})"
+    return f"{top or 1}/{base}{hat}{power}"
