@@ -1,0 +1,184 @@
+r"""Free shapes, whose size the data decide: a smooth curve of a channel, or one level per category.
+
+They name no mechanism. Both are rebuilt from plain data by `free_effect`, so a model file holds them whole.
+
+.. math:: h = \sum_j c_j B_j(x), \qquad h = \sum_k d_k [x = k]
+
+B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the knot of reference has none, so the
+shape is zero there. Beyond the outer knots a natural spline goes on as a straight line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache, partial
+
+import numpy as np
+
+from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, Effect, Parameter
+from sealfit.errors import ParameterError
+
+SMOOTH, LEVELS = "smooth", "levels"
+
+
+def smooth_effect(knots: Sequence[float], reference: float | None = None) -> Effect:
+    """Return a natural cubic spline of the channel, with its values at the knots as amplitudes.
+
+    Parameters
+    ----------
+    knots : sequence of float
+        At least two different channel values, in rising order.
+    reference : float, optional
+        The shape is zero at the knot nearest to it; default: the first knot. That knot has no amplitude: a common level
+        belongs to the declared model.
+
+    Returns
+    -------
+    Effect
+        Amplitudes `c_j`, j the number of the knot from 1.
+
+    Raises
+    ------
+    ParameterError
+        If there are fewer than two knots, or they do not rise.
+
+    Notes
+    -----
+    Natural cubic spline: de Boor 2001, A Practical Guide to Splines, Springer.
+    """
+    places = tuple(float(k) for k in knots)
+    if len(places) < 2 or not np.isfinite(places).all() or not (np.diff(places) > 0).all():
+        raise ParameterError(f"smooth: knots {list(places)} must be two or more rising numbers.", mend="Sort them.")
+    zero = 0 if reference is None else int(np.argmin(np.abs(np.array(places) - reference)))
+    free = [j for j in range(len(places)) if j != zero]
+    x = places[free[-1]]
+    return Effect(
+        id=SMOOTH,
+        label="smooth in {x}",
+        equation=r"h = \sum_j c_j B_j(x)",
+        form=f"natural cubic spline through (x_j, c_j), knots {_listed(places)}, zero at {places[zero]:.6g}",
+        reads=(CHANNEL,),
+        acts_on=ANYWHERE,
+        parameters=tuple(
+            Parameter(
+                f"c_{j + 1}",
+                "{y}",
+                0.0,
+                AMPLITUDE,
+                f"value at {places[j]:.6g} less that at {places[zero]:.6g}",
+                linear=True,
+            )
+            for j in free
+        ),
+        shape=partial(_spline, places, zero),
+        source="Form: ours. de Boor 2001, A Practical Guide to Splines, Springer; natural end conditions.",
+        # By hand: at a knot the spline is that knot's amplitude, whatever the others are.
+        worked=({CHANNEL: x}, {f"c_{j + 1}": float(j + 1) for j in free}, float(free[-1] + 1)),
+        physical=False,
+    )
+
+
+def _spline(places: tuple[float, ...], zero: int, inputs: Mapping, **values) -> np.ndarray:
+    basis = _natural(places, np.asarray(inputs[CHANNEL], dtype=float))
+    amplitude = np.array([0.0 if j == zero else values[f"c_{j + 1}"] for j in range(len(places))])
+    return basis @ amplitude
+
+
+@lru_cache(maxsize=64)
+def _cardinal(places: tuple[float, ...]):
+    """Return the cardinal splines of these knots and their slopes at both ends."""
+    from scipy.interpolate import CubicSpline  # here, so that the catalogue can be listed without scipy
+
+    spline = CubicSpline(places, np.eye(len(places)), bc_type="natural")
+    return spline, spline(places[0], 1), spline(places[-1], 1)
+
+
+def _natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
+    """Return every cardinal spline at x, shape (..., knots): straight beyond the outer knots."""
+    spline, first, last = _cardinal(places)
+    inside = np.clip(x, places[0], places[-1])
+    below, above = np.minimum(x - places[0], 0.0), np.maximum(x - places[-1], 0.0)
+    return spline(inside) + below[..., None] * first + above[..., None] * last
+
+
+def levels_effect(categories: Sequence[str]) -> Effect:
+    """Return one level per category of the channel, as differences from the first category.
+
+    Parameters
+    ----------
+    categories : sequence of str
+        At least two different categories; the first is what the declared model stands for.
+
+    Returns
+    -------
+    Effect
+        Amplitudes `d_1`, `d_2`, ... for the categories after the first. A category that is not listed gives NaN.
+
+    Raises
+    ------
+    ParameterError
+        If there are fewer than two categories, or one stands twice.
+    """
+    names = tuple(str(c) for c in categories)
+    if len(names) < 2 or len(set(names)) != len(names):
+        raise ParameterError(f"levels: {list(names)} must be two or more different categories.", mend="List each once.")
+    return Effect(
+        id=LEVELS,
+        label="levels of {x}",
+        equation=r"h = \sum_k d_k [x = k]",
+        form=f"d_k for category k of {_listed(names)}; 0 for {names[0]}",
+        reads=(CHANNEL,),
+        acts_on=ANYWHERE,
+        parameters=tuple(
+            Parameter(f"d_{k}", "{y}", 0.0, AMPLITUDE, f"{name} less {names[0]}", linear=True)
+            for k, name in enumerate(names[1:], start=1)
+        ),
+        shape=partial(_levels, names),
+        source="Form: ours. One number per category, as in any analysis of variance.",
+        # By hand: the last category has its own difference.
+        worked=({CHANNEL: names[-1]}, {f"d_{k}": k / 10 for k in range(1, len(names))}, (len(names) - 1) / 10),
+        physical=False,
+    )
+
+
+def _levels(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
+    given = np.asarray(inputs[CHANNEL]).astype(str)
+    result = np.full(given.shape, np.nan)
+    for k, name in enumerate(names):
+        result[given == name] = 0.0 if k == 0 else values[f"d_{k}"]
+    return result
+
+
+def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
+    """Return the free shape that `fixed` describes, as it stands in a model file.
+
+    Parameters
+    ----------
+    id : str
+        `smooth` or `levels`.
+    fixed : mapping
+        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels. Other entries are not looked at.
+
+    Raises
+    ------
+    ParameterError
+        If the id is another one, or an entry is missing or not usable.
+
+    Examples
+    --------
+    >>> effect = free_effect("smooth", {"knots": [0.0, 1.0, 2.0], "x_ref": 0.0})
+    >>> effect.linear, [float(h) for h in effect.shape({"x": [0.0, 2.0, 3.0]}, c_2=1.0, c_3=2.0)]
+    (('c_2', 'c_3'), [0.0, 2.0, 3.0])
+    """
+    need = {SMOOTH: "knots", LEVELS: "categories"}.get(id)
+    if need is None:
+        raise ParameterError(f"'{id}' is no free shape.", mend="Use 'smooth' or 'levels'.")
+    if need not in fixed:
+        raise ParameterError(f"{id}: '{need}' is missing.", mend=f"Give '{need}' in its fixed values.")
+    if id == SMOOTH:
+        return smooth_effect(fixed["knots"], fixed.get("x_ref"))
+    return levels_effect(fixed["categories"])
+
+
+def _listed(values: Sequence[object]) -> str:
+    return ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in values)
