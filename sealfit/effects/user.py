@@ -1,0 +1,184 @@
+"""The users' own effects: Python files in a folder that the config on the command line names.
+
+The one place where Python is run. A file holds one `Effect` (or several) at its top level, as the files beside this one
+do; helpers it imports must be installed. A file whose name starts with an underscore is not read.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from hashlib import sha256
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from sealfit.effects import EFFECTS
+from sealfit.effects.contract import CHANNEL, Effect
+from sealfit.effects.free import LEVELS, SMOOTH
+from sealfit.errors import ConfigError, ParameterError
+
+EXAMPLE = "See sealfit/effects/drift.py for a whole one."
+TOLERANCE = 1e-9  # of a worked value, which a user may have written with ten digits
+
+
+def load_user_effects(folder: Path) -> dict[str, Effect]:
+    """Return the effects of every .py file in `folder`, by id, in the order of the file names.
+
+    Raises
+    ------
+    ConfigError
+        Naming the file and what to do: if the folder is missing, a file cannot be run or holds no effect, an id exists
+        already or is not a plain name, or an effect breaks the contract (its worked value, its linearity, its shape).
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ConfigError("there is no such folder.", file=folder, mend="Check loop.effects_folder in the config.")
+    found: dict[str, Effect] = {}
+    for path in sorted(folder.glob("*.py")):
+        if path.name.startswith("_"):
+            continue
+        for effect in _effects_of(path):
+            _refuse_taken(effect.id, found, path)
+            fault = contract_fault(effect)
+            if fault:
+                raise ConfigError(f"effect '{effect.id}': {fault}.", file=path, mend=f"Mend the file. {EXAMPLE}")
+            found[effect.id] = replace(effect, shape=FileShape(path.resolve(), effect.id, effect.shape))
+    return found
+
+
+@dataclass(frozen=True)
+class FileShape:
+    """The shape of an effect that lives in a user's file: a worker process, which cannot import it, reads it again."""
+
+    path: Path
+    id: str
+    function: Callable[..., np.ndarray]
+
+    def __call__(self, inputs: Mapping, **values: float) -> np.ndarray:
+        """Return the shape, shape (n,)."""
+        return self.function(inputs, **values)
+
+    def __reduce__(self):
+        return _read_again, (self.path, self.id)
+
+
+@lru_cache(maxsize=64)
+def _read_again(path: Path, id: str) -> FileShape:
+    function = next(effect.shape for effect in _effects_of(path) if effect.id == id)
+    return FileShape(path, id, function)
+
+
+def _effects_of(path: Path) -> list[Effect]:
+    own = [value for value in vars(_run(path)).values() if isinstance(value, Effect)]
+    unique = {id(effect): effect for effect in own if EFFECTS.get(effect.id) is not effect}  # not what it imported
+    if not unique:
+        raise ConfigError(
+            "holds no effect.", file=path, mend=f"Define one at its top level, or move the file. {EXAMPLE}"
+        )
+    return list(unique.values())
+
+
+def _run(path: Path) -> ModuleType:
+    # The name holds the place, so that two folders may hold files of one name and worker processes find the module.
+    name = f"sealfit_user_{sha256(str(path.resolve()).encode()).hexdigest()[:12]}_{path.stem}"
+    module = ModuleType(name)
+    module.__file__ = str(path)
+    sys.modules[name] = module
+    try:
+        # Not through the import system: that would leave compiled files in the user's folder, and believe old ones.
+        exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
+    except ParameterError as error:  # the contract's own words
+        del sys.modules[name]
+        raise ConfigError(str(error), file=path, mend=f"Mend the file. {EXAMPLE}") from error
+    except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to mend
+        del sys.modules[name]
+        line = _line_in(path, error)
+        message = f"cannot be run: {type(error).__name__}: {error}."
+        raise ConfigError(message, file=path, line=line, mend="Mend the file, or move it out of the folder.") from error
+    return module
+
+
+def _line_in(path: Path, error: BaseException) -> int | None:
+    """Return the last line of the file that the error came through."""
+    if isinstance(error, SyntaxError):
+        return error.lineno
+    line, trace = None, error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == str(path):
+            line = trace.tb_lineno
+        trace = trace.tb_next
+    return line
+
+
+def _refuse_taken(name: str, found: Mapping[str, Effect], path: Path) -> None:
+    if not (isinstance(name, str) and name.isidentifier()):
+        raise ConfigError(f"id {name!r} is not a plain name.", file=path, mend="Use letters, digits and underscores.")
+    if name in EFFECTS or name in (SMOOTH, LEVELS):
+        raise ConfigError(f"the catalogue has an effect '{name}' already.", file=path, mend="Give it another id.")
+    if name in found:
+        raise ConfigError(f"another file of the folder has an effect '{name}' already.", file=path, mend="Rename one.")
+
+
+def contract_fault(effect: Effect) -> str:
+    """Return what in an effect breaks the contract, in words; empty if nothing does."""
+    try:
+        with np.errstate(all="ignore"):
+            return _description_fault(effect) or _shape_fault(effect)
+    except Exception as error:  # its shape is the user's code
+        return f"its shape fails with its worked inputs: {type(error).__name__}: {error}"
+
+
+def _description_fault(effect: Effect) -> str:
+    for name in ("label", "equation", "form", "source"):
+        if not (isinstance(getattr(effect, name), str) and getattr(effect, name).strip()):
+            return f"its {name} is empty"
+    if not effect.acts_on:
+        return "acts_on is empty: say on what it may act"
+    if not effect.reads:
+        return "reads is empty: name the channels it depends on"
+    if CHANNEL in effect.reads and len(effect.reads) > 1:
+        return "reads mixes 'x' (any channel) with named channels"
+    names = [p.name for p in effect.parameters]
+    if len(set(names)) != len(names):
+        return "two parameters share a name"
+    for p in effect.parameters:
+        if not np.isfinite(p.bounds).all():
+            return f"the bounds of {p.name} are not finite"
+        if not p.linear and isinstance(p.search, str) and p.search not in ("inside", "span", "ratio"):
+            return f"search of {p.name} is '{p.search}': use numbers, 'inside', 'span' or 'ratio'"
+    inputs, values, _ = effect.worked
+    missing = [name for name in effect.reads if name not in inputs]
+    if missing:
+        return f"its worked value gives no {', '.join(missing)}"
+    if set(values) != set(names):
+        return f"its worked value gives parameters {sorted(values)}, not {sorted(names)}"
+    return ""
+
+
+def _shape_fault(effect: Effect) -> str:
+    inputs, values, expected = effect.worked
+    arrays = {name: np.full(3, value) if name in effect.reads else value for name, value in inputs.items()}
+    before = {name: np.copy(value) for name, value in arrays.items()}
+    result = effect.shape(arrays, **values)
+    if np.shape(result) != (3,):
+        return f"its shape returns an array of shape {np.shape(result)} for three rows"
+    if not np.allclose(result, expected, rtol=TOLERANCE, atol=1e-12):
+        return f"its shape gives {result[0]:.10g} where its worked value says {expected:.10g}"
+    if any(not np.array_equal(before[name], arrays[name]) for name in before):
+        return "its shape edits its inputs"
+    amplitudes = {name: values[name] for name in effect.linear}
+    doubled = effect.shape(arrays, **{**values, **{name: 2 * value for name, value in amplitudes.items()}})
+    if not np.allclose(doubled, 2 * result, rtol=TOLERANCE, atol=1e-12):
+        return f"its shape is not linear in {', '.join(amplitudes)}: twice the amplitude must give twice the shape"
+    nothing = effect.shape(arrays, **{**values, **dict.fromkeys(amplitudes, 0.0)})
+    if np.any(nothing != 0):
+        return f"its shape is not zero where {', '.join(amplitudes)} is zero"
+    for p in effect.parameters:
+        for bound in p.bounds:
+            if not np.isfinite(effect.shape(arrays, **{**values, p.name: bound})).all():
+                return f"its shape is not finite at the bound {p.name} = {bound:g}"
+    return ""
