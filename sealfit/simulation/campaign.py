@@ -26,6 +26,7 @@ from sealfit.simulation.truth import load_truth, truth_document, truth_path
 
 DISPLACEMENT_DECIMALS = 5  # 10 nm, as fine as any linear encoder on such a rig
 NOT_IN_RUNS = ["condition", "direction", "run_order", "elapsed_h"]  # keys and derived channels, which ingest makes
+CRAWL = 1e-3  # of the speed: slow enough for break-away; at zero itself a law in log speed has no value
 RMS_ROWS = 64  # rows per file on which an effect's RMS is taken; the rest would not change its second digit
 
 
@@ -170,8 +171,14 @@ def _force(
 ) -> np.ndarray:
     """Return a trace's measured force in N, shape (n,)."""
     # At rest the bristles keep the last direction: a crawl stands for it, at which the law gives the break-away force.
-    crawl = np.where(motion.speed_mm_s == 0.0, 1e-9 * speed * motion.direction, motion.speed_mm_s)
-    friction, added = law.parts({**channels, "speed_mm_s": crawl})
+    crawl = motion.direction * np.maximum(np.abs(motion.speed_mm_s), CRAWL * speed)
+    # Within a bristle's length nothing has slid yet, nor at the clock's zero: a law in their logarithm starts after.
+    begun = {
+        "speed_mm_s": crawl,
+        "distance_mm": np.maximum(motion.distance_mm, spec.design.stiffness_mm),
+        "time_s": np.maximum(motion.stroke_time_s, motion.time_s[1]),
+    }
+    friction, added = law.parts({**channels, **begun})
     if not (np.isfinite(friction).all() and np.isfinite(added).all()):
         raise ConfigError(
             f"the effects give no number in {channels['file'][0]}.", mend="Check their parameters and formulas."

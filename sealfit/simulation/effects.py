@@ -8,26 +8,31 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field, model_validator
 
+from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect, Operation, Target
-from sealfit.errors import ConfigError
+from sealfit.effects.free import LEVELS, SMOOTH, smooth_effect
+from sealfit.errors import ConfigError, ParameterError
 from sealfit.simulation.formula import evaluate_formula, parse_formula
 from sealfit.simulation.strict import Strict
 
+EXPRESSION = "expression"
+
 
 class EffectEntry(Strict):
-    """One effect: of the catalogue, `levels` (one value per category), or a formula of channels."""
+    """One effect: of the catalogue, `smooth`, `levels` (one value per category), or a formula of channels."""
 
     id: str
     channels: tuple[str, ...] = Field((), description="in the order in which the effect reads them")
     acts_on: Target | None = Field(None, description="default: the catalogue's likeliest; force for an expression")
     operation: Operation | None = Field(None, description="default: the catalogue's likeliest; add for an expression")
     parameters: dict[str, float] = Field(default_factory=dict)
-    reference: dict[str, float] = Field(default_factory=dict, description="fixed inputs, e.g. a reference load")
+    reference: dict[str, float] = Field(default_factory=dict, description="where it is zero or one, e.g. load_N_ref")
+    knots: tuple[float, ...] = Field((), description="of a smooth shape")
     formula: str | None = Field(None, description="of an expression")
 
     @model_validator(mode="after")
     def _whole(self) -> EffectEntry:
-        if (self.id == "expression") != (self.formula is not None):
+        if (self.id == EXPRESSION) != (self.formula is not None):
             raise ValueError("id = 'expression' and formula belong together")
         if self.formula is not None:
             try:
@@ -38,7 +43,7 @@ class EffectEntry(Strict):
                 raise ValueError(str(error)) from None
             if self.channels and unknown:
                 raise ValueError(f"formula reads {', '.join(unknown)}: list it in channels or parameters")
-        if self.id == "levels" and (len(self.channels) != 1 or not self.parameters):
+        if self.id == LEVELS and (len(self.channels) != 1 or not self.parameters):
             raise ValueError("levels needs one channel, and parameters = {category = value, ...}")
         return self
 
@@ -70,18 +75,12 @@ def resolve_effects(entries: Sequence[EffectEntry]) -> tuple[BoundEffect, ...]:
 def _resolve(entry: EffectEntry, place: str) -> BoundEffect:
     if entry.formula is not None:
         return _expression(entry)
-    if entry.id == "levels":
+    if entry.id == LEVELS:
         return _levels(entry)
-    from sealfit.effects import EFFECTS
-
-    if entry.id not in EFFECTS:
-        raise ConfigError(
-            f"{place}: there is no such effect.",
-            mend=f"Known: {', '.join(sorted({*EFFECTS, 'levels', 'expression'}))}.",
-        )
-    effect = EFFECTS[entry.id]
+    effect = _catalogued(entry, place)
     channels = _bound_channels(entry, effect, place)
     _check_parameters(entry, effect, place)
+    _check_reference(entry, effect, place)
     acts_on, operation = _target(entry, effect, place)
     values, reference = dict(entry.parameters), {k: np.float64(v) for k, v in entry.reference.items()}
 
@@ -91,6 +90,25 @@ def _resolve(entry: EffectEntry, place: str) -> BoundEffect:
         return np.asarray(effect.shape({**inputs, **reference}, **values), dtype=float)
 
     return BoundEffect(entry.id, channels, acts_on, operation, effect.form, values, shape)
+
+
+def _catalogued(entry: EffectEntry, place: str) -> Effect:
+    if entry.id == SMOOTH:
+        try:
+            return smooth_effect(entry.knots, entry.reference.get("x_ref"))
+        except ParameterError as error:
+            raise ConfigError(f"{place}: {error}", mend="Give knots = [...].") from error
+    if entry.id not in EFFECTS:
+        known = ", ".join(sorted({*EFFECTS, SMOOTH, LEVELS, EXPRESSION}))
+        raise ConfigError(f"{place}: there is no such effect.", mend=f"Known: {known}.")
+    return EFFECTS[entry.id]
+
+
+def _check_reference(entry: EffectEntry, effect: Effect, place: str) -> None:
+    known = [f"{name}_ref" for name in effect.reads]
+    for name in entry.reference:
+        if name not in known:
+            raise ConfigError(f"{place}: has no reference '{name}'.", mend=f"It may have {', '.join(known)}.")
 
 
 def _bound_channels(entry: EffectEntry, effect: Effect, place: str) -> tuple[str, ...]:
@@ -159,7 +177,7 @@ def _levels(entry: EffectEntry) -> BoundEffect:
         return np.where(labels[place] == found, values[place], 0.0)  # a category without a value has none
 
     target, operation = entry.acts_on or "force", entry.operation or "add"
-    return BoundEffect("levels", (channel,), target, operation, "value of the level", dict(entry.parameters), shape)
+    return BoundEffect(LEVELS, (channel,), target, operation, "value of the level", dict(entry.parameters), shape)
 
 
 def _as_label(values: np.ndarray) -> np.ndarray:
