@@ -6,6 +6,7 @@ Everything here works on what is already known of each file, and reads none.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -40,8 +41,8 @@ def _text(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
-def add_order(entries: Sequence[Entry], files: Sequence[Channels]) -> list[Fault]:
-    """Add `run_order` and `elapsed_h` to the files that say when they were started; return faults of bad times.
+def add_order(entries: Sequence[Entry], files: Sequence[Channels]) -> tuple[list[Channels], list[Fault]]:
+    """Return the files with `run_order` and `elapsed_h` where they say when they were started, and faults of bad times.
 
     Equal times share the order of the first of them. A time without a zone is taken as UTC, so that one campaign
     with and without zones keeps one order.
@@ -58,18 +59,16 @@ def add_order(entries: Sequence[Entry], files: Sequence[Channels]) -> list[Fault
             mend = "Write it as 2024-03-01T09:30:00."
             faults.append(entry.fault("not_a_time", "is no ISO 8601 time.", "started_at", value=text, mend=mend))
     ordered = sorted(times.values())
+    added = [dict(channels) for channels in files]
     for i, time in times.items():
-        files[i]["run_order"] = float(ordered.index(time) + 1)
-        files[i]["elapsed_h"] = (time - ordered[0]).total_seconds() / 3600
-    return faults
+        added[i]["run_order"] = float(bisect_left(ordered, time) + 1)
+        added[i]["elapsed_h"] = (time - ordered[0]).total_seconds() / 3600
+    return added, faults
 
 
-def add_specimens(files: Sequence[Channels], conditions: Sequence[str]) -> set[int]:
-    """Add the default `specimen_id`, one per condition; return the indices of the files that name their own."""
-    own = {i for i, channels in enumerate(files) if "specimen_id" in channels}
-    for channels, condition in zip(files, conditions, strict=True):
-        channels.setdefault("specimen_id", condition)
-    return own
+def add_specimens(files: Sequence[Channels], conditions: Sequence[str]) -> list[Channels]:
+    """Return the files with a `specimen_id`: one per condition where none is named."""
+    return [{"specimen_id": condition, **channels} for channels, condition in zip(files, conditions, strict=True)]
 
 
 def add_runs(
@@ -77,34 +76,35 @@ def add_runs(
     conditions: Sequence[str],
     speeds: Sequence[float | None],
     measured: Sequence[float],
-    own: set[int],
     unit: str,
-) -> list[Fault]:
-    """Add `run_id` where it is missing: one per condition, commanded speed and (named) specimen.
+) -> tuple[list[Channels], list[Fault]]:
+    """Return the files with a `run_id`, and what is to be said of it.
+
+    Where none is given there is one per condition, commanded speed and (named) specimen.
 
     Parameters
     ----------
     files : sequence of dict
-        Channels of each file, with `specimen_id`; changed in place.
+        Channels of each file.
     conditions : sequence of str
         Condition of each file in words.
     speeds : sequence of float or None
         Commanded speeds, signed where a sign was given.
     measured : sequence of float
         Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run.
-    own : set of int
-        Files whose specimen was named, and so tells runs apart.
     unit : str
         Unit of the speeds.
     """
-    missing = [i for i, channels in enumerate(files) if "run_id" not in channels]
+    run_ids = {i: channels["run_id"] for i, channels in enumerate(files) if "run_id" in channels}
     groups = defaultdict(list)
-    for i in missing:
+    for i in range(len(files)):
+        if i in run_ids:
+            continue
         words = [conditions[i]]
-        if i in own:
+        if "specimen_id" in files[i]:
             words.append(str(files[i]["specimen_id"]))
         if speeds[i] is not None:
-            files[i]["run_id"] = ", ".join([*words, f"{speeds[i]:g} {unit}"])
+            run_ids[i] = ", ".join([*words, f"{speeds[i]:g} {unit}"])
         else:
             groups[", ".join(words)].append(i)
     for words, members in groups.items():
@@ -116,28 +116,29 @@ def add_runs(
             if after is None or not measured[after] <= measured[i] * (1 + SAME_SPEED):
                 middle = measured[cluster[len(cluster) // 2]]
                 name = words if math.isnan(middle) else f"{words}, about {middle:.3g} {unit}"
-                for j in cluster:
-                    files[j]["run_id"] = name
+                run_ids.update(dict.fromkeys(cluster, name))
                 cluster = []
+    added = [{**channels, "run_id": run_ids[i]} for i, channels in enumerate(files)]
     if not groups:
-        return []
+        return added, []
     reason = "neither run_id nor a commanded speed is given; files of one condition share a run within 5 % of speed."
-    return [Fault("run_id_derived", reason, severity="info", action="kept", mend="Give run_id or speed_mm_s.")]
+    said = Fault("run_id_derived", reason, severity="info", action="kept", mend="Give run_id or speed_mm_s.")
+    return added, [said]
 
 
-def add_repeats(files: Sequence[Channels]) -> None:
-    """Add `repeat` where it is missing: by `started_at` if the whole run has it, else by file order."""
+def add_repeats(files: Sequence[Channels]) -> list[Channels]:
+    """Return the files with a `repeat`: where missing by `started_at` if the whole run has it, else by file order."""
     runs = defaultdict(list)
     for i, channels in enumerate(files):
         runs[channels["run_id"]].append(i)
+    numbers = {}
     for members in runs.values():
         if all("elapsed_h" in files[i] for i in members):
             members.sort(key=lambda i: (files[i]["elapsed_h"], i))
         used = {files[i]["repeat"] for i in members if "repeat" in files[i]}
         free = (number for number in range(1, len(members) + len(used) + 1) if number not in used)
-        for i in members:
-            if "repeat" not in files[i]:
-                files[i]["repeat"] = next(free)
+        numbers.update({i: next(free) for i in members if "repeat" not in files[i]})
+    return [{**channels, "repeat": channels.get("repeat", numbers.get(i))} for i, channels in enumerate(files)]
 
 
 def disagreements(

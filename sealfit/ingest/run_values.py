@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from sealfit.config import Config
 from sealfit.errors import Fault
@@ -17,50 +17,56 @@ MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
 _MOSTLY = 0.8  # a column with this share of numbers is one of numbers, and the rest of its cells are slips
 
 
-def to_numbers(entries: Sequence[Entry], files: Sequence[Channels], config: Config) -> list[Fault]:
-    """Turn the cells of every column of numbers into numbers, in place; return faults of cells that are none."""
-    faults = []
-    for name in dict.fromkeys(name for channels in files for name in channels):
-        rows = [i for i, channels in enumerate(files) if name in channels]
-        if name in TEXT_COLUMNS:
-            _as_labels(files, rows, name)
-            continue
-        numbers = {i: v if isinstance(v := files[i][name], float) else as_number(v) for i in rows}
-        wrong = [i for i, number in numbers.items() if number is None or not math.isfinite(number)]
-        known = name in NUMBERS or name == "repeat"
-        mostly = len(wrong) < (1 - _MOSTLY) * len(rows)
-        if wrong and not known and not mostly:
-            _as_labels(files, rows, name)
-            continue
-        if wrong and not known and name not in config.condition:
-            i = wrong[0]
-            reason = f"{len(wrong)} of {len(rows)} cells are no numbers; the column is kept as labels."
-            mend = "Empty the cell, or put a number there."
-            place = {"severity": "warning", "action": "kept", "value": str(files[i][name]), "mend": mend}
-            faults.append(entries[i].fault("not_a_number", reason, name, **place))
-            _as_labels(files, rows, name)
-            continue
-        for i in wrong:
-            mend = "Put a number there."
-            faults.append(
-                entries[i].fault("not_a_number", "is not a number.", name, value=str(files[i][name]), mend=mend)
-            )
-        for i, number in numbers.items():
-            files[i][name] = number if number is not None else math.nan
-    for entry, channels in zip(entries, files, strict=True):
-        repeat = channels.get("repeat")
-        if repeat is not None and math.isfinite(repeat):
-            if repeat != int(repeat):
-                mend = "Number the repeats 1, 2, 3."
-                faults.append(entry.fault("not_a_number", "is no whole number.", "repeat", value=repeat, mend=mend))
-            channels["repeat"] = int(repeat)
-    return faults
+def to_values(
+    entries: Sequence[Entry], files: Sequence[Channels], config: Config
+) -> tuple[list[Channels], list[Fault]]:
+    """Return the files with every column as numbers or as labels, and faults of cells that are neither.
+
+    A column of numbers is one whose name says so, one of the config's condition columns or a channel where more than
+    four fifths of the cells are numbers, and any where all are.
+    """
+    columns: dict[str, dict[int, float | str]] = {}
+    for i, channels in enumerate(files):
+        for name, value in channels.items():
+            columns.setdefault(name, {})[i] = value
+    faults: list[Fault] = []
+    made: list[Channels] = [{} for _ in files]
+    for name, cells in columns.items():
+        values, found = _column(name, cells, entries, config)
+        faults += found
+        for i, value in values.items():
+            made[i][name] = value
+    return made, faults
 
 
-def _as_labels(files: Sequence[Channels], rows: Sequence[int], name: str) -> None:
-    for i in rows:
-        value = files[i][name]
-        files[i][name] = value if isinstance(value, str) else f"{value:g}"
+def _column(
+    name: str, cells: Mapping[int, float | str], entries: Sequence[Entry], config: Config
+) -> tuple[Mapping[int, float | str], list[Fault]]:
+    labels = {i: cell if isinstance(cell, str) else f"{cell:g}" for i, cell in cells.items()}
+    if name in TEXT_COLUMNS:
+        return labels, []
+    numbers = {i: cell if isinstance(cell, float) else as_number(cell) for i, cell in cells.items()}
+    wrong = [i for i, number in numbers.items() if number is None or not math.isfinite(number)]
+    known = name in NUMBERS or name == "repeat"
+    if wrong and not known and len(wrong) >= (1 - _MOSTLY) * len(cells):
+        return labels, []
+    if wrong and not known and name not in config.condition:
+        i = wrong[0]
+        reason = f"{len(wrong)} of {len(cells)} cells are no numbers; the column is kept as labels."
+        mend = "Empty the cell, or put a number there."
+        place = {"severity": "warning", "action": "kept", "value": labels[i], "mend": mend}
+        return labels, [entries[i].fault("not_a_number", reason, name, **place)]
+    mend = "Put a number there."
+    faults = [entries[i].fault("not_a_number", "is not a number.", name, value=labels[i], mend=mend) for i in wrong]
+    values = {i: math.nan if number is None else number for i, number in numbers.items()}  # nan: not missing, but wrong
+    if name != "repeat":
+        return values, faults
+    broken = [i for i, number in values.items() if math.isfinite(number) and number != int(number)]
+    mend = "Number the repeats 1, 2, 3."
+    faults += [
+        entries[i].fault("not_a_number", "is no whole number.", name, value=values[i], mend=mend) for i in broken
+    ]
+    return {i: int(number) if math.isfinite(number) else -i for i, number in values.items()}, faults
 
 
 def out_of_range(entries: Sequence[Entry], files: Sequence[Channels]) -> list[Fault]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from sealfit.conditions import condition_columns
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, ConfigError, Fault
-from sealfit.ingest.columns import suggestion
+from sealfit.ingest.columns import RESERVED, beside, suggestion
 from sealfit.ingest.derive import (
     Channels,
     add_order,
@@ -27,7 +27,7 @@ from sealfit.ingest.derive import (
 from sealfit.ingest.names import TEXT_COLUMNS, NameParts, name_parts
 from sealfit.ingest.read import read_trace
 from sealfit.ingest.refs import TraceRef
-from sealfit.ingest.run_values import MISSING, out_of_range, to_numbers
+from sealfit.ingest.run_values import MISSING, out_of_range, to_values
 from sealfit.ingest.runs_csv import Entry, list_entries
 from sealfit.ingest.speed_check import measured_speed
 from sealfit.ingest.speed_unit import speed_factor
@@ -63,24 +63,29 @@ def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fa
         {**_header(campaign, entry.file, config), **named.channels, **_cells(entry)}
         for entry, named in zip(entries, parts, strict=True)
     ]
-    faults += to_numbers(entries, files, config)
-    measured, left_out, found = _from_traces(campaign, entries, files, config)
+    files, found = to_values(entries, files, config)
+    faults += found
+    files, measured, left_out, found = _from_traces(campaign, entries, files, config)
     keep = [i for i in range(len(entries)) if i not in left_out]
     entries, files, measured = ([rows[i] for i in keep] for rows in (entries, files, measured))
     faults += found + _missing(entries, files, config) + out_of_range(entries, files)
-    faults += add_order(entries, files)
+    files, found = add_order(entries, files)
+    faults += found
     _stop_at_errors(faults)
-    speeds = [channels.pop("speed_mm_s", None) for channels in files]
+    speeds = [channels.get("speed_mm_s") for channels in files]
     conditions = condition_keys(files, config)
-    own = add_specimens(files, conditions)
-    faults += add_runs(files, conditions, speeds, measured, own, config.units.unit("speed"))
-    add_repeats(files)
+    files, found = add_runs(files, conditions, speeds, measured, config.units.unit("speed"))
+    faults += found
+    files = add_repeats(add_specimens(files, conditions))
     faults += disagreements(entries, files, conditions, speeds)
     _stop_at_errors(faults)
-    for channels, speed in zip(files, speeds, strict=True):
-        if speed is not None:
-            channels["speed_set_mm_s"] = abs(speed)
-    return [TraceRef(entry.file, channels) for entry, channels in zip(entries, files, strict=True)], faults
+    return [TraceRef(entry.file, _set_speed(channels)) for entry, channels in zip(entries, files, strict=True)], faults
+
+
+def _set_speed(channels: Channels) -> Channels:
+    """Return the channels with the commanded speed under its own name, as a magnitude."""
+    rest = {name: value for name, value in channels.items() if name != "speed_mm_s"}
+    return {**rest, "speed_set_mm_s": abs(channels["speed_mm_s"])} if "speed_mm_s" in channels else rest
 
 
 def _stop_at_errors(faults: Sequence[Fault]) -> None:
@@ -174,41 +179,44 @@ def _wanted(channels: Channels, config: Config) -> list[str]:
 
 def _from_traces(
     campaign: Path, entries: Sequence[Entry], files: Sequence[Channels], config: Config
-) -> tuple[list[float], set[int], list[Fault]]:
-    """Add what is missing from constant columns of the traces, in place, reading only files that lack something.
+) -> tuple[list[Channels], list[float], set[int], list[Fault]]:
+    """Return the files with what constant columns of their traces add, reading only files that lack something.
 
-    Returns the measured speed of each file read (nan of the others), the files to leave out, and their faults.
+    Also the measured speed of each file read (nan of the others), the files to leave out, and their faults.
     """
-    measured, left_out, faults = [math.nan] * len(entries), set(), []
+    added, measured = [dict(channels) for channels in files], [math.nan] * len(files)
+    left_out: set[int] = set()
+    faults: list[Fault] = []
     for i, (entry, channels) in enumerate(zip(entries, files, strict=True)):
-        speed_known = "run_id" in channels or "speed_mm_s" in channels
-        if speed_known and not _wanted(channels, config):
+        wanted = _wanted(channels, config)
+        if not wanted and ("run_id" in channels or "speed_mm_s" in channels):
             continue
         try:
             table = read_trace(campaign, TraceRef(entry.file, {}), config).table
         except BadFile as error:
-            if _wanted(channels, config):  # otherwise it is left out, and said why, when it is read for good
+            if wanted:  # otherwise it is left out, and said why, when it is read for good
                 left_out.add(i)
                 faults += error.faults
             continue
         _, plateau = measured_speed(table["time_s"].to_numpy(), table["displacement_mm"].to_numpy())
         measured[i] = plateau * speed_factor(config.units)
-        sources = {"run_id": "run_id_file", "repeat": "repeat_file", "specimen_id": "specimen_id_file"}
-        sources |= {"started_at": "started_at_file", "speed_mm_s": "speed_file_mm_s"}
-        for name in (*_wanted(channels, config), *sources):
-            column = sources.get(name, name)
+        sources = {
+            name: beside(name, RESERVED) for name in ("run_id", "repeat", "specimen_id", "started_at", "speed_mm_s")
+        }
+        sources |= {name: name for name in wanted}
+        for name, column in sources.items():
             if name in channels or column not in table:
                 continue
             values = table[column]
             if (values == values.iloc[0]).all():
-                channels[name] = _constant(name, values.iloc[0])
-            elif name in _wanted(channels, config):
+                added[i][name] = _constant(name, values.iloc[0])
+            elif name in wanted:
                 reason = f"varies within the file, {values.min()} to {values.max()}; a condition is one value."
                 mend = "Write the value that was set into runs.csv."
                 place = {"file": entry.file, "column": name, "action": "file left out", "mend": mend}
                 faults.append(Fault("condition_varies", reason, **place))
                 left_out.add(i)
-    return measured, left_out, faults
+    return added, measured, left_out, faults
 
 
 def _constant(name: str, value: float | str) -> float | str:

@@ -191,6 +191,7 @@ def test_every_fault_is_told_at_once(tmp_path):
         .replace("60,80,4,49.03,5,2024-03-01T09", "hot,80,4,49.03,5,never")
     )
     found = faults(campaign(tmp_path, table))
+    assert len(found) == 4
     assert {(fault.line, fault.column) for fault in found} == {
         (2, "temperature_C"),
         (2, "started_at"),
