@@ -172,7 +172,7 @@ def reml(
         np.clip(first, low + 1.0, high - 1.0),
         method="L-BFGS-B",
         bounds=[(low, high)] * len(kinds),
-        options={"maxiter": 60, "ftol": 1e-9},
+        options={"maxiter": 40, "ftol": 1e-7},
     )
     share = np.exp(best.x)
     variances = np.where(share > 1e-5, unit * share, 0.0)

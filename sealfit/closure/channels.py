@@ -1,0 +1,127 @@
+"""Channels: what may order a residual, and the unit of evidence of each.
+
+The unit of evidence is the coarsest nesting level within each of whose groups the channel is constant. A category with
+each of its levels in one group only (a serial number) is a grouping, never an effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from sealfit.fit.rows import LEVELS, Rows
+
+FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
+MANY_UNITS = 20  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up
+FREE_DF = 4  # columns of a free shape: enough for a peak, an approach or a step; more only costs power
+WIDE = 20.0  # a positive channel that spans this factor is looked at on a logarithmic scale
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One channel on the rows: numbers, or categories as strings."""
+
+    name: str
+    values: np.ndarray  # (n,) float or str
+    unit: str  # "sample" or a nesting level
+
+    @property
+    def numeric(self) -> bool:
+        """Whether the channel holds numbers."""
+        return self.values.dtype.kind == "f"
+
+
+def find_channels(rows: Rows, ignore: Iterable[str] = (), *, rig_position: bool = True) -> list[Channel]:
+    """Return every channel of the rows that varies and is not a grouping.
+
+    Parameters
+    ----------
+    rows : Rows
+        The rows.
+    ignore : iterable of str
+        Names left out.
+    rig_position : bool
+        Whether displacement means the same place in every file.
+    """
+    skip = set(ignore) | (set() if rig_position else {"displacement_mm"})
+    found = []
+    for name in rows.channels:
+        if name in skip:
+            continue
+        values = np.abs(rows.speed) if name == "speed_mm_s" else rows.values(name)
+        if values.dtype.kind == "f":
+            if not np.isfinite(values).all() or np.ptp(values) <= 1e-9 * max(np.abs(values).max(), 1e-300):
+                continue
+        elif np.unique(values).size < 2:
+            continue
+        unit = unit_of(values, rows)
+        channel = Channel(name, values, unit)
+        if not channel.numeric and _is_grouping(channel, rows):
+            continue
+        found.append(channel)
+    return found
+
+
+def unit_of(values: np.ndarray, rows: Rows) -> str:
+    """Return the coarsest level within each of whose groups `values` are constant; "sample" if within none."""
+    for level in reversed(LEVELS):
+        start, code = rows.groups.starts[level], rows.codes(level)
+        first = values[start][code]
+        if values.dtype.kind == "f":
+            close = np.abs(values - first) <= 1e-9 * max(float(np.abs(values).max()), 1e-300)
+        else:
+            close = values == first
+        if close.all():
+            return level
+    return "sample"
+
+
+def flip_level(unit: str, rows: Rows) -> str:
+    """Return the level whose whole groups are moved by sign flips, folds and bootstraps."""
+    if FINER[unit] >= FINER["run"]:
+        return unit
+    return "run" if rows.groups.starts["run"].size >= MANY_UNITS else "file"
+
+
+def _is_grouping(channel: Channel, rows: Rows) -> bool:
+    level = channel.unit if channel.unit != "sample" else "stroke"
+    first = channel.values[rows.groups.starts[level]]
+    return np.unique(first).size == first.size
+
+
+def free_columns(channel: Channel) -> np.ndarray:
+    """Return the columns of a free shape, first a straight line: shape (n, k), each centred and scaled.
+
+    A cubic B-spline with knots at quantiles (in the logarithm where a positive channel spans a factor of 20); one
+    column per category but the first for categories.
+    """
+    if not channel.numeric:
+        levels = np.unique(channel.values)
+        return (channel.values[:, None] == levels[None, 1:]).astype(float)
+    x = scaled(channel.values)
+    distinct = np.unique(x)
+    df = min(FREE_DF, distinct.size - 1)
+    columns = [x]
+    if df >= 2:
+        if distinct.size <= FREE_DF + 1:
+            columns += [x**k for k in range(2, df + 1)]
+        else:
+            inner = np.quantile(distinct, np.linspace(0, 1, df)[1:-1]) if df > 2 else []
+            knots = np.r_[[distinct[0]] * 4, inner, [distinct[-1]] * 4]
+            spline = BSpline.design_matrix(x, knots, 3).toarray()
+            columns += list(spline[:, 1:-1].T)
+    stacked = np.column_stack(columns)
+    stacked = stacked - stacked.mean(axis=0)
+    size = np.sqrt((stacked**2).mean(axis=0))
+    return stacked[:, size > 1e-12] / size[size > 1e-12]
+
+
+def scaled(values: np.ndarray) -> np.ndarray:
+    """Return a channel on the scale it is looked at, mapped to [-1, 1]: logarithmic where it spans a factor of 20."""
+    low, high = float(values.min()), float(values.max())
+    if low > 0 and high / low >= WIDE:
+        values, low, high = np.log(values), np.log(low), np.log(high)
+    return np.clip(2 * (values - low) / (high - low) - 1, -1.0, 1.0)

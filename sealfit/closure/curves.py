@@ -1,0 +1,166 @@
+"""Tables that the report draws of the loop: residual by channel, effect shapes, force against speed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.channels import Channel, unit_of
+from sealfit.closure.document import parameter_unit
+from sealfit.closure.grow import Grown
+from sealfit.closure.intervals import degrees_of_freedom, mean_se, t_quantile
+from sealfit.closure.naming import free_term
+from sealfit.config import Config
+from sealfit.fit.estimate import Fitted, fit
+from sealfit.fit.joint import Term, evaluate, term_derivatives
+from sealfit.fit.rows import point_rows
+from sealfit.tables import CHANNELS, CURVES, SHAPES
+
+GROUPS = 12  # groups of a numeric channel in the residual plot
+POINTS = 60  # points of a drawn curve
+
+
+def channel_table(grown: Grown, before: Fitted, after: Fitted) -> pd.DataFrame:
+    """Return the mean residual by channel, before and after, with standard errors from whole files."""
+    rows = before.rows
+    files = rows.codes("file")
+    records = []
+    for name, known in grown.channels.items():
+        values = rows.values(name) if name != "speed_mm_s" else np.abs(rows.speed)
+        if known.numeric:
+            edges = np.unique(np.quantile(values, np.linspace(0, 1, GROUPS + 1)))
+            distinct = np.unique(values)
+            if distinct.size <= GROUPS:
+                code, middle = np.searchsorted(distinct, values), distinct
+            else:
+                code = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
+                middle = np.bincount(code, values) / np.maximum(np.bincount(code), 1)
+            labels: list = [None] * middle.size
+        else:
+            labels, code = np.unique(values, return_inverse=True)
+            middle = [None] * len(labels)
+        for group in np.unique(code):
+            inside = code == group
+            record = {"channel": name, "x": middle[group], "label": labels[group], "n": int(inside.sum())}
+            for stage, fitted in (("before", before), ("after", after)):
+                weight, residual = rows.weight[inside], fitted.residual[inside]
+                mean = weight @ residual / weight.sum()
+                per_file = np.bincount(files[inside], weight * (residual - mean))
+                record[f"{stage}_N"] = mean
+                record[f"{stage}_se_N"] = float(np.sqrt((per_file**2).sum()) / weight.sum())
+            records.append(record)
+    return pd.DataFrame(records, columns=CHANNELS.names())
+
+
+def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
+    """Return each effect's shape along its channel with a 95 % band, and the free shape beside it."""
+    records: list[dict] = []
+    reach = t_quantile(degrees_of_freedom(after))
+    offset = after.model.theta.size
+    for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True)):
+        count = len(term.effect.parameters)
+        covariance = after.covariance[offset : offset + count, offset : offset + count]
+        offset += count
+        inputs, x, labels = _along(term, after)
+        value = np.asarray(term.effect.shape(inputs, **values), dtype=float)
+        tangent = np.column_stack([np.broadcast_to(d, value.shape) for d in term_derivatives(term, values, inputs)])
+        se = mean_se(tangent, covariance)
+        free = _free_shape(after, number, x)
+        unit = parameter_unit("{y}", term, config.units)
+        for k in range(value.size):
+            records.append(
+                {
+                    "effect": number,
+                    "id": term.effect.id,
+                    "channel": term.channels[0],
+                    "x": x[k] if labels is None else None,
+                    "label": None if labels is None else labels[k],
+                    "value": value[k],
+                    "lo95": value[k] - reach * se[k],
+                    "hi95": value[k] + reach * se[k],
+                    "free": None if free is None else free[k],
+                    "unit": unit,
+                }
+            )
+    return pd.DataFrame(records, columns=SHAPES.names())
+
+
+def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
+    """Return inputs along a term's first channel, others at their means; and the channel's values or categories."""
+    rows = after.rows
+    first = term.channels[0]
+    values = rows.values(first)
+    if values.dtype.kind != "f":
+        labels = [str(c) for c in np.unique(values)]
+        return {term.effect.reads[0]: np.array(labels), **term.fixed}, np.full(len(labels), np.nan), labels
+    values = np.abs(values) if first == "speed_mm_s" else values
+    low, high = float(values.min()), float(values.max())
+    if "lambda_" in after.model.values[after.model.terms.index(term)]:
+        high = min(high, low + 4 * after.model.values[after.model.terms.index(term)]["lambda_"])
+    distinct = np.unique(values)
+    x = distinct if distinct.size <= 12 else np.linspace(low, high, 4 * POINTS if high < values.max() else POINTS)
+    inputs = {}
+    for name, channel in zip(term.effect.reads, term.channels, strict=True):
+        own = rows.values(channel)
+        inputs[name] = x if channel == first else np.full(x.size, float(np.mean(np.abs(own))))
+    fixed = {key: value for key, value in term.fixed.items() if key != "shift"}
+    return {**inputs, **fixed}, x, None
+
+
+def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
+    """Return the free shape fitted in place of an effect, level with it on average; None for periodic or level ones."""
+    term = after.model.terms[number]
+    if len(term.channels) != 1 or term.effect.id in ("ripple", "sinusoid", "smooth", "levels") or np.isnan(x).any():
+        return None
+    if term.channels[0] == "direction":
+        return None
+    rows = after.rows
+    values = np.abs(rows.speed) if term.channels[0] == "speed_mm_s" else rows.values(term.channels[0])
+    free = free_term(Channel(term.channels[0], values, unit_of(values, rows)), term.acts_on, term.operation)
+    model = after.model.without_term(number).with_term(free, {p.name: 0.0 for p in free.effect.parameters})
+    fitted = fit(model, rows, after.scatter, turns=0)
+    shape = free.effect.shape({free.effect.reads[0]: x, **free.fixed}, **fitted.model.values[-1])
+    own = term.effect.shape({term.effect.reads[0]: x, **term.fixed}, **after.model.values[number])
+    return shape + float(np.mean(own - shape))
+
+
+def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
+    """Return force against speed per condition, before and after, other channels at their means."""
+    rows = after.rows
+    tables, codes = [], []
+    for number in range(len(rows.conditions)):
+        inside = rows.condition == number
+        for sign in (1.0, -1.0):
+            chosen = inside & (np.sign(rows.speed) == sign)
+            if not chosen.any():
+                continue
+            speeds = np.abs(rows.speed[chosen])
+            count = POINTS if speeds.max() > 1.02 * speeds.min() else 1
+            table = _typical(rows.table[chosen], count)
+            table["speed_mm_s"] = sign * np.geomspace(speeds.min(), speeds.max(), count)
+            table["direction"] = sign
+            tables.append(table)
+            codes.append(np.full(count, number))
+    points = pd.concat(tables, ignore_index=True)
+    at = point_rows(points, np.concatenate(codes), rows.conditions, has_load=rows.has_load, has_aging=rows.has_aging)
+    mean, tangent = evaluate(after.model, at)
+    reach = t_quantile(degrees_of_freedom(after)) * mean_se(tangent, after.covariance)
+    points = points.assign(
+        force_before_N=evaluate(before.model, at, jacobian=False)[0],
+        force_after_N=mean,
+        force_after_lo95_N=mean - reach,
+        force_after_hi95_N=mean + reach,
+    )
+    return points[CURVES.names()]
+
+
+def _typical(table: pd.DataFrame, count: int) -> pd.DataFrame:
+    """Return `count` rows with every numeric channel at its mean and every category at its commonest."""
+    one = {}
+    for name in table.columns:
+        column = table[name]
+        one[name] = column.mean() if pd.api.types.is_float_dtype(column) else column.mode().iloc[0]
+        if name in ("repeat", "stroke"):
+            one[name] = float(column.mean())
+    one["file"] = ""
+    return pd.DataFrame([one] * count)

@@ -1,0 +1,182 @@
+"""closure.json's entries: effects with intervals, what is left, and which runs would tell rivals apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.channels import FINER, unit_of
+from sealfit.closure.grow import Added, Grown, describe
+from sealfit.closure.intervals import effect_intervals
+from sealfit.closure.ripple import Peak
+from sealfit.config import Config
+from sealfit.fit.estimate import Fitted
+from sealfit.fit.joint import Term, evaluate
+from sealfit.fit.rows import Rows
+from sealfit.tables import Units
+
+LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
+QUANTITY_UNIT = {"sigma_2": ("force", "speed"), "v_s": ("speed",), "b": ("days",)}
+
+
+def effect_entries(after: Fitted, added: Sequence[Added], config: Config) -> list[dict]:
+    """Return closure.json's `effects`, one per term of the after-model."""
+    entries = []
+    for number, (item, term) in enumerate(zip(added, after.model.terms, strict=True)):
+        proposal = item.proposal
+        intervals = effect_intervals(after, number, proposal.unit)
+        parameters = [
+            {
+                "name": p.name,
+                "value": intervals[p.name][0],
+                "ci95": [intervals[p.name][1], intervals[p.name][2]],
+                "unit": parameter_unit(p.unit, term, config.units),
+            }
+            for p in term.effect.parameters
+        ]
+        entries.append(
+            {
+                "id": term.effect.id,
+                "label": describe(term),
+                "level": effect_level(term, after.rows),
+                "channels": channels_of(term, after.rows),
+                "acts_on": term.acts_on,
+                "operation": term.operation,
+                "form": form_of(term),
+                "named": proposal.named,
+                "candidate": False,
+                "parameters": parameters,
+                "p_value": proposal.p_value,
+                "heldout_gain_N": None if not np.isfinite(item.gain_N) else item.gain_N,
+                "alternatives": [
+                    {
+                        "id": rival.term.effect.id,
+                        "channels": channels_of(rival.term, after.rows),
+                        "acts_on": rival.term.acts_on,
+                        "heldout_rmse_N": None,
+                    }
+                    for rival in item.rivals
+                ],
+            }
+        )
+    return entries
+
+
+def channels_of(term: Term, rows: Rows) -> list[str]:
+    """Return the channels an effect uses; an unsigned force along a channel of whole files uses direction too."""
+    names = list(term.channels)
+    both_ways = rows.speed.min() < 0 < rows.speed.max()
+    coarse = all(FINER[unit_of(rows.values(name), rows)] > FINER["stroke"] for name in names)
+    if both_ways and coarse and (term.acts_on, term.operation) == ("force", "add") and "direction" not in names:
+        names.insert(0, "direction")
+    return names
+
+
+def effect_level(term: Term, rows: Rows) -> str:
+    """Return the finest level at which one of the effect's channels varies, in closure.json's words."""
+    units = [unit_of(rows.values(name), rows) for name in channels_of(term, rows)]
+    return LEVEL_NAMES[min(units, key=FINER.get)]
+
+
+def form_of(term: Term) -> str:
+    """Return the effect's equation in plain text with its fixed reference value."""
+    text = term.effect.form
+    reference = term.fixed.get("x_ref")
+    return text.replace("x_ref", f"{reference:g}") if reference is not None else text
+
+
+def parameter_unit(unit: str, term: Term, units: Units) -> str:
+    """Return a parameter's true unit: {x} is the channel's, {y} that of what the effect gives."""
+    channel = units.of(term.channels[0])
+    if term.operation == "multiply":
+        given = ""
+    elif term.acts_on == "force":
+        given = units.unit("force")
+    elif term.acts_on == "sigma_2":
+        given = f"{units.unit('force')}/({units.unit('speed')})"
+    elif term.acts_on == "v_s":
+        given = units.unit("speed")
+    else:
+        given = ""
+    return unit.replace("{x}", channel).replace("{y}", given).strip("/ ")
+
+
+def effect_table(entries: Sequence[dict], added: Sequence[Added]) -> pd.DataFrame:
+    """Return the `effects` table: a row per parameter."""
+    names = [
+        "round", "id", "label", "channels", "acts_on", "operation", "form", "named",
+        "parameter", "value", "lo95", "hi95", "unit", "p_value",
+    ]  # fmt: skip
+    records = [
+        {
+            "round": item.round,
+            **{key: entry[key] for key in ("id", "label", "acts_on", "operation", "form", "named", "p_value")},
+            "channels": " ".join(entry["channels"]),
+            "parameter": p["name"],
+            "value": p["value"],
+            "lo95": p["ci95"][0],
+            "hi95": p["ci95"][1],
+            "unit": p["unit"],
+        }
+        for item, entry in zip(added, entries, strict=True)
+        for p in entry["parameters"]
+    ]
+    return pd.DataFrame(records, columns=names)
+
+
+def left_entry(grown: Grown, rmse_N: float, floor_N: float | None) -> dict:
+    """Return closure.json's `left`: the error above the floor, and the strongest structure that is still there."""
+    above = np.sqrt(max(rmse_N**2 - floor_N**2, 0.0)) if floor_N is not None else None
+    left = grown.left
+    if isinstance(left, Peak):
+        return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
+    if left is not None:
+        names = [grown.channels[n].unit for n in left.channels if n in grown.channels]
+        level = LEVEL_NAMES[min(names or [left.unit], key=FINER.get)]
+        return {"rmse_N": above, "level": level, "channel": " ".join(left.channels), "p_value": left.p_value}
+    smallest = min((c.p_value for c in grown.last), default=None)
+    return {"rmse_N": above, "level": None, "channel": None, "p_value": smallest}
+
+
+def next_runs(grown: Grown, config: Config) -> list[dict]:
+    """Return the runs that would tell rivals apart: where their fitted forces differ most, by computing them."""
+    wanted = []
+    for item in grown.added:
+        for rival in item.rivals[:1]:
+            found = _where_apart(item, rival.fitted, config)
+            if found is not None:
+                wanted.append(
+                    {
+                        "why": f"tells {describe(item.proposal.term)} from {describe(rival.term)}: "
+                        f"they differ there by {found[1]:.3g} {config.units.unit('force')}",
+                        "conditions": found[0],
+                    }
+                )
+    return wanted
+
+
+def _where_apart(item: Added, rival: Fitted, config: Config) -> tuple[dict, float] | None:
+    """Return the run, tested or at half and double speed, at which two fitted models differ most, and by how much."""
+    rows = item.proposal.fitted.rows
+    best: tuple[dict, float] | None = None
+    for factor in (0.5, 1.0, 2.0):
+        table = rows.table.assign(speed_mm_s=rows.speed * factor, time_s=rows.table["time_s"] / factor)
+        moved = Rows(**{**rows.__dict__, "table": table, "speed": rows.speed * factor})
+        one = evaluate(item.proposal.fitted.model, moved, jacobian=False)[0]
+        other = evaluate(rival.model, moved, jacobian=False)[0]
+        apart = np.abs(one - other)
+        apart[~np.isfinite(apart)] = 0.0
+        k = int(np.argmax(apart))
+        if best is None or apart[k] > best[1]:
+            where = {name: _plain(table[name].iloc[k]) for name in config.condition if name in table}
+            where["speed_mm_s"] = float(table["speed_mm_s"].iloc[k])
+            for name in dict.fromkeys((*item.proposal.term.channels,)):
+                where[name] = _plain(table[name].iloc[k])
+            best = (where, float(apart[k]))
+    return best if best is not None and best[1] > 0 else None
+
+
+def _plain(value: object) -> object:
+    return value.item() if hasattr(value, "item") else value

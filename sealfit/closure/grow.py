@@ -1,0 +1,182 @@
+"""Round after round: search, name, confirm, add, refit, drop what became needless, until nothing is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.channels import Channel, find_channels
+from sealfit.closure.confirm import heldout_gain
+from sealfit.closure.naming import Proposal, propose, rivals
+from sealfit.closure.ripple import Peak, find_ripple
+from sealfit.closure.search import Candidate, search
+from sealfit.config import Config
+from sealfit.effects.contract import Effect
+from sealfit.fit.estimate import Fitted, fit, fit_declared
+from sealfit.fit.joint import Term, evaluate
+from sealfit.fit.rows import Rows
+
+TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
+
+
+@dataclass(frozen=True)
+class Added:
+    """An accepted effect: the proposal, its gain on held-out data and the rivals these data cannot tell from it."""
+
+    proposal: Proposal
+    gain_N: float
+    rivals: tuple[Proposal, ...]
+    round: int
+
+
+@dataclass(frozen=True)
+class Grown:
+    """The end of the loop on some rows: both fits, what was added, and what the last searches found."""
+
+    before: Fitted
+    after: Fitted
+    added: tuple[Added, ...]
+    first: tuple[Candidate, ...]  # candidates on the declared model
+    last: tuple[Candidate, ...]  # candidates on the final one
+    left: Candidate | Peak | None  # what is still significant
+    channels: Mapping[str, Channel] = field(default_factory=dict)
+
+
+def grow(
+    rows: Rows,
+    samples: pd.DataFrame,
+    config: Config,
+    effects: Mapping[str, Effect],
+    *,
+    confirm: bool = True,
+    start: Fitted | None = None,
+    on_progress: Callable[[str], None] | None = None,
+) -> Grown:
+    """Return the model grown until no channel orders its residual.
+
+    Parameters
+    ----------
+    rows : Rows
+        Bins as arrays.
+    samples : DataFrame
+        Steady samples for the ripple search: file, stroke, direction, unit, displacement_mm, time_s, force_N.
+    config : Config
+        Levels of error, rounds, folds.
+    effects : mapping
+        The catalogue.
+    confirm : bool
+        Whether a proposal must also gain on held-out units; left out inside the outer folds, where the outer fold
+        itself is the held-out data.
+    start : Fitted, optional
+        The declared model fitted to more rows: where the fit begins, so that it need not search again.
+    on_progress : callable, optional
+        Told in words what is being done.
+    """
+    say = on_progress or (lambda text: None)
+    rng = np.random.default_rng(config.loop.seed)
+    rig = config.position_origin == "rig"
+    before = fitted = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
+    channels = {c.name: c for c in find_channels(rows, config.loop.ignore_channels, rig_position=rig)}
+    alpha = config.loop.family_error
+    added: list[Added] = []
+    refused: set[tuple] = set()
+    first: tuple[Candidate, ...] = ()
+    last: tuple[Candidate, ...] = ()
+    left: Candidate | Peak | None = None
+    for number in range(1, config.loop.max_rounds + 2):
+        candidates = search(fitted, list(channels.values()), rng)
+        last = tuple(candidates)
+        first = first or last
+        peak = find_ripple(_residual_samples(samples, fitted), common_phase=rig)
+        peak = peak if peak is not None and peak.p_value <= alpha and ("peak", peak.axis) not in refused else None
+        significant = [c for c in candidates if c.p_value <= alpha]
+        say(f"round {number}: {len(candidates)} candidates on {len(channels)} channels, {len(significant)} significant")
+        left = significant[0] if significant else peak
+        open_ = [c for c in significant if c.key not in refused]
+        if (not open_ and peak is None) or number > config.loop.max_rounds:
+            break
+        proposals = propose(fitted, open_, channels, peak, effects)
+        accepted = None
+        for proposal in proposals[:TRIES]:
+            gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed) if confirm else np.nan
+            say(f"  {describe(proposal.term)}: held-out gain {gain:.4g}")
+            if not confirm or gain > 0:
+                accepted = Added(proposal, gain, tuple(rivals(proposal, proposals)), number)
+                break
+        if accepted is None:
+            refused |= {c.key for c in open_} | ({("peak", peak.axis)} if peak else set())
+            continue
+        added.append(accepted)
+        fitted = fit(accepted.proposal.fitted.model, rows, fitted.scatter, turns=2)
+        fitted, added = _drop_needless(fitted, added)
+    return Grown(before, fitted if added else before, tuple(added), first, last, left, channels)
+
+
+def describe(term: Term) -> str:
+    """Return an effect in words, e.g. "ripple along displacement_mm, on force"."""
+    label = term.effect.label.replace("{x}", term.channels[0])
+    return f"{label}, {'added to' if term.operation == 'add' else 'factor on'} {term.acts_on}"
+
+
+def _drop_needless(fitted: Fitted, added: list[Added]) -> tuple[Fitted, list[Added]]:
+    """Return the fit without effects that a later one has made needless, by Schwarz's price."""
+    k = 0
+    while k < len(added) - 1:
+        price = added[k].proposal.price
+        without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0)
+        if without.deviance - fitted.deviance < price:
+            fitted = fit(without.model, fitted.rows, fitted.scatter, turns=1)
+            added = [a for j, a in enumerate(added) if j != k]
+        else:
+            k += 1
+    return fitted, added
+
+
+def steady_samples(traces: pd.DataFrame, rows: Rows) -> pd.DataFrame:
+    """Return the steady samples of the strokes in `rows`, with direction and unit, for the ripple search."""
+    table = rows.table
+    keys = pd.DataFrame(
+        {
+            "file": table["file"],
+            "stroke": table["stroke"],
+            "direction": table["direction"],
+            "unit": rows.codes("file"),
+        }
+    ).drop_duplicates(["file", "stroke"])
+    columns = ["file", "stroke", "time_s", "displacement_mm", "force_N"]
+    return traces.loc[traces["steady"], columns].merge(keys, on=["file", "stroke"], how="inner")
+
+
+def _residual_samples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
+    """Return the samples with `residual_N`: force less the periodic effects already in the model.
+
+    Everything slow is taken out of each stroke by the spectrum itself; what is periodic is evaluated at the samples.
+    """
+    periodic = [
+        (t, v)
+        for t, v in zip(fitted.model.terms, fitted.model.values, strict=True)
+        if t.effect.id in ("ripple", "sinusoid")
+    ]
+    residual = samples["force_N"].to_numpy(dtype=float)
+    if periodic:
+        rows = fitted.rows
+        level = rows.groups.means(fitted.force, "stroke")
+        first = rows.table.iloc[rows.groups.starts["stroke"]][["file", "stroke"]].assign(level=level)
+        per_sample = samples[["file", "stroke"]].merge(first, on=["file", "stroke"], how="left")["level"].to_numpy()
+        for term, values in periodic:
+            place = samples[term.channels[0]].to_numpy(dtype=float)
+            shift = term.fixed.get("shift")
+            if shift is not None:
+                place = place + samples["file"].map(shift).to_numpy(dtype=float)
+            name = term.effect.reads[0]
+            shape = term.effect.shape({name: place, **term.fixed}, **values)
+            residual = residual - shape * (1.0 if term.operation == "add" else per_sample)
+    return samples.assign(residual_N=residual)
+
+
+def predict_rows(fitted: Fitted, rows: Rows) -> np.ndarray:
+    """Return the fitted model's force at other rows of the same campaign, shape (n,)."""
+    return evaluate(fitted.model, rows, jacobian=False)[0]

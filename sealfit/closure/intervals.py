@@ -1,0 +1,56 @@
+"""Intervals of the joint model: parameters of effects, and the mean force at points."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from sealfit.fit.estimate import Fitted
+from sealfit.fit.rows import LEVELS
+
+
+def degrees_of_freedom(fitted: Fitted) -> float:
+    """Return the degrees of freedom of the coarsest level that scatters: units there less the levels they estimate."""
+    active = [c.level for c in fitted.scatter.components if c.variance > 0]
+    level = active[-1] if active else "file"
+    units = fitted.rows.groups.starts[LEVELS[max(LEVELS.index(level), 1)]].size
+    between = len({(p.quantity, p.owner) for p in fitted.model.declared.parameters if p.quantity in ("mu_0c", "a_c")})
+    return float(max(units - (between if level == "specimen" else fitted.basis.shape[1]), 3))
+
+
+def t_quantile(df: float) -> float:
+    """Return the two-sided 95 % quantile of Student's t."""
+    return float(stats.t.ppf(0.975, df))
+
+
+def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
+    """Return the sandwich covariance from whole groups of a level (CR2), shape (p, p)."""
+    scores = np.add.reduceat(
+        fitted.white_jacobian * fitted.unit_residual(level)[:, None], fitted.rows.groups.starts[level], axis=0
+    )
+    return fitted.covariance @ (scores.T @ scores) @ fitted.covariance
+
+
+def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, tuple[float, float, float]]:
+    """Return {parameter: (value, lo95, hi95)} of one effect.
+
+    The wider of two standard errors counts: that of the fitted scatter, and the one that whole units of the effect's
+    own level show, so that an effect which itself scatters between units is not given too short an interval.
+    """
+    p0 = fitted.model.theta.size + sum(len(t.effect.parameters) for t in fitted.model.terms[:number])
+    count = len(fitted.model.terms[number].effect.parameters)
+    place = slice(p0, p0 + count)
+    variance = np.maximum(np.diag(fitted.covariance)[place], np.diag(robust_covariance(fitted, level))[place])
+    units = fitted.rows.groups.starts[level].size
+    reach = t_quantile(max(units - count - 1, 2)) * np.sqrt(variance)
+    values = fitted.model.values[number]
+    result = {}
+    for p, r in zip(fitted.model.terms[number].effect.parameters, reach, strict=True):
+        low, high = values[p.name] - r, values[p.name] + r
+        result[p.name] = (values[p.name], float(low), float(high))
+    return result
+
+
+def mean_se(tangent: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the standard error of the model's force from its tangent, shape (n, p), and covariance -> (n,)."""
+    return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", tangent, covariance, tangent), 0.0))

@@ -1,0 +1,170 @@
+"""How large the residual is, at which level it sits, and how small it could be: errors, noise floor, lack of fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from sealfit.closure.search import Candidate
+from sealfit.fit.estimate import Fitted
+from sealfit.fit.rows import LEVELS, Rows
+
+
+@dataclass(frozen=True)
+class PureError:
+    """Scatter of files within a run, the common repeat pattern removed; None where no run has repeats."""
+
+    bin_variance: float  # of one bin of one file about the true mean of its run
+    file_sd_N: np.ndarray  # (files,) not used beyond its count
+    df: float
+
+
+def errors(rows: Rows, residual: np.ndarray) -> dict[str, float]:
+    """Return rmse_N, rmse_runs_N, max_abs_N and mean_abs_pct of a residual, shape (n,), each file weighing the same."""
+    weight = rows.weight
+    run = pd.factorize(rows.table["run_id"])[0]
+    per_run = np.bincount(run, weight)
+    means = np.bincount(run, weight * residual) / per_run
+    size = np.abs(np.bincount(run, weight * rows.force) / per_run)
+    relative = np.abs(residual) / np.where(size > 0, size, np.nan)[run]
+    known = np.isfinite(relative)
+    return {
+        "rmse_N": float(np.sqrt(weight @ residual**2)),
+        "rmse_runs_N": float(np.sqrt(np.mean(means**2))),
+        "max_abs_N": float(np.abs(residual).max()),
+        "mean_abs_pct": float(100 * (weight[known] @ relative[known]) / weight[known].sum()) if known.any() else None,
+    }
+
+
+def without_repeat_pattern(rows: Rows, residual: np.ndarray) -> np.ndarray:
+    """Return the residual less what every run's first, second, third repeat have in common, shape (n,)."""
+    repeat = pd.factorize(rows.table["repeat"])[0]
+    if repeat.max() == 0:
+        return residual
+    run = pd.factorize(rows.table["run_id"])[0]
+    count = np.bincount(run)
+    centred = residual - (np.bincount(run, residual) / count)[run]
+    pattern = np.bincount(repeat, centred) / np.bincount(repeat)
+    return residual - pattern[repeat]
+
+
+def pure_error(rows: Rows, residual: np.ndarray) -> tuple[float, float] | None:
+    """Return (variance, df) of one bin about its run's mean over repeats; None where no run has repeats.
+
+    What the repeats have in common at a place is the run's true shape and does not count; nor does the pattern that all
+    runs show from one repeat to the next.
+    """
+    table = rows.table
+    clean = without_repeat_pattern(rows, residual)
+    place = table.groupby(["run_id", "stroke", "bin"], sort=False).ngroup().to_numpy()
+    count = np.bincount(place)
+    mean = np.bincount(place, clean) / count
+    repeated = count[place] > 1
+    df = float((count[count > 1] - 1).sum())
+    if df <= 0:
+        return None
+    return float(((clean - mean[place])[repeated] ** 2).sum() / df), df
+
+
+def noise_floor(fitted: Fitted) -> float | None:
+    """Return the RMSE that the true mean would have on these bins: bin, file and run scatter; None without repeats."""
+    pure = pure_error(fitted.rows, fitted.residual)
+    if pure is None:
+        return None
+    run = fitted.rows.weight @ fitted.scatter.level_variance("run", fitted.force)
+    return float(np.sqrt(pure[0] + run))
+
+
+def lack_of_fit(fitted: Fitted) -> float | None:
+    """Return the p-value of run means against the scatter of files within runs (F test); None without repeats."""
+    rows = fitted.rows
+    clean = without_repeat_pattern(rows, fitted.residual)
+    keys = rows.table[["run_id", "file"]].assign(residual=clean, force=fitted.force)
+    files = keys.groupby(["run_id", "file"], sort=False).mean().reset_index()
+    spread = np.sqrt(fitted.scatter.level_variance("file", files["force"].to_numpy()) + 1e-300)
+    noise = fitted.scatter.noise_sd(files["force"].to_numpy())
+    per_file = len(rows.table) / len(files)
+    scale = np.sqrt(spread**2 + noise**2 / per_file)
+    files["z"] = files["residual"] / scale
+    by_run = files.groupby("run_id")["z"]
+    count, mean = by_run.count().to_numpy(), by_run.mean().to_numpy()
+    pattern = max(rows.table["repeat"].nunique() - 1, 0)
+    df_pure = float((count - 1).sum() - pattern)
+    df_fit = float(count.size - fitted.basis.shape[1])
+    if df_pure < 1 or df_fit < 1:
+        return None
+    pure = float(((files["z"] - by_run.transform("mean")) ** 2).sum()) / df_pure
+    lack = float((count * mean**2).sum()) / df_fit
+    return float(stats.f.sf(lack / max(pure, 1e-300), df_fit, df_pure))
+
+
+def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.DataFrame:
+    """Return the residual's variance by level and, within the levels, by channel (table `levels`)."""
+    rows, force = fitted.rows, fitted.force
+    parts = {"sample": float(rows.weight @ fitted.scatter.noise_sd(force) ** 2)}
+    df = {"sample": float(force.size - rows.groups.starts["stroke"].size)}
+    for level in LEVELS:
+        variance = float(rows.weight @ fitted.scatter.level_variance(level, force))
+        known = [c for c in fitted.scatter.components if c.level == level]
+        if known:
+            parts[level], df[level] = variance, known[0].df
+    total = sum(parts.values()) or 1.0
+    records = [
+        {
+            "stage": stage,
+            "level": level,
+            "channel": None,
+            "sd_N": np.sqrt(v),
+            "share": v / total,
+            "df": df[level],
+            "p_value": None,
+        }
+        for level, v in parts.items()
+    ]
+    best: dict[tuple, Candidate] = {}
+    for candidate in candidates:
+        name = " ".join(candidate.channels)
+        if name not in best or candidate.log_p < best[name].log_p:
+            best[name] = candidate
+    sd = float(np.sqrt(rows.weight @ fitted.residual**2))
+    white = float(fitted.white_residual @ fitted.white_residual)
+    for name, candidate in best.items():
+        share = candidate.chi2 / max(white, 1e-300)
+        records.append(
+            {
+                "stage": stage,
+                "level": candidate.unit,
+                "channel": name,
+                "sd_N": sd * np.sqrt(share),
+                "share": share,
+                "df": float(candidate.df),
+                "p_value": candidate.p_value,
+            }
+        )
+    return pd.DataFrame(records)
+
+
+def scatter_list(fitted: Fitted) -> list[dict]:
+    """Return closure.json's `scatter`: per level the SD in force units, relative to the force, and its df."""
+    force = fitted.force
+    mean_square = float(fitted.rows.weight @ force**2)
+    result = []
+    for level in LEVELS:
+        known = [c for c in fitted.scatter.components if c.level == level]
+        if not known:
+            continue
+        variance = float(fitted.rows.weight @ fitted.scatter.level_variance(level, force))
+        if variance <= 0:
+            continue
+        result.append(
+            {
+                "level": level,
+                "sd_rel": float(np.sqrt(variance / mean_square)),
+                "sd_N": float(np.sqrt(variance)),
+                "df": known[0].df,
+            }
+        )
+    return result

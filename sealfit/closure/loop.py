@@ -1,0 +1,160 @@
+"""Close the loop: before, what is missing, after, and what is left, as closure.json and its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.confirm import folds, heldout_level
+from sealfit.closure.curves import channel_table, curve_table, shape_table
+from sealfit.closure.document import effect_entries, effect_table, left_entry, next_runs
+from sealfit.closure.grow import Grown, grow, predict_rows, steady_samples
+from sealfit.closure.levels import errors, lack_of_fit, level_table, noise_floor, scatter_list
+from sealfit.closure.record import to_record
+from sealfit.config import Config
+from sealfit.effects import EFFECTS
+from sealfit.fit.estimate import Fitted, fit, fit_declared
+from sealfit.fit.rows import Rows, make_rows, thin
+
+MOST_ROWS = 12_000  # rows the search works on; more are merged along their strokes
+FINE_BINS = 8  # a ripple needs this many bins in a wavelength, so rows are then not merged
+
+
+@dataclass(frozen=True)
+class Closure:
+    """closure.json as a dict, the model that predict needs, and the loop's tables."""
+
+    document: dict
+    model: dict
+    tables: dict[str, pd.DataFrame]
+
+
+def close_loop(
+    bins: pd.DataFrame,
+    traces: pd.DataFrame,
+    config: Config,
+    *,
+    on_progress: Callable[[str], None] | None = None,
+) -> Closure:
+    """Return the closed loop of one campaign.
+
+    Parameters
+    ----------
+    bins : DataFrame
+        Table `bins`.
+    traces : DataFrame
+        Table `traces`: the raw samples, for what is finer than the bins.
+    config : Config
+        The rig.
+    on_progress : callable, optional
+        Told in words what is being done.
+    """
+    say = on_progress or (lambda text: None)
+    effects = dict(EFFECTS)
+    if config.loop.effects_folder is not None:
+        from sealfit.effects.user import load_user_effects
+
+        effects |= load_user_effects(Path(config.loop.effects_folder))
+    bins = bins.reset_index(drop=True)
+    rows = make_rows(bins, has_aging=config.aging)
+    coarse = rows if len(bins) <= MOST_ROWS else make_rows(thin(bins, MOST_ROWS), has_aging=config.aging)
+    samples = steady_samples(traces, rows)
+    grown = grow(coarse, samples, config, effects, on_progress=say)
+    say("before and after on all rows")
+    before = grown.before if coarse is rows else fit_declared(rows)
+    after = before
+    if grown.added:
+        after = grown.after if coarse is rows else fit(grown.after.model, rows, grown.after.scatter, turns=2)
+    level = heldout_level(rows)
+    say(f"held out by {level}: the search repeated without each fold")
+    held_before, held_after = _heldout(rows, coarse, samples, config, effects, level, grown, say)
+    document = _document(config, grown, before, after, held_before, held_after, level)
+    tables = {
+        "effects": effect_table(document["effects"], grown.added),
+        "residuals_before": _residual_table(bins, before, held_before),
+        "residuals_after": _residual_table(bins, after, held_after),
+        "levels": pd.concat(
+            [level_table("before", before, list(grown.first)), level_table("after", after, list(grown.last))],
+            ignore_index=True,
+        ),
+        "channels": channel_table(grown, before, after),
+        "shapes": shape_table(after, config),
+        "curves": curve_table(before, after),
+    }
+    return Closure(document, to_record(before, after, config), tables)
+
+
+def _heldout(
+    rows: Rows, coarse: Rows, samples: pd.DataFrame, config: Config, effects, level: str, grown: Grown, say
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return each row's force, before and after, by fits and a search that did not see its group; NaN if never out."""
+    before, after = np.full(rows.force.size, np.nan), np.full(rows.force.size, np.nan)
+    for k, out in enumerate(folds(rows, level, config.loop.folds, config.loop.seed)):
+        say(f"  fold {k + 1}")
+        names = rows.table[["file", "stroke"]].assign(out=out).drop_duplicates()
+        away = coarse.table[["file", "stroke"]].merge(names, on=["file", "stroke"], how="left")["out"].to_numpy(bool)
+        train = coarse.subset(~away)
+        test = rows.subset(out)
+        if not grown.added:
+            kept = fit(grown.before.model, train, grown.before.scatter, turns=1)
+            before[out] = after[out] = predict_rows(kept, test)
+            continue
+        seen = samples.merge(names.loc[~names["out"], ["file", "stroke"]], on=["file", "stroke"])
+        part = grow(train, seen, config, effects, confirm=False, start=grown.before)
+        before[out] = predict_rows(part.before, test)
+        after[out] = predict_rows(part.after, test)
+    return before, after
+
+
+def _document(config, grown: Grown, before: Fitted, after: Fitted, held_before, held_after, level: str) -> dict:
+    floor = noise_floor(after)
+    entries = effect_entries(after, grown.added, config)
+    numbers = {}
+    for name, fitted, held in (("before", before, held_before), ("after", after, held_after)):
+        found = errors(fitted.rows, fitted.residual)
+        known = np.isfinite(held)
+        weight = fitted.rows.weight[known]
+        out = float(np.sqrt(weight @ (fitted.rows.force - held)[known] ** 2 / weight.sum())) if known.any() else None
+        numbers[name] = {
+            "rmse_N": found["rmse_N"],
+            "rmse_runs_N": found["rmse_runs_N"],
+            "heldout_rmse_N": out,
+            "max_abs_N": found["max_abs_N"],
+            "mean_abs_pct": found["mean_abs_pct"],
+            "lack_of_fit_p": lack_of_fit(fitted),
+        }
+    verdict = "unexplained" if grown.left is not None else "closed" if grown.added else "nothing_missing"
+    units = config.units
+    slots = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
+    return {
+        "schema": 1,
+        "verdict": verdict,
+        "units": {slot: units.of(slot) for slot in slots},
+        "noise_floor_N": floor,
+        **numbers,
+        "heldout_unit": level,
+        "effects": entries,
+        "scatter": scatter_list(after),
+        "left": left_entry(grown, numbers["after"]["rmse_N"], floor),
+        "next_runs": next_runs(grown, config),
+    }
+
+
+def _residual_table(bins: pd.DataFrame, fitted: Fitted, held: np.ndarray) -> pd.DataFrame:
+    """Return `bins`, in its order, with the model, the residual, their held-out counterparts and the weight."""
+    rows = fitted.rows
+    added = pd.DataFrame(
+        {
+            "model_N": fitted.force,
+            "residual_N": fitted.residual,
+            "heldout_model_N": held,
+            "heldout_residual_N": rows.force - held,
+            "weight": rows.weight,
+        },
+        index=rows.order,
+    )
+    return pd.concat([bins, added.loc[np.arange(len(bins))]], axis=1)

@@ -1,0 +1,301 @@
+"""From a channel that orders the residual to the effect that explains it: the catalogue, closed forms, free shapes.
+
+Every form that may act there is fitted to the residual in the tangent space (exact in its amplitudes, a grid over the
+rest), the best few are refitted jointly with the physics, and the likelihood less Schwarz's price per parameter
+decides.
+Where rivals do equally well, a named mechanism comes before a closed form, and that before a free shape.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sealfit.closure.channels import FREE_DF, WIDE, Channel
+from sealfit.closure.ripple import Peak
+from sealfit.closure.search import Candidate, project
+from sealfit.effects import EFFECTS
+from sealfit.effects.contract import CHANNEL, Effect
+from sealfit.effects.free import free_effect
+from sealfit.fit.estimate import Fitted, fit
+from sealfit.fit.joint import Term, term_derivatives, term_slope
+
+CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
+REFITTED = 6  # proposals refitted jointly
+TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
+RIVAL = 10.0  # an alternative: the data favour the chosen one by less than exp(5)
+SAME = 0.98  # correlation above which two candidates are one effect here
+PHASES = tuple(np.arange(4) * np.pi / 4)
+PREFERRED = ("mu", "mu_c", "mu_s", "v_s", "sigma_2", "a", "b", "mu_0", "force")
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A term with start values, how much it explains, and, once refitted, the joint fit."""
+
+    term: Term
+    values: Mapping[str, float]
+    unit: str  # level of its whole units
+    units: int
+    chi2: float
+    p_value: float
+    column: np.ndarray  # (n,) what it adds to the force, whitened and projected
+    fitted: Fitted | None = None
+
+    @property
+    def price(self) -> float:
+        """Schwarz's price of its parameters."""
+        return len(self.term.effect.parameters) * np.log(max(self.units, 2))
+
+    @property
+    def criterion(self) -> float:
+        """Twice the negative log likelihood plus the price; smaller is better."""
+        return (self.fitted.deviance if self.fitted is not None else -self.chi2) + self.price
+
+    @property
+    def named(self) -> bool:
+        """Whether the form has a name."""
+        return self.term.effect.id not in ("smooth",)
+
+    @property
+    def rank(self) -> tuple:
+        """Order among equals: mechanism, closed form, free shape; then fewer parameters; then what it acts on."""
+        effect = self.term.effect
+        kind = 0 if effect.physical else 2 if effect.id == "smooth" else 1
+        return (kind, len(effect.parameters), PREFERRED.index(self.term.acts_on))
+
+
+def propose(
+    fitted: Fitted,
+    significant: Sequence[Candidate],
+    channels: Mapping[str, Channel],
+    peak: Peak | None = None,
+    effects: Mapping[str, Effect] = EFFECTS,
+) -> list[Proposal]:
+    """Return jointly refitted proposals for what orders the residual most, best first.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The current model.
+    significant : sequence of Candidate
+        Candidates accepted by the search, strongest first.
+    channels : mapping
+        Channels by name.
+    peak : Peak, optional
+        A periodic component found on the raw samples.
+    effects : mapping
+        The catalogue, the user's own effects included.
+    """
+    found: list[Proposal] = []
+    if significant:
+        best = significant[0].chi2
+        seen = set()
+        for candidate in significant:
+            if candidate.chi2 < CONTENDER * best or candidate.key in seen:
+                continue
+            seen.add(candidate.key)
+            for term, search in _terms(candidate, channels, fitted, effects):
+                found += _linearised(fitted, term, search, candidate)
+    if peak is not None:
+        for term, search, candidate in _periodic(fitted, peak, effects):
+            found += _linearised(fitted, term, search, candidate)
+    found.sort(key=lambda p: p.criterion)
+    found = [_refit(fitted, p) for p in _spread(found)]
+    return _ordered(found)
+
+
+def _spread(found: list[Proposal]) -> list[Proposal]:
+    """Return the few best, each effect and target once, the best free shape always among them."""
+    kept, seen = [], set()
+    for proposal in found:
+        if proposal.term.key() in seen:
+            continue
+        if len(kept) < REFITTED or (proposal.term.effect.id == "smooth" and not any(not p.named for p in kept)):
+            seen.add(proposal.term.key())
+            kept.append(proposal)
+    return kept
+
+
+def _ordered(found: list[Proposal]) -> list[Proposal]:
+    """Return proposals best first, the preferred one among equals in front."""
+    if not found:
+        return []
+    found = sorted(found, key=lambda p: p.criterion)
+    best = found[0]
+    equals = [p for p in found if p.criterion - best.criterion < TIED or _same(p, best, TIED * 2)]
+    first = min(equals, key=lambda p: (p.rank, p.criterion))
+    return [first, *(p for p in found if p is not first)]
+
+
+def _same(one: Proposal, other: Proposal, margin: float) -> bool:
+    return correlation(one, other) > SAME and one.criterion - other.criterion < margin
+
+
+def correlation(one: Proposal, other: Proposal) -> float:
+    """Return the correlation of what two proposals add to the force, after projection."""
+    size = np.linalg.norm(one.column) * np.linalg.norm(other.column)
+    return float(abs(one.column @ other.column) / size) if size > 0 else 0.0
+
+
+def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
+    """Return the proposals that these data cannot tell from the chosen one."""
+    return [
+        p
+        for p in found
+        if p is not chosen
+        and p.fitted is not None
+        and (p.criterion - chosen.criterion < RIVAL or correlation(p, chosen) > SAME)
+    ]
+
+
+def _refit(fitted: Fitted, proposal: Proposal) -> Proposal:
+    model = fitted.model.with_term(proposal.term, proposal.values)
+    return replace(proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0))
+
+
+def _terms(
+    candidate: Candidate, channels: Mapping[str, Channel], fitted: Fitted, effects: Mapping[str, Effect]
+) -> Iterator[tuple[Term, dict]]:
+    """Yield every form that may act where the candidate does, with the values to try for each searched parameter."""
+    target = (candidate.acts_on, candidate.operation)
+    name = candidate.channels[-1]
+    channel = channels[name]
+    known = set(fitted.rows.table.columns)
+    for effect in effects.values():
+        if target not in effect.acts_on or not set(effect.reads) <= known | {CHANNEL}:
+            continue
+        if effect.reads == (CHANNEL,):
+            if not channel.numeric or name == "direction" or effect.id == "sinusoid":
+                continue
+            if not _in_domain(effect, channel.values):
+                continue
+            fixed = {"x_ref": reference(channel.values)}
+            yield Term(effect, (name,), *target, fixed=fixed), _grids(effect, channel.values)
+        elif name in effect.reads and effect.id != "ripple":
+            fixed = {f"{c}_ref": reference(np.abs(channels[c].values)) for c in effect.reads if c in channels}
+            fixed["x_ref"] = reference(np.abs(channel.values)) if channel.numeric else 0.0
+            yield Term(effect, effect.reads, *target, fixed=fixed), _grids(effect, np.abs(channel.values))
+    if name != "direction":
+        yield free_term(channel, *target), {}
+
+
+def free_term(channel: Channel, acts_on: str, operation: str) -> Term:
+    """Return the free shape of a channel: a spline with knots at quantiles, or one level per category."""
+    if channel.numeric:
+        distinct = np.unique(channel.values)
+        count = min(FREE_DF + 1, distinct.size)
+        if distinct.size <= FREE_DF + 1:
+            knots = distinct
+        elif distinct[0] > 0 and distinct[-1] / distinct[0] >= WIDE:
+            knots = np.geomspace(distinct[0], distinct[-1], count)
+        else:
+            knots = np.quantile(distinct, np.linspace(0, 1, count))
+        fixed = {"knots": tuple(float(k) for k in knots), "x_ref": float(knots[0])}
+        return Term(free_effect("smooth", fixed), (channel.name,), acts_on, operation, fixed)
+    fixed = {"categories": tuple(str(c) for c in np.unique(channel.values))}
+    return Term(free_effect("levels", fixed), (channel.name,), acts_on, operation, fixed)
+
+
+def _periodic(fitted: Fitted, peak: Peak, effects: Mapping[str, Effect]) -> Iterator[tuple[Term, dict, Candidate]]:
+    rows = fitted.rows
+    effect = effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"]
+    both = np.unique(np.sign(rows.speed)).size == 2
+    ways = [("force", "add")] if peak.sign_symmetric else []
+    if not both or not peak.sign_symmetric:
+        ways += [("mu", "multiply"), ("force", "multiply")]
+    fixed: dict = {"x_ref": 0.0}
+    phases = PHASES
+    if not peak.common_phase:
+        fixed["shift"] = file_shifts(fitted, peak)
+        phases = (0.0,)
+    lengths = (peak.wavelength,)
+    names = {
+        p.name: (lengths if p.name == "lambda_" or p.name.startswith("lambda") else phases) for p in effect.nonlinear
+    }
+    units = rows.groups.starts["file"].size
+    for way in ways:
+        if way in effect.acts_on:
+            candidate = Candidate((peak.axis,), *way, "file", np.empty((0, 0)), 0.0, 2, units, 0.0, peak.p_value)
+            yield Term(effect, (peak.axis,), *way, fixed=fixed), names, candidate
+
+
+def file_shifts(fitted: Fitted, peak: Peak) -> dict[str, float]:
+    """Return per file how far its own origin lies from the ripple's, from the phase of its residual."""
+    rows = fitted.rows
+    place = rows.table[peak.axis].to_numpy()
+    turn = 2 * np.pi * place / peak.wavelength
+    inside = fitted.residual - rows.groups.means(fitted.residual, "stroke")[rows.codes("stroke")]
+    shifts = {}
+    for name, index in rows.table.groupby("file").indices.items():
+        columns = np.column_stack([np.sin(turn[index]), np.cos(turn[index])])
+        (a, b), *_ = np.linalg.lstsq(columns, inside[index], rcond=None)
+        shifts[name] = float(np.arctan2(b, a) * peak.wavelength / (2 * np.pi))
+    return shifts
+
+
+def reference(values: np.ndarray) -> float:
+    """Return a channel's reference value: its mean, to three digits, so that it reads well."""
+    mean = float(np.mean(values))
+    return float(f"{mean:.3g}")
+
+
+def _in_domain(effect: Effect, values: np.ndarray) -> bool:
+    """Whether a form gives numbers at every value of the channel."""
+    sample = np.unique(values)[:: max(1, np.unique(values).size // 50)]
+    with np.errstate(all="ignore"):
+        result = effect.shape({CHANNEL: sample, "x_ref": reference(values)}, **effect.start())
+    return bool(np.isfinite(result).all())
+
+
+def _grids(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
+    """Return the values to try for each parameter that is searched."""
+    span = float(np.ptp(values)) or 1.0
+    grids = {}
+    for p in effect.nonlinear:
+        if p.search == "inside":
+            grid = np.quantile(np.unique(values), np.linspace(0.05, 0.95, 13))
+        elif p.search == "span":
+            grid = np.geomspace(span / 100, span * 2, 13)
+        elif p.search == "ratio":
+            positive = np.abs(values[values != 0])
+            grid = np.geomspace(positive.min(), positive.max(), 13) if positive.size else np.array([p.start])
+        else:
+            grid = np.array(p.search or (p.start,))
+        grids[p.name] = tuple(float(x) for x in np.unique(np.clip(grid, *p.bounds)))
+    return grids
+
+
+def _linearised(fitted: Fitted, term: Term, search: Mapping[str, tuple], candidate: Candidate) -> list[Proposal]:
+    """Return the term at the best point of its grid, its amplitudes exact; nothing where none is left of it here."""
+    effect = term.effect
+    slope = term_slope(fitted.model, fitted.rows, term.acts_on, term.operation)
+    inputs = term.inputs(fitted.rows)
+    names = list(search)
+    points = [dict(zip(names, point, strict=True)) for point in itertools.product(*search.values())] or [{}]
+    linear = [k for k, p in enumerate(effect.parameters) if p.linear]
+    best: Proposal | None = None
+    for part in range(0, len(points), 32):
+        some = points[part : part + 32]
+        columns = []
+        for point in some:
+            values = {**effect.start(), **point}
+            derivatives = term_derivatives(term, values, inputs, only_linear=True)
+            columns += [slope * derivatives[k] for k in range(len(linear))]
+        with np.errstate(all="ignore"):
+            left = project(fitted, np.column_stack(columns))
+        for k, point in enumerate(some):
+            own = left[:, k * len(linear) : (k + 1) * len(linear)]
+            if not np.isfinite(own).all() or not np.abs(own).max() > 0:
+                continue
+            amplitude, *_ = np.linalg.lstsq(own, fitted.white_residual, rcond=1e-10)
+            column = own @ amplitude
+            chi2 = float(2 * column @ fitted.white_residual - column @ column)
+            if best is None or chi2 > best.chi2:
+                named = {effect.parameters[i].name: float(a) for i, a in zip(linear, amplitude, strict=True)}
+                values = {p.name: {**effect.start(), **point, **named}[p.name] for p in effect.parameters}
+                best = Proposal(term, values, candidate.unit, candidate.units, chi2, candidate.p_value, column)
+    return [best] if best is not None else []

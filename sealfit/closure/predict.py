@@ -1,0 +1,216 @@
+"""Force at new points, before and after, with 95 % intervals of the mean and of one new measurement.
+
+The mean is that of the population: average specimen, set-up and repeat gain, every random effect at zero. Its interval
+holds the parameters' uncertainty, in which the scatter of specimens, runs and files already stands; that of a
+measurement adds one draw of each level and the noise of a bin. The sensor's accuracy stands apart (GUM, type B).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.intervals import mean_se, t_quantile
+from sealfit.closure.record import from_record
+from sealfit.conditions import add_keys
+from sealfit.config import Config
+from sealfit.errors import RequestError
+from sealfit.fit.joint import Declared, Model, evaluate
+from sealfit.fit.mixed import Component, Scatter
+from sealfit.fit.rows import LEVELS, point_rows
+
+BEYOND = 1e-6  # relative slack before a value counts as outside the tested range
+ANSWERS = (
+    "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N", "meas_lo95_N", "meas_hi95_N",
+)  # fmt: skip
+
+
+def predict(model: dict, points: pd.DataFrame) -> pd.DataFrame:
+    """Return `points` with the forces before and after, their intervals, `extrapolated` and `note`.
+
+    Parameters
+    ----------
+    model : dict
+        What the loop recorded (OUT/model.json).
+    points : DataFrame
+        Condition columns, signed `speed_mm_s`, and every channel that the after-model reads; grouping columns such as
+        `specimen_id` are ignored.
+
+    Raises
+    ------
+    RequestError
+        If a condition column, the speed or a channel of the after-model is missing altogether.
+    """
+    before, after, conditions = from_record(model)
+    config = Config.model_validate(model["config"])
+    table = _complete(points.reset_index(drop=True), model, after, config)
+    notes = [[] for _ in range(len(table))]
+    before, after, conditions, code = _conditions(before, after, conditions, table, notes, config)
+    _check_values(table, after, model, notes)
+    good = np.array([not note for note in notes]) & (code >= 0)
+    answer = pd.DataFrame({name: np.full(len(table), np.nan) for name in ANSWERS})
+    extrapolated = _outside(table, conditions, code, model, notes, after)
+    if good.any():
+        at = point_rows(
+            table[good].reset_index(drop=True),
+            code[good],
+            conditions,
+            has_load=model["has_load"],
+            has_aging=model["has_aging"],
+        )
+        mean, tangent = evaluate(after, at)
+        reach = t_quantile(model["df"])
+        half = reach * mean_se(tangent, np.array(model["covariance"]))
+        spread = reach * np.sqrt((half / reach) ** 2 + _one_measurement(model["scatter"], mean))
+        answer.loc[good, list(ANSWERS)] = np.column_stack(
+            [evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half, mean - spread, mean + spread]
+        )
+    bad = answer["force_after_N"].isna().to_numpy()
+    return points.reset_index(drop=True).assign(
+        **{name: answer[name] for name in ANSWERS},
+        extrapolated=np.where(bad, False, extrapolated),
+        note=["; ".join(note) for note in notes],
+    )
+
+
+def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -> pd.DataFrame:
+    """Return the points with every column the model reads: given, derived, or the campaign's only value."""
+    ranges = model["ranges"]
+    table = points.assign(file="")
+    if "elapsed_h" not in table and "started_at" in table and model.get("first_started_at"):
+        first = pd.Timestamp(model["first_started_at"])
+        started = pd.to_datetime(table["started_at"], errors="coerce", utc=first.tzinfo is not None)
+        table["elapsed_h"] = (started - first).dt.total_seconds() / 3600
+    needed = [*config.condition, *([] if not config.rubber else config.rubber)]
+    if any(form != "constant" for form in after.declared.stribeck.values()) or "speed_mm_s" in points:
+        needed.append("speed_mm_s")
+    if model["has_load"]:
+        needed.append("load_N")
+    needed += [name for term in after.terms for name in term.channels]
+    if "direction" in needed and "direction" not in table and "speed_mm_s" in table:
+        table["direction"] = np.sign(pd.to_numeric(table["speed_mm_s"], errors="coerce"))
+    for name in dict.fromkeys(needed):
+        if name in table:
+            continue
+        tested = ranges.get(name)
+        if tested is not None and len(tested) == 2 and tested[0] == tested[1] and name not in config.condition:
+            table[name] = tested[0]
+            continue
+        unit = config.units.of(name)
+        raise RequestError(
+            "is missing, and the model needs it.",
+            column=name,
+            mend=f"Add the column{f' in {unit}' if unit else ''}"
+            + (f"; tested from {tested[0]:g} to {tested[1]:g}." if _is_range(tested) else "."),
+        )
+    if "speed_mm_s" not in table:
+        table["speed_mm_s"] = ranges["speed_mm_s"][0]
+    for name in ("speed_mm_s", "load_N"):
+        if name in table:
+            table[name] = pd.to_numeric(table[name], errors="coerce")
+    return table
+
+
+def _is_range(tested: object) -> bool:
+    return isinstance(tested, list) and len(tested) == 2 and all(isinstance(x, float) for x in tested)
+
+
+def _conditions(
+    before: Model, after: Model, conditions: pd.DataFrame, table: pd.DataFrame, notes: list, config: Config
+) -> tuple[Model, Model, pd.DataFrame, np.ndarray]:
+    """Return the models over tested and asked-for conditions, and each point's condition; -1 where none reaches it."""
+    keys = add_keys(table, config)
+    days = pd.to_numeric(table["aging_days"], errors="coerce") if config.aging else pd.Series(0.0, table.index)
+    known = {name: k for k, name in enumerate(conditions["condition"])}
+    declared = after.declared
+    names, index = list(conditions["condition"]), {q: list(v) for q, v in declared.index.items()}
+    added = []
+    code = np.full(len(table), -1)
+    for k in range(len(table)):
+        name, series, rubber = keys["condition"].iloc[k], keys["series"].iloc[k], keys["rubber"].iloc[k]
+        if pd.isna(name):
+            notes[k].append("an empty condition cell: fill it in")
+            continue
+        if name not in known:
+            like = conditions.index[(conditions["series"] == series) & (conditions["rubber"] == rubber)]
+            lawful = [c for c in like if declared.index["a_c"][c] >= 0]
+            if not lawful or not days.iloc[k] >= 0:
+                notes[k].append(
+                    f"condition {name} was not tested and no fitted law reaches it: ask for a tested one, "
+                    "or for other days of a tested series with three or more days"
+                )
+                continue
+            known[name] = len(names)
+            names.append(name)
+            added.append({"condition": name, "series": series, "rubber": rubber, "aging_days": float(days.iloc[k])})
+            for quantity in index:
+                index[quantity].append(int(declared.index[quantity][lawful[0]]))
+        code[k] = known[name]
+    wider = Declared(
+        declared.parameters,
+        {q: np.array(v, dtype=int) for q, v in index.items()},
+        tuple(names),
+        declared.has_load,
+        declared.stribeck,
+        declared.law,
+    )
+    full = pd.concat([conditions, pd.DataFrame(added)], ignore_index=True) if added else conditions
+    return replace(before, declared=wider), replace(after, declared=wider), full, code
+
+
+def _check_values(table: pd.DataFrame, after: Model, model: dict, notes: list) -> None:
+    """Note every point with a cell that the model cannot use."""
+    speed = table["speed_mm_s"].to_numpy(dtype=float)
+    for k in np.flatnonzero(~np.isfinite(speed) | (speed == 0)):
+        notes[k].append("speed_mm_s must be a signed number other than 0 (the model holds in sliding)")
+    if model["has_load"]:
+        for k in np.flatnonzero(~(table["load_N"].to_numpy(dtype=float) > 0)):
+            notes[k].append("load_N must be a positive number")
+    for name in dict.fromkeys(n for term in after.terms for n in term.channels):
+        tested = model["ranges"].get(name)
+        if _is_range(tested):
+            table[name] = pd.to_numeric(table[name], errors="coerce").astype(float)
+            for k in np.flatnonzero(~np.isfinite(table[name].to_numpy())):
+                notes[k].append(f"{name} must be a number")
+        elif isinstance(tested, list):
+            table[name] = table[name].astype(str)
+            for k in np.flatnonzero(~table[name].isin(tested).to_numpy()):
+                notes[k].append(f"{name} must be one of {', '.join(tested)}")
+
+
+def _outside(
+    table: pd.DataFrame, conditions: pd.DataFrame, code: np.ndarray, model: dict, notes: list, after: Model
+) -> np.ndarray:
+    """Return which points lie beyond what was tested, and note how (the point is answered all the same)."""
+    ranges = model["ranges"]
+    outside = np.zeros(len(table), dtype=bool)
+    tested_count = len(model["conditions"]["condition"])
+    series = np.array(conditions["series"], dtype=object)
+    days = conditions["aging_days"].to_numpy(dtype=float)
+    if model["has_aging"]:
+        for k in np.flatnonzero(code >= tested_count):
+            own = days[:tested_count][series[:tested_count] == series[code[k]]]
+            outside[k] |= bool(days[code[k]] > own.max())
+    read = {"speed_mm_s"} | {name for term in after.terms for name in term.channels}
+    if model["has_load"]:
+        read.add("load_N")
+    for name in read:
+        tested = ranges.get(name)
+        if not _is_range(tested) or name == "direction":
+            continue
+        values = pd.to_numeric(table[name], errors="coerce").to_numpy(dtype=float)
+        values = np.abs(values) if name == "speed_mm_s" else values
+        slack = BEYOND * max(abs(tested[0]), abs(tested[1]), 1e-12)
+        outside |= (values < tested[0] - slack) | (values > tested[1] + slack)
+    return outside
+
+
+def _one_measurement(scatter: dict, force: np.ndarray) -> np.ndarray:
+    """Return the variance of one new bin on a new specimen, set-up and repeat, shape (n,)."""
+    known = Scatter(scatter["s0"], scatter["g"], tuple(Component(**c) for c in scatter["components"]))
+    total = known.noise_sd(force) ** 2
+    for level in LEVELS:
+        total = total + known.level_variance(level, force)
+    return total

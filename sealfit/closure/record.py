@@ -1,0 +1,112 @@
+"""The fitted model as plain data: what `predict` needs, written to OUT/model.json."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.intervals import degrees_of_freedom
+from sealfit.config import Config
+from sealfit.effects import EFFECTS
+from sealfit.effects.free import LEVELS, SMOOTH, free_effect
+from sealfit.fit.estimate import Fitted
+from sealfit.fit.joint import QUANTITIES, Declared, JointParameter, Model, Term
+from sealfit.fit.rows import Rows
+
+
+def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
+    """Return both fitted models with covariance, scatter and tested ranges as JSON-able values."""
+    rows = after.rows
+    return {
+        "schema": 1,
+        "config": config.model_dump(mode="json"),
+        "conditions": rows.conditions.to_dict(orient="list"),
+        "has_load": rows.has_load,
+        "has_aging": rows.has_aging,
+        "declared": {
+            "parameters": [[p.quantity, p.owner] for p in after.model.declared.parameters],
+            "index": {q: after.model.declared.index[q].tolist() for q in QUANTITIES},
+            "stribeck": dict(after.model.declared.stribeck),
+            "law": {k: bool(v) for k, v in after.model.declared.law.items()},
+        },
+        "before": _model(before.model),
+        "after": _model(after.model),
+        "covariance": after.covariance.tolist(),
+        "df": degrees_of_freedom(after),
+        "scatter": {
+            "s0": float(after.scatter.s0),
+            "g": float(after.scatter.g),
+            "components": [
+                {"level": c.level, "kind": c.kind, "variance": float(c.variance)} for c in after.scatter.components
+            ],
+        },
+        "ranges": _ranges(rows),
+    }
+
+
+def _model(model: Model) -> dict:
+    return {
+        "theta": model.theta.tolist(),
+        "terms": [
+            {
+                "id": term.effect.id,
+                "channels": list(term.channels),
+                "acts_on": term.acts_on,
+                "operation": term.operation,
+                "fixed": {k: ({} if k == "shift" else _plain(v)) for k, v in term.fixed.items()},
+                "values": {k: float(v) for k, v in values.items()},
+            }
+            for term, values in zip(model.terms, model.values, strict=True)
+        ],
+    }
+
+
+def _plain(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _ranges(rows: Rows) -> dict:
+    """Return what was tested: the range of each numeric channel, the set of each category."""
+    ranges: dict = {}
+    for name in rows.channels:
+        values = np.abs(rows.speed) if name == "speed_mm_s" else rows.values(name)
+        if values.dtype.kind == "f":
+            known = values[np.isfinite(values)]
+            if known.size:
+                ranges[name] = [float(known.min()), float(known.max())]
+        else:
+            ranges[name] = sorted({str(v) for v in values})
+    return ranges
+
+
+def from_record(record: dict) -> tuple[Model, Model, pd.DataFrame]:
+    """Return the models before and after and the table of conditions from a record."""
+    raw = record["declared"]
+    declared = Declared(
+        tuple(JointParameter(*p) for p in raw["parameters"]),
+        {q: np.array(v, dtype=int) for q, v in raw["index"].items()},
+        tuple(record["conditions"]["condition"]),
+        record["has_load"],
+        raw["stribeck"],
+        raw["law"],
+    )
+    effects = dict(EFFECTS)
+    folder = record["config"]["loop"]["effects_folder"]
+    if folder is not None:
+        from pathlib import Path
+
+        from sealfit.effects.user import load_user_effects
+
+        effects |= load_user_effects(Path(folder))
+    models = []
+    for stage in ("before", "after"):
+        model = Model(declared, np.array(record[stage]["theta"], dtype=float))
+        for raw_term in record[stage]["terms"]:
+            fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in raw_term["fixed"].items()}
+            effect = (
+                free_effect(raw_term["id"], fixed) if raw_term["id"] in (SMOOTH, LEVELS) else effects[raw_term["id"]]
+            )
+            term = Term(effect, tuple(raw_term["channels"]), raw_term["acts_on"], raw_term["operation"], fixed)
+            model = model.with_term(term, raw_term["values"])
+        models.append(model)
+    return models[0], models[1], pd.DataFrame(record["conditions"])

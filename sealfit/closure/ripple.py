@@ -1,0 +1,225 @@
+r"""Ripples: periodic force along displacement or time, sought on the raw samples of the steady windows.
+
+Bins hide what is finer than they are, so every stroke's own samples are transformed: :math:`Z_u(f)` is the complex
+amplitude of unit u (a file, or a run of many) at frequency f. A ripple of the rig has one phase everywhere, so
+:math:`R = |\sum_u Z_u|^2 / \sum_u |Z_u|^2` is large; with phases that fall as they like, R is exponential with mean 1.
+Where each file has an origin of its own only the power is shared: it is held against the local background spectrum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+from scipy.special import digamma
+
+LEAST_SAMPLES = 32  # a stroke with fewer steady samples says nothing of a ripple
+NEIGHBOURS = 25  # frequencies on each side that make the local background
+LOBE = 4  # frequencies on each side that the taper smears a peak over
+ABOVE_BACKGROUND = 4.0  # a peak's power over the median of its neighbours: a smooth trend has no peak
+
+
+@dataclass(frozen=True)
+class Peak:
+    """One periodic component: along which axis, its wavelength, how it acts and how surely it is there."""
+
+    axis: str  # displacement_mm | time_s
+    wavelength: float
+    sign_symmetric: bool  # True: same force both ways (added force); False: follows the direction (factor)
+    common_phase: bool
+    statistic: float
+    p_value: float  # adjusted over the frequencies, axes and ways of acting looked at
+    amplitude: float  # in force units, mean over units
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Complex amplitudes per unit and direction on one grid of frequencies."""
+
+    frequency: np.ndarray  # (f,)
+    amplitude: np.ndarray  # (units, f) complex, zero above a unit's own Nyquist frequency
+    known: np.ndarray  # (units, f) whether the unit reaches that frequency
+    direction: np.ndarray  # (units,)
+    unit: np.ndarray  # (units,) number of the file or run
+    strokes: np.ndarray  # (units,) strokes averaged
+
+
+def find_ripple(
+    samples: pd.DataFrame, *, common_phase: bool, axes: tuple[str, ...] = ("displacement_mm", "time_s")
+) -> Peak | None:
+    """Return the strongest periodic component of the samples' residual, or None where there is none to test.
+
+    Parameters
+    ----------
+    samples : DataFrame
+        Steady samples in order: file, stroke, direction, unit, the axes, `residual_N`.
+    common_phase : bool
+        Whether displacement means the same place in every file (`position_origin = "rig"`).
+    axes : tuple of str
+        Axes to look along; time is the rival of displacement (mains, servo).
+    """
+    peaks = []
+    for axis in axes:
+        spectra = spectra_along(samples, axis)
+        if spectra is None:
+            continue
+        fixed = common_phase and axis == "displacement_mm"
+        peaks += _coherent(spectra, axis) if fixed else _incoherent(spectra, axis)
+    if not peaks:
+        return None
+    best = min(peaks, key=lambda peak: (peak.p_value, -peak.statistic))
+    return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
+
+
+def spectra_along(samples: pd.DataFrame, axis: str) -> Spectra | None:
+    """Return the complex amplitudes of each unit and direction along one axis.
+
+    A stroke is freed of a parabola, tapered (Hann) and transformed on a grid that divides twice the longest stroke, so
+    that every stroke has the same frequencies whatever its sampling; the wavelength is at most half a usual stroke.
+    """
+    place = samples[axis].to_numpy(dtype=float)
+    residual = samples["residual_N"].to_numpy(dtype=float)
+    stroke = pd.factorize(pd.Series(list(zip(samples["file"], samples["stroke"], strict=True))))[0]
+    starts = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]])
+    ends = np.r_[starts[1:], stroke.size]
+    good = [(a, b) for a, b in zip(starts, ends, strict=True) if b - a >= LEAST_SAMPLES and np.ptp(place[a:b]) > 0]
+    if len(good) < 3:
+        return None
+    spans = np.array([np.ptp(place[a:b]) for a, b in good])
+    steps = np.array([s / (b - a - 1) for s, (a, b) in zip(spans, good, strict=True)])
+    longest = 2 * spans.max()
+    count = int(min(2**15, np.ceil(longest / np.quantile(steps, 0.1))))
+    frequency = np.arange(count // 2 + 1) / longest
+    lowest = 2 / np.median(spans)
+    direction = samples["direction"].to_numpy()[[a for a, _ in good]]
+    unit = pd.factorize(samples["unit"].to_numpy()[[a for a, _ in good]])[0]
+    keys, number = np.unique(np.column_stack([unit, direction]), axis=0, return_inverse=True)
+    number = number.ravel()
+    total = np.zeros((len(keys), frequency.size), dtype=complex)
+    weight = np.zeros((len(keys), frequency.size))
+    strokes = np.bincount(number, minlength=len(keys))
+    for k, (a, b) in enumerate(good):
+        order = np.argsort(place[a:b], kind="stable")
+        x, y = place[a:b][order], residual[a:b][order]
+        own = int(np.clip(np.ceil(longest / steps[k]), 8, 2**15))
+        step = longest / own
+        grid = np.arange(x[0], x[-1], step)
+        scaled = 2 * (grid - grid[0]) / max(grid[-1] - grid[0], 1e-300) - 1
+        value = np.interp(grid, x, y)
+        value = value - np.polynomial.legendre.legval(scaled, np.polynomial.legendre.legfit(scaled, value, 2))
+        taper = np.hanning(grid.size + 2)[1:-1]
+        transform = np.fft.rfft(value * taper, own) * (2 / taper.sum())
+        reach = min(transform.size, frequency.size)
+        reach = min(reach, int(np.searchsorted(frequency, 0.5 / steps[k], side="right")))
+        turned = transform[:reach] * np.exp(-2j * np.pi * frequency[:reach] * grid[0])
+        total[number[k], :reach] += turned
+        weight[number[k], :reach] += 1
+    use = (frequency >= lowest) & (weight.sum(axis=0) >= 0.25 * len(good))
+    if use.sum() < 4:
+        return None
+    amplitude = np.where(weight > 0, total / np.maximum(weight, 1), 0.0)
+    return Spectra(frequency[use], amplitude[:, use], weight[:, use] > 0, keys[:, 1], keys[:, 0], strokes)
+
+
+def _coherent(spectra: Spectra, axis: str) -> list[Peak]:
+    """Return the best peak of each way of acting: the same force both ways, or following the direction."""
+    both = np.unique(spectra.direction).size == 2
+    peaks = []
+    for symmetric in (True, False) if both else (True,):
+        factor = np.ones_like(spectra.direction, dtype=float) if symmetric else spectra.direction.astype(float)
+        turned = spectra.amplitude * factor[:, None]
+        size = np.maximum(spectra.unit.max() + 1, 1)
+        by_unit = np.zeros((size, spectra.frequency.size), dtype=complex)
+        np.add.at(by_unit, spectra.unit, turned)
+        # Each unit weighs by its own spread, so that one noisy file does not decide.
+        spread = np.sqrt(np.median(np.abs(by_unit) ** 2, axis=1, keepdims=True)) + 1e-300
+        white = by_unit / spread
+        total = np.abs(white.sum(axis=0)) ** 2
+        statistic = total / np.maximum((np.abs(white) ** 2).sum(axis=0), 1e-300)
+        sharp = total / _background(total) > ABOVE_BACKGROUND
+        units = int((np.abs(by_unit) > 0).any(axis=1).sum())
+        if units < 4 or not sharp.any():
+            continue
+        k = int(np.argmax(np.where(sharp, statistic, 0)))
+        p = _coherence_p(statistic[k], units) * spectra.frequency.size * (2 if both else 1)
+        present = spectra.known[:, k]
+        amplitude = float(np.abs((turned[present, k]).mean()))
+        peaks.append(
+            Peak(axis, _refined(total, spectra.frequency, k), symmetric, True, float(statistic[k]), p, amplitude)
+        )
+    return peaks
+
+
+def _coherence_p(statistic: float, units: int) -> float:
+    """Return P(R >= statistic) for random phases: R/n is Beta(1, n - 1) where amplitudes are alike."""
+    return float(stats.beta.sf(min(statistic / units, 1.0), 1, max(units - 1, 1)))
+
+
+def _incoherent(spectra: Spectra, axis: str) -> list[Peak]:
+    """Return the best peak of power shared by all units whatever their phases.
+
+    The mean of U units' powers, each on its own scale, is Gamma(U) about the background.
+    """
+    power = np.abs(spectra.amplitude) ** 2
+    count = spectra.known.sum(axis=0)
+    scale = power.sum(axis=1, keepdims=True) / np.maximum(spectra.known.sum(axis=1, keepdims=True), 1)
+    mean = (power / np.maximum(scale, 1e-300)).sum(axis=0) / np.maximum(count, 1)
+    ratio = mean / _smooth_background(mean, spectra.frequency, count)
+    k = int(np.argmax(ratio))
+    p = float(stats.gamma.sf(ratio[k] * count[k], count[k])) * spectra.frequency.size
+    amplitude = float(np.sqrt((power[:, k] * spectra.known[:, k]).sum() / max(count[k], 1)))
+    return [Peak(axis, _refined(mean, spectra.frequency, k), True, False, float(ratio[k]), p, amplitude)]
+
+
+def _smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Return the background of a mean of `count` powers: a straight line in log-log through each point's neighbours.
+
+    Correlated noise falls steeply towards high frequencies, which a plain median of neighbours would take for a peak at
+    the low end. Neighbours that stand out are clipped, the peak's own main lobe left out.
+    """
+    value = np.log(np.maximum(power, 1e-300))
+    place = np.log(frequency)
+    pad = NEIGHBOURS
+
+    def windows(x: np.ndarray) -> np.ndarray:
+        padded = np.pad(x, pad, constant_values=np.nan)
+        return np.lib.stride_tricks.sliding_window_view(padded, 2 * pad + 1)
+
+    y, x = windows(value).copy(), windows(place)
+    y[:, np.abs(np.arange(-pad, pad + 1)) <= LOBE] = np.nan
+    for _ in range(3):
+        weight = np.isfinite(y).astype(float)
+        total = weight.sum(axis=1)
+        mean_x = np.nansum(np.where(weight > 0, x, 0.0), axis=1) / total
+        mean_y = np.nansum(y, axis=1) / total
+        dx = np.where(weight > 0, x - mean_x[:, None], 0.0)
+        dy = np.where(weight > 0, y - mean_y[:, None], 0.0)
+        slope = (dx * dy).sum(axis=1) / np.maximum((dx**2).sum(axis=1), 1e-300)
+        line = mean_y[:, None] + slope[:, None] * (x - mean_x[:, None])
+        spread = np.sqrt(np.nanmean((y - line) ** 2, axis=1))[:, None]
+        y = np.minimum(y, line + 2 * spread)
+    level = mean_y + slope * (place - mean_x)
+    return np.exp(level - (digamma(count) - np.log(count)))
+
+
+def _background(power: np.ndarray) -> np.ndarray:
+    """Return the median of each frequency's neighbours, the peak's own main lobe left out."""
+    padded = np.pad(power, NEIGHBOURS, mode="reflect" if power.size > NEIGHBOURS else "edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1)
+    keep = np.abs(np.arange(-NEIGHBOURS, NEIGHBOURS + 1)) > LOBE
+    return np.maximum(np.median(windows[:, keep], axis=1), 1e-300)
+
+
+def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
+    """Return the wavelength at the parabola through the highest point of a peak and its two neighbours."""
+    first = max(k - LOBE, 0)
+    k = first + int(np.argmax(power[first : k + LOBE + 1]))
+    if 0 < k < power.size - 1:
+        left, middle, right = power[k - 1 : k + 2]
+        bend = left - 2 * middle + right
+        if bend < 0:
+            shift = 0.5 * (left - right) / bend
+            return float(1 / (frequency[k] + shift * (frequency[1] - frequency[0])))
+    return float(1 / frequency[k])

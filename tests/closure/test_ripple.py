@@ -1,0 +1,79 @@
+import numpy as np
+import pandas as pd
+import pytest
+
+from sealfit.closure.ripple import find_ripple
+
+
+def make_samples(
+    seed=0, files=12, amplitude=0.0, wavelength=3.0, phase="common", directions=(1, -1), noise_N=0.2, along="x"
+):
+    rng = np.random.default_rng(seed)
+    tables = []
+    for k in range(files):
+        own = rng.uniform(0, 2 * np.pi) if phase == "free" else 0.4
+        for stroke, direction in enumerate(directions, start=1):
+            speed = 10.0 + 0.7 * k
+            n = 400
+            t = np.arange(n) * 0.01
+            x = 5.0 + direction * speed * t + (0 if direction > 0 else 40)
+            place = x if along == "x" else t * 10
+            force = (
+                5.0 * direction + amplitude * np.sin(2 * np.pi * place / wavelength + own) + rng.normal(0, noise_N, n)
+            )
+            tables.append(
+                pd.DataFrame(
+                    {
+                        "file": f"f{k}",
+                        "stroke": stroke,
+                        "direction": direction,
+                        "unit": k,
+                        "displacement_mm": x,
+                        "time_s": t,
+                        "residual_N": force,
+                    }
+                )
+            )
+    return pd.concat(tables, ignore_index=True)
+
+
+def test_common_phase_ripple_is_found_at_its_wavelength_below_the_noise():
+    peak = find_ripple(make_samples(amplitude=0.05), common_phase=True)
+    assert (peak.axis, peak.common_phase, peak.sign_symmetric) == ("displacement_mm", True, True)
+    assert peak.wavelength == pytest.approx(3.0, rel=0.01)
+    assert peak.p_value < 1e-4
+
+
+def test_free_phase_ripple_is_found_by_its_power():
+    peak = find_ripple(make_samples(amplitude=0.12, phase="free"), common_phase=False)
+    assert (peak.axis, peak.common_phase) == ("displacement_mm", False)
+    assert peak.wavelength == pytest.approx(3.0, rel=0.01)
+    assert peak.p_value < 1e-4
+
+
+def test_hum_in_time_is_not_taken_for_position():
+    peak = find_ripple(make_samples(amplitude=0.15, along="t"), common_phase=True)
+    assert peak.axis == "time_s"
+    assert peak.wavelength == pytest.approx(0.3, rel=0.02)
+
+
+def test_noise_alone_seldom_looks_like_a_ripple():
+    white = [find_ripple(make_samples(seed=s, files=10), common_phase=True).p_value for s in range(60)]
+    assert np.mean(np.array(white) < 0.05) <= 0.1  # nominal 5 %; 60 draws: at most 6
+
+
+def test_correlated_noise_is_not_a_ripple():
+    found = []
+    for seed in range(25):
+        samples = make_samples(seed=seed, files=10, noise_N=0.0)
+        rng = np.random.default_rng(seed)
+        wave = rng.normal(0, 0.2, len(samples))
+        for k in range(1, wave.size):
+            wave[k] += 0.9 * wave[k - 1]
+        found.append(find_ripple(samples.assign(residual_N=wave), common_phase=True).p_value)
+    assert np.mean(np.array(found) < 0.005) <= 0.04
+
+
+def test_too_few_samples_say_nothing():
+    samples = make_samples(files=2)
+    assert find_ripple(samples[samples.groupby(["file", "stroke"]).cumcount() < 10], common_phase=True) is None
