@@ -17,7 +17,7 @@ from sealfit.errors import ParameterError
 CHANNEL = "x"
 """In `Effect.reads`: any one numeric channel; `shape` finds it in `inputs["x"]`."""
 
-AMPLITUDE = (-1e6, 1e6)
+AMPLITUDE = (-1e9, 1e9)
 """Bounds of an amplitude that carries units: a free sign, and no size that a rig's numbers could reach."""
 
 Target = Literal["force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b"]
