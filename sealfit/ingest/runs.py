@@ -57,6 +57,8 @@ def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fa
     entries, faults = list_entries(campaign, config)
     if any(fault.check in ("path_outside", "missing_file") for fault in faults):
         _stop_at_errors(faults)  # nothing can be said of files that are not there, and none outside is opened
+    if not entries:
+        raise CampaignError([*faults, _nothing_left()])
     entries, parts, found = _matched(entries, config)
     faults += found
     files = [
@@ -67,6 +69,8 @@ def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fa
     faults += found
     files, measured, left_out, found = _from_traces(campaign, entries, files, config)
     keep = [i for i in range(len(entries)) if i not in left_out]
+    if not keep:
+        raise CampaignError([*faults, *found, _nothing_left()])
     entries, files, measured = ([rows[i] for i in keep] for rows in (entries, files, measured))
     faults += found + _missing(entries, files, config) + out_of_range(entries, files)
     files, found = add_order(entries, files)
@@ -80,6 +84,11 @@ def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fa
     faults += disagreements(entries, files, conditions, speeds)
     _stop_at_errors(faults)
     return [TraceRef(entry.file, _set_speed(channels)) for entry, channels in zip(entries, files, strict=True)], faults
+
+
+def _nothing_left() -> Fault:
+    mend = "Mend what is said above; start with one file."
+    return Fault("nothing_left", "no trace file can be used.", mend=mend)
 
 
 def _set_speed(channels: Channels) -> Channels:
@@ -150,7 +159,9 @@ def _matched(entries: list[Entry], config: Config) -> tuple[list[Entry], list[Na
         kept.append(entry)
         parts.append(named)
     if entries and not kept:
-        raise CampaignError([*faults[:3], Fault("not_matched", f"none of {len(entries)} file names is matched.")])
+        mend = "Check files.name_pattern in the rig config."
+        reason = f"none of {len(entries)} file names is matched."
+        raise CampaignError([*faults[:3], Fault("not_matched", reason, mend=mend)])
     return kept, parts, faults
 
 

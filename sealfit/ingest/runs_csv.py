@@ -105,7 +105,7 @@ def _read_runs(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]
             faults.append(Fault("empty_cell", reason, file=RUNS_CSV, line=number, column="file", mend="Name it."))
             continue
         entries.append(Entry(_posix(campaign, file), number, named))
-    if not entries and not faults:
+    if not entries and not any(fault.severity == "error" for fault in faults):
         raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=RUNS_CSV)
     return entries, faults
 

@@ -332,6 +332,19 @@ def test_configs_that_cannot_be_meant_are_refused_before_any_file_is_opened(tmp_
     assert column in [fault.column for fault in found]
 
 
+def test_a_folder_in_which_nothing_fits_stops_the_run(tmp_path):
+    trace(tmp_path, "raw/no1/x.csv")
+    (*_, fault) = faults(tmp_path, NAMED)
+    assert "none of 1 file names is matched" in fault.reason
+    (tmp_path / "raw/no1/x.csv").rename(tmp_path / "raw/no1/5.csv")
+    only_excluded = NAMED.replace("**/steps/*", "**/5.csv")
+    assert [fault.check for fault in faults(tmp_path, only_excluded)] == ["excluded", "nothing_left"]
+    (tmp_path / "runs.csv").write_text("file\nraw/no1/5.csv\n")
+    trace(tmp_path, "raw/no1/5.csv")
+    (tmp_path / "raw/no1/5.csv").write_text(HEADER)  # the condition should stand in the trace, and there is none
+    assert [fault.check for fault in faults(tmp_path, DAYS)] == ["no_rows", "nothing_left"]
+
+
 @pytest.mark.parametrize("glob", ["../*.csv", "/etc/*"])
 def test_globs_stay_inside(tmp_path, glob):
     assert faults(tmp_path, f'files.glob = "{glob}"')[0].check == "path_outside"
@@ -359,3 +372,26 @@ def test_every_file_has_a_run_and_a_repeat_that_no_other_has(tmp_path_factory, r
     refs, _ = list_traces(folder, config(DAYS))
     assert len({(ref.channels["run_id"], ref.channels["repeat"]) for ref in refs}) == len(rows)
     assert len({ref.channels["run_id"] for ref in refs}) == len({row[:2] for row in rows})
+
+
+cells = st.sampled_from(
+    ["a.csv", "b.csv", "../a.csv", "", "1", "2", "-1", "x", "nan", "inf", "4,5", '"', "é", "2024-01-01", "0"]
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.lists(cells, min_size=1, max_size=6).map(",".join), max_size=6), st.binary(max_size=20))
+def test_any_runs_csv_is_read_or_refused_with_a_mend(tmp_path_factory, lines, junk):
+    folder = tmp_path_factory.mktemp("c")
+    trace(folder, "a.csv")
+    trace(folder, "b.csv")
+    head = "file,aging_days,repeat,speed_mm_s,started_at"
+    (folder / "runs.csv").write_bytes("\n".join([head, *lines]).encode() + junk)
+    try:
+        refs, _ = list_traces(folder, config(DAYS))
+    except CampaignError as error:
+        assert all(fault.reason and fault.mend for fault in error.faults)  # noqa: PT017
+        return
+    assert len(refs) > 0
+    assert all({"run_id", "repeat", "specimen_id", "aging_days"} <= set(ref.channels) for ref in refs)
+    assert len({(ref.channels["run_id"], ref.channels["repeat"]) for ref in refs}) == len(refs)
