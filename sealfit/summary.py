@@ -196,9 +196,8 @@ def closure_lines(part: Mapping) -> list[str]:
     found.append(_line(f"error ({unit})", "; ".join(texts)))
     if part["noise_floor_N"] is not None:
         found.append(_line("noise floor", f"{_number(part['noise_floor_N'])} {unit}"))
-    left = part["left"]
-    if left["rmse_N"] is not None:
-        found.append(_line("left", f"rmse {_number(left['rmse_N'])} {unit}"))
+    if part["verdict"] == "unexplained":
+        found.append(_line("left", f"rmse {_number(part['left']['rmse_N'])} {unit}"))
     for run in part["next_runs"][:3]:
         found.append(_line("next runs", run["why"]))
     return found

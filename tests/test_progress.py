@@ -1,0 +1,53 @@
+import io
+
+import pytest
+
+from sealfit.errors import Fault
+from sealfit.progress import LINE_EVERY_S, Lines, Silent, Terminal
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("sealfit.progress.time.monotonic", lambda: now[0])
+    return now
+
+
+def test_plain_progress_is_a_line_now_and_then_and_one_at_the_end(clock):
+    stream = io.StringIO()
+    with Lines(stream).counting("reading") as on_file:
+        for done in range(1, 101):
+            clock[0] += LINE_EVERY_S / 8
+            on_file(done, 100)
+    lines = stream.getvalue().splitlines()
+    assert lines[0] == "reading: 8 of 100"
+    assert lines[-1] == "reading: 100 of 100"
+    assert len(lines) == 13  # 8, 16, ..., 96, and 100
+
+
+def test_a_terminal_keeps_one_line_of_what_was_counted():
+    stream = io.StringIO()
+    with Terminal(stream).counting("reading") as on_file:
+        on_file(1, 2)
+        on_file(2, 2)
+    assert stream.getvalue().endswith("reading: 2\n")
+
+
+def test_faults_are_said_with_what_was_done_and_remarks_are_not():
+    stream = io.StringIO()
+    kept = Fault("gap", "has a gap.", "a.csv", severity="warning", action="kept", mend="Look at the logger.")
+    left = Fault("empty", "is empty.", "b.csv", action="file left out")
+    Lines(stream).faults([kept, left, Fault("read", "was read.", severity="info", action="kept")])
+    assert stream.getvalue() == (
+        "warning: a.csv: has a gap. Look at the logger.\nerror: b.csv: is empty. [file left out]\n"
+    )
+
+
+def test_silence_says_nothing(capsys):
+    silent = Silent()
+    silent.say("x")
+    silent.warn("x")
+    silent.faults([Fault("x", "x.")])
+    with silent.counting("x") as on_file:
+        on_file(1, 1)
+    assert capsys.readouterr() == ("", "")
