@@ -1,48 +1,11 @@
-from pathlib import Path
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from trace_helpers import DAYS, campaign, channels, config, faults, trace
 
-from sealfit.config import parse_config
 from sealfit.errors import CampaignError
 from sealfit.ingest.derive import condition_keys
 from sealfit.ingest.runs import list_traces
-from sealfit.ingest.runs_csv import natural
-
-DAYS = 'condition = ["aging_days"]\n'
-HEADER = "time_s,displacement_mm,force_N"
-
-
-def config(text=""):
-    return parse_config(text, "rig.toml")
-
-
-def trace(folder: Path, file: str, speed=5.0, **constants):
-    path = folder / file
-    path.parent.mkdir(parents=True, exist_ok=True)
-    extra = "".join(f",{value}" for value in constants.values())
-    rows = [f"{0.1 * i:.1f},{0.1 * speed * i:.6f},2.0{extra}" for i in range(100)]
-    path.write_text("\n".join([HEADER + "".join(f",{name}" for name in constants), *rows]))
-
-
-def campaign(folder: Path, table: str, files=("a.csv", "b.csv", "c.csv")) -> Path:
-    for file in files:
-        trace(folder, file)
-    (folder / "runs.csv").write_text("\n".join(line.strip() for line in table.strip().splitlines()) + "\n")
-    return folder
-
-
-def channels(folder, text=""):
-    refs, _ = list_traces(folder, config(text))
-    return {ref.file: ref.channels for ref in refs}
-
-
-def faults(folder, text=""):
-    with pytest.raises(CampaignError) as caught:
-        list_traces(folder, config(text))
-    return caught.value.faults
-
 
 FULL = """
 file,run_id,repeat,specimen_id,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s,started_at,batch,humidity_pct
@@ -245,115 +208,6 @@ def test_misspelt_channels_and_slips_in_them_are_warned_of(tmp_path):
     refs, found = list_traces(folder, config(DAYS))
     assert ("lab_C", "o", 2) in [(fault.column, fault.value, fault.line) for fault in found]
     assert refs[3].channels["lab_C"] == "3"
-
-
-NAMED = """
-condition = ["drive"]
-[files]
-glob = "raw/**/*.csv"
-exclude = ["**/steps/*"]
-name_pattern = '^raw/no(?P<drive>\\d+)/(?P<_sign>n?)(?P<_rpm>\\d+)(?:_(?P<note>\\w+))?\\.csv$'
-values._sign = {"" = 1, n = -1}
-values.drive = {1 = "screw"}
-compute.speed_mm_s = "_sign * _rpm"
-columns = {run_id = "{drive} {_sign}x{_rpm}", repeat = "1"}
-"""
-
-
-def test_names_of_files_say_what_runs_csv_would(tmp_path):
-    for file in ("raw/no1/n20.csv", "raw/no1/100.csv", "raw/no3/20_warm.csv", "raw/no1/steps/5.csv", "raw/no1/x.csv"):
-        trace(tmp_path, file)
-    refs, found = list_traces(tmp_path, config(NAMED))
-    by_file = {ref.file: ref.channels for ref in refs}
-    assert list(by_file) == ["raw/no1/100.csv", "raw/no1/n20.csv", "raw/no3/20_warm.csv"]
-    assert by_file["raw/no1/n20.csv"] == {
-        "drive": "screw",
-        "run_id": "screw -1x20",
-        "repeat": 1,
-        "specimen_id": "drive=screw",
-        "speed_set_mm_s": 20.0,
-    }
-    assert by_file["raw/no3/20_warm.csv"]["note"] == "warm"
-    assert by_file["raw/no3/20_warm.csv"]["drive"] == "3"
-    listed = {(fault.check, fault.file, fault.severity, fault.action) for fault in found}
-    assert ("excluded", "raw/no1/steps/5.csv", "info", "file left out") in listed
-    assert ("not_matched", "raw/no1/x.csv", "warning", "file left out") in listed
-
-
-def test_runs_csv_goes_before_the_name_and_the_name_before_the_header(tmp_path):
-    text = (
-        DAYS
-        + """
-    files.name_pattern = '(?P<aging_days>\\d+)d\\.csv'
-    trace.header_ends_at = "^time_s"
-    trace.header_fields = {aging_days = "^days: (.*)", oven = "^oven: (.*)", _x = "^(days)"}
-    """
-    )
-    for file in ("4d.csv", "8d.csv", "late.csv"):
-        trace(tmp_path, file)
-        (tmp_path / file).write_text("days: 99\noven: B2\n" + (tmp_path / file).read_text())
-    (tmp_path / "runs.csv").write_text("file,aging_days,speed_mm_s\n4d.csv,2,5\n8d.csv,,5\nlate.csv,,5\n")
-    found = channels(tmp_path, text)
-    assert [found[file]["aging_days"] for file in ("4d.csv", "8d.csv", "late.csv")] == [2.0, 8.0, 99.0]
-    assert found["4d.csv"]["oven"] == "B2"
-    assert "_x" not in found["4d.csv"]
-
-
-def test_conditions_may_stand_in_the_traces_as_constants(tmp_path):
-    trace(tmp_path, "a.csv", aging_days=4, run_id=7)
-    trace(tmp_path, "b.csv", aging_days=8, run_id=8)
-    trace(tmp_path, "c.csv")
-    text = (tmp_path / "b.csv").read_text()
-    (tmp_path / "d.csv").write_text(text.replace("2.0,8,8", "2.0,9,8", 1))
-    (tmp_path / "runs.csv").write_text("file\na.csv\nb.csv\nd.csv\ngone.csv\n")
-    refs, found = list_traces(tmp_path, config(DAYS))
-    by_file = {ref.file: ref.channels for ref in refs}
-    assert by_file["a.csv"]["aging_days"] == 4.0
-    assert by_file["a.csv"]["run_id"] == "7"
-    assert set(by_file) == {"a.csv", "b.csv"}
-    left_out = {(fault.file, fault.check) for fault in found if fault.action == "file left out"}
-    assert left_out == {("d.csv", "condition_varies"), ("gone.csv", "missing_file"), ("c.csv", "not_listed")}
-
-
-@pytest.mark.parametrize(
-    ("text", "column"),
-    [
-        ('trace.encoding = "klingon"', "trace.encoding"),
-        ('trace.delimiter = "::"', "trace.delimiter"),
-        ('trace.decimal = ","', "trace.delimiter"),
-        ('condition = ["speed_mm_s"]', "condition"),
-        ('trace.names = "none"', "trace.columns.time_s"),
-        ('files.columns.run_id = "{rig}"', "files"),
-        ('quantities.speed = {quantity = "speed", unit = "knot"}', "quantities"),
-    ],
-)
-def test_configs_that_cannot_be_meant_are_refused_before_any_file_is_opened(tmp_path, text, column):
-    found = faults(tmp_path / "no folder is needed", text)
-    assert column in [fault.column for fault in found]
-
-
-def test_a_folder_in_which_nothing_fits_stops_the_run(tmp_path):
-    trace(tmp_path, "raw/no1/x.csv")
-    (*_, fault) = faults(tmp_path, NAMED)
-    assert "none of 1 file names is matched" in fault.reason
-    (tmp_path / "raw/no1/x.csv").rename(tmp_path / "raw/no1/5.csv")
-    only_excluded = NAMED.replace("**/steps/*", "**/5.csv")
-    assert [fault.check for fault in faults(tmp_path, only_excluded)] == ["excluded", "nothing_left"]
-    (tmp_path / "runs.csv").write_text("file\nraw/no1/5.csv\n")
-    trace(tmp_path, "raw/no1/5.csv")
-    (tmp_path / "raw/no1/5.csv").write_text(HEADER)  # the condition should stand in the trace, and there is none
-    assert [fault.check for fault in faults(tmp_path, DAYS)] == ["no_rows", "nothing_left"]
-
-
-@pytest.mark.parametrize("glob", ["../*.csv", "/etc/*"])
-def test_globs_stay_inside(tmp_path, glob):
-    assert faults(tmp_path, f'files.glob = "{glob}"')[0].check == "path_outside"
-
-
-@given(st.lists(st.integers(0, 10**6), unique=True, min_size=2))
-def test_natural_order_is_that_of_the_numbers(numbers):
-    names = sorted((f"run{number}.csv" for number in numbers), key=natural)
-    assert names == [f"run{number}.csv" for number in sorted(numbers)]
 
 
 @settings(max_examples=30, deadline=None)
