@@ -1,4 +1,4 @@
-"""One contract for every effect of the catalogue, with no test code of its own; then what single forms promise."""
+"""One contract for every effect of the catalogue and for free shapes, with no test code of their own."""
 
 import copy
 import pickle
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect, Parameter, fill_unit
-from sealfit.effects.free import free_effect, levels_effect, smooth_effect
+from sealfit.effects.free import levels_effect, smooth_effect
 from sealfit.errors import ParameterError
 
 FREE = {
@@ -194,185 +194,27 @@ def test_closed_forms_read_any_channel_and_mechanisms_read_named_ones(effect):
     assert ("{x}" in effect.label) != effect.physical
 
 
-# ---------------------------------------------------------------- what single forms promise
-
-
-@pytest.mark.parametrize("name", ["linear", "quadratic", "log", "power"])
-def test_forms_with_a_reference_are_zero_there(name):
-    effect = EFFECTS[name]
-    npt.assert_array_equal(effect.shape({"x": np.array([7.0]), "x_ref": 7.0}, **nonzero(effect)), [0.0])
-
-
-@pytest.mark.parametrize("name", ["exponential_approach", "saturation", "log_growth"])
-def test_forms_from_the_origin_start_there_and_say_nothing_below(name):
-    effect = EFFECTS[name]
-    shape = effect.shape({"x": np.array([0.0, -1.0]), "x_ref": 7.0}, **nonzero(effect))
-    npt.assert_array_equal(shape, [0.0, np.nan])
-
-
-@pytest.mark.parametrize("name", ["log", "power"])
-def test_forms_of_a_positive_channel_say_nothing_elsewhere(name):
-    effect = EFFECTS[name]
-    npt.assert_array_equal(
-        effect.shape({"x": np.array([0.0, -1.0]), "x_ref": 7.0}, **nonzero(effect)), [np.nan, np.nan]
-    )
-    npt.assert_array_equal(effect.shape({"x": np.array([2.0]), "x_ref": 0.0}, **nonzero(effect)), [np.nan])
-
-
-@given(speed=st.floats(1e-3, 1e3), n=st.floats(0.1, 3), A=st.floats(-100, 100))
-def test_an_added_viscous_force_is_odd_in_the_speed(speed, n, A):
-    shape = EFFECTS["power_viscous"].shape
-    forward = shape({"speed_mm_s": np.array([speed])}, A=A, n=n)
-    npt.assert_array_equal(shape({"speed_mm_s": np.array([-speed])}, A=A, n=n), -forward)
-
-
-@pytest.mark.parametrize("name", ["log_rate", "grosch_peak", "warming_power", "warming_conduction"])
-def test_a_factor_is_even_in_the_speed(name):
-    effect = EFFECTS[name]
-    inputs = {**inputs_of(effect), "speed_mm_s": np.geomspace(0.1, 60.0, 12)}
-    back = {**inputs, "speed_mm_s": -inputs["speed_mm_s"]}
-    values = nonzero(effect)
-    npt.assert_array_equal(effect.shape(inputs, **values), effect.shape(back, **values))
-
-
-def test_warming_by_power_at_the_reference_is_warming_by_time():
-    time = np.linspace(0.0, 30.0, 7)
-    at_reference = {
-        "speed_mm_s": np.full(7, 5.0),
-        "speed_mm_s_ref": 5.0,
-        "load_N": np.full(7, 50.0),
-        "load_N_ref": 50.0,
-    }
-    power = EFFECTS["warming_power"].shape({"time_s": time, **at_reference}, A=0.2, tau=4.0)
-    npt.assert_allclose(power, EFFECTS["warming_time"].shape({"time_s": time}, A=0.2, tau=4.0), rtol=1e-15)
-
-
-def test_conduction_follows_the_root_of_time_at_one_speed():
-    # v s = v^2 t: at one speed the surface warms as the root of the time, Carslaw & Jaeger's half-space.
-    time = np.array([1.0, 4.0, 9.0])
-    shape = EFFECTS["warming_conduction"].shape(
-        {"distance_mm": 5.0 * time, "distance_mm_ref": 5.0, "speed_mm_s": np.full(3, 5.0), "speed_mm_s_ref": 5.0},
-        A=0.05,
-    )
-    npt.assert_allclose(shape, [-0.05, -0.10, -0.15], rtol=1e-14)
-
-
-def test_nothing_warms_before_sliding_begins():
-    for name, channel in (("warming_time", "time_s"), ("warming_distance", "distance_mm")):
-        effect = EFFECTS[name]
-        npt.assert_array_equal(effect.shape({channel: np.array([-2.0, 0.0])}, **nonzero(effect)), [0.0, 0.0])
-
-
-def test_first_repeat_and_first_stroke_are_the_reference():
-    for name, channel in (("conditioning", "repeat"), ("run_in", "stroke")):
-        effect = EFFECTS[name]
-        npt.assert_array_equal(effect.shape({channel: np.array([1.0])}, **nonzero(effect)), [0.0])
-
-
-@given(ratio=st.floats(0.5, 2.0), exponent=st.floats(2 / 3, 1.0))
-def test_load_exponent_is_the_power_law_to_first_order(ratio, exponent):
-    # What is left out of (N / N_ref)^(n - 1) - 1 is at most half the square of its logarithm (n < 1: one sign apart).
-    first = EFFECTS["load_exponent"].shape({"load_N": np.array([50.0 * ratio]), "load_N_ref": 50.0}, A=exponent - 1)
-    exact = ratio ** (exponent - 1) - 1
-    logarithm = (exponent - 1) * np.log(ratio)
-    assert abs(exact - first[0]) <= 0.5 * logarithm**2 * np.exp(abs(logarithm)) + 1e-12
-
-
-def test_a_floor_stops_the_logarithmic_fall():
-    # mu_0 - a ln(1 + t / b) with A = a: beyond t_f the sum is -a ln(t_f / b) up to a b / t.
-    days = np.array([100.0, 1e3, 1e4])
-    given_back = EFFECTS["aging_floor"].shape({"aging_days": days}, A=0.03, t_f=50.0)
-    npt.assert_allclose(-0.03 * np.log1p(days / 0.1) + given_back, -0.03 * np.log(500.0), atol=0.03 * 0.1 / 100)
-
-
-def test_an_induction_lag_is_largest_at_its_day_and_gone_at_day_0():
-    days = np.array([0.0, 1.9, 2.0, 2.1, 60.0])
-    lag = EFFECTS["aging_induction"].shape({"aging_days": days}, A=0.1, t_i=2.0)
-    assert lag[0] == 0
-    npt.assert_allclose(lag[2], 0.1, rtol=1e-15)
-    assert lag[2] > max(lag[1], lag[3])
-    assert abs(lag[4]) < 1e-10
-
-
-def test_asymmetry_is_the_difference_of_both_ways_and_leaves_their_mean():
-    forward, back = EFFECTS["asymmetry"].shape({"direction": np.array([1.0, -1.0])}, A=0.08)
-    npt.assert_allclose([forward - back, forward + back], [0.08, 0.0], rtol=1e-15)
-
-
-def test_a_viscoelastic_peak_has_no_force_at_rest():
-    shape = EFFECTS["grosch_peak"].shape({"speed_mm_s": np.array([0.0])}, A=0.3, v_p=1.0, w=1.0)
-    npt.assert_array_equal(shape, [0.0])
-
-
-# ---------------------------------------------------------------- free shapes
-
-
-@given(
-    knots=st.lists(st.integers(-50, 50), min_size=3, max_size=6, unique=True).map(sorted),
-    amplitudes=st.lists(st.floats(-5, 5), min_size=6, max_size=6),
-)
-def test_smooth_goes_through_its_knots_and_is_zero_at_the_reference(knots, amplitudes):
-    effect = smooth_effect(knots, reference=knots[1])
-    values = dict(zip(effect.linear, amplitudes, strict=False))
-    wanted = [values.get(f"c_{j + 1}", 0.0) for j in range(len(knots))]
-    npt.assert_allclose(effect.shape({"x": np.array(knots, float)}, **values), wanted, atol=1e-10)
-
-
-def test_smooth_holds_straight_lines_inside_and_beyond_its_knots():
-    effect = smooth_effect([0.0, 1.0, 4.0, 10.0], reference=0.0)
-    x = np.array([-5.0, 0.0, 0.3, 2.0, 7.7, 10.0, 25.0])
-    npt.assert_allclose(effect.shape({"x": x}, c_2=0.5, c_3=2.0, c_4=5.0), 0.5 * x, atol=1e-13)
-
-
-def test_smooth_goes_on_straight_and_without_a_kink_beyond_its_knots():
-    effect = smooth_effect([0.0, 1.0, 2.0])
-    for end, way in ((0.0, -1.0), (2.0, 1.0)):
-        x = end + way * np.array([-1e-6, 0.0, 1e-6, 1.0, 2.0, 3.0])
-        h = effect.shape({"x": x}, c_2=1.0, c_3=-1.0)
-        npt.assert_allclose(np.diff(h[3:]), np.diff(h[3:])[0], rtol=1e-12)
-        npt.assert_allclose((h[1] - h[0]) / 1e-6, (h[2] - h[1]) / 1e-6, rtol=1e-4)
-
-
-def test_smooth_against_a_natural_spline_solved_by_hand():
-    # Knots 0, 1, 2 with values 0, 1, 0: the middle second derivative m solves 4 m = 6 (0 - 2 + 0), m = -3, so at 1/2
-    # h = 1/2 - m/6 (1/2 - 1/8) = 1/2 + 3/16 = 11/16.
-    npt.assert_allclose(smooth_effect([0, 1, 2]).shape({"x": np.array([0.5])}, c_2=1.0, c_3=0.0), [11 / 16], rtol=1e-14)
-
-
-def test_a_category_that_was_not_fitted_gets_no_value():
-    effect = levels_effect(["A", "B"])
-    npt.assert_array_equal(effect.shape({"x": np.array(["B", "C", "A"])}, d_1=0.3), [0.3, np.nan, 0.0])
-    assert effect.parameters[0].meaning == "B less A"
-
-
-@pytest.mark.parametrize(
-    ("id_", "fixed"),
-    [("smooth", {"knots": [0.0, 2.0, 5.0], "x_ref": 2.1}), ("levels", {"categories": ["A", "B", "C"]})],
-)
-def test_free_shapes_are_rebuilt_from_plain_data(id_, fixed):
-    direct = smooth_effect(fixed["knots"], fixed["x_ref"]) if id_ == "smooth" else levels_effect(fixed["categories"])
-    rebuilt = free_effect(id_, fixed)
-    assert rebuilt.parameters == direct.parameters
-    assert (rebuilt.id, rebuilt.form) == (id_, direct.form)
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: smooth_effect([1.0]), "two or more rising numbers"),
-        (lambda: smooth_effect([1.0, 1.0]), "two or more rising numbers"),
-        (lambda: smooth_effect([1.0, np.nan]), "two or more rising numbers"),
-        (lambda: levels_effect(["A"]), "two or more different categories"),
-        (lambda: levels_effect(["A", "A"]), "two or more different categories"),
-        (lambda: free_effect("wavelet", {}), "'wavelet' is no free shape.*'smooth' or 'levels'"),
-        (lambda: free_effect("smooth", {}), "'knots' is missing"),
-        (lambda: Parameter("A", "", 2.0, (0.0, 1.0), "x"), "start 2.0 lies outside its bounds"),
-    ],
-)
-def test_refuses_what_makes_no_effect(call, words):
-    with pytest.raises(ParameterError, match=words):
-        call()
-
-
 def test_symbols_are_printed_without_the_underscore_that_python_needs():
     assert [p.symbol for p in EFFECTS["ripple"].parameters] == ["A", "lambda", "phi"]
+
+
+def test_a_parameter_that_starts_outside_its_bounds_is_refused():
+    with pytest.raises(ParameterError, match=r"start 2\.0 lies outside its bounds"):
+        Parameter("A", "", 2.0, (0.0, 1.0), "x")
+
+
+@pytest.mark.parametrize(
+    ("unit", "x", "y", "filled"),
+    [
+        ("{y}", "mm", "", ""),
+        ("{x}", "mm", "N", "mm"),
+        ("{y}/{x}", "mm", "N", "N/mm"),
+        ("{y}/{x}", "mm", "", "1/mm"),
+        ("{y}/{x}", "", "mN m", "mN m"),
+        ("{y}/{x}", "", "", ""),
+        ("{y}/{x}^2", "mm/s", "N", "N/(mm/s)^2"),
+        ("rad", "mm", "N", "rad"),
+    ],
+)
+def test_units_are_filled_in(unit, x, y, filled):
+    assert fill_unit(unit, x, y) == filled

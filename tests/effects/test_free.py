@@ -1,0 +1,78 @@
+"""Free shapes: natural splines and levels, rebuilt from plain data."""
+
+import json
+
+import numpy as np
+import numpy.testing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sealfit.effects.free import free_effect, levels_effect, smooth_effect
+from sealfit.errors import ParameterError
+
+
+@given(
+    knots=st.lists(st.integers(-50, 50), min_size=3, max_size=6, unique=True).map(sorted),
+    amplitudes=st.lists(st.floats(-5, 5), min_size=6, max_size=6),
+)
+def test_smooth_goes_through_its_knots_and_is_zero_at_the_reference(knots, amplitudes):
+    effect = smooth_effect(knots, reference=knots[1])
+    values = dict(zip(effect.linear, amplitudes, strict=False))
+    wanted = [values.get(f"c_{j + 1}", 0.0) for j in range(len(knots))]
+    npt.assert_allclose(effect.shape({"x": np.array(knots, float)}, **values), wanted, atol=1e-10)
+
+
+def test_smooth_holds_straight_lines_inside_and_beyond_its_knots():
+    effect = smooth_effect([0.0, 1.0, 4.0, 10.0], reference=0.0)
+    x = np.array([-5.0, 0.0, 0.3, 2.0, 7.7, 10.0, 25.0])
+    npt.assert_allclose(effect.shape({"x": x}, c_2=0.5, c_3=2.0, c_4=5.0), 0.5 * x, atol=1e-13)
+
+
+def test_smooth_goes_on_straight_and_without_a_kink_beyond_its_knots():
+    effect = smooth_effect([0.0, 1.0, 2.0])
+    for end, way in ((0.0, -1.0), (2.0, 1.0)):
+        x = end + way * np.array([-1e-6, 0.0, 1e-6, 1.0, 2.0, 3.0])
+        h = effect.shape({"x": x}, c_2=1.0, c_3=-1.0)
+        npt.assert_allclose(np.diff(h[3:]), np.diff(h[3:])[0], rtol=1e-12)
+        npt.assert_allclose((h[1] - h[0]) / 1e-6, (h[2] - h[1]) / 1e-6, rtol=1e-4)
+
+
+def test_smooth_against_a_natural_spline_solved_by_hand():
+    # Knots 0, 1, 2 with values 0, 1, 0: the middle second derivative m solves 4 m = 6 (0 - 2 + 0), m = -3, so at 1/2
+    # h = 1/2 - m/6 (1/2 - 1/8) = 1/2 + 3/16 = 11/16.
+    npt.assert_allclose(smooth_effect([0, 1, 2]).shape({"x": np.array([0.5])}, c_2=1.0, c_3=0.0), [11 / 16], rtol=1e-14)
+
+
+def test_a_category_that_was_not_fitted_gets_no_value():
+    effect = levels_effect(["A", "B"])
+    npt.assert_array_equal(effect.shape({"x": np.array(["B", "C", "A"])}, d_1=0.3), [0.3, np.nan, 0.0])
+    assert effect.parameters[0].meaning == "B less A"
+
+
+@pytest.mark.parametrize(
+    ("id_", "fixed"),
+    [("smooth", {"knots": [0.0, 2.0, 5.0], "x_ref": 2.1}), ("levels", {"categories": ["A", "B", "C"]})],
+)
+def test_free_shapes_are_rebuilt_from_plain_data(id_, fixed):
+    direct = smooth_effect(fixed["knots"], fixed["x_ref"]) if id_ == "smooth" else levels_effect(fixed["categories"])
+    rebuilt = free_effect(id_, json.loads(json.dumps(fixed)))
+    assert rebuilt.parameters == direct.parameters
+    assert (rebuilt.id, rebuilt.form) == (id_, direct.form)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: smooth_effect([1.0]), "two or more rising numbers"),
+        (lambda: smooth_effect([1.0, 1.0]), "two or more rising numbers"),
+        (lambda: smooth_effect([1.0, np.nan]), "two or more rising numbers"),
+        (lambda: levels_effect(["A"]), "two or more different categories"),
+        (lambda: levels_effect(["A", "A"]), "two or more different categories"),
+        (lambda: free_effect("wavelet", {}), "'wavelet' is no free shape.*'smooth' or 'levels'"),
+        (lambda: free_effect("smooth", {}), "'knots' is missing"),
+    ],
+)
+def test_refuses_what_makes_no_effect(call, words):
+    with pytest.raises(ParameterError, match=words):
+        call()
