@@ -1,6 +1,7 @@
 import json
 import math
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -714,3 +715,69 @@ def test_truth_only_falls_with_age(days):
     truth = {"spec": Spec().model_dump(mode="json")}
     points = pd.DataFrame({"aging_days": sorted(days), "speed_mm_s": 3.0}).assign(**POINT)
     assert (np.diff(true_force(truth, points)) <= 0).all()
+
+
+# ---------------------------------------------------------------- the sample, and the way in
+def test_the_sample_campaign_is_written_again_byte_for_byte(tmp_path):
+    simulate(load_spec(SAMPLE / "simulated.spec.toml"), tmp_path / "simulated")
+    assert tree(tmp_path / "simulated") == tree(SAMPLE / "simulated")
+    assert truth_path(tmp_path / "simulated").read_bytes() == truth_path(SAMPLE / "simulated").read_bytes()
+
+
+def test_the_sample_campaign_is_small_and_says_nothing_of_its_effect():
+    files = tree(SAMPLE / "simulated")
+    assert sum(len(content) for content in files.values()) < 3e6
+    for content in files.values():
+        header = content.split(b"\n", 1)[0]
+        assert b"distance" not in header
+        assert b"warming" not in header
+
+
+def test_every_key_of_a_spec_is_in_the_readme():
+    text = (SAMPLE / "README.md").read_text("utf-8")
+    keys = set()
+
+    def walk(schema):
+        for name, entry in schema.get("properties", {}).items():
+            keys.add(name)
+            walk(entry)
+        for entry in schema.get("$defs", {}).values():
+            walk(entry)
+
+    walk(Spec.model_json_schema())
+    keys -= {"physics", "design", "effects", "channels", "noise", "growth", "series"}  # named as tables
+    assert len(keys) > 60
+    written = set(re.findall(r"\w+", " ".join(re.findall(r"`([^`]+)`", text))))
+    assert sorted(keys - written) == []
+
+
+@pytest.mark.parametrize(
+    "design",
+    [
+        {"start_scatter_mm": 2.0},
+        {"directions": (1, -1)},
+        {"directions": (1, -1), "strokes_per_file": 3, "max_rows": 3000},
+    ],
+    ids=["one way", "separate files", "strokes in one file"],
+)
+def test_ingest_reads_a_campaign_with_the_default_config_and_finds_the_truth(campaign, tmp_path, design):
+    from sealfit.config import load_config
+    from sealfit.ingest.campaign import ingest_campaign
+
+    truth, _, _ = campaign(
+        design={"days": (4.0,), "repeats": 2, "speeds_mm_s": (1.0, 5.0, 25.0), **design},
+        effects=[
+            effect("-0.06 * (1 - exp(-time_s / 3))", "mu", "multiply"),
+            effect("0.5 * tanh((displacement_mm - 20) / 5) + 0.01 * distance_mm * stroke + 0.1 * direction"),
+            effect("0.02 * run_order + 0.01 * elapsed_h"),
+        ],
+        noise=[{"kind": "white", "sd_N": 0.02}],
+    )
+    found = ingest_campaign(tmp_path / "c", load_config())
+    bins = found.tables["bins"]
+    assert found.faults == []
+    assert bins["file"].nunique() == len({row["file"] for row in truth["files"]})
+    left = bins["force_N"] - true_force(truth, bins)
+    # A bin has some 20 samples of 0.02 N; its mean position stands for a curved truth to within as much.
+    assert left.abs().max() < 0.05
+    assert abs(left.mean()) < 0.003
