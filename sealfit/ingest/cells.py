@@ -18,6 +18,7 @@ from sealfit.config import TraceFormat
 from sealfit.errors import Fault
 from sealfit.ingest.text import Layout, as_number, split_line, without_strays
 
+OVERLOAD = 1e30  # no rig measures this; instruments write 9.9e37 for overload and 9.91e37 for no value (SCPI)
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
 _CLOCK = re.compile(r"(.*\s)?\d+:\d+(:\d+([.,]\d+)?)?")
 _REMARK = re.compile(r"\s*([-+]?[\d.,]+(?:[eE][-+]?\d+)?)[\s,;]+(?P<remark>.*[^\W\d_].*?)[\s,;]*$")

@@ -8,7 +8,7 @@ import numpy as np
 
 from sealfit.config import Config
 from sealfit.errors import Fault
-from sealfit.ingest.cells import decimal_mend, listed
+from sealfit.ingest.cells import OVERLOAD, decimal_mend, listed
 from sealfit.ingest.text import as_number
 
 MAX_LABELS = 20  # a text column with more different values, most of them used once, is a clock or a serial number
@@ -39,7 +39,9 @@ def channel_columns(
     for name, values in columns.items():
         if name in slots:
             continue
-        numbers, texts = (values, None) if values.dtype.kind == "f" else (_numbers(values), values)
+        numbers, texts = (
+            (values, None) if values.dtype.kind == "f" else (_numbers(values, config.trace.decimal), values)
+        )
         if texts is not None:
             full = np.array([cell is not None for cell in texts])
             if np.isfinite(numbers).sum() <= 0.5 * full.sum():
@@ -49,7 +51,7 @@ def channel_columns(
                     del kept[name]
                 continue
             kept[name] = numbers
-        missing = good & ~np.isfinite(numbers)
+        missing = good & ~(np.abs(numbers) < OVERLOAD)
         share = missing.sum() / max(good.sum(), 1)
         if share == 1:
             faults.append(_left_out(name, "the column is empty", "info", file))
@@ -63,8 +65,8 @@ def channel_columns(
     return kept, drop, faults
 
 
-def _numbers(texts: np.ndarray) -> np.ndarray:
-    found = [None if cell is None else as_number(cell) for cell in texts]
+def _numbers(texts: np.ndarray, decimal: str) -> np.ndarray:
+    found = [None if cell is None else as_number(cell, decimal) for cell in texts]
     return np.array([np.nan if number is None else number for number in found])
 
 
@@ -96,11 +98,11 @@ def _cell_faults(name, numbers, texts, at, line, decimal, file) -> list[Fault]:
     def make(i: int) -> Fault:
         place = {"file": file, "line": int(line[i]), "column": name, "action": "row left out"}
         cell = None if texts is None else texts[i]
-        if cell is not None and as_number(cell) is None:
+        if cell is not None and as_number(cell, decimal) is None:
             mend = decimal_mend(cell, decimal) or "Put a number there or delete the line."
             return Fault("not_a_number", "is not a number.", value=cell, mend=mend, **place)
-        value = cell if cell is not None else "" if np.isnan(numbers[i]) else float(numbers[i])
-        reason = "is not a finite number." if value != "" else "the cell holds no number."
+        value = cell if cell is not None else "" if np.isnan(numbers[i]) else str(numbers[i])  # JSON has no inf
+        reason = "is no measured number." if value != "" else "the cell holds no number."
         return Fault("not_finite", reason, value=value, mend="Fill it or delete the line.", **place)
 
     def rest(count: int) -> Fault:

@@ -49,7 +49,7 @@ def name_parts(file: str, settings: Files) -> NameParts:
     texts: dict[str, str] = {}
     values: dict[str, float | str] = {}
     if settings.name_pattern is not None:
-        match = re.search(settings.name_pattern, file)
+        match = re.fullmatch(settings.name_pattern, file)
         if match is None:
             return NameParts(False, {})
         for name, text in match.groupdict(default="").items():

@@ -13,7 +13,7 @@ import pandas as pd
 
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import BadFile, ConfigError, Fault
-from sealfit.ingest.cells import Cells, listed, read_cells
+from sealfit.ingest.cells import OVERLOAD, Cells, listed, read_cells
 from sealfit.ingest.channels import channel_columns
 from sealfit.ingest.columns import RESERVED, SLOTS, beside, locate, numeric_names, required
 from sealfit.ingest.expression import evaluate, parse
@@ -183,9 +183,11 @@ def _clean(rows: _Rows, names: list[str], file: str) -> tuple[_Rows, int, list[F
     for name in names:
         if name not in rows.columns:
             continue
-        wrong = ~np.isfinite(rows.columns[name])
-        finite &= ~wrong
+        sizes = np.abs(rows.columns[name])
+        wrong, overload = ~np.isfinite(sizes), (sizes >= OVERLOAD) & np.isfinite(sizes)
+        finite &= ~(wrong | overload)
         faults += _row_faults("not_finite", "the computed value is not a finite number.", name, rows, wrong, file)
+        faults += _row_faults("overload", "is an instrument's mark for overload.", name, rows, overload, file)
     good = rows.where(finite)
     back = _out_of_order(good.columns["time_s"])
     faults += _row_faults("time_order", "time repeats or runs backwards.", "time_s", good, back, file)
@@ -194,10 +196,16 @@ def _clean(rows: _Rows, names: list[str], file: str) -> tuple[_Rows, int, list[F
 
 def _row_faults(check: str, reason: str, name: str, rows: _Rows, wrong: np.ndarray, file: str) -> list[Fault]:
     place = {"file": file, "column": name, "action": "row left out"}
-    mend = "Check the recorder's clock, or delete the line." if check == "time_order" else "Check [trace.compute]."
+    mend = {
+        "time_order": "Check the recorder's clock, or delete the line.",
+        "not_finite": "Check [trace.compute].",
+        "overload": "Check the sensor's range.",
+    }[check]
 
     def make(i: int) -> Fault:
-        return Fault(check, reason, line=int(rows.line[i]), value=float(rows.columns[name][i]), mend=mend, **place)
+        value = float(rows.columns[name][i])
+        shown = value if np.isfinite(value) else str(value)  # JSON has no nan
+        return Fault(check, reason, line=int(rows.line[i]), value=shown, mend=mend, **place)
 
     def rest(count: int) -> Fault:
         return Fault(check, f"and {count} more rows: {reason}", value=float(count), **place)

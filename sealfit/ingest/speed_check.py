@@ -41,10 +41,11 @@ def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[flo
     at = np.unique(np.linspace(0, len(time_s) - 1, min(len(time_s), pieces + 1)).astype(int))
     if len(at) < 2:
         return math.nan, math.nan
-    path, time = np.abs(np.diff(displacement_mm[at])), np.diff(time_s[at])
-    speeds = path / time
-    moving = speeds[speeds > 0.5 * np.quantile(speeds, 0.9)]
-    return float(path.sum() / time.sum()), float(np.median(moving)) if len(moving) else math.nan
+    with np.errstate(all="ignore"):  # beyond 1e308 there is no speed: nan or inf, and no check
+        path, time = np.abs(np.diff(displacement_mm[at])), np.diff(time_s[at])
+        speeds = path / time
+        moving = speeds[speeds > 0.5 * np.quantile(speeds, 0.9)]
+        return float(path.sum() / time.sum()), float(np.median(moving)) if len(moving) else math.nan
 
 
 def _strokes(displacement_mm: np.ndarray) -> int:
@@ -69,7 +70,7 @@ def check_speed(table: pd.DataFrame, ref: TraceRef, config: Config) -> Fault | N
     time_s, displacement = table["time_s"].to_numpy(), table["displacement_mm"].to_numpy()
     factor = speed_factor(config.units)
     mean, plateau = (factor * speed for speed in measured_speed(time_s, displacement))
-    if not plateau > 0:
+    if not (0 < plateau < math.inf and mean < math.inf):
         return None  # nothing moves: said where strokes are sought
     measured = min(max(commanded, min(mean, plateau)), max(mean, plateau))  # the nearest to the commanded one
     ratio = measured / commanded

@@ -100,6 +100,34 @@ def test_channels_are_numbers_or_labels_and_remarks_are_named(tmp_path):
     assert 11 not in trace.line
 
 
+def test_slips_in_a_channel_with_decimal_commas(tmp_path):
+    rows = [f"{row},{20 + i % 3}.5".replace(",", ";").replace(".", ",") for i, row in enumerate(ROWS)]
+    rows[5] = rows[5].rpartition(";")[0] + ";20.5"
+    rig = 'trace.delimiter = ";"\ntrace.decimal = ","'
+    trace = read(tmp_path, csv_of(rows, HEADER.replace(",", ";") + ";lab_C"), rig)
+    npt.assert_allclose(trace.table["lab_C"].iloc[:3], [20.5, 21.5, 22.5])
+    ((fault),) = trace.faults
+    assert (fault.line, fault.column, fault.value) == (7, "lab_C", "20.5")
+    assert 'decimal = "."' in fault.mend
+
+
+def test_what_cannot_be_computed_is_a_fault_that_json_can_hold(tmp_path):
+    trace = read(tmp_path, csv_of(ROWS), 'trace.compute.force_N = "1 / displacement_mm"')  # 1/0 on the first row
+    (fault,) = trace.faults
+    assert (fault.check, fault.line, fault.value) == ("not_finite", 2, "inf")
+
+
+def test_an_instrument_s_mark_for_overload_is_no_force(tmp_path):
+    rows = [f"{row},20" for row in ROWS]
+    rows[10], rows[20] = "1.0,5.0,9.9E+37,20", "2.0,10.0,2.2,9.91e37"
+    trace = read(tmp_path, csv_of(rows, HEADER + ",lab_C"))
+    assert {(f.check, f.line, f.column, f.action) for f in trace.faults} == {
+        ("overload", 12, "force_N", "row left out"),
+        ("not_finite", 22, "lab_C", "row left out"),
+    }
+    assert len(trace.table) == 98
+
+
 def test_a_sparse_channel_is_left_out_and_not_the_file(tmp_path):
     rows = [f"{row},{20 if i % 10 == 0 else ''}" for i, row in enumerate(ROWS)]
     trace = read(tmp_path, csv_of(rows, HEADER + ",temperature_lab_C"))

@@ -39,6 +39,15 @@ def test_names_of_files_say_what_runs_csv_would(tmp_path):
     assert ("not_matched", "raw/no1/x.csv", "warning", "file left out") in listed
 
 
+def test_the_pattern_must_match_the_whole_path(tmp_path):
+    text = DAYS + "files.glob = '**/*.csv'\nfiles.name_pattern = '(?P<aging_days>\\d+)d\\.csv'"
+    for file in ("4d.csv", "old/8d.csv", "8d.csv.csv"):
+        trace(tmp_path, file)
+    refs, found = list_traces(tmp_path, config(text))
+    assert [ref.file for ref in refs] == ["4d.csv"]
+    assert {fault.file for fault in found if fault.check == "not_matched"} == {"old/8d.csv", "8d.csv.csv"}
+
+
 def test_runs_csv_goes_before_the_name_and_the_name_before_the_header(tmp_path):
     text = (
         DAYS
