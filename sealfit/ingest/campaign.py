@@ -22,8 +22,8 @@ from sealfit.ingest.runs import list_traces
 from sealfit.ingest.trace_file import FileStrokes, read_strokes
 from sealfit.tables import BINS, FLOAT, INT, RUNS, STEADY, TEXT, Schema
 
-INNER = ("several", "equal", "run", "sliding", "row")  # columns that serve the ingest only
-PER_SAMPLE = ("time_s", "displacement_mm", "distance_mm", "force_N")
+INNER = ("several", "equal", "extreme", "run", "sliding", "row")  # columns that serve the ingest only
+OF_SAMPLES = ("time_s", "displacement_mm", "distance_mm", "force_N", "force_sd_N", "n")  # their means are in `steady`
 FAULTY = ("warning", "error")
 SHOWN = 20  # faults that a campaign without a single usable stroke lists
 
@@ -77,7 +77,7 @@ def ingest_campaign(
     inputs = _inputs(campaign, files, strokes, faults)
     tables = {
         "inputs": inputs,
-        "runs": _shaped(strokes, RUNS, drop=(*_steady_only(), *_sample_channels(files))),
+        "runs": _shaped(strokes, RUNS, drop=(*_steady_only(), *OF_SAMPLES)),
         "quality": quality_table(faults, inputs["file"].tolist()),
         "traces": samples.drop(columns=["row", "sliding"]),
         "traces_mean": mean_traces(*_sliding(samples, strokes)),
@@ -179,11 +179,6 @@ def _bins(samples: pd.DataFrame, strokes: pd.DataFrame, config: Config) -> pd.Da
 def _steady_only() -> tuple[str, ...]:
     inner = {column.name for column in STEADY.columns} - {column.name for column in RUNS.columns}
     return tuple(inner - {column.name for column in BINS.columns})
-
-
-def _sample_channels(files: Sequence[FileStrokes]) -> tuple[str, ...]:
-    """Return what belongs to samples and not to runs: their means over a window stand in `steady`."""
-    return (*PER_SAMPLE, "force_sd_N", "n")
 
 
 def _shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.DataFrame:

@@ -7,6 +7,7 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import Fault
+from sealfit.ingest.quality import FINE
 from sealfit.ingest.scatter import outlying_repeats, repeat_means
 
 AGAINST = -0.5  # share of its peers' force by which a force against its motion is of the wrong sign, not an offset
@@ -71,37 +72,45 @@ def _against(row: pd.Series, force_N: float, wrong: bool) -> Fault:
 def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     """Return which strokes to keep, shape (n,), and findings on forces that never change in the steady window.
 
-    A sensor is dead where the others show noise; where most strokes are constant, the sensor is coarse, and they are
-    kept.
+    Where the other strokes show noise larger than the sensor's steps, the sensor is dead, or at the end of its range if
+    the value is the largest of the stroke. Where they do not, it is coarse (or without noise), and they are kept.
 
     Parameters
     ----------
     strokes : DataFrame
-        One row per stroke: file, stroke, several, equal (share of samples equal to the one before), force_N, used.
+        One row per stroke: file, stroke, several, equal (share of samples equal to the one before), extreme (whether
+        the window's largest force is the stroke's), force_N, used.
     """
     used = strokes["used"].to_numpy(bool)
     constant = used & (strokes["equal"].to_numpy(float) >= 1.0)
     keep = np.ones(len(strokes), bool)
     if not constant.any():
         return keep, []
-    dead = constant.sum() < 0.5 * used.sum()
-    keep = ~constant if dead else keep
-    reason = "the force never changes in the steady window"
-    found = [
-        Fault(
-            "stuck",
-            f"{reason}, unlike in other strokes." if dead else f"{reason}, as in most strokes: the sensor is coarse.",
-            file=row["file"],
-            stroke=int(row["stroke"]) if row["several"] else None,
-            column="force_N",
-            value=float(row["force_N"]),
-            severity="error" if dead else "warning",
-            action="stroke left out" if dead else "kept",
-            mend="Check the cable and the logger, and measure again." if dead else "Use a finer range.",
-        )
-        for _, row in strokes[constant].iterrows()
-    ]
-    return keep, found
+    others = strokes["equal"].to_numpy(float)[used & ~constant]
+    dead = bool(len(others) and np.median(others) < FINE)
+    return (~constant if dead else keep), [_constant(row, dead) for _, row in strokes[constant].iterrows()]
+
+
+def _constant(row: pd.Series, dead: bool) -> Fault:
+    check, reason = "coarse", "and other strokes show no noise either: its steps are larger than the noise."
+    mend = "Use a finer range if the sensor has one."
+    if dead:
+        check, reason = "stuck", "unlike in other strokes."
+        mend = "Check the cable and the logger, and measure again."
+    if dead and row["extreme"]:
+        check = "saturated"
+        mend = f"The sensor may be at the end of its range: use a larger one. {mend}"
+    return Fault(
+        check,
+        f"the force is {row['force_N']:g} all along the steady window, {reason}",
+        file=row["file"],
+        stroke=int(row["stroke"]) if row["several"] else None,
+        column="force_N",
+        value=float(row["force_N"]),
+        severity="error" if dead else "info",
+        action="stroke left out" if dead else "kept",
+        mend=mend,
+    )
 
 
 def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, list[Fault]]:

@@ -18,7 +18,10 @@ from sealfit.ingest.strokes import Stroke
 from sealfit.tables import QUALITY
 
 LOAD_TOLERANCE = 0.1  # dead weights are better than that, and a wrong plate is worse
-FINE = 0.3  # share of equal neighbours below which noise is finer than the sensor's steps
+FINE = 0.3  # share of equal neighbours below which noise is plainly larger than the sensor's steps
+# Above this share (noise of a third of a step) a reading that rests in the middle of a step, as long as the force does,
+# cannot be told from a stuck one.
+COARSE = 0.6
 FEW_LEVELS = 5
 
 
@@ -97,14 +100,21 @@ def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list
     share = float(top.mean())
     if share < settings.saturated_share or top.sum() < 5 or len(others) < 20 or len(np.unique(others)) < FEW_LEVELS:
         return []
-    below = ~top[1:] & ~top[:-1]  # neighbours that are both below the extreme tell how the noise is resolved
-    same = float(np.mean(np.diff(force_N)[below] == 0.0)) if below.sum() >= 20 else 1.0
     at_next_level = np.count_nonzero(np.abs(others) == np.abs(others).max())
-    if same > FINE or top.sum() <= 2 * at_next_level:
+    if not _shows_noise(force_N, ~top, FINE) or top.sum() <= 2 * at_next_level:
         return []  # few levels altogether: the sensor is coarse, not at its end
     value = float(force_N[np.argmax(size)])
     reason = f"{share:.0%} of the steady samples lie exactly at the extreme {value:g}: the end of the sensor's range."
     return [_broken("saturated", reason, line[np.argmax(top)], value, "Use a larger range and measure again.")]
+
+
+def _shows_noise(force_N: np.ndarray, rows: np.ndarray, most_equal: float) -> bool:
+    """Return whether neighbours among `rows` differ mostly, and up and down as noise does, not along a smooth curve."""
+    change = np.diff(force_N)[rows[1:] & rows[:-1]]
+    if len(change) < 10 or np.mean(change == 0.0) > most_equal:
+        return False
+    change = change[change != 0.0]
+    return bool(np.mean(change[1:] * change[:-1] < 0.0) > 0.25)  # noise: 2/3; a smooth curve: next to nothing
 
 
 def _stuck(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault]:
@@ -127,9 +137,9 @@ def stuck_samples(force_N: np.ndarray, samples: int) -> tuple[int, int] | None:
     none.
 
     The run must be `samples` long, five times as long as the long ones among the others, and longer than as many
-    samples with this share of equal neighbours would show by chance (1e-6). So a coarse sensor, whose reading rests
-    on one step for long, is not stuck. A stroke that is constant all along has no others: see
-    `peers.constant_strokes`.
+    samples with this share of equal neighbours would show by chance (1e-6); and the sensor must show its noise, or a
+    reading that rests on one of its coarse steps would be called stuck. A stroke that is constant all along has no
+    others: see `peers.constant_strokes`.
     """
     edges = np.concatenate(([0], np.flatnonzero(np.diff(force_N) != 0.0) + 1, [len(force_N)]))
     lengths = np.diff(edges)
@@ -141,6 +151,10 @@ def stuck_samples(force_N: np.ndarray, samples: int) -> tuple[int, int] | None:
     usual = float(ordered[np.searchsorted(np.cumsum(ordered), 0.9 * others.sum())])
     same = 1.0 - len(others) / others.sum()
     if run <= 5.0 * usual or len(force_N) * same**run > 1e-6:
+        return None
+    apart = np.ones(len(force_N), bool)
+    apart[edges[longest] : edges[longest + 1]] = False
+    if not _shows_noise(force_N, apart, COARSE):
         return None
     return int(edges[longest]), run
 

@@ -63,8 +63,8 @@ def force_spikes(
     suspects = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, apart))
     if not len(suspects):
         return keep, []
-    rest = np.delete(force_N, suspects)
-    low, high = (float(rest.min()), float(rest.max())) if len(rest) else (-np.inf, np.inf)
+    rest = np.append(np.delete(force_N, suspects), 0.0)  # at rest the force may be zero
+    low, high = float(rest.min()), float(rest.max())
     beyond = np.maximum(low - force_N, force_N - high) > 0.5 * (high - low)
     spikes = suspects[steady[suspects] | beyond[suspects]]
     if len(spikes) > settings.max_bad_rows * len(force_N):

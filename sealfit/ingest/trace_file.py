@@ -148,6 +148,9 @@ def _stroke_row(ref: TraceRef, stroke: Stroke, samples: Mapping[str, np.ndarray]
         "displacement_from_mm": float(ends[0]),
         "displacement_to_mm": float(ends[1]),
         "equal": equal_neighbours(force),
+        "extreme": bool(
+            len(rows) and np.abs(force).max() >= np.abs(samples["force_N"][stroke.start : stroke.stop]).max()
+        ),
     }
 
 

@@ -77,7 +77,7 @@ def test_false_flags_keep_to_the_family_wise_level(runs):
 
 
 def test_a_shifted_repeat_is_found_as_often_as_the_best_possible_test_finds_it():
-    # A shift of d SDs stands d sqrt(2/3) SDs of a residual off its run; for 180 repeats at 0.001 the limit is about 4.6.
+    # A shift of d SDs stands d sqrt(2/3) SDs of a residual off its run; of 180 repeats at 0.001 the limit is about 4.6.
     # d = 6 leaves it at 4.9 (power about 0.6), d = 8 at 6.5 (0.97).
     rng = np.random.default_rng(8)
     found = {}

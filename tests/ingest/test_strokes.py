@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from sealfit.config import Strokes
 from sealfit.ingest.presliding import rise_end_mm
-from sealfit.ingest.strokes import find_strokes, slope, turning_rows
+from sealfit.ingest.strokes import find_strokes, turning_rows
+from sealfit.ingest.window import slope
 
 
 def stroke(

@@ -1,0 +1,234 @@
+import numpy as np
+import pandas as pd
+import pytest
+
+from sealfit.config import Config, Quality, Strokes
+from sealfit.errors import Fault
+from sealfit.ingest.peers import constant_strokes, outlying_files, reversed_strokes
+from sealfit.ingest.quality import load_faults, quality_table, speed_column_faults, stroke_faults, stuck_samples
+from sealfit.ingest.spikes import displacement_spikes, force_spikes, resolution
+from sealfit.ingest.strokes import find_strokes
+from sealfit.tables import QUALITY
+
+
+def trace(n=1000, noise=0.1, step=0.0, seed=0, ripple=0.0):
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0.0, 8.0, n)
+    x = 5.0 * time
+    force = (30.0 + ripple * np.sin(2 * np.pi * x / 6.0)) * (1.0 - np.exp(-x / 0.3)) + rng.normal(0.0, noise, n)
+    return time, x, np.round(force / step) * step if step else force
+
+
+def checks(time, x, force, **quality):
+    config = Config(quality=Quality(**quality))
+    (stroke,) = find_strokes(time, x, force, config.strokes)
+    return stroke_faults("f.csv", None, stroke, time, force, 2 + np.arange(len(time)), config)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    ("noise", "step", "ripple"),
+    [
+        (0.1, 0.0, 0.0),
+        (0.1, 0.01, 0.0),
+        (0.1, 0.1, 0.5),
+        (0.05, 0.5, 0.0),
+        (0.1, 0.5, 2.0),
+        (0.0, 0.0, 0.0),
+        (0.0, 0.001, 0.0),
+        (0.0, 0.1, 1.0),
+        (0.0, 1.0, 0.0),
+    ],
+)
+def test_a_sound_stroke_is_not_blamed_however_fine_or_coarse_its_sensor(noise, step, ripple, seed):
+    assert checks(*trace(noise=noise, step=step, seed=seed, ripple=ripple)) == []
+
+
+def test_clipping_at_the_sensor_s_end_is_named_with_value_and_line():
+    time, x, force = trace(step=0.01)
+    (fault,) = checks(time, x, np.minimum(force, 30.05))
+    assert (fault.check, fault.value, fault.action, fault.column) == ("saturated", 30.05, "stroke left out", "force_N")
+    # 30 N with an SD of 0.1 N: 31 % of the samples lie above 30.05 N.
+    assert 0.26 < float(fault.reason.split("%")[0]) / 100 < 0.36
+    assert force[fault.line - 2] >= 30.05
+    (mirrored,) = checks(time, -x, -np.minimum(force, 30.05))
+    assert mirrored.value == -30.05
+
+
+def test_a_sensor_that_stops_while_the_platform_moves_is_stuck():
+    time, x, force = trace(step=0.01)
+    force[500:620] = force[500]
+    (fault,) = checks(time, x, force)
+    assert (fault.check, fault.line, fault.action) == ("stuck", 502, "stroke left out")
+    assert "120 samples" in fault.reason
+    force = trace(step=0.01)[2]
+    force[500:530] = force[500]
+    assert checks(time, x, force) == []
+
+
+def test_equal_samples_are_counted_from_their_first_place():
+    values = np.random.default_rng(0).normal(size=300)
+    values[100:160] = 0.5
+    assert stuck_samples(values, 50) == (100, 60)
+    assert stuck_samples(values, 61) is None
+
+
+def test_gaps_are_told_and_too_much_hidden_time_leaves_the_stroke_out():
+    time, x, force = trace()
+    keep = np.ones(1000, bool)
+    keep[400:500] = False
+    (fault,) = checks(time[keep], x[keep], force[keep])
+    assert (fault.check, fault.action, fault.line) == ("gaps", "kept", 401)
+    assert fault.value == pytest.approx(0.1, abs=0.002)
+    keep[500:700] = False
+    (fault,) = checks(time[keep], x[keep], force[keep])
+    assert (fault.severity, fault.action) == ("error", "stroke left out")
+
+
+def test_a_stroke_too_short_says_what_is_needed():
+    time, x, force = trace(n=18)
+    (stroke,) = find_strokes(time, x, force, Strokes())
+    (fault,) = stroke_faults("f.csv", 3, stroke, time, force, np.arange(18), Config())
+    assert (fault.check, fault.stroke, fault.action) == ("too_short", 3, "stroke left out")
+    assert "at least 20 are needed" in fault.reason
+    assert "strokes.min_samples" in fault.mend
+
+
+def spikes(time, x, force, **quality):
+    found = find_strokes(time, x, force, Strokes())
+    return force_spikes("f.csv", force, found, 2 + np.arange(len(force)), Quality(**quality))
+
+
+@pytest.mark.parametrize("place", [0, 1, 500, 998, 999])
+def test_a_single_wrong_sample_is_left_out_wherever_it_stands(place):
+    time, x, force = trace()
+    force[place] = -1200.0
+    keep, (fault,) = spikes(time, x, force)
+    assert np.flatnonzero(~keep).tolist() == [place]
+    assert (fault.check, fault.line, fault.value, fault.action) == ("spike", place + 2, -1200.0, "row left out")
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_ripples_and_break_away_peaks_are_no_spikes(seed):
+    time, x, force = trace(seed=seed, ripple=1.0)
+    force = force + 12.0 * np.exp(-(((x - 0.35) / 0.06) ** 2))  # a peak of three samples
+    keep, found = spikes(time, x, force)
+    assert keep.all()
+    assert found == []
+    heavy = trace(seed=seed)[2] + 0.1 * np.random.default_rng(seed).standard_t(3, 1000)
+    assert spikes(time, x, heavy, spike_sigma=30.0)[0].all()
+
+
+def test_bursts_are_the_nature_of_the_signal_and_are_said_but_kept():
+    time, x, force = trace()
+    force[np.random.default_rng(1).choice(np.arange(100, 1000), 30, replace=False)] += 20.0
+    keep, found = spikes(time, x, force, max_bad_rows=0.01)
+    assert keep.all()
+    assert [(f.check, f.action) for f in found] == [("spikes", "kept")]
+
+
+def test_spikes_name_their_stroke_where_there_are_several():
+    time = np.arange(1600) * 0.01
+    x = np.where(time < 8, 5 * time, 80 - 5 * time)
+    force = np.where(time < 8, 20.0, -20.0) + np.random.default_rng(0).normal(0, 0.1, 1600)
+    force[1200] = 500.0
+    _, (fault,) = spikes(time, x, force)
+    assert fault.stroke == 2
+
+
+def test_a_displacement_that_jumps_away_and_back_is_left_out_and_a_fast_turn_is_not():
+    x = trace()[1]
+    x[300] += 2.0
+    keep, (fault,) = displacement_spikes("f.csv", x, np.arange(1000), Quality())
+    assert np.flatnonzero(~keep).tolist() == [300]
+    assert (fault.column, fault.line) == ("displacement_mm", 300)
+    triangle = np.abs(np.arange(1000) - 500) * 0.04
+    assert displacement_spikes("f.csv", triangle, np.arange(1000), Quality())[0].all()
+
+
+def test_resolution_is_the_smallest_step():
+    assert resolution(np.array([1.0, 1.5, 3.0, 1.0])) == 0.5
+    assert resolution(np.ones(3)) == 0.0
+
+
+def strokes(force, **columns):
+    n = len(force)
+    flags = {"several": False, "extreme": False, "used": True}
+    base = {"file": [f"f{i}" for i in range(n)], "stroke": 1, "run": "r", "direction": 1, "equal": 0.1, **flags}
+    return pd.DataFrame({**base, "force_N": force, **columns})
+
+
+def test_a_force_of_the_wrong_sign_is_left_out_where_its_peers_have_the_right_one():
+    keep, (fault,) = reversed_strokes(strokes([20.0, -20.0, 21.0]))
+    assert keep.tolist() == [True, False, True]
+    assert (fault.check, fault.file, fault.action) == ("reversed", "f1", "stroke left out")
+
+
+def test_a_campaign_that_counts_force_the_other_way_is_kept_and_told():
+    keep, found = reversed_strokes(strokes([-20.0, -20.0, -21.0]))
+    assert keep.all()
+    assert {(f.action, f.severity) for f in found} == {("kept", "warning")}
+    assert "compute.force_N" in found[0].mend
+
+
+def test_an_offset_larger_than_the_friction_is_no_wrong_sign():
+    keep, found = reversed_strokes(strokes([3.0, 2.5, -0.4], run=["a", "b", "c"]))
+    assert keep.all()
+    assert len(found) == 1
+    keep, found = reversed_strokes(strokes([3.0, 2.5, -2.0, -3.0], direction=[1, 1, -1, -1]))
+    assert found == []
+
+
+def test_a_constant_force_is_a_dead_sensor_only_where_others_show_noise():
+    dead, (fault,) = constant_strokes(strokes([20.0, 21.0, 22.0], equal=[1.0, 0.05, 0.1]))
+    assert dead.tolist() == [False, True, True]
+    assert (fault.check, fault.action) == ("stuck", "stroke left out")
+    _, (fault,) = constant_strokes(strokes([20.0, 21.0, 22.0], equal=[1.0, 0.05, 0.1], extreme=[True, False, False]))
+    assert fault.check == "saturated"
+    coarse, (fault,) = constant_strokes(strokes([20.0, 21.0, 22.0], equal=[1.0, 0.95, 0.8]))
+    assert coarse.all()
+    assert (fault.check, fault.action, fault.severity) == ("coarse", "kept", "info")
+    assert constant_strokes(strokes([20.0, 20.0], equal=[1.0, 1.0]))[0].all()
+
+
+def repeats(force, used=True):
+    runs = np.repeat([f"r{i}" for i in range(len(force) // 3)], 3)
+    return pd.DataFrame(
+        {"file": [f"f{i}" for i in range(len(force))], "run_id": runs, "repeat": np.tile([1, 2, 3], len(force) // 3),
+         "force_N": force, "used": used}
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("drop", [False, True])
+def test_an_outlying_repeat_is_flagged_and_left_out_only_where_the_config_says_so(drop):
+    force = 30.0 + np.random.default_rng(3).normal(0.0, 0.2, 90)
+    force[40] += 6.0
+    made, (fault,) = outlying_files(repeats(force), Config(quality=Quality(drop_outliers=drop)))
+    assert np.flatnonzero(made["outlier"]).tolist() == [40]
+    assert np.flatnonzero(~made["used"]).tolist() == ([40] if drop else [])
+    assert fault.action == ("file left out" if drop else "kept")
+    assert "repeat 2 of run r13 is 36." in fault.reason
+
+
+def test_speed_and_load_columns_are_compared_with_what_was_measured_and_declared():
+    assert speed_column_faults("f", None, 5.0, -5.2, Config()) == []
+    (fault,) = speed_column_faults("f", 2, 5.0, 300.0, Config())
+    assert (fault.check, fault.stroke, fault.action) == ("speed_disagreement", 2, "kept")
+    assert load_faults("f", 50.0, 49.0, "N") == []
+    (fault,) = load_faults("f", 60.0, 49.03, "N")
+    assert fault.reason == "measured 60 N, declared 49.03 N."
+
+
+def test_the_quality_table_has_a_row_per_finding_and_one_for_every_sound_file():
+    faults = [
+        Fault("spike", "b.", file="b", line=9, value=1.5, action="row left out", severity="warning"),
+        Fault("gaps", "a.", file="b", line=3, severity="warning", action="kept"),
+        Fault("not_listed", "c.", file="c", severity="info", action="file left out"),
+    ]
+    table = quality_table(faults, ["a", "b", "c"])
+    assert table["file"].tolist() == ["a", "b", "b", "c"]
+    assert table["check"].tolist() == ["ok", "gaps", "spike", "not_listed"]
+    assert table["line"].tolist()[1:3] == [3, 9]
+    assert table["value"].tolist()[2] == "1.5"
+    assert table.columns.tolist() == QUALITY.names()
+    assert quality_table([], []).columns.tolist() == QUALITY.names()
