@@ -103,13 +103,13 @@ def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter
             open_below = name == "v_s" and low == 0.0
             row |= {"value": condition.values[j], "se": _finite(np.sqrt(covariance[j, j])), "u_sys": abs(shift[j])}
             row |= {"lo95": None if open_below else _finite(low), "hi95": _finite(high)}
-        yield _row(**row)
+        yield table_row(**row)
     residual = force - _model(condition, speed, load)
     yield from _statistics(condition, k, variance, scatter, residual, config.units.unit("force"))
     if np.isfinite(variance.value[k]):
         for i, one in enumerate(condition.names):
             for j, other in enumerate(condition.names[: i + 1]):
-                yield _row(
+                yield table_row(
                     quantity="covariance",
                     parameter=f"{spelled[other]},{spelled[one]}",
                     value=_finite(covariance[i, j]),
@@ -117,7 +117,7 @@ def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter
                     identified=judged[one][0] and judged[other][0],
                 )
     for j, name in enumerate(condition.names):
-        yield _row(
+        yield table_row(
             quantity="sensor_shift",
             parameter=spelled[name],
             value=shift[j],
@@ -162,7 +162,7 @@ def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterat
         ("n_files", condition.runs["files"].sum(), "", ""),
         ("n_speeds", max(len(values) for values in condition.levels.values()), "", "levels within one direction"),
     ):
-        yield _row(
+        yield table_row(
             quantity="statistics", parameter=name, value=_finite(value), unit=unit, identified=True, reason=reason
         )
 
@@ -185,12 +185,15 @@ def _finite(value) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
 
 
-def _row(*, quantity, parameter, value=None, se=None, lo95=None, hi95=None, u_sys=None, unit, identified, reason=""):
+def table_row(
+    *, quantity, parameter, value=None, se=None, lo95=None, hi95=None, u_sys=None, unit, identified, reason=""
+) -> dict:
+    """Return one row of a fit table; None, and an end that is open, become null."""
     numbers = {"value": value, "se": se, "lo95": lo95, "hi95": hi95, "u_sys": u_sys}
     return {
         "quantity": quantity,
         "parameter": parameter,
-        **{name: np.nan if number is None else float(number) for name, number in numbers.items()},
+        **{name: np.nan if _finite(number) is None else float(number) for name, number in numbers.items()},
         "unit": unit,
         "identified": bool(identified),
         "reason": reason,
