@@ -14,6 +14,7 @@ from sealfit.progress import Silent
 from sealfit.staging import Staged, disk
 from sealfit.state import ConfigCopy
 from sealfit.store import Store
+from sealfit.tables import Units
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -248,7 +249,7 @@ def effects(out: Path | None = None) -> dict:
     from sealfit.effects import EFFECTS
 
     if out is None:
-        return {"effects": summary.of_effects(EFFECTS.values(), None)}
+        return {"effects": summary.of_effects(EFFECTS.values(), Units())}
     store = Store.open(existing_out(out))
     known = dict(EFFECTS)
     if store.config.loop.effects_folder is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sealfit.tables import Units
@@ -86,7 +87,7 @@ def verdict_sentence(closure: Mapping, units: Units) -> str:
         count, f"{count} effects were missing and are added"
     )
     if closure["verdict"] == "nothing_missing":
-        return "nothing is missing: the declared model explains these measurements down to their own scatter"
+        return "the declared model explains these measurements down to their own scatter"
     if closure["verdict"] == "closed":
         return f"{added}; no significant structure is left"
     return f"{added}, and something is left that could not be named{_where(closure['left'], units)}"
@@ -98,32 +99,35 @@ def _where(left: Mapping, units: Units) -> str:
     return where + along + (f" (p = {left['p_value']:.2g})" if left["p_value"] is not None else "")
 
 
-def of_effects(effects: Iterable[Effect], units: Units | None) -> list[dict]:
-    """Return the catalogue as plain values."""
-    return [
-        {
-            "id": effect.id,
-            "label": effect.label,
-            "form": effect.form,
-            "equation": effect.equation,
-            "reads": list(effect.reads),
-            "acts_on": [{"target": target, "operation": operation} for target, operation in effect.acts_on],
-            "physical": effect.physical,
-            "source": effect.source,
-            "parameters": [
-                {"name": p.name, "unit": _effect_unit(p.unit, effect.reads, units), "meaning": p.meaning}
-                for p in effect.parameters
-            ],
-        }
-        for effect in effects
-    ]
+def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
+    """Return the catalogue as plain values; parameters have their units for the likeliest way to act."""
+    from types import SimpleNamespace
 
+    from sealfit.closure.document import parameter_unit
+    from sealfit.effects.contract import CHANNEL
 
-def _effect_unit(unit: str, reads: tuple[str, ...], units: Units | None) -> str:
-    """Fill in what the contract leaves open: {x} for the channel's unit, {y} for that of what the effect gives."""
-    if units is not None and len(reads) == 1 and units.of(reads[0]):
-        unit = unit.replace("{x}", units.of(reads[0]))
-    return unit.replace("{x}", "[channel]").replace("{y}", "[target]")
+    units = replace(units, channels={**units.channels, CHANNEL: "unit of x"})
+    listed = []
+    for effect in effects:
+        target, operation = effect.acts_on[0]
+        likeliest = SimpleNamespace(channels=effect.reads, acts_on=target, operation=operation)
+        listed.append(
+            {
+                "id": effect.id,
+                "label": effect.label.replace("{x}", "a channel x"),
+                "form": effect.form,
+                "equation": effect.equation,
+                "reads": list(effect.reads),
+                "acts_on": [{"target": target, "operation": operation} for target, operation in effect.acts_on],
+                "physical": effect.physical,
+                "source": effect.source,
+                "parameters": [
+                    {"name": p.name, "unit": parameter_unit(p.unit, likeliest, units), "meaning": p.meaning}
+                    for p in effect.parameters
+                ],
+            }
+        )
+    return listed
 
 
 # ---------------------------------------------------------------- the same in lines
@@ -131,8 +135,8 @@ def lines(summary: Mapping) -> list[str]:
     """Return the summary of one step or of all of them, a line for each thing worth knowing."""
     writers = {
         "ingest": ingest_lines,
-        "fit_steady": lambda part: _fit_lines("steady fit", "condition", part),
-        "fit_aging": lambda part: _fit_lines("aging", "series", part),
+        "fit_steady": lambda part: _fit_lines("steady fit", part),
+        "fit_aging": lambda part: _fit_lines("aging", part),
         "close_loop": closure_lines,
         "report": lambda part: [_line("report", part["file"])],
     }
@@ -155,7 +159,7 @@ def ingest_lines(part: Mapping) -> list[str]:
     return found
 
 
-def _fit_lines(title: str, of: str, part: Mapping) -> list[str]:
+def _fit_lines(title: str, part: Mapping) -> list[str]:
     ranges = part["parameters"]
     if not ranges:
         return [_line(title, "nothing to fit")]
@@ -167,10 +171,13 @@ def _fit_lines(title: str, of: str, part: Mapping) -> list[str]:
         found.append(_line(title if not found else "", name + ", ".join(texts)))
     lacking = [entry for entry in ranges if entry["identified"] < entry["of"]]
     if lacking:
-        texts = ", ".join(f"{entry['parameter']} in {entry['of'] - entry['identified']}" for entry in lacking)
-        reasons = " ".join(dict.fromkeys(entry["reason"] for entry in lacking if entry["reason"]))
-        plural = of if of == "series" else f"{of}s"
-        found.append(_line("", f"not identified, of {part[of]} {plural}: {texts}. {reasons}".rstrip(" .") + "."))
+        names = [f"{e['quantity']} {e['parameter']}" if len(quantities) > 1 else e["parameter"] for e in lacking]
+        texts = [
+            f"{name} in {entry['of'] - entry['identified']} of {entry['of']}" if entry["of"] > 1 else name
+            for name, entry in zip(names, lacking, strict=True)
+        ]
+        reason = next((entry["reason"] for entry in lacking if entry["reason"]), "")
+        found.append(_line("", f"not identified: {', '.join(texts)}. {reason}".rstrip()))
     return found
 
 
@@ -214,7 +221,9 @@ def effects_lines(listed: Mapping) -> list[str]:
     for effect in listed["effects"]:
         mark = "  [in the model of this OUT]" if effect["id"] in (listed.get("added") or ()) else ""
         found.append(f"{effect['id']}: {effect['label']}{mark}")
+        acts = ", ".join(_acts({**way, "acts_on": way["target"]}) for way in effect["acts_on"])
         found.append(f"    {effect['form']}")
+        found.append(f"    {acts}")
         for p in effect["parameters"]:
             found.append(f"    {p['name']}{' [' + p['unit'] + ']' if p['unit'] else ''}: {p['meaning']}")
     if listed.get("added", ()) is None:

@@ -162,7 +162,7 @@ def test_run_does_every_step_and_says_so_in_a_few_lines(sealfit, parts, campaign
     assert 8 <= len(lines) <= 14
     assert "files       1 used, 0 left out" in lines
     assert "steady fit  mu_s 0.7 to 0.8" in lines
-    assert "            not identified, of 3 conditions: mu_s in 1. Too few speeds." in lines
+    assert "            not identified: mu_s in 1 of 3. Too few speeds." in lines
     assert "verdict     closed: one effect was missing and is added; no significant structure is left" in lines
     assert "error (N)   rmse 0.4 -> 0.2; held out 0.5 -> unknown; run means 0.3 -> 0.3; largest 1.5 -> 1.5" in lines
     assert f"report      {out / 'report.html'}" in lines
@@ -257,7 +257,7 @@ def test_many_faults_are_cut_short(sealfit, parts, campaign, out):
 @pytest.mark.parametrize(
     ("verdict", "effects", "left", "expected"),
     [
-        ("nothing_missing", [], [None, None, None], "nothing is missing: the declared model explains"),
+        ("nothing_missing", [], [None, None, None], "the declared model explains"),
         (
             "unexplained",
             [],
