@@ -10,6 +10,9 @@ ENOUGH = np.log(100.0)  # where 1/5000 would take more than a third of the strok
 HALF_WAY = 0.75  # a force that begins above this share of its level comes up, if at all, over a short distance:
 SHORT = 0.01  # this share of the stroke; a longer climb is an effect (run-in, warming), and stays inside
 EARLY = (0.05, 0.5)  # share of the distance in which the plateau is read: near the rise, past any ordinary rise
+LATE = (0.6, 0.95)  # the same where the rise takes so long that half of the stroke may still be part of it
+LONG = 0.1  # rise to 63 % over more than this share of the stroke: a stroke hardly longer than its pre-sliding
+MARGIN = 1.05  # the first arrival in the later band is early by a part of the last bend
 
 
 def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> float:
@@ -19,6 +22,9 @@ def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> 
     F(x) = A + B x - C exp(-x / x_0); A + B x stands for whatever changes slowly beside it. For every x_0 on a grid
     the rest is linear least squares; the x_0 with the smallest sum of squares is taken, and the rise ends where
     1/5000 of it is left. A rig that comes up along a straight line (its own elasticity) is over well before.
+
+    Where the rise takes more than a tenth of the stroke (a fretting stroke), no such law is asked: it ends where the
+    force first arrives in the band of the late plateau.
 
     Only a force that begins below everything the plateau later shows is a rise: the trough of a ripple, or a force
     that warming lets fall, is not.
@@ -63,12 +69,22 @@ def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> 
     scale = _scale_mm(distance_mm[:high], force_N[:high], begin, level)
     if scale <= 0.0:
         return 0.0
+    if scale > LONG * length and begin <= HALF_WAY * level:
+        return MARGIN * _arrival_mm(distance_mm, force_N)
     fitted = _rise_length_mm(distance_mm, force_N, scale)
     if begin > HALF_WAY * level and fitted > SHORT * length:
         return 0.0
     settled = min(SETTLED * fitted, max(length / 3.0, ENOUGH * fitted))
     ramp = float(distance_mm[min(ramp_end, len(distance_mm) - 1)])
     return float(max(settled, ramp + AFTER_RAMP * fitted if ramp > 0.0 else 0.0))
+
+
+def _arrival_mm(distance_mm: np.ndarray, force_N: np.ndarray) -> float:
+    """Return the distance at which the force first comes into the band in which it stays late in the stroke."""
+    low, high = np.searchsorted(distance_mm, [share * distance_mm[-1] for share in LATE])
+    if high - low < 8:
+        return 0.0
+    return float(distance_mm[int(np.argmax(force_N >= np.percentile(force_N[low:high], 2)))])
 
 
 def _scale_mm(distance_mm: np.ndarray, force_N: np.ndarray, begin: float, level: float) -> float:

@@ -13,7 +13,7 @@ from sealfit.ingest.window import slope
 def stroke(
     v=5.0, length=40.0, n=1000, *, rise=0.3, force=30.0, lag=0.05, lead=0.0, noise=0.1, blur=0.002, seed=0, **more
 ):
-    """A stroke of a rig whose speed lags by `lag` s: time, displacement, force, and the force without rise and noise."""
+    """A stroke of a rig whose speed lags by `lag` s: time, displacement, force; and force without rise and noise."""
     rng = np.random.default_rng(seed)
     time = np.linspace(0.0, length / v + lead, n)
     since = np.maximum(time - lead, 0.0)
@@ -234,3 +234,14 @@ def test_no_rise_is_found_in_a_force_that_falls_or_begins_within_its_later_band(
     x = np.linspace(0.0, 40.0, 1000)
     assert rise_end_mm(x, 30.0 + 5.0 * np.exp(-x / 3.0), 0) == 0.0
     assert rise_end_mm(x, np.full(1000, 30.0), 0) == 0.0
+
+
+def test_a_stroke_hardly_longer_than_its_rise_keeps_its_plateau():
+    # As a fretting stroke swings over: along a straight line for half of the way, then a plateau that climbs a little.
+    time = np.linspace(0.0, 1.0, 200)
+    x = 0.23 * time
+    force = np.minimum(-2.2 + 4.4 * x / 0.1, 2.2 + 0.5 * (x - 0.1)) + np.random.default_rng(0).normal(0.0, 0.005, 200)
+    found = only(time, x, force)
+    # Past the bend at 0.1 mm, and no later than where the late plateau begins: 60 % of the way, 0.138 mm, and a margin.
+    assert 0.1 < x[found.rows[0]] < 0.147
+    assert found.rows[-1] == 199
