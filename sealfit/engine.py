@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -23,6 +24,7 @@ Made = TypeVar("Made")
 CHUNKS_PER_WORKER = 4  # enough to even out items of different cost, few enough to keep the cost of sending low
 MAX_CHUNK = 32  # so that progress is shown often
 WAITING_PER_WORKER = 2  # chunks sent ahead of the one awaited: bounds the memory of results not yet taken
+PROCESSES_START_S = 3.0  # until two new processes have loaded numpy and pandas on two cores: 1.5 to 3 s
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -34,12 +36,12 @@ def cores() -> int:
 
 
 def run_map(
-    function: Callable[[Given], Made], items: Iterable[Given], *, workers: int = 1, few: int = 1
+    function: Callable[[Given], Made], items: Iterable[Given], *, workers: int = 1, trial_s: float = 0.0
 ) -> Iterator[Made]:
     """Yield `function(item)` for every item, in the order of the items.
 
-    With one worker, with at most `few` items, or inside a worker, the work is done here; otherwise in `workers` new
-    processes, several items at a time. Results do not depend on `workers`.
+    With one worker, one item, or inside a worker, the work is done here; otherwise in `workers` new processes, several
+    items at a time. Results do not depend on `workers`.
 
     Parameters
     ----------
@@ -50,18 +52,27 @@ def run_map(
         What to map over; each item is sent to a process, so keep it small.
     workers : int
         Processes to use, at least 1.
-    few : int
-        Up to this many items are not worth a process (starting one takes about a second).
+    trial_s : float
+        Work here for this many seconds first, and start processes only if what is left would take longer than they
+        take to start. For items that are usually quick; leave it out where a single item may take long.
 
     Raises
     ------
     WorkerError
         If a process dies before it has answered (killed, or out of memory).
     """
-    waiting = list(items)
-    if workers <= 1 or len(waiting) <= few or multiprocessing.parent_process() is not None:
-        return map(function, waiting)
-    return _in_processes(function, waiting, min(workers, len(waiting)))
+    waiting = deque(items)
+    if workers <= 1 or multiprocessing.parent_process() is not None:
+        yield from map(function, waiting)
+        return
+    began, done = time.monotonic(), 0
+    while waiting and (time.monotonic() - began < trial_s or len(waiting) == 1):
+        yield function(waiting.popleft())
+        done += 1
+    if waiting and done and (time.monotonic() - began) / done * len(waiting) < PROCESSES_START_S:
+        yield from map(function, waiting)
+    elif waiting:
+        yield from _in_processes(function, list(waiting), min(workers, len(waiting)))
 
 
 def _in_processes(function: Callable[[Given], Made], items: Sequence[Given], workers: int) -> Iterator[Made]:

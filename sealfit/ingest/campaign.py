@@ -61,7 +61,7 @@ def ingest_campaign(
     campaign = Path(campaign)
     refs, faults = list_traces(campaign, config)
     files: list[FileStrokes] = []
-    for made in run_map(partial(read_strokes, campaign=campaign, config=config), refs, workers=workers):
+    for made in run_map(partial(read_strokes, campaign=campaign, config=config), refs, workers=workers, trial_s=1.0):
         files.append(made)
         if on_file is not None:
             on_file(len(files), len(refs))
