@@ -1,0 +1,78 @@
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sealfit.simulate import load_truth, simulate, truth_path
+from sealfit.simulation.design import plan_files
+
+PATH = Path(__file__).parents[1] / "benchmarks" / "campaigns.py"
+
+
+def load():
+    spec = importlib.util.spec_from_file_location("benchmark_campaigns", PATH)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+campaigns = load()
+EFFECTS_ONLY = list(campaigns.EFFECT_CAMPAIGNS)
+
+
+def files_of(spec):
+    return plan_files(spec.design, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("name", [*campaigns.NULLS, *EFFECTS_ONLY])
+@pytest.mark.parametrize(("size", "low", "high"), [("small", 190, 220), ("large", 590, 630)])
+def test_sizes_are_about_200_and_600_files(name, size, low, high):
+    assert low <= len(files_of(campaigns.campaign(name, size=size))) <= high
+
+
+def test_there_are_eight_nulls_and_they_have_no_effect():
+    assert len(campaigns.NULLS) == 8
+    assert all(campaigns.campaign(name).effects == () for name in campaigns.NULLS)
+    assert len({tuple(kind.kind for kind in campaigns.campaign(name).noise) for name in campaigns.NULLS}) >= 7
+
+
+def test_the_papers_campaign_has_its_73_conditions_and_1752_files():
+    spec = campaigns.paper_campaign()
+    files = files_of(spec)
+    assert len(files) == 1752
+    assert files["condition"].nunique() == 73
+    assert set(files["temperature_C"]) == {20.0, 40.0, 60.0, 80.0, 23.0}  # 23 is the unaged rubber's
+    assert (files["load_N"] == 49.03).all()
+    # Every day's tests begin on that day, and end before the next.
+    late = files["elapsed_h"] / 24 - files["aging_days"]
+    assert late.between(0, 1).all()
+
+
+@pytest.mark.parametrize("name", EFFECTS_ONLY)
+def test_strengths_stand_in_their_proportion_to_the_scatter(name, tmp_path):
+    rms = []
+    for strength in campaigns.STRENGTHS:
+        simulate(campaigns.campaign(name, strength=strength, rows=60), tmp_path / strength)
+        truth = load_truth(truth_path(tmp_path / strength))
+        rms.append([effect["rms_N"] for effect in truth["effects"]])
+    mean = np.abs([row["mean_force_N"] for row in truth["files"]]).mean()
+    # One file's scatter: repeat, set-up and specimen, 0.5 % of some 25 N each.
+    scatter = mean * np.sqrt(3) * 0.005
+    rms = np.array(rms)
+    assert ((rms[0] > 0.2 * scatter) & (rms[0] < 2 * scatter)).all()
+    np.testing.assert_allclose(rms[1] / rms[0], 3.0, rtol=0.02)
+    np.testing.assert_allclose(rms[2] / rms[0], 10.0, rtol=0.12)  # factors multiply each other
+
+
+def test_the_command_writes_one_and_refuses_an_unknown_name(tmp_path, capsys):
+    out = tmp_path / "c"
+    assert campaigns.main(["null_specimen_with_columns", "--seed", "3", "--out", str(out), "--rows", "60"]) == 0
+    runs = pd.read_csv(out / "runs.csv")
+    assert {"lab_temperature_C", "sheet"} <= set(runs.columns)
+    assert load_truth(truth_path(out))["spec"]["seed"] == 3
+    assert campaigns.main(["no_such", "--out", str(tmp_path / "d")]) == 1
+    assert "there is no campaign 'no_such'" in capsys.readouterr().err
+    assert campaigns.main(["--list"]) == 0
+    assert len(capsys.readouterr().out.split()) == 24
