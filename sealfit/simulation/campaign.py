@@ -56,12 +56,12 @@ def simulate(spec: Spec, out: Path) -> None:
             os.replace(part / "new", out)
             os.replace(part / "truth.json", truth_path(out))
         except OSError as error:
-            if (part / "old").exists() and not out.exists():
-                os.replace(part / "old", out)
             raise OutError(
                 f"cannot be written ({error.strerror}).", file=out, mend="Check the disk and the folder's permissions."
             ) from error
     finally:
+        if (part / "old").exists() and not out.exists():
+            os.replace(part / "old", out)  # whatever stopped it, Ctrl-C too: the last campaign comes back
         shutil.rmtree(part, ignore_errors=True)
 
 

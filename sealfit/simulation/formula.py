@@ -7,6 +7,7 @@ arrays are ever computed with. It allows more than the expressions of a rig conf
 from __future__ import annotations
 
 import ast
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -80,7 +81,9 @@ def parse_formula(text: str) -> Formula:
     if len(text) > MAX_CHARACTERS:
         raise ConfigError(f"a formula of {len(text)} characters.", mend=f"Keep it below {MAX_CHARACTERS}.")
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # "1if": a remark of Python's about text that is refused below anyway
+            tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = getattr(error, "msg", None) or "it is nested too deeply"
         raise ConfigError(f"{text!r} is no formula: {reason}.", mend=_MEND) from error

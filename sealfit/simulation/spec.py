@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError, model_validator
 
+from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
 from sealfit.simulation.channels import Channel
 from sealfit.simulation.design import Design
@@ -71,7 +72,11 @@ class Spec(Strict):
             seen.add(channel.name)
             if channel.kind == "slow" and not self.design.dated:
                 raise ValueError(f"channel '{channel.name}' drifts with the calendar: design.order must not be undated")
+        labels = {c.name: c.labels for c in self.channels if c.kind == "category" and c.labels}
         for number, effect in enumerate(self.effects):
+            for category in effect.parameters if effect.id == LEVELS and effect.channels[0] in labels else ():
+                if category not in labels[effect.channels[0]]:
+                    raise ValueError(f"effects.{number} (levels): '{category}' is no label of {effect.channels[0]}")
             read = parse_formula(effect.formula).channels if effect.formula is not None else ()
             for name in (*effect.channels, *(n for n in read if n not in effect.parameters)):
                 if name not in self.channel_names:

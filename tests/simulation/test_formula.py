@@ -1,6 +1,8 @@
 import numpy as np
 import numpy.testing as npt
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sealfit.errors import ConfigError
 from sealfit.simulation.formula import evaluate_formula, parse_formula
@@ -86,3 +88,17 @@ def test_formula_says_that_a_category_is_no_number():
 
 def test_a_huge_power_is_infinite_at_once():
     assert np.isinf(value("9 ** 9 ** 9 ** 9"))
+
+
+@given(st.text(max_size=40) | st.text("x1.+-*/()=<>!'\"[]{}:, \n\\@%&|if", max_size=25))
+def test_any_text_is_a_formula_of_numbers_or_refused(text):
+    try:
+        formula = parse_formula(text)
+    except ConfigError:
+        return
+    assert evaluate_formula(formula, {name: np.ones(2) for name in formula.channels}).dtype == float
+
+
+@given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3), st.floats(0.1, 1e3))
+def test_arithmetic_is_pythons(a, b, c):
+    npt.assert_allclose(value("a + b * 2 - (a - b) / c ** 2", a=a, b=b, c=c), a + b * 2 - (a - b) / c**2, rtol=1e-12)
