@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -22,6 +23,7 @@ class Motion:
     speed_mm_s: np.ndarray  # signed; zero at rest
     direction: np.ndarray
     stroke: np.ndarray
+    cruising: np.ndarray  # bool: between the ramps
     steady: np.ndarray
 
 
@@ -51,6 +53,8 @@ def move(design: Design, speed_mm_s: float, direction: int, start_mm: float) -> 
     number = np.minimum((time / period).astype(int), design.strokes_per_file - 1)
     since = time - number * period - rest  # since the stroke began to move
     along, speed = _trapezoid(since, ramp, cruise, speed_mm_s, length)
+    cruising = (since > ramp) & (since < ramp + cruise)
+    settled = 0.5 * speed_mm_s * ramp + STEADY_LENGTHS * design.stiffness_mm
     sign = direction * np.where(number % 2, -1, 1)
     both = design.strokes_per_file > 1
     return Motion(
@@ -61,7 +65,8 @@ def move(design: Design, speed_mm_s: float, direction: int, start_mm: float) -> 
         speed_mm_s=sign * speed,
         direction=sign,
         stroke=number + 1,
-        steady=(since > ramp) & (since < ramp + cruise) & (along > STEADY_LENGTHS * design.stiffness_mm),
+        cruising=cruising,
+        steady=cruising & (along > settled),
     )
 
 
@@ -82,16 +87,35 @@ def _trapezoid(
 
 
 def with_presliding(friction_N: np.ndarray, motion: Motion, stiffness_mm: float) -> np.ndarray:
-    r"""Return the friction with its pre-sliding rise, shape (n,).
+    r"""Return the friction with what the bristles make of it where the speed changes, shape (n,).
 
-    .. math:: F(x) = F_{steady} (1 - e^{-x/x_0}) + F_{before} e^{-x/x_0}
+    .. math:: dF/dx = (F_{steady} - F) / x_0
 
-    the solution of Eqs. 2 and 3 in the distance x at constant speed, with x_0 = g / sigma_0; F_before is what the last
-    stroke left behind, nothing in a file's first.
+    which is Eq. 2 over the distance x, with x_0 = g / sigma_0 taken as constant: the force rises from rest over x_0,
+    passes a break-away where the ramp is longer than that, follows a stop as far as x_0 lets it, and holds at rest.
+    While the speed is constant only what is left of the start decays, so the truth of steady sliding has no lag.
+
+    Parameters
+    ----------
+    friction_N : ndarray, shape (n,)
+        Force of steady sliding at every row's speed.
+    motion : Motion
+        The rows.
+    stiffness_mm : float
+        x_0 in mm.
     """
-    left = np.exp(-motion.distance_mm / stiffness_mm)
-    result = friction_N * (1.0 - left)
-    for stroke in range(2, int(motion.stroke[-1]) + 1):
-        own = motion.stroke == stroke
-        result[own] += result[np.flatnonzero(motion.stroke == stroke - 1)[-1]] * left[own]
+    left = np.exp(-np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0])) / stiffness_mm).tolist()
+    result = friction_N.astype(float)
+    phase = 2 * motion.stroke + motion.cruising
+    edges = np.flatnonzero(np.diff(phase, prepend=-1, append=-1))
+    force = 0.0
+    for first, last in pairwise(edges.tolist()):
+        if motion.cruising[first]:
+            slid = np.abs(motion.displacement_mm[first:last] - motion.displacement_mm[first])
+            result[first:last] += (force - friction_N[first]) * left[first] * np.exp(-slid / stiffness_mm)
+            force = float(result[last - 1])
+            continue
+        for row, target in enumerate(friction_N[first:last].tolist(), start=first):
+            force = target + (force - target) * left[row]
+            result[row] = force
     return result

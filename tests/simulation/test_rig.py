@@ -67,6 +67,29 @@ def test_strokes_both_ways_in_one_file(campaign):
     assert {row["run_id"] for row in truth["runs"]} >= {"unaged_2mms+", "unaged_2mms-"}
 
 
+def test_a_turn_without_ramp_and_rest_begins_with_the_force_before_it(campaign):
+    design = {**ONE_CONDITION, "directions": (1, -1), "strokes_per_file": 2, "ramp_s": 0.0, "dwell_s": 0.0}
+    physics = {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0}
+    _, runs, traces = campaign(design={**design, "stiffness_mm": 1.0, "max_rows": 2000}, physics=physics)
+    trace = traces[runs["file"][0]]
+    back = trace.iloc[trace["displacement_mm"].argmax() + 1 :]
+    since = 40 - back["displacement_mm"]
+    # dF/dx = (-F_0 - F) / x_0 from +F_0: F = F_0 (2 exp(-x / x_0) - 1).
+    npt.assert_allclose(back["force_N"], 0.5 * 49.03 * (2 * np.exp(-since) - 1), atol=0.05 * 0.5 * 49.03)
+    npt.assert_allclose(back["force_N"].iloc[-500:], -0.5 * 49.03, atol=1e-5)
+
+
+def test_a_stop_rises_as_far_as_the_bristles_let_it(campaign):
+    design = {**ONE_CONDITION, "speeds_mm_s": (20.0,), "stiffness_mm": 0.5, "max_rows": 1000}
+    _, runs, traces = campaign(design=design, physics={"sigma_2": 0.0})
+    force = traces[runs["file"][0]]["force_N"]
+    free, full = 0.609 * 49.03, 0.93513 * 49.03
+    end = force.iloc[-1]
+    # The last millimetres are slow, but mu_s is not reached within 0.5 mm of them; at rest the force holds.
+    assert free + 0.02 * (full - free) < end < free + 0.5 * (full - free)
+    npt.assert_allclose(force.iloc[-10:], end)
+
+
 def test_columns_that_the_design_does_not_have_are_missing(campaign):
     _, runs, traces = campaign(
         "bare",
