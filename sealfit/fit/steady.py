@@ -11,7 +11,7 @@ from sealfit.conditions import condition_columns
 from sealfit.config import Config
 from sealfit.fit.condition import FULL, Condition, bound, drop_flat_curve, judge, make_condition, solve
 from sealfit.fit.stribeck import NAMES, linearised
-from sealfit.fit.uncertainty import UnitVariance, run_means, run_weights, unit_variance
+from sealfit.fit.uncertainty import UnitVariance, likelier, run_means, run_weights, unit_variance
 from sealfit.ingest.scatter import Scatter, repeat_scatter
 from sealfit.tables import STEADY_FIT, Units
 
@@ -54,9 +54,10 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     """
     runs = run_means(steady)
     scatter = repeat_scatter(steady)
-    runs["weight"] = run_weights(runs, scatter)
-    conditions = [make_condition(name, rows) for name, rows in runs.groupby("condition", sort=True)]
-    solve(conditions)
+    choices = run_weights(runs, scatter)
+    solved = [_solved(runs.assign(weight=weight)) for weight in choices]
+    chi2 = [sum(c.chi2 for c in conditions) for conditions in solved]
+    conditions = solved[likelier(chi2, choices, sum(c.df for c in solved[0])) if len(solved) > 1 else 0]
     first = _unit_variance(conditions, scatter)
     for condition, value, df in zip(conditions, first.value, first.df, strict=True):
         if condition.model == FULL:
@@ -70,6 +71,12 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
     fixed = STEADY_FIT.names()
     return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
+
+
+def _solved(runs: pd.DataFrame) -> list[Condition]:
+    conditions = [make_condition(name, rows) for name, rows in runs.groupby("condition", sort=True)]
+    solve(conditions)
+    return conditions
 
 
 def _unit_variance(conditions: list[Condition], scatter: Scatter) -> UnitVariance:

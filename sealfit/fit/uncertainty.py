@@ -8,6 +8,7 @@ by the Birge ratio, the root of the reduced chi-square.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ from sealfit.ingest.scatter import Scatter
 POOLING_P = 0.25  # Bancroft's level for "is there set-up scatter at all": at 5 % it would too often be missed
 WORSE_P = 0.01  # a condition that disagrees more than the others at this level is widened by its own ratio
 SMALLEST_SD = 1e-9  # of the largest force: repeats that agree to the last digit do not make a run infinitely certain
+SMALLEST_SHARE = 0.05  # of the largest force: a scatter in proportion to the force does not vanish with it
 NEEDED = ("condition", "series", "rubber", "run_id", "file", "direction", "speed_mm_s", "load_N", "force_N", "used")
 
 
@@ -75,13 +77,35 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     return runs
 
 
-def run_weights(runs: pd.DataFrame, scatter: Scatter) -> np.ndarray:
-    """Return 1/variance of each run mean from the scatter of repeats, shape (n,); all 1 where nothing was repeated."""
+def run_weights(runs: pd.DataFrame, scatter: Scatter) -> list[np.ndarray]:
+    """Return 1/variance of each run mean, shape (n,): one choice with repeats, two without.
+
+    With repeats it follows from their pooled scatter. Without, only its shape can be guessed, the same everywhere or in
+    proportion to the force squared, and `likelier` says which the residuals bear out.
+    """
+    force = runs["force"].abs().to_numpy(float)
     if not scatter.df > 0:
-        return np.ones(len(runs))
-    sd = scatter.sd_N(runs["force"].to_numpy(float))
-    floor = SMALLEST_SD * float(runs["force"].abs().max()) or 1.0
-    return runs["files"].to_numpy(float) / np.maximum(sd, floor) ** 2
+        return [np.ones(len(runs)), 1.0 / np.maximum(force, SMALLEST_SHARE * force.max() or 1.0) ** 2]
+    floor = SMALLEST_SD * float(force.max()) or 1.0
+    return [runs["files"].to_numpy(float) / np.maximum(scatter.sd_N(force), floor) ** 2]
+
+
+def likelier(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float) -> int:
+    """Return which weights the residuals bear out: least n ln(chi2/df) - sum ln w, twice the negative log likelihood.
+
+    Parameters
+    ----------
+    chi2 : sequence of float
+        Weighted sum of squares of the whole campaign under each choice.
+    weights : sequence of ndarray, shape (n,)
+        The choices.
+    df : float
+        Degrees of freedom of chi2.
+    """
+    if not df > 0:
+        return 0
+    with np.errstate(divide="ignore"):
+        return int(np.argmin([len(w) * np.log(c / df) - np.log(w).sum() for c, w in zip(chi2, weights, strict=True)]))
 
 
 @dataclass(frozen=True)

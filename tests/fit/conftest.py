@@ -19,13 +19,14 @@ def steady_rows(
     noise=0.004,
     setup=0.0,
     specimen=0.0,
+    constant=0.0,
     load=49.03,
     ways=(1, -1),
     commanded=True,
     model=None,
     laws=None,
 ):
-    """Table `steady` of a campaign with known truth; noise, setup and specimen are relative standard deviations."""
+    """Table `steady` of a campaign with known truth; noise, setup and specimen are relative, constant in N."""
     rng = np.random.default_rng(seed)
     rows = []
     for place, (temperature, compression) in enumerate(series):
@@ -61,7 +62,8 @@ def steady_rows(
                                 "speed_mm_s": way * speed,
                                 "speed_set_mm_s": speed if commanded else np.nan,
                                 "load_N": load if load else np.nan,
-                                "force_N": float(force) * (1 + noise * rng.normal()),
+                                "force_N": float(force) * (1 + noise * rng.normal())
+                                + (constant * rng.normal() if constant else 0.0),
                                 "used": True,
                                 "temperature_C": temperature,
                                 "compression_ratio_pct": compression,

@@ -7,7 +7,7 @@ from scipy.optimize import curve_fit
 from sealfit.config import Config, Quantity, Sensor
 from sealfit.errors import FitError
 from sealfit.fit.steady import fit_conditions
-from sealfit.fit.uncertainty import run_means, speed_levels, unit_variance
+from sealfit.fit.uncertainty import likelier, run_means, speed_levels, unit_variance
 from sealfit.tables import STEADY_FIT
 
 TRUTH = {"mu_s": 0.7, "mu_c": 0.45, "v_s": 6.0, "sigma_2": 0.03}
@@ -245,6 +245,19 @@ def test_without_repeats_the_residual_is_the_scatter_and_lack_of_fit_is_null(cam
     npt.assert_allclose(row.value, 0.7, atol=4 * row.se)
 
 
+@pytest.mark.parametrize(("noise", "constant"), [(0.01, 0.0), (0.0, 0.3)], ids=["relative", "constant"])
+def test_without_repeats_the_residuals_say_how_scatter_goes_with_force(campaign, noise, constant):
+    """mu_s is seen where the force is largest: were 1 % taken for a constant, its error would be a third too small."""
+    errors, stated = [], []
+    for seed in range(40):
+        table = campaign(seed=seed, repeats=1, noise=noise, constant=constant, days=(0, 1, 2), model=TRUTH, ways=(1,))
+        row = steady(fit_conditions(table, Config()), "mu_s")
+        errors.append(row.value - 0.7)
+        stated.append(row.se)
+    # the spread of 40 errors is known to 11 %; three of those
+    npt.assert_allclose(np.sqrt(np.mean(np.square(stated))) / np.std(errors), 1.0, atol=0.34)
+
+
 def test_four_single_runs_are_fitted_exactly_and_trusted_with_nothing(campaign):
     fits = fit_conditions(campaign(repeats=1, speeds=(1, 4, 10, 40), ways=(1,), **UNAGED), Config())
     row = steady(fits, "mu_s")
@@ -296,3 +309,12 @@ def test_a_condition_worse_than_the_others_gets_its_own_ratio():
     assert list(variance.own) == [False] * 9 + [True]
     npt.assert_allclose(variance.value[-1], 20.0)
     assert variance.df[-1] == 5
+
+
+def test_likelier_weights_by_hand():
+    force = np.array([1.0, 1, 10, 10])
+    error = np.array([0.1, -0.1, 1, -1])  # in proportion to the force
+    weights = [np.ones(4), 1 / force**2]
+    assert likelier([np.sum(w * error**2) for w in weights], weights, 4) == 1
+    even = np.array([0.1, -0.1, 0.1, -0.1])
+    assert likelier([np.sum(w * even**2) for w in weights], weights, 4) == 0
