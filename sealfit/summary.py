@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift")  # `quantity` of rows about the fit itself
 
+EFFECT_KEYS = ("id", "label", "form", "acts_on", "operation", "channels", "named", "candidate", "parameters")
+
 
 # ---------------------------------------------------------------- plain values
 def of_steps(store: Store, steps: Iterable[str]) -> dict:
@@ -73,10 +75,7 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
 def of_closure(closure: Mapping, units: Units) -> dict:
     """Return the verdict, the errors before and after, the effects and what is left."""
     kept = ("verdict", "units", "noise_floor_N", "before", "after", "heldout_unit", "left", "next_runs")
-    effects = [
-        {key: effect[key] for key in ("id", "label", "form", "acts_on", "operation", "channels", "named", "candidate")}
-        for effect in closure["effects"]
-    ]
+    effects = [{key: effect[key] for key in EFFECT_KEYS} for effect in closure["effects"]]
     return {**{key: closure[key] for key in kept}, "sentence": verdict_sentence(closure, units), "effects": effects}
 
 
@@ -196,18 +195,23 @@ def closure_lines(part: Mapping) -> list[str]:
     found = [_line("verdict", f"{part['verdict']}: {part['sentence']}")]
     for effect in part["effects"]:
         status = "candidate, not applied: " if effect["candidate"] else "+ "
-        unnamed = "" if effect["named"] else " (no form in the catalogue does as well)"
-        found.append(_line("", f"{status}{effect['label']}: {effect['form']}, {_acts(effect)}{unnamed}"))
+        values = ", ".join(_value(p) for p in effect["parameters"]) if effect["named"] else "no form does as well"
+        found.append(_line("", f"{status}{effect['label']}: {values}"))
     rows = (("rmse", "rmse_N"), ("held out", "heldout_rmse_N"), ("run means", "rmse_runs_N"), ("largest", "max_abs_N"))
     texts = [f"{name} {_number(before[key])} -> {_number(after[key])}" for name, key in rows]
     found.append(_line(f"error ({unit})", "; ".join(texts)))
     if part["noise_floor_N"] is not None:
         found.append(_line("noise floor", f"{_number(part['noise_floor_N'])} {unit}"))
-    if part["verdict"] == "unexplained":
+    if part["verdict"] == "unexplained" and part["left"]["rmse_N"] is not None:
         found.append(_line("left", f"rmse {_number(part['left']['rmse_N'])} {unit}"))
     for run in part["next_runs"][:3]:
         found.append(_line("next runs", run["why"]))
     return found
+
+
+def _value(parameter: Mapping) -> str:
+    unit = f" {parameter['unit']}" if parameter["unit"] else ""
+    return f"{parameter['name']} {_number(parameter['value'])}{unit}"
 
 
 def _acts(effect: Mapping) -> str:
@@ -241,7 +245,7 @@ def predict_lines(part: Mapping) -> list[str]:
 
 
 def _line(title: str, text: str) -> str:
-    return f"{title:<12}{text}"
+    return f"{title:<11} {text}"
 
 
 def _count(number: int, what: str) -> str:

@@ -30,6 +30,10 @@ EFFECT = {
     "channels": ["displacement_mm"],
     "named": True,
     "candidate": False,
+    "parameters": [
+        {"name": "A", "value": 0.25, "ci95": [0.2, 0.3], "unit": "N"},
+        {"name": "n", "value": float("nan"), "ci95": [None, None], "unit": ""},
+    ],
 }
 CLOSURE = {
     "schema": 1,

@@ -164,6 +164,7 @@ def test_run_does_every_step_and_says_so_in_a_few_lines(sealfit, parts, campaign
     assert "steady fit  mu_s 0.7 to 0.8" in lines
     assert "            not identified: mu_s in 1 of 3. Too few speeds." in lines
     assert "verdict     closed: one effect was missing and is added; no significant structure is left" in lines
+    assert "            + lead-screw ripple: A 0.25 N, n unknown" in lines
     assert "error (N)   rmse 0.4 -> 0.2; held out 0.5 -> unknown; run means 0.3 -> 0.3; largest 1.5 -> 1.5" in lines
     assert f"report      {out / 'report.html'}" in lines
     assert "reading trace files: 1 of 1" in ended.stderr
@@ -252,6 +253,16 @@ def test_many_faults_are_cut_short(sealfit, parts, campaign, out):
     ended = sealfit("ingest", campaign, "--out", out)
     assert ended.stderr.count("is not a number") == 20
     assert "and 80 more: `sealfit check`" in ended.stderr
+
+
+def test_an_effect_that_is_not_named_or_not_applied_is_said_so(sealfit, parts, campaign, out):
+    unnamed = {**fake_parts.EFFECT, "label": "smooth in time", "named": False}
+    candidate = {**fake_parts.EFFECT, "candidate": True}
+    parts.closure = {**fake_parts.CLOSURE, "effects": [unnamed, candidate]}
+    lines = sealfit("run", campaign, "--out", out).stdout.splitlines()
+    assert "            + smooth in time: no form does as well" in lines
+    assert "            candidate, not applied: lead-screw ripple: A 0.25 N, n unknown" in lines
+    assert "closed: one effect was missing and is added" in "".join(lines)
 
 
 @pytest.mark.parametrize(
