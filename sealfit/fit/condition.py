@@ -11,6 +11,7 @@ from sealfit.fit.batch import project
 from sealfit.fit.interval import constrained_ends
 from sealfit.fit.stribeck import NAMES, flat_p_value, solve_stribeck, stribeck_intervals, tangent
 from sealfit.fit.uncertainty import speed_levels
+from sealfit.physics import stribeck_force
 
 FULL, VISCOUS, CONSTANT = 4, 2, 1  # speed levels within one direction that each model needs
 SIGNIFICANT = 0.05
@@ -54,6 +55,27 @@ class Condition:
         """Derivative of F sgn v along the parameters, shape (n, p)."""
         speed, load, _, _ = self.arrays
         return tangent(speed, load, self.values) if self.model == FULL else self.columns()
+
+    def model_force(self) -> np.ndarray:
+        """F sgn v of the fitted model at every run, shape (n,)."""
+        speed, load, _, _ = self.arrays
+        if self.model != FULL:
+            return self.columns() @ self.values
+        mu_s, mu_c, v_s, sigma_2 = self.values
+        return stribeck_force(speed, load, mu_s=mu_s, mu_c=mu_c, v_s=v_s, sigma_2=sigma_2)
+
+    def offset(self) -> float:
+        """Half the difference between the directions' residuals where it is clear (4 standard errors), else 0.
+
+        It is no part of the declared model, but it widens the intervals and can hide a Stribeck curve: worth a word.
+        """
+        rest, way = self.runs["force"].to_numpy(float) - self.model_force(), self.runs["direction"].to_numpy()
+        one, other = rest[way > 0], rest[way < 0]
+        if min(len(one), len(other)) < 3:
+            return 0.0
+        half = (one.mean() - other.mean()) / 2
+        error = np.sqrt(one.var(ddof=1) / len(one) + other.var(ddof=1) / len(other)) / 2
+        return float(half) if abs(half) > 4 * error else 0.0
 
     def columns(self) -> np.ndarray:
         """Columns of the model without Stribeck curve, shape (n, p)."""
@@ -152,6 +174,13 @@ def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
         flat = f"mu_s = mu_c is not rejected (p = {condition.flat_p:.2g}): no Stribeck curve is seen"
         verdict |= {"mu_s": (False, f"{flat}, mu_s is mu_c."), "v_s": (False, f"{flat}, so v_s has no meaning.")}
         verdict["mu_c"] = (True, "of the fit without Stribeck curve; mu_s = mu_c is not rejected.")
+        if condition.offset():
+            hidden = (
+                "The offset between the two directions counts as scatter here and may hide a curve; see close-loop."
+            )
+            verdict |= {
+                name: (ok, f"{why} {hidden}".strip()) for name, (ok, why) in verdict.items() if name != "sigma_2"
+            }
     elif condition.low is None:
         unknown = "as many parameters as runs and no repeats: nothing shows how far to trust it."
         verdict |= {name: (False, unknown) for name in NAMES}

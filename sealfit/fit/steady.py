@@ -94,7 +94,7 @@ def _keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 # ---------------------------------------------------------------- what the table says
 def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter, config: Config) -> Iterator[dict]:
     unit_of = parameter_units(config.units, condition.has_load)
-    speed, load, force, weight = condition.arrays
+    _, _, force, weight = condition.arrays
     covariance, shift = linearised(condition.jacobian(), weight, condition.values, condition.names)
     covariance = covariance * variance.value[k]
     shift = np.where(np.abs(shift) > 1e-12 * np.abs(condition.values), shift * config.sensor.u, 0.0)  # else rounding
@@ -111,7 +111,7 @@ def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter
             row |= {"value": condition.values[j], "se": _finite(np.sqrt(covariance[j, j])), "u_sys": abs(shift[j])}
             row |= {"lo95": None if open_below else _finite(low), "hi95": _finite(high)}
         yield table_row(**row)
-    residual = force - _model(condition, speed, load)
+    residual = force - condition.model_force()
     yield from _statistics(condition, k, variance, scatter, residual, config.units.unit("force"))
     if np.isfinite(variance.value[k]):
         for i, one in enumerate(condition.names):
@@ -133,14 +133,6 @@ def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter
         )
 
 
-def _model(condition: Condition, speed: np.ndarray, load: np.ndarray) -> np.ndarray:
-    if condition.model != FULL:
-        return condition.columns() @ condition.values
-    mu_s, mu_c, v_s, sigma_2 = condition.values
-    decay = np.exp(-((speed / v_s) ** 2))
-    return load * (mu_s * decay + mu_c * (1 - decay)) + sigma_2 * speed
-
-
 def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterator[dict]:
     repeated = scatter.df > 0
     no_repeats = "" if repeated else "no run was repeated: there is no pure error to compare with."
@@ -153,6 +145,9 @@ def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterat
             "lack of fit: the runs disagree with the model by more than their repeats scatter (set-up scatter between "
             f"runs, or something the model lacks); intervals are widened {np.sqrt(variance.value[k]):.2g} times."
         )
+    offset = condition.offset()
+    if offset:
+        lack = f"{lack} The two directions differ: offset of {offset:.3g} {force_unit}, in no declared model.".strip()
     if condition.left_out:
         lack = f"{lack} {condition.left_out} runs without load were left out of the fit.".strip()
     for name, value, unit, reason in (
@@ -161,7 +156,12 @@ def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterat
         ("reduced_chi2", ratio if repeated else None, "", no_repeats),
         ("lack_of_fit_F", variance.f[k], "", no_repeats),
         ("lack_of_fit_p", variance.p[k], "", lack),
-        ("birge_ratio", np.sqrt(variance.value[k]) if repeated else None, "", "own" if variance.own[k] else "pooled"),
+        (
+            "birge_ratio",
+            np.sqrt(variance.value[k]) if repeated else None,
+            "",
+            no_repeats or ("own" if variance.own[k] else "pooled"),
+        ),
         ("error_df", variance.df[k], "", "degrees of freedom of the intervals' Student t"),
         ("flat_p", condition.flat_p, "", "chance of this much Stribeck curve where mu_s = mu_c"),
         ("rmse_N", np.sqrt(np.mean(residual**2)), force_unit, ""),
