@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ from sealfit.errors import CampaignError, Fault, OutError
 from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, glob_names
 from sealfit.places import RUNS, campaign_folder, existing_file, existing_out, refuse_effects_in
 from sealfit.progress import Silent
-from sealfit.staging import Staged, disk
+from sealfit.staging import Staged
 from sealfit.state import ConfigCopy
 from sealfit.store import Store
 from sealfit.tables import Units
@@ -267,26 +266,14 @@ def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:
     Raises
     ------
     OutError
-        If `out` exists and `force` is not given, or if it is not a simulated campaign; or if the disk refuses.
+        If `out` is there already and `force` is not given, or as `sealfit.simulate.simulate`.
     """
-    from sealfit.simulate import load_spec
+    from sealfit.simulate import load_spec, truth_path
     from sealfit.simulate import simulate as make
 
     loaded = load_spec(existing_file(spec, "spec"))
-    truth = out.parent / f"{out.name}.truth.json"
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        if not truth.is_file() or not out.is_dir():
-            raise OutError("exists and is no simulated campaign.", file=out, mend="Choose another --out.")
-        if not force:
-            raise OutError("exists already.", file=out, mend="Choose another --out, or replace it with --force.")
-    with disk(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
-            made = Path(folder) / out.name
-            make(loaded, made)
-            if out.exists():
-                out.rename(Path(folder) / "replaced")
-            made.rename(out)
-            (Path(folder) / truth.name).replace(truth)
+    if not force and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
+        raise OutError("is there already.", file=out, mend="Choose another --out, or replace it with --force.")
+    make(loaded, out)
     files = sum(1 for path in out.rglob("*") if path.is_file() and path.name != RUNS)
-    return {"campaign": str(out), "truth": str(truth), "files": files}
+    return {"campaign": str(out), "truth": str(truth_path(out)), "files": files}

@@ -115,10 +115,9 @@ class Parts:
 
     def simulate(self, spec, out):
         self._called("simulate")
-        out.mkdir()
+        out.mkdir(parents=True, exist_ok=True)
         (out / "runs.csv").write_text("file\na.csv\n")
         (out / "a.csv").write_text(f"{spec}\n")
-        out.with_name(out.name + ".truth.json").write_text("{}")
 
 
 def put_in(monkeypatch):
@@ -139,4 +138,5 @@ def put_in(monkeypatch):
             setattr(module, name, getattr(parts, name))
         monkeypatch.setitem(sys.modules, place, module)
     sys.modules["sealfit.simulate"].load_spec = lambda path: path.read_text()
+    sys.modules["sealfit.simulate"].truth_path = lambda out: out.with_name(out.name + ".truth.json")
     return parts

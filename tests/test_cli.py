@@ -9,7 +9,7 @@ import fake_parts
 import pandas as pd
 import pytest
 
-from sealfit import cli, steps
+from sealfit import cli
 from sealfit.errors import CampaignError, Fault, FitError
 from sealfit.fingerprint import STEPS
 
@@ -411,25 +411,15 @@ def test_predict_never_overwrites_the_points(sealfit, done, tmp_path):
 
 
 # ---------------------------------------------------------------- simulate
-def test_simulate_writes_campaign_and_truth_and_keeps_what_is_there(sealfit, parts, tmp_path):
+def test_simulate_names_campaign_and_truth_and_replaces_only_when_told(sealfit, parts, tmp_path):
     spec, made = tmp_path / "spec.toml", tmp_path / "deep" / "made"
     spec.write_text("one")
     ended = sealfit("simulate", spec, "--out", made)
     assert ended.code == 0
-    assert f"1 trace files in {made}" in ended.stdout
-    assert sorted(path.name for path in made.parent.iterdir()) == ["made", "made.truth.json"]
+    assert ended.stdout == f"1 trace files in {made}\ntruth: {made}.truth.json\n"
     spec.write_text("two")
-    assert "exists already. Choose another --out, or replace it" in sealfit("simulate", spec, "--out", made).stderr
+    assert "is there already. Choose another --out, or replace it" in sealfit("simulate", spec, "--out", made).stderr
     assert (made / "a.csv").read_text() == "one\n"
     assert sealfit("simulate", spec, "--out", made, "--force").code == 0
     assert (made / "a.csv").read_text() == "two\n"
-    (tmp_path / "deep" / "made.truth.json").unlink()
-    assert "is no simulated campaign" in sealfit("simulate", spec, "--out", made, "--force").stderr
-
-
-def test_a_simulation_that_fails_leaves_nothing(parts, tmp_path):
-    (tmp_path / "spec.toml").write_text("one")
-    parts.raises["simulate"] = ZeroDivisionError()
-    with pytest.raises(ZeroDivisionError):
-        steps.simulate(tmp_path / "spec.toml", tmp_path / "made")
-    assert [path.name for path in tmp_path.iterdir()] == ["spec.toml"]
+    assert "there is no spec" in sealfit("simulate", tmp_path / "none.toml", "--out", made).stderr
