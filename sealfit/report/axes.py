@@ -1,0 +1,66 @@
+"""What several plots share: axes that read well, one scale for all panels, the order of names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+from sealfit.report.symbols import plain, short
+
+MOST_TICKS = 8  # names of categories that fit below a panel
+
+
+def log_axis(ax: Axes) -> None:
+    """Make the x axis logarithmic, with ticks at 1, 2 and 5 written as plain numbers."""
+    ax.set_xscale("log")
+    low, high = ax.get_xlim()
+    subs = (1.0, 2.0, 5.0) if np.log10(high / low) < 2.8 else (1.0,)
+    ax.xaxis.set_major_locator(LogLocator(subs=subs, numticks=20))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.xaxis.set_minor_locator(NullLocator() if len(subs) > 1 else LogLocator(subs=(2.0, 5.0), numticks=40))
+    ax.xaxis.set_minor_formatter(NullFormatter())
+
+
+def category_ticks(ax: Axes, labels: Sequence[str]) -> None:
+    """Name categories below the axis, each that fits; cut long names, skip evenly where there are many."""
+    every = int(np.ceil(len(labels) / MOST_TICKS))
+    shown = list(range(0, len(labels), every))
+    room = max(4, int(42 / max(len(shown), 1)))
+    ax.set_xticks(shown, [plain(short(labels[k], room)) for k in shown])
+    ax.set_xlim(-0.6, len(labels) - 0.4)
+    ax.grid(axis="x", visible=False)
+
+
+def padded(low: float, high: float) -> tuple[float, float]:
+    """Return the ends of a scale that holds both values with a little room."""
+    room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
+    return float(low - room), float(high + room)
+
+
+def is_number(text: str) -> bool:
+    """Return whether text is a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def in_order(values: Iterable[str], key: Callable[[str], str] = str) -> list[str]:
+    """Return texts in order, those that are numbers by their size and before the others."""
+    return sorted(
+        values, key=lambda value: (0, float(key(value)), "") if is_number(key(value)) else (1, 0.0, key(value))
+    )
+
+
+def natural(entry: tuple[str, object]) -> list[tuple[int, float, str]]:
+    """Return a sort key that puts 9 before 10."""
+    return [(0, float(word), "") if is_number(word) else (1, 0.0, word) for word in entry[0].split()]
+
+
+def capital(text: str) -> str:
+    """Return text with its first letter large."""
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,38 @@
+"""All plots of a report, from its tables; each subject is drawn in a file of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pandas as pd
+
+from sealfit.config import Config
+from sealfit.report.figures_curves import aging, traces_mean
+from sealfit.report.figures_loop import before_after, variance_levels
+from sealfit.report.figures_residual import effect_shapes, residual_channels
+from sealfit.report.figures_speed import force_speed
+from sealfit.report.style import Plot
+
+
+def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> dict[str, Plot]:
+    """Return every plot that these tables give, by name; one without data is not there.
+
+    Parameters
+    ----------
+    tables : mapping of str to DataFrame
+        The report's tables, all of them present, some perhaps empty.
+    closure : mapping or None
+        closure.json, or None where the loop was not run.
+    config : Config
+        Gives the labels their true units.
+    """
+    plots = (
+        before_after(tables, closure, config),
+        effect_shapes(tables, closure, config),
+        variance_levels(tables, config),
+        residual_channels(tables, config),
+        force_speed(tables, config),
+        aging(tables, config),
+        traces_mean(tables, config),
+    )
+    return {plot.name: plot for plot in plots if plot is not None}

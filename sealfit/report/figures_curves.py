@@ -1,0 +1,183 @@
+"""Aging curves, and a few averaged traces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from sealfit.config import Config
+from sealfit.report.axes import natural, padded
+from sealfit.report.numbers import count, given, number
+from sealfit.report.style import AFTER, CYCLE, FLOOR, QUIET, Key, Panel, Plot
+from sealfit.report.symbols import ConditionNames, is_unaged, joined, plain, short, symbol_plain
+from sealfit.tables import Units
+
+TRACE_BUCKETS = 350  # of each, the lowest and the highest sample are drawn: what the eye can see of a trace
+MOST_TRACES = 6
+
+
+# ---------------------------------------------------------------- aging
+def draw_aging(ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Units) -> None:
+    """Draw what aging does to the coefficients of one series: the law with its band, and each condition's fit.
+
+    Parameters
+    ----------
+    ax : Axes
+        Drawn on; the caller owns the figure.
+    points : DataFrame
+        Columns quantity, aging_days, value, lo95, hi95: the fits per condition.
+    curves : DataFrame
+        Rows of table `aging_curves`.
+    units : Units
+        Give the labels their true units.
+    """
+    quantities = list(dict.fromkeys([*curves["quantity"], *points["quantity"]]))
+    for k, quantity in enumerate(quantities):
+        colour, marker = CYCLE[k % len(CYCLE)], "os^Dv"[k % 5]
+        curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
+        ax.fill_between(curve["aging_days"], curve["lo95"], curve["hi95"], color=colour, alpha=0.18, linewidth=0)
+        ax.plot(curve["aging_days"], curve["value"], color=colour)
+        here = points[points["quantity"] == quantity]
+        spread = np.abs(np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float))
+        ax.errorbar(
+            here["aging_days"],
+            here["value"],
+            np.nan_to_num(spread),
+            color=colour,
+            linestyle="",
+            marker=marker,
+            capsize=1.5,
+            elinewidth=0.8,
+        )
+    ax.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
+    ax.set_xlabel(plain(units.label("aging_days")))
+    ax.set_ylabel(
+        "friction coefficient" if "mu_s" in quantities or "mu_c" in quantities else plain(units.label("force_N"))
+    )
+
+
+def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+    """Return the aging curves, a panel per series, or None if this campaign does not age rubber."""
+    curves = tables["aging_curves"]
+    if curves.empty or not config.aging:
+        return None
+    names = ConditionNames.of(config)
+    quantities = list(dict.fromkeys(curves["quantity"]))
+    points = aging_points(tables["steady_fit"], quantities, names)
+    series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural((names(s), None)))
+    rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
+    shown = pd.concat([curves["value"], curves["lo95"], curves["hi95"], points["value"]]).dropna()
+    span = padded(shown.quantile(0.002), shown.quantile(0.998))
+    right = max(curves["aging_days"].max(), points["aging_days"].max() if len(points) else 0.0)
+    panels = []
+    for name in series:
+        curve = curves[curves["series"] == name]
+        own = points["series"] == name
+        start = points["series"].map(is_unaged).astype(bool) & (points["rubber"] == rubber.get(name))
+        here = points[own | start]
+
+        def draw(ax: Axes, here=here, curve=curve) -> None:
+            draw_aging(ax, here, curve, config.units)
+            ax.set_ylim(*span)
+            ax.set_xlim(-0.03 * right, 1.03 * right)
+
+        first = float(curve["value"].iloc[0])
+        alt = f"Aging, {names(name)}: {joined([symbol_plain(q) for q in quantities])} over {number(right)} d; "
+        alt += f"{symbol_plain(quantities[0])} starts at {number(first)}."
+        panels.append(Panel(short(names(name)), alt, draw))
+    legend = [Key(q, CYCLE[k % len(CYCLE)], symbol=True) for k, q in enumerate(quantities)]
+    legend += [Key("fit per condition, 95 %", FLOOR, "point"), Key("aging law, 95 % band", FLOOR, "band")]
+    return Plot("aging", "Aging", tuple(panels), tuple(legend))
+
+
+def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str], names: ConditionNames) -> pd.DataFrame:
+    """Return the identified coefficients of every condition with the days they belong to."""
+    rows = steady_fit[steady_fit["parameter"].isin(list(quantities)) & steady_fit["identified"].astype(bool)]
+    days = [0.0 if is_unaged(c) else float(names.parts(c).get("aging_days", "nan")) for c in rows["condition"]]
+    columns = ["series", "rubber", "value", "lo95", "hi95"]
+    return rows[columns].assign(quantity=rows["parameter"], aging_days=days)
+
+
+# ---------------------------------------------------------------- averaged traces
+def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
+    """Draw one run's mean force along its displacement with its standard error; the steady window is shaded."""
+    thin = envelope(trace)
+    ax.fill_between(
+        thin["displacement_mm"],
+        thin["force_N"] - thin["force_se_N"].fillna(0),
+        thin["force_N"] + thin["force_se_N"].fillna(0),
+        color=AFTER,
+        alpha=0.25,
+        linewidth=0,
+    )
+    ax.plot(thin["displacement_mm"], thin["force_N"], color=AFTER, linewidth=0.9)
+    steady = trace.loc[trace["steady"].astype(bool), "displacement_mm"]
+    if len(steady):
+        ax.axvspan(steady.min(), steady.max(), color=QUIET, alpha=0.12, linewidth=0, zorder=0)
+    ax.set_xlabel(plain(units.label("displacement_mm")))
+    ax.set_ylabel(plain(units.label("force_N")))
+
+
+def envelope(trace: pd.DataFrame, buckets: int = TRACE_BUCKETS) -> pd.DataFrame:
+    """Return a trace thinned to the lowest and highest force of each bucket, so that ripples keep their height."""
+    trace = trace[trace["force_N"].notna()].sort_values("displacement_mm")
+    if len(trace) <= 2 * buckets:
+        return trace
+    bucket = (np.arange(len(trace)) * buckets) // len(trace)
+    force = trace["force_N"].reset_index(drop=True)
+    ends = force.groupby(bucket).agg(["idxmin", "idxmax"]).to_numpy().ravel()
+    return trace.iloc[np.unique(np.concatenate([ends, [0, len(trace) - 1]]))]
+
+
+def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+    """Return a few averaged traces, spread over conditions and speeds, or None if there are none."""
+    traces = tables["traces_mean"]
+    chosen = _examples(traces, tables["runs"])
+    if chosen.empty:
+        return None
+    names, units = ConditionNames.of(config), config.units
+    shown = traces.loc[traces["run_id"].isin(chosen["run_id"]), "force_N"].dropna()
+    span = padded(shown.min(), shown.max())
+    panels = []
+    for run in chosen.itertuples():
+        trace = traces[traces["run_id"] == run.run_id]
+        speed = f", {given(run.speed)} {units.unit('speed')}" if np.isfinite(run.speed) else ""
+        repeats = int(trace["n"].max())
+        title = f"{names(run.condition)}{speed}"
+
+        def draw(ax: Axes, trace=trace) -> None:
+            draw_trace(ax, trace, units)
+            ax.set_ylim(*span)
+
+        alt = f"Mean trace of {title}, {count(repeats, 'stroke')} averaged: {units.quantity('force')} from "
+        alt += f"{number(trace['force_N'].min())} to {number(trace['force_N'].max())} {units.unit('force')}."
+        panels.append(Panel(short(title, 40), alt, draw))
+    legend = (
+        Key("mean of the repeats", AFTER),
+        Key("± standard error", AFTER, "band"),
+        Key("steady window", QUIET, "band"),
+    )
+    return Plot("traces_mean", "Averaged traces", tuple(panels), legend)
+
+
+def _examples(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return up to six runs: conditions spread evenly, and along them the speeds from slow to fast."""
+    if traces.empty:
+        return pd.DataFrame(columns=["run_id", "condition", "speed"])
+    speed = runs["speed_set_mm_s"].fillna(runs["speed_mm_s"].abs()).astype(float)
+    speed = speed.groupby(runs["run_id"]).mean()
+    known = traces.drop_duplicates("run_id")[["run_id", "condition"]]
+    known = known.assign(speed=known["run_id"].map(speed).astype(float))
+    groups = [g.sort_values("speed") for _, g in known.groupby("condition", sort=False)]
+    n = min(MOST_TRACES, len(known))
+    picked = []
+    for k in range(n):
+        group = groups[round(k * (len(groups) - 1) / max(n - 1, 1))]
+        left = group[~group["run_id"].isin([row["run_id"] for row in picked])]
+        if len(left):
+            picked.append(left.iloc[round(k * (len(left) - 1) / max(n - 1, 1))])
+    return pd.DataFrame(picked)

@@ -1,0 +1,246 @@
+"""Force against speed: a panel per series, every condition with its model, band and run means."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from sealfit.config import Config
+from sealfit.report.axes import capital, in_order, is_number, log_axis, natural, padded
+from sealfit.report.numbers import count, number
+from sealfit.report.style import BLACK, CYCLE, FLOOR, Key, Panel, Plot, shades
+from sealfit.report.symbols import ConditionNames, channel_words, is_unaged, plain, short
+from sealfit.tables import Units
+
+MOST_COLOURS = 10  # in one panel; with more, each value of the last condition column has its own
+LOG_SPAN = 20.0  # speeds that span this factor are drawn on a logarithmic axis
+
+
+@dataclass(frozen=True)
+class Line:
+    """One condition in a panel of force against speed, all in the direction of motion (magnitudes).
+
+    `curves` holds, per direction and load, columns direction, speed, before, after, lo, hi; `points` speed, force, sd,
+    direction.
+    """
+
+    label: str
+    colour: str
+    curves: tuple[pd.DataFrame, ...] = ()
+    points: pd.DataFrame = field(default_factory=pd.DataFrame)
+
+
+def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool = False) -> None:
+    """Draw force against speed of several conditions: model with its band, declared model dotted, run means.
+
+    Parameters
+    ----------
+    ax : Axes
+        Drawn on; the caller owns the figure.
+    lines : sequence of Line
+        The conditions.
+    units : Units
+        Give the labels their true units.
+    log : bool
+        Whether the speed axis is logarithmic.
+    """
+    for line in lines:
+        for curve in line.curves:
+            ax.fill_between(curve["speed"], curve["lo"], curve["hi"], color=line.colour, alpha=0.2, linewidth=0)
+            ax.plot(curve["speed"], curve["before"], color=line.colour, linestyle=":", linewidth=0.9, alpha=0.8)
+            backward = len(curve) and curve["direction"].iloc[0] < 0
+            ax.plot(curve["speed"], curve["after"], color=line.colour, linestyle="--" if backward else "-")
+        for direction, points in line.points.groupby("direction") if len(line.points) else ():
+            ax.errorbar(
+                points["speed"],
+                points["force"],
+                points["sd"].fillna(0.0),
+                color=line.colour,
+                linestyle="",
+                marker="o" if direction > 0 else "<",
+                markersize=3.4,
+                markerfacecolor=line.colour if direction > 0 else "white",
+                markeredgewidth=0.9,
+                elinewidth=0.8,
+                capsize=1.5,
+            )
+    if log:
+        log_axis(ax)
+    else:
+        ax.set_xlim(left=0.0)
+    ax.set_xlabel(plain(units.label("speed_mm_s")))
+    ax.set_ylabel(plain(units.label("force_N")))
+
+
+def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+    """Return force against speed for every condition, a panel per series, or None if nothing was measured."""
+    points, curves = run_points(tables["steady"], config), curve_lines(tables, config)
+    conditions = pd.unique(pd.concat([points["condition"], curves["condition"]], ignore_index=True))
+    if not len(conditions):
+        return None
+    names = ConditionNames.of(config)
+    last = "aging_days" if config.aging else config.condition[-1]
+    rubber = tables["steady"].drop_duplicates("condition").set_index("condition")["rubber"].to_dict()
+    unaged = [c for c in conditions if is_unaged(c)]
+    groups = _groups([c for c in conditions if not is_unaged(c)], names, last)
+    if not groups:
+        groups = {"": unaged}
+    levels = in_order({names.parts(c).get(last, "") for group in groups.values() for c in group} - {""})
+    numeric = all(is_number(level) for level in levels)
+    colour = dict(zip(levels, shades(len(levels)) if numeric else _cycle(len(levels)), strict=True))
+    speeds = pd.concat([points["speed"], curves["speed"]])
+    speeds = speeds[speeds > 0].astype(float)
+    log = len(speeds) > 0 and speeds.max() / speeds.min() > LOG_SPAN
+    # one scale for all panels, so that conditions can be compared across them
+    shown = pd.concat([points["force"] + points["sd"].fillna(0), points["force"] - points["sd"].fillna(0)])
+    shown = pd.concat([shown, curves["after"], curves["before"]]).dropna()
+    span = padded(shown.min(), shown.max())
+    x_span = (speeds.min() / 1.2 if log else 0.0, speeds.max() * (1.2 if log else 1.06))
+    panels = []
+    for title, group in groups.items():
+        shared = [c for c in unaged if c not in group and rubber.get(c) in {rubber.get(g) for g in group}]
+        lines = [
+            Line(
+                names(c),
+                BLACK if is_unaged(c) else colour[names.parts(c)[last]],
+                tuple(
+                    part for _, part in curves[curves["condition"] == c].groupby(["direction", "load"], dropna=False)
+                ),
+                points[points["condition"] == c],
+            )
+            for c in [*shared, *group]
+        ]
+        panels.append(
+            Panel(short(title), _force_alt(title, lines, config), _force_drawer(lines, config, log, span, x_span))
+        )
+    legend = [Key(short(names(c)), BLACK) for c in unaged]
+    legend += [Key(short(_level_label(last, level, names)), colour[level]) for level in levels]
+    both = points["direction"].nunique() > 1
+    legend.append(Key("run means, forward" if both else "run means", FLOOR, "point"))
+    if both:
+        legend.append(Key("run means, backward", FLOOR, "left"))
+    if len(curves):
+        legend.append(Key("model", FLOOR) if curves["lo"].notna().any() else Key("steady fit", FLOOR))
+        if curves["direction"].nunique() > 1:
+            legend.append(Key("model, backward", FLOOR, "dashed"))
+        if curves["lo"].notna().any():
+            legend.append(Key("95 % band", FLOOR, "band"))
+        if _differ(curves):
+            legend.append(Key("declared model", FLOOR, "dotted"))
+    quantity = config.units.quantity("force")
+    return Plot(
+        "force_speed", f"{capital(quantity)} against {config.units.quantity('speed')}", tuple(panels), tuple(legend)
+    )
+
+
+def _force_drawer(lines, config: Config, log: bool, span, x_span) -> Callable[[Axes], None]:
+    def draw(ax: Axes) -> None:
+        ax.set_xlim(*x_span)
+        draw_force_speed(ax, lines, config.units, log=log)
+        ax.set_xlim(*x_span)
+        ax.set_ylim(*span)
+        if log:
+            log_axis(ax)
+
+    return draw
+
+
+def _force_alt(title: str, lines: Sequence[Line], config: Config) -> str:
+    forces = pd.concat([line.points["force"] for line in lines if len(line.points)] or [pd.Series(dtype=float)])
+    unit = config.units.unit("force")
+    text = f"{config.units.quantity('force')} against {config.units.quantity('speed')}{', ' + title if title else ''}: "
+    text += f"{count(len(lines), 'condition')}"
+    if len(forces):
+        text += f", run means from {number(forces.min())} to {number(forces.max())} {unit}"
+    return text + "."
+
+
+def run_points(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
+    """Return mean and scatter of every run: condition, direction, speed, force (in the direction of motion), sd, n."""
+    used = steady[steady["used"].astype(bool)]
+    if used.empty:
+        return pd.DataFrame(columns=["condition", "direction", "speed", "force", "sd", "n"]).astype({"force": float})
+    sign = used["direction"].astype(float)
+    rows = used.assign(speed=used["speed_mm_s"].abs(), force=used["force_N"] * sign)
+    files = rows.groupby(["condition", "run_id", "direction", "file"], sort=False)[["speed", "force"]].mean()
+    runs = files.groupby(level=["condition", "run_id", "direction"], sort=False)
+    found = runs["speed"].mean().to_frame()
+    found["force"], found["sd"], found["n"] = runs["force"].mean(), runs["force"].std(), runs["force"].size()
+    return found.reset_index()
+
+
+def curve_lines(tables: Mapping[str, pd.DataFrame], config: Config) -> pd.DataFrame:
+    """Return the loop's curves, or those of the steady fit where the loop was not run, by magnitude of the speed."""
+    curves = tables["curves"]
+    if curves.empty:
+        return _steady_curves(tables["steady_fit"], tables["steady"])
+    sign = np.sign(curves["speed_mm_s"]).replace(0.0, 1.0)
+    ends = np.sort(
+        np.stack([curves["force_after_lo95_N"] * sign, curves["force_after_hi95_N"] * sign]).astype(float), axis=0
+    )
+    return pd.DataFrame(
+        {
+            "condition": curves["condition"],
+            "direction": sign,
+            "load": curves["load_N"],
+            "speed": curves["speed_mm_s"].abs(),
+            "before": curves["force_before_N"] * sign,
+            "after": curves["force_after_N"] * sign,
+            "lo": ends[0],
+            "hi": ends[1],
+        }
+    ).sort_values(["condition", "direction", "speed"])
+
+
+def _steady_curves(fit: pd.DataFrame, steady: pd.DataFrame) -> pd.DataFrame:
+    from sealfit.physics.stribeck import stribeck_force
+
+    columns = ["condition", "direction", "load", "speed", "before", "after", "lo", "hi"]
+    found = []
+    for condition, rows in fit.groupby("condition", sort=False):
+        values = rows.set_index("parameter")["value"].to_dict()
+        here = steady[(steady["condition"] == condition) & steady["used"].astype(bool)]
+        load = here["load_N"].mean() if here["load_N"].notna().any() else np.nan
+        top = {"mu_s": values.get("mu_s", values.get("F_s")), "mu_c": values.get("mu_c", values.get("F_c"))}
+        top |= {"v_s": values.get("v_s"), "sigma_2": values.get("sigma_2")}
+        if here.empty or any(value is None or not np.isfinite(value) for value in top.values()) or top["v_s"] <= 0:
+            continue
+        speed = np.geomspace(max(here["speed_mm_s"].abs().min(), 1e-6) / 1.2, here["speed_mm_s"].abs().max() * 1.05, 80)
+        force = stribeck_force(speed, 1.0 if np.isnan(load) else load, **top)
+        found.append(pd.DataFrame({"condition": condition, "direction": 1.0, "load": load, "speed": speed,
+                                   "before": force, "after": force, "lo": np.nan, "hi": np.nan}))  # fmt: skip
+    return pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=columns).astype({"speed": float})
+
+
+def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict[str, list[str]]:
+    """Return {title: conditions} of the panels: conditions that differ in the last column only stand together."""
+    groups: dict[str, list[str]] = {}
+    for condition in conditions:
+        others = {name: value for name, value in names.parts(condition).items() if name != last}
+        title = names(", ".join(f"{name}={value}" for name, value in others.items())) if others else ""
+        groups.setdefault(title, []).append(condition)
+    groups = {
+        t: in_order(g, key=lambda c: names.parts(c).get(last, "")) for t, g in sorted(groups.items(), key=natural)
+    }
+    if any(len(group) > MOST_COLOURS for group in groups.values()):
+        return {names(c): [c] for group in groups.values() for c in group}
+    return groups
+
+
+def _differ(curves: pd.DataFrame) -> bool:
+    gap = (curves["after"] - curves["before"]).abs().max()
+    return bool(gap > 1e-9 * max(curves["after"].abs().max(), 1e-300))
+
+
+def _cycle(n: int) -> list[str]:
+    return [CYCLE[k % len(CYCLE)] for k in range(n)]
+
+
+def _level_label(name: str, level: str, names: ConditionNames) -> str:
+    if name == "aging_days":
+        return f"{level} d"
+    return names(f"{name}={level}") if names.units.of(name) else f"{channel_words(name, names.units)} {level}"

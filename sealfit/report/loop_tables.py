@@ -1,0 +1,170 @@
+"""The loop's results as rows for the page: errors, effects, scatter, tests by channel, runs to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pandas as pd
+from markupsafe import Markup
+
+from sealfit.config import Config
+from sealfit.report.figures_loop import LEVELS
+from sealfit.report.numbers import NOTHING, given, known, measured, number, of_unit, p_value, together
+from sealfit.report.symbols import (
+    ConditionNames,
+    channel_label,
+    channel_words,
+    effect_label,
+    joined,
+    symbol_html,
+    true_units,
+)
+from sealfit.report.words import PARTS, acts, meaning
+
+MOST_TESTS = 40
+
+
+def error_rows(closure: Mapping, config: Config) -> list[dict]:
+    """Return the rows of the table before and after: label, note, before, after, change."""
+    unit, held = config.units.unit("force"), closure.get("heldout_unit") or "run"
+    rows = (
+        ("heldout_rmse_N", f"rms error on {held}s the fit did not see", unit),
+        ("rmse_N", "rms error, all bins, in sample", unit),
+        ("rmse_runs_N", "rms error of the run means, in sample", unit),
+        ("max_abs_N", "largest error of a bin", unit),
+        ("mean_abs_pct", "mean absolute error, of the measured run mean", "%"),
+    )
+    found = []
+    for key, label, of in rows:
+        before, after = closure["before"].get(key), closure["after"].get(key)
+        texts = together([before, after, closure.get("noise_floor_N") if key in ("rmse_N", "heldout_rmse_N") else None])
+        change = _change(before, after) if known(before) and known(after) and before else NOTHING
+        found.append({"label": label, "unit": of, "before": texts[0], "after": texts[1], "change": change})
+    p = [closure[stage].get("lack_of_fit_p") for stage in ("before", "after")]
+    texts = [p_value(value).removeprefix("= ") for value in p]
+    return [*found, {"label": "lack of fit, p", "unit": "", "before": texts[0], "after": texts[1], "change": ""}]
+
+
+def _change(before: float, after: float) -> str:
+    percent = round(100 * (after / before - 1))
+    return f"{percent:+d}\u00a0%".replace("-", "−") if percent else "0\u00a0%"
+
+
+def effect_cards(closure: Mapping, config: Config) -> list[dict]:
+    """Return every effect, added or candidate, with all that is said about it."""
+    cards = []
+    for index, effect in enumerate(closure["effects"]):
+        label = effect_label(effect, config.units)
+        channels = joined([channel_label(name, config.units) for name in effect["channels"]])
+        gain = effect.get("heldout_gain_N")
+        cards.append(
+            {
+                "index": index,
+                "title": label[:1].upper() + label[1:],
+                "named": effect["named"],
+                "candidate": effect["candidate"],
+                "note": effect.get("note") or "",
+                "acts": acts(effect, config),
+                "given": "factor minus one" if effect["operation"] == "multiply" else f"added {_added(effect, config)}",
+                "form": effect["form"],
+                "level": PARTS.get(effect["level"], effect["level"]),
+                "channels": channels,
+                "parameters": [_parameter(p, effect) for p in effect["parameters"]],
+                "p": p_value(effect.get("p_value")),
+                "gain": of_unit(number(gain, 2), config.units.unit("force")) if known(gain) else "",
+                "rivals": [_rival(rival, config) for rival in effect.get("alternatives") or []],
+            }
+        )
+    return cards
+
+
+def _added(effect: Mapping, config: Config) -> str | Markup:
+    return (
+        config.units.quantity("force")
+        if effect["acts_on"] == "force"
+        else Markup("to {}").format(symbol_html(effect["acts_on"]))
+    )
+
+
+def _parameter(p: Mapping, effect: Mapping) -> dict:
+    value, interval = measured(p["value"], *(p.get("ci95") or (None, None)))
+    return {"symbol": symbol_html(p["name"]), "meaning": meaning(effect["id"], p["name"]), "value": value,
+            "interval": interval, "unit": p.get("unit") or ""}  # fmt: skip
+
+
+def _rival(rival: Mapping, config: Config) -> Markup:
+    from sealfit.effects import EFFECTS
+
+    known_effect = EFFECTS.get(rival["id"])
+    channels = joined([channel_words(name, config.units) for name in rival.get("channels") or []])
+    label = known_effect.label.replace("{x}", channels) if known_effect else str(rival["id"]).replace("_", " ")
+    target = config.units.quantity("force") if rival["acts_on"] == "force" else symbol_html(rival["acts_on"])
+    text = Markup("{}, acting on {}").format(label, target)
+    if channels and channels not in label:
+        text += Markup(" along {}").format(channels)
+    if known(rival.get("heldout_rmse_N")):
+        text += Markup(" (held-out error {})").format(
+            of_unit(number(rival["heldout_rmse_N"]), config.units.unit("force"))
+        )
+    return text
+
+
+def scatter_rows(closure: Mapping, config: Config) -> list[dict]:
+    """Return the scatter that is no structure, by level."""
+    return [
+        {
+            "level": PARTS.get(entry["level"], entry["level"]),
+            "sd": number(entry.get("sd_N"), 2),
+            "share": f"{number(100 * entry['sd_rel'], 2)} %" if known(entry.get("sd_rel")) else NOTHING,
+            "df": number(entry.get("df"), 2) if known(entry.get("df")) else NOTHING,
+        }
+        for entry in closure.get("scatter") or []
+    ]
+
+
+def channel_tests(levels: pd.DataFrame, config: Config) -> list[dict]:
+    """Return what each channel orders of the residual, before and after, the most significant first."""
+    tested = levels[levels["channel"].notna()]
+    if tested.empty:
+        return []
+    rows: dict[tuple, dict] = {}
+    known_names = set(tested["channel"])
+    for row in tested.itertuples():
+        words = channel_words(row.channel, config.units)
+        if " " in row.channel and all(part in known_names for part in row.channel.split(" ")):
+            words = joined([channel_words(part, config.units) for part in row.channel.split(" ")])
+        entry = rows.setdefault(
+            (row.channel, row.level),
+            {"channel": words, "level": PARTS.get(row.level, row.level), "rank": 1.0}
+            | {f"{what}_{stage}": NOTHING for what in ("sd", "p") for stage in ("before", "after")},
+        )
+        entry[f"sd_{row.stage}"] = number(row.sd_N, 2)
+        entry[f"p_{row.stage}"] = p_value(row.p_value).removeprefix("= ") if known(row.p_value) else NOTHING
+        if row.stage == "before" and known(row.p_value):
+            entry["rank"] = row.p_value
+    order = {level: k for k, level in enumerate(reversed(LEVELS))}
+    listed = sorted(rows.items(), key=lambda item: (item[1]["rank"], order.get(item[0][1], 9)))
+    return [entry for _, entry in listed[:MOST_TESTS]]
+
+
+def next_runs(closure: Mapping, config: Config) -> list[dict]:
+    """Return why and where to measure next."""
+    names, found = ConditionNames.of(config), []
+    for entry in closure.get("next_runs") or []:
+        wanted = entry.get("conditions")
+        wanted = wanted if isinstance(wanted, list) else [wanted] if wanted else []
+        why = true_units(str(entry.get("why", "")), config.units)
+        found.append({"why": why[:1].upper() + why[1:], "conditions": [_wanted(one, names, config) for one in wanted]})
+    return found
+
+
+def _wanted(one: object, names: ConditionNames, config: Config) -> str:
+    """Return a condition to measure at, e.g. "aging temperature 60 °C, sliding speed 5 mm/s"."""
+    if not isinstance(one, Mapping):
+        return names(one)
+    parts = []
+    for name, value in one.items():
+        text = given(float(value)) if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
+        unit = config.units.of(name)
+        parts.append(f"{channel_words(name, config.units)} {text}{' ' + unit if unit else ''}")
+    return ", ".join(parts)

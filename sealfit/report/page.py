@@ -1,0 +1,142 @@
+"""One self-contained report.html: its tables and sentences, and every plot as an image inside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+
+import pandas as pd
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from sealfit.config import Config
+from sealfit.report import facts
+from sealfit.report.figures import draw_all
+from sealfit.report.figures_residual import MOST_CHANNELS
+from sealfit.report.loop_tables import channel_tests, effect_cards, error_rows, next_runs, scatter_rows
+from sealfit.report.numbers import count, given, number
+from sealfit.report.parameters import parameter_tables
+from sealfit.report.style import Plot, compose, data_uri, panel_figure, svg
+from sealfit.report.symbols import ConditionNames, symbol_html
+from sealfit.report.words import left_over, verdict, with_left_channels
+
+TABLES = (
+    "inputs", "runs", "quality", "traces_mean", "steady", "steady_fit", "aging_fit", "aging_curves", "effects",
+    "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves",
+)  # fmt: skip
+VERDICTS = {
+    "closed": "Closed",
+    "nothing_missing": "Nothing missing",
+    "unexplained": "Unexplained",
+    None: "Not closed yet",
+}
+
+
+@dataclass(frozen=True)
+class Report:
+    """The page, and its plots by name for whoever saves them as files."""
+
+    html: str
+    figures: dict[str, Figure]
+
+
+def build_report(
+    tables: Mapping[str, pd.DataFrame], closure: Mapping | None, provenance: Mapping, config: Config
+) -> Report:
+    """Return the report of one campaign.
+
+    Parameters
+    ----------
+    tables : mapping of str to DataFrame
+        Tables of OUT by name, as `sealfit.tables` describes them; what is missing or empty is said to be so.
+    closure : mapping or None
+        closure.json, or None where the loop was not run.
+    provenance : mapping
+        provenance.json.
+    config : Config
+        Names the conditions and gives every quantity its true unit.
+
+    Returns
+    -------
+    Report
+        The page asks for nothing outside itself. The figures are not yet drawn to a file.
+    """
+    tables = facts.complete(tables, TABLES)
+    if closure is not None:
+        closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
+    plots = draw_all(tables, closure, config)
+    html = _environment().from_string(_text("template.html")).render(
+        style=Markup(_text("style.css")), **_content(tables, closure, provenance, config, plots)
+    )  # fmt: skip
+    return Report(html, {name: compose(plot) for name, plot in plots.items()})
+
+
+def _content(
+    tables: Mapping[str, pd.DataFrame],
+    closure: Mapping | None,
+    provenance: Mapping,
+    config: Config,
+    plots: Mapping[str, Plot],
+) -> dict:
+    fitted = parameter_tables(tables["steady_fit"], "condition", config)
+    fitted += parameter_tables(tables["aging_fit"], "series", config)
+    findings, in_all = facts.quality_findings(tables["quality"], config)
+    return {
+        "closure": closure,
+        "badge": VERDICTS[closure["verdict"] if closure else None],
+        "verdict": verdict(closure, tables["shapes"], config),
+        "facts": facts.campaign_facts(tables, config),
+        "errors": error_rows(closure, config) if closure else [],
+        "cards": effect_cards(closure, config) if closure else [],
+        "scatter": scatter_rows(closure, config) if closure else [],
+        "left": left_over(closure, config) if closure else "",
+        "next_runs": next_runs(closure, config) if closure else [],
+        "tests": channel_tests(tables["levels"], config),
+        "more_channels": max(0, tables["channels"]["channel"].nunique() - MOST_CHANNELS),
+        "parameter_tables": sorted(fitted, key=lambda table: table.single),  # how well the fits do comes last
+        "aging_fitted": len(tables["aging_fit"]) > 0,
+        "aging": config.aging,
+        "condition_key": ConditionNames.of(config).key,
+        "sensor": config.sensor,
+        "unit": config.units.unit("force"),
+        "force": config.units.quantity("force"),
+        "counts": facts.quality_counts(tables["quality"]),
+        "findings": findings,
+        "findings_in_all": in_all,
+        "provenance": facts.provenance_facts(provenance),
+        "plots": {name: _images(plot) for name, plot in plots.items()},
+    }
+
+
+def _images(plot: Plot) -> dict:
+    """Return a plot as the template draws it: every panel an image of its own, so that they flow with the page."""
+    panels = []
+    for panel in plot.panels:
+        figure = panel_figure(panel)
+        width, height = figure.get_size_inches() * 96
+        panels.append(
+            {
+                "src": data_uri(svg(figure)),
+                "alt": panel.alt,
+                "effect": panel.effect,
+                "width": round(width),
+                "height": round(height),
+            }
+        )
+    legend = [
+        {"label": symbol_html(key.label) if key.symbol else key.label, "colour": key.colour, "mark": key.mark}
+        for key in plot.legend
+    ]
+    return {"title": plot.title, "panels": panels, "legend": legend}
+
+
+def _environment() -> Environment:
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    environment.globals |= {"count": count, "number": number, "given": given}
+    return environment
+
+
+def _text(name: str) -> str:
+    return files("sealfit.report").joinpath(name).read_text("utf-8")

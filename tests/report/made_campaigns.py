@@ -1,0 +1,330 @@
+"""Tables of campaigns with known truth, as a report gets them; the laws are Eq. 14 and Eq. 15, the scatter is drawn."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from report.made_tables import (
+    DROP,
+    TAU,
+    aging_curves,
+    aging_fit,
+    channels,
+    closure_document,
+    curves,
+    effects,
+    empty,
+    inputs,
+    law,
+    levels,
+    quality,
+    residuals,
+    shapes,
+    steady_rows,
+    table,
+    trace,
+)
+
+from sealfit.conditions import add_keys
+from sealfit.config import Config
+
+NAMES = (
+    "inputs",
+    "runs",
+    "quality",
+    "traces_mean",
+    "steady",
+    "bins",
+    "steady_fit",
+    "aging_fit",
+    "aging_curves",
+    "effects",
+    "residuals_before",
+    "residuals_after",
+    "levels",
+    "channels",
+    "shapes",
+    "curves",
+)
+PROVENANCE = {
+    "program": "sealfit",
+    "version": "0.1.0",
+    "python": "3.11.9",
+    "system": "Linux x86_64",
+    "packages": {"numpy": "2.4.0", "pandas": "3.1.0", "scipy": "1.17.0", "matplotlib": "3.10.0"},
+    "campaign": "/data/hydrothermal-2024",
+    "config": {"name": "default", "path": None, "text": 'name = "default"\n'},
+    "inputs": [],
+    "steps": [
+        {"step": "ingest", "version": "0.1.0", "finished_at": "2024-05-02T09:31:10+00:00", "seconds": 12.4},
+        {"step": "close-loop", "version": "0.1.0", "finished_at": "2024-05-02T09:33:40+00:00", "seconds": 131.02},
+    ],
+}
+NOISE, RUN_SD = 0.25, 0.12
+
+
+@dataclass
+class Made:
+    """What build_report takes."""
+
+    tables: dict
+    closure: dict | None
+    provenance: dict
+    config: Config
+
+    @property
+    def arguments(self):
+        return self.tables, self.closure, self.provenance, self.config
+
+
+def aging_campaign(
+    *,
+    temperatures=(60,),
+    compressions=(80, 100),
+    days=(1, 4, 16),
+    speeds=(0.5, 1, 2, 5, 10, 20),
+    verdict="closed",
+    bins_per_file=20,
+    trace_points=200,
+    seed=1,
+):
+    """Return a campaign of the paper's kind; `verdict` "closed" has warming by sliding, "nothing_missing" has nothing,
+    "unexplained" a hump along displacement."""
+    rng = np.random.default_rng(seed)
+    config = Config()
+    drop = DROP if verdict == "closed" else 0.0
+    hump = 0.6 if verdict == "unexplained" else 0.0
+    conditions = [(60.0, 100.0, 0.0)]
+    conditions += [(float(t), float(c), float(d)) for t in temperatures for c in compressions for d in days]
+    files, bins, traces, fits = [], [], [], []
+    order = 0
+    for number, (temperature, compression, day) in enumerate(conditions):
+        mu_s, mu_c, v_s, sigma_2 = law(temperature, compression, day)
+        fits += steady_rows(temperature, compression, day, (mu_s, mu_c, v_s, sigma_2), rng)
+        for speed in speeds:
+            run = f"T{temperature:g}C{compression:g}D{day:g}V{speed:g}"
+            offset = rng.normal(0, RUN_SD)
+            for repeat in (1, 2, 3):
+                order += 1
+                file = f"traces/{run}_{repeat}.csv"
+                displacement = np.linspace(2.0, 38.0, bins_per_file)
+                time = displacement / speed
+                mean = 49.03 * (mu_c + (mu_s - mu_c) * np.exp(-((speed / v_s) ** 2))) + sigma_2 * speed
+                warm = 1 - drop * (1 - np.exp(-time / TAU))
+                odd = hump * np.exp(-(((displacement - 25) / 3) ** 2))
+                force = mean * warm + odd + offset + rng.normal(0, 0.05) + rng.normal(0, NOISE, bins_per_file)
+                key = {
+                    "file": file,
+                    "run_id": run,
+                    "repeat": repeat,
+                    "stroke": 1,
+                    "direction": 1,
+                    "specimen_id": f"S{number}",
+                    "temperature_C": temperature,
+                    "compression_ratio_pct": compression,
+                    "aging_days": day,
+                    "speed_mm_s": speed * 1.002,
+                    "speed_set_mm_s": speed,
+                    "load_N": 49.03,
+                    "run_order": float(order),
+                    "elapsed_h": order * 0.11,
+                    "operator": "AB"[order % 2],
+                }
+                frame = pd.DataFrame({**key, "bin": np.arange(bins_per_file), "force_N": force, "n": 50})
+                frame = frame.assign(displacement_mm=displacement, distance_mm=displacement - 2.0, time_s=time)
+                # "before" is the same mean with part of the warming everywhere, between slow and fast runs
+                bins.append(frame.assign(force_sd_N=0.3, before=mean * (1 - 0.6 * drop), after=mean * warm))
+                files.append(
+                    {
+                        **key,
+                        "force_N": force.mean(),
+                        "force_sd_N": force.std(),
+                        "force_se_N": 0.04,
+                        "n": 1000,
+                        "displacement_mm": 20.0,
+                        "displacement_from_mm": 2.0,
+                        "displacement_to_mm": 38.0,
+                        "time_s": 20 / speed,
+                        "distance_mm": 18.0,
+                        "outlier": False,
+                        "used": True,
+                    }
+                )
+            traces.append(trace(run, (temperature, compression, day), mean, speed, drop, trace_points, rng))
+    bins = add_keys(pd.concat(bins, ignore_index=True), config)
+    steady = add_keys(pd.DataFrame(files), config)
+    fits = add_keys(pd.DataFrame(fits), config)
+    traces = add_keys(pd.concat(traces, ignore_index=True), config)
+    found = residuals(bins, after_is_before=verdict != "closed")
+    closure = closure_document(found, verdict)
+    tables = {name: empty(name) for name in NAMES}
+    tables |= {
+        "inputs": table(
+            "inputs",
+            [
+                {"file": f, "size": 51234, "sha256": "ab" * 32, "rows": 1000, "strokes": 1, "status": "used"}
+                for f in steady["file"]
+            ],
+        ),
+        "runs": table("runs", steady.assign(started_at="2024-04-02T08:00:00")),
+        "quality": quality(steady),
+        "traces_mean": table("traces_mean", traces),
+        "steady": table("steady", steady),
+        "bins": table("bins", bins.drop(columns=["before", "after"])),
+        "steady_fit": table("steady_fit", fits),
+        "aging_fit": aging_fit(fits),
+        "aging_curves": aging_curves(fits, max(days)),
+        "residuals_before": found["before"],
+        "residuals_after": found["after"],
+        "levels": levels(found),
+        "channels": channels(found),
+        "curves": curves(fits, speeds, drop),
+    }
+    if verdict == "closed":
+        tables["shapes"] = shapes()
+        tables["effects"] = effects(closure)
+    return Made(tables, closure, {**PROVENANCE, "inputs": inputs(steady["file"])}, config)
+
+
+def paper_sized():
+    """Return 73 conditions at 8 speeds, 1752 files."""
+    return aging_campaign(
+        temperatures=(20, 40, 60, 80),
+        compressions=(80, 90, 100),
+        days=(1, 2, 4, 8, 12, 16),
+        speeds=(0.2, 0.5, 1, 2, 5, 10, 20, 50),
+        bins_per_file=40,
+        trace_points=400,
+    )
+
+
+def torque_campaign(seed=3):
+    """Return a rig that measures torque against rpm, without load and without aging: two pressures, both directions."""
+    rng = np.random.default_rng(seed)
+    config = Config.model_validate(
+        {
+            "name": "screw drive",
+            "condition": ["pressure_bar"],
+            "column_units": {"oil_temp": "°C"},
+            "quantities": {
+                "force": {"quantity": "torque", "unit": "mN m"},
+                "displacement": {"quantity": "angle", "unit": "turn"},
+                "speed": {"quantity": "rotational speed", "unit": "rpm"},
+            },
+        }
+    )
+    rows, fits, curve = [], [], []
+    for pressure, scale in ((2, 1.0), (8, 1.9)):
+        for parameter, value, unit in (
+            ("F_s", 82 * scale, "mN m"),
+            ("F_c", 51 * scale, "mN m"),
+            ("v_s", 35.0, "rpm"),
+            ("sigma_2", 0.08, "mN m/rpm"),
+        ):
+            fits.append(
+                {
+                    "pressure_bar": pressure,
+                    "quantity": "steady",
+                    "parameter": parameter,
+                    "value": value,
+                    "se": 0.02 * value,
+                    "lo95": 0.96 * value,
+                    "hi95": 1.04 * value,
+                    "u_sys": 0.1,
+                    "unit": unit,
+                    "identified": True,
+                }
+            )
+        for sign in (1, -1):
+            for rpm in (10, 25, 50, 100, 150, 200):
+                offset = rng.normal(0, 1.0)
+                for repeat in (1, 2, 3):
+                    torque = (
+                        sign * (scale * (51 + 31 * np.exp(-((rpm / 35) ** 2))) + 0.08 * rpm)
+                        + offset
+                        + rng.normal(0, 0.4)
+                    )
+                    run = f"p{pressure}n{rpm}{'+' if sign > 0 else '-'}"
+                    rows.append(
+                        {
+                            "file": f"{run}_{repeat}.csv",
+                            "run_id": run,
+                            "repeat": repeat,
+                            "stroke": 1,
+                            "direction": sign,
+                            "specimen_id": f"p{pressure}",
+                            "pressure_bar": pressure,
+                            "speed_mm_s": sign * rpm * 1.0,
+                            "load_N": None,
+                            "force_N": torque,
+                            "force_sd_N": 1.0,
+                            "force_se_N": 0.1,
+                            "n": 500,
+                            "displacement_mm": 3.0,
+                            "used": True,
+                            "outlier": False,
+                            "oil_temp": 21.0,
+                        }
+                    )
+        for sign in (1, -1):
+            for rpm in np.geomspace(8, 210, 50):
+                force = sign * (scale * (51 + 31 * np.exp(-((rpm / 35) ** 2))) + 0.08 * rpm)
+                curve.append(
+                    {
+                        "pressure_bar": pressure,
+                        "speed_mm_s": sign * rpm,
+                        "force_before_N": force,
+                        "force_after_N": force,
+                        "force_after_lo95_N": force - 2,
+                        "force_after_hi95_N": force + 2,
+                    }
+                )
+    steady = add_keys(pd.DataFrame(rows), config)
+    tables = {name: empty(name) for name in NAMES}
+    tables |= {
+        "steady": table("steady", steady),
+        "runs": table("runs", steady),
+        "quality": quality(steady),
+        "steady_fit": table("steady_fit", add_keys(pd.DataFrame(fits), config)),
+        "curves": table("curves", add_keys(pd.DataFrame(curve), config)),
+    }
+    errors = {
+        "rmse_N": 1.31,
+        "rmse_runs_N": 0.97,
+        "heldout_rmse_N": 1.52,
+        "max_abs_N": 4.2,
+        "mean_abs_pct": 1.3,
+        "lack_of_fit_p": 0.31,
+    }
+    closure = {
+        "schema": 1,
+        "verdict": "nothing_missing",
+        "units": {"force_N": "mN m", "displacement_mm": "turn", "speed_mm_s": "rpm", "load_N": "N", "time_s": "s"},
+        "noise_floor_N": 1.2,
+        "before": errors,
+        "after": dict(errors),
+        "heldout_unit": "run",
+        "effects": [],
+        "scatter": [],
+        "left": {"rmse_N": 1.31, "level": None, "channel": None, "p_value": None},
+        "next_runs": [],
+    }
+    return Made(tables, closure, PROVENANCE, config)
+
+
+def not_run():
+    """Return the aging campaign as it stands when the loop was not run and nothing was fitted across days."""
+    made = aging_campaign()
+    for name in (
+        "effects",
+        "residuals_before",
+        "residuals_after",
+        "levels",
+        "channels",
+        "shapes",
+        "curves",
+        "aging_curves",
+        "aging_fit",
+    ):
+        made.tables[name] = empty(name)
+    return Made(made.tables, None, made.provenance, made.config)

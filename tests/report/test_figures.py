@@ -1,0 +1,240 @@
+import warnings
+
+import numpy as np
+import numpy.testing as npt
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from report.made_campaigns import Made, aging_campaign, not_run, paper_sized, torque_campaign
+from report.made_tables import DROP, empty, shapes, table
+
+from sealfit.config import Config
+from sealfit.report.figures import draw_all
+from sealfit.report.figures_curves import draw_aging, draw_trace, envelope
+from sealfit.report.figures_loop import draw_errors, draw_levels, run_means
+from sealfit.report.figures_residual import channel_order, draw_channel, draw_shape
+from sealfit.report.figures_speed import curve_lines, force_speed, run_points
+from sealfit.report.style import Key, Panel, Plot, compose, panel_figure, svg
+from sealfit.tables import Units
+
+TORQUE = Units({"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")})
+
+
+@pytest.fixture
+def ax():
+    return Figure().add_subplot()
+
+
+@pytest.fixture(scope="module")
+def made():
+    return aging_campaign()
+
+
+# ---------------------------------------------------------------- force against speed
+def test_run_means_average_files_and_take_the_direction_out():
+    steady = pd.DataFrame(
+        {
+            "condition": "c",
+            "run_id": ["r+", "r+", "r-", "r-"],
+            "direction": [1, 1, -1, -1],
+            "file": ["a", "b", "a", "b"],
+            "speed_mm_s": [5.0, 5.0, -5.0, -5.0],
+            "force_N": [10.0, 12.0, -20.0, -20.0],
+            "used": [True, True, True, True],
+        }
+    )
+    points = run_points(steady, Config()).set_index("run_id")
+    assert points.loc["r+", "force"] == 11.0
+    npt.assert_allclose(points.loc["r+", "sd"], np.sqrt(2.0))
+    assert points.loc["r-", ["speed", "force", "sd"]].tolist() == [5.0, 20.0, 0.0]
+
+
+def test_what_was_left_out_of_the_fit_is_not_drawn(made):
+    steady = made.tables["steady"].assign(used=made.tables["steady"]["repeat"] != 3)
+    assert (run_points(steady, made.config)["n"] == 2).all()
+
+
+def test_every_series_has_a_panel_with_its_days_and_the_unaged(made):
+    plot = force_speed(made.tables, made.config)
+    assert [panel.title for panel in plot.panels] == ["60 °C · 80 %", "60 °C · 100 %"]
+    assert [key.label for key in plot.legend[:4]] == ["unaged", "1 d", "4 d", "16 d"]
+    assert all("4 conditions" in panel.alt for panel in plot.panels)
+
+
+def test_all_panels_share_one_scale():
+    plot = force_speed(paper_sized().tables, Config())
+    assert len(plot.panels) == 12
+    assert len({panel_figure(panel).axes[0].get_ylim() for panel in plot.panels}) == 1
+
+
+def test_torque_rig_shows_true_units_and_no_slot_names():
+    made = torque_campaign()
+    plot = force_speed(made.tables, made.config)
+    (panel,) = plot.panels
+    axes = panel_figure(panel).axes[0]
+    assert axes.get_ylabel() == "torque (mN m)"
+    assert axes.get_xlabel() == "rotational speed (rpm)"
+    assert [key.label for key in plot.legend[:4]] == ["2 bar", "8 bar", "run means, forward", "run means, backward"]
+
+
+def test_bands_of_backward_motion_are_not_upside_down():
+    made = torque_campaign()
+    curves = curve_lines(made.tables, made.config)
+    assert (curves["lo"] < curves["after"]).all()
+    assert (curves["after"] < curves["hi"]).all()
+    assert (curves["after"] > 0).all()
+
+
+def test_without_the_loop_the_steady_fit_is_drawn():
+    made = not_run()
+    curves = curve_lines(made.tables, made.config)
+    fit = made.tables["steady_fit"]
+    values = fit[fit["condition"] == "unaged"].set_index("parameter")["value"]
+    line = curves[curves["condition"] == "unaged"].iloc[0]
+    # Eq. 14 by hand at the slowest point
+    mu = values["mu_c"] + (values["mu_s"] - values["mu_c"]) * np.exp(-((line["speed"] / values["v_s"]) ** 2))
+    npt.assert_allclose(line["after"], 49.03 * mu + values["sigma_2"] * line["speed"], rtol=1e-12)
+    assert curves["lo"].isna().all()
+
+
+def test_many_conditions_of_one_kind_get_panels_of_their_own():
+    rows = pd.DataFrame({"batch": np.repeat([f"b{k}" for k in range(14)], 2)})
+    rows = rows.assign(
+        condition="batch=" + rows["batch"], series="batch=" + rows["batch"], rubber="rubber", direction=1,
+        run_id=rows["batch"], file=[f"{k}.csv" for k in range(28)], speed_mm_s=5.0, force_N=10.0, load_N=1.0, used=True,
+    )  # fmt: skip
+    tables = {"steady": rows, "curves": empty("curves"), "steady_fit": empty("steady_fit")}
+    plot = force_speed(tables, Config(condition=["batch"]))
+    assert [panel.title for panel in plot.panels][:3] == ["b0", "b1", "b10"]
+    assert len(plot.panels) == 14
+
+
+# ---------------------------------------------------------------- aging and traces
+def test_aging_draws_points_bars_and_law(ax):
+    points = pd.DataFrame({"quantity": "mu_s", "aging_days": [0.0, 4.0], "value": [0.9, 0.8], "lo95": [0.88, 0.79],
+                           "hi95": [0.92, np.nan]})  # fmt: skip
+    curves = pd.DataFrame({"quantity": "mu_s", "aging_days": [0.0, 4.0], "value": [0.9, 0.8], "lo95": 0.7, "hi95": 1.0})
+    draw_aging(ax, points, curves, Units())
+    npt.assert_array_equal(ax.lines[0].get_ydata(), [0.9, 0.8])
+    (bars,) = ax.containers
+    npt.assert_allclose(bars.lines[2][0].get_segments()[0][:, 1], [0.88, 0.92])
+    assert ax.get_xlabel() == "aging time (d)"
+
+
+def test_unaged_rubber_starts_every_series(made):
+    plot = draw_all(made.tables, made.closure, made.config)["aging"]
+    for panel in plot.panels:
+        bars = panel_figure(panel).axes[0].containers
+        assert [min(bar.lines[0].get_xdata()) for bar in bars] == [0.0, 0.0]
+
+
+def test_thinned_traces_keep_every_peak():
+    x = np.linspace(0, 40, 5000)
+    force = np.sin(x)
+    force[1234] = 9.0
+    thin = envelope(pd.DataFrame({"displacement_mm": x, "force_N": force}))
+    assert len(thin) <= 702
+    assert thin["force_N"].max() == 9.0
+    assert thin["force_N"].min() == force.min()
+    assert thin["displacement_mm"].is_monotonic_increasing
+
+
+def test_trace_shades_its_steady_window(ax):
+    x = np.linspace(0, 40, 81)
+    trace = pd.DataFrame({"displacement_mm": x, "force_N": 1.0, "force_se_N": np.nan, "steady": (x >= 5) & (x <= 30)})
+    draw_trace(ax, trace, TORQUE)
+    (window,) = ax.patches
+    assert (window.get_x(), window.get_x() + window.get_width()) == (5.0, 30.0)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("angle (turn)", "torque (mN m)")
+
+
+# ---------------------------------------------------------------- the loop
+def test_errors_stand_beside_the_noise_floor(ax, made):
+    draw_errors(ax, made.closure, TORQUE)
+    lines = {tuple(np.atleast_1d(line.get_xdata())) for line in ax.lines}
+    for key in ("rmse_N", "rmse_runs_N", "heldout_rmse_N"):
+        assert (made.closure["before"][key],) in lines
+        assert (made.closure["after"][key],) in lines
+    assert (0.262, 0.262) in lines
+    assert ax.get_xlabel() == "rms error (mN m)"
+
+
+def test_run_means_weigh_files_alike():
+    rows = pd.DataFrame({"run_id": "r", "file": ["a", "a", "a", "b"], "residual_N": [1.0, 1.0, 1.0, 3.0]})
+    assert run_means(rows, "residual_N").tolist() == [2.0]
+
+
+def test_levels_are_drawn_as_variance(ax):
+    sds = {"before": 3.0, "after": 1.0}
+    rows = [{"stage": stage, "level": "run", "sd_N": sd, "share": 1.0, "df": 9.0} for stage, sd in sds.items()]
+    draw_levels(ax, table("levels", rows), TORQUE)
+    assert [bar.get_width() for bar in ax.patches] == [9.0, 1.0]
+    assert {text.get_text() for text in ax.texts} == {"3.0", "1.0"}
+    assert ax.get_xlabel() == "variance ((mN m)²)"
+
+
+def test_channels_have_95_percent_bars(ax):
+    rows = table("channels", [{"channel": "batch", "label": name, "n": 9, "before_N": 1.0, "before_se_N": 0.5,
+                               "after_N": 0.0, "after_se_N": 0.5} for name in "ab"])  # fmt: skip
+    draw_channel(ax, rows, "batch", TORQUE)
+    segment = ax.containers[0].lines[2][0].get_segments()[0]
+    npt.assert_allclose(segment[:, 1], [1 - 0.97998, 1 + 0.97998], rtol=1e-4)  # 1.95996 of 0.5
+    assert [tick.get_text() for tick in ax.get_xticklabels()] == ["a", "b"]
+    assert ax.get_ylabel() == "residual (mN m)"
+
+
+def test_the_strongest_channel_comes_first(made):
+    assert channel_order(made.tables["channels"])[0] == "time_s"
+
+
+def test_a_factor_is_drawn_in_percent(ax, made):
+    draw_shape(ax, shapes(), made.closure["effects"][0], Units())
+    assert ax.get_ylabel() == r"change of $\mu$ (%)"
+    npt.assert_allclose(ax.lines[-1].get_ydata()[-1], -100 * DROP, rtol=1e-6)
+
+
+def test_an_added_force_has_its_unit(ax, made):
+    rows = shapes().assign(unit="mN m")
+    draw_shape(ax, rows, {**made.closure["effects"][0], "acts_on": "force", "operation": "add"}, TORQUE)
+    assert ax.get_ylabel() == "added torque (mN m)"
+
+
+# ---------------------------------------------------------------- style
+@pytest.mark.parametrize("label", ["<script>", 'a"quote', "a$b$c", "_hidden", "&amp;", "x" * 200])
+def test_any_column_name_can_be_drawn(label):
+    rows = [{"channel": label, "label": label, "n": 1, "before_N": 1.0, "after_N": 0.0}] * 2
+    panel = Panel(label, "alt", lambda ax: draw_channel(ax, table("channels", rows), label, Units()))
+    text = svg(compose(Plot("p", label, (panel,), (Key(label, "#000000"),))))
+    assert text.count("<svg") == 1
+    assert "<script>" not in text
+
+
+def test_letters_that_the_font_lacks_become_text():
+    panel = Panel("温度", "alt", lambda ax: ax.plot([0, 1], [0, 1]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "温度" in svg(panel_figure(panel))
+
+
+def test_the_same_tables_give_the_same_bytes(made):
+    plot = draw_all(made.tables, made.closure, made.config)["variance_levels"]
+    assert svg(panel_figure(plot.panels[0])) == svg(panel_figure(plot.panels[0]))
+
+
+def test_text_lies_inside_every_figure():
+    for made in (aging_campaign(), torque_campaign()):
+        for name, plot in draw_all(made.tables, made.closure, made.config).items():
+            figure = compose(plot)
+            box = figure.get_tightbbox()  # of all that is drawn, in inches
+            assert min(box.x0, box.y0) >= 0, name
+            assert box.x1 <= figure.get_figwidth(), name
+            assert box.y1 <= figure.get_figheight(), name
+
+
+@pytest.mark.parametrize("verdict", ["closed", "nothing_missing", "unexplained"])
+def test_no_panel_is_empty(verdict):
+    made: Made = aging_campaign(verdict=verdict)
+    for name, plot in draw_all(made.tables, made.closure, made.config).items():
+        for panel in plot.panels:
+            assert panel_figure(panel).axes[0].has_data(), name
+            assert len(panel.alt) > 20

@@ -1,0 +1,238 @@
+import base64
+import html.parser
+import re
+
+import pandas as pd
+import pytest
+from report.made_campaigns import NAMES, aging_campaign, not_run, paper_sized, torque_campaign
+from report.made_tables import empty
+
+from sealfit.config import Config
+from sealfit.report.page import build_report
+
+VOID = {"meta", "img", "br", "link", "path", "rect", "circle"}
+
+
+class Page(html.parser.HTMLParser):
+    """Collects what a page says, shows and asks for; notes tags that do not close."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.images, self.addresses, self.ids, self.links, self.words = [], [], [], [], [], []
+        self.open = []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.tags.append(tag)
+        if tag == "img":
+            self.images.append(found)
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "data", "action", "srcset", "poster")]
+        self.ids += [found["id"]] if "id" in found else []
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.words.append(data)
+
+    @property
+    def text(self):
+        return re.sub(r"[\s\u00a0]+", " ", " ".join(self.words))
+
+
+MADE = {
+    "closed": aging_campaign,
+    "nothing_missing": lambda: aging_campaign(verdict="nothing_missing"),
+    "unexplained": lambda: aging_campaign(verdict="unexplained"),
+    "torque": torque_campaign,
+    "not_run": not_run,
+}
+
+
+@pytest.fixture(scope="module")
+def reports():
+    return {name: build_report(*make().arguments) for name, make in MADE.items()}
+
+
+@pytest.fixture(scope="module")
+def pages(reports):
+    return {name: Page(report.html) for name, report in reports.items()}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_the_page_asks_for_nothing(name, reports, pages):
+    for address in pages[name].addresses:
+        assert address.startswith(("#", "data:image/svg+xml;base64,"))
+    assert "script" not in pages[name].tags
+    style = re.search(r"<style>(.*?)</style>", reports[name].html, re.S)[1]
+    assert "url(" not in style
+    assert "@import" not in style
+    for image in pages[name].images:
+        drawing = base64.b64decode(image["src"].partition(",")[2]).decode()
+        outside = re.findall(r'(?:href|src)="(?!#)([^"]*)"', drawing)
+        assert outside == []
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_every_image_says_what_it_shows(name, pages):
+    assert all(len(image["alt"]) > 20 for image in pages[name].images)
+    assert pages[name].images
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_contents_lead_somewhere_and_ids_are_single(name, pages):
+    targets = [address[1:] for address in pages[name].addresses if address.startswith("#")]
+    assert len(targets) == 10
+    assert set(targets) <= set(pages[name].ids)
+    assert len(set(pages[name].ids)) == len(pages[name].ids)
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_nothing_unavailable_is_printed_raw(name, pages):
+    assert not re.search(r"\b(nan|None|NaN|inf|NaT|undefined)\b", pages[name].text)
+
+
+def test_figures_are_named_for_the_store(reports):
+    assert set(reports["closed"].figures) == {
+        "before_after", "effect_shapes", "variance_levels", "residual_channels", "force_speed", "aging", "traces_mean",
+    }  # fmt: skip
+    assert set(reports["torque"].figures) == {"before_after", "force_speed"}
+
+
+def test_the_verdict_stands_at_the_top(pages):
+    text = pages["closed"].text
+    assert text.index("The declared model missed warming by sliding") < text.index("rms error on runs")
+    assert "misses nothing that these data can show" in pages["nothing_missing"].text
+    assert "misses something that no effect explains" in pages["unexplained"].text
+
+
+def test_before_and_after_stand_beside_the_floor(pages):
+    text = pages["closed"].text
+    for words in ("before after change", "rms error on runs the fit did not see (N)", "noise floor", "lack of fit, p"):
+        assert words in text
+    assert "before after change" not in pages["nothing_missing"].text
+
+
+def test_effects_say_all_that_is_known(pages):
+    text = pages["closed"].text
+    assert "It scales the friction coefficient μ and goes with time (s), within a trace." in text
+    assert "share of friction lost when warm" in text
+    assert "These data cannot tell it from: warming by sliding (distance), acting on μ" in text
+    assert "candidate, not applied" in text
+    assert "Replicate specimens would show" in text
+
+
+def test_torque_is_never_called_force_nor_its_slot(reports, pages):
+    text = pages["torque"].text + " ".join(image["alt"] for image in pages["torque"].images)
+    for slot in ("force_N", "displacement_mm", "speed_mm_s", "load_N", "friction force", "mm/s"):
+        assert slot not in text
+    assert "mN m" in text
+    assert "This rig does not age rubber" in text
+    assert "no load given: torque is fitted in place of coefficients" in text
+
+
+def test_a_loop_that_was_not_run_is_said_not_guessed(pages):
+    text = pages["not_run"].text
+    assert "The loop has not been closed on these data" in text
+    assert "No aging law was fitted" in text
+    assert "verdict" not in text
+
+
+def test_parameters_say_what_is_not_identified(pages):
+    text = pages["closed"].text
+    assert "not identified: fewer than two speeds lie below 2 v_s" in text
+    assert "u sys" in text
+
+
+def test_text_from_data_is_escaped():
+    made = aging_campaign()
+    nasty = "<script>alert('x')</script>"
+    made.tables["channels"] = made.tables["channels"].replace({"channel": {"operator": nasty}})
+    made.tables["levels"] = made.tables["levels"].replace({"channel": {"operator": nasty}})
+    made.closure["effects"][0]["label"] = nasty
+    made.closure["effects"][0]["form"] = nasty
+    made.closure["next_runs"] = [{"why": nasty, "conditions": {nasty: nasty}}]
+    made.provenance["campaign"] = f"/data/{nasty.replace('/', '')}"
+    report = build_report(*made.arguments)
+    page = Page(report.html)
+    assert "script" not in page.tags
+    assert "b" not in page.tags
+    assert nasty in page.text
+    assert 'traces/a "quoted" <b>.csv' in page.text
+    for image in page.images:
+        assert "<script" not in base64.b64decode(image["src"].partition(",")[2]).decode()
+
+
+@pytest.mark.parametrize("missing", NAMES)
+def test_any_table_may_be_missing(missing):
+    made = aging_campaign(speeds=(1, 10), days=(4,))
+    made.tables.pop(missing)
+    Page(build_report(*made.arguments).html)
+
+
+def test_with_no_tables_at_all_it_still_says_so():
+    page = Page(build_report({}, None, {}, Config()).html)
+    for words in ("no steady measurement", "No parameters were fitted", "no averaged traces", "No quality findings"):
+        assert words in page.text
+
+
+def test_null_everywhere_is_a_page_too():
+    made = aging_campaign(speeds=(1, 10), days=(4,))
+    nothing = dict.fromkeys(made.closure["before"])
+    made.closure.update(before=nothing, after=dict(nothing), noise_floor_N=None, heldout_unit=None, scatter=[])
+    made.closure["left"] = dict.fromkeys(made.closure["left"])
+    for effect in made.closure["effects"]:
+        effect.update(p_value=None, heldout_gain_N=None)
+        for p in effect["parameters"]:
+            p.update(value=None, ci95=[None, None])
+    text = Page(build_report(*made.arguments).html).text
+    assert "the noise floor and the lack of fit cannot be known" in text
+    assert not re.search(r"\b(nan|None)\b", text)
+
+
+def test_findings_are_counted_and_listed(pages):
+    text = pages["closed"].text
+    assert "bad number error row left out 1 1" in text
+    assert "friction force (N) jumps by 40 between two samples. Look at the cable." in text
+
+
+def test_many_findings_are_cut_and_counted():
+    made = aging_campaign(speeds=(1, 10), days=(4,))
+    row = made.tables["quality"].iloc[[-1]]
+    made.tables["quality"] = pd.concat([row] * 900, ignore_index=True)
+    assert "The first 400 of 900" in Page(build_report(*made.arguments).html).text
+
+
+def test_the_arguments_are_left_as_they_were():
+    made = aging_campaign(speeds=(1, 10), days=(4,))
+    before = {name: frame.copy() for name, frame in made.tables.items()}
+    left = dict(made.closure["left"])
+    build_report(*made.arguments)
+    assert made.closure["left"] == left
+    for name, frame in before.items():
+        pd.testing.assert_frame_equal(made.tables[name], frame)
+
+
+def test_paper_sized_campaign_gives_a_page_that_can_be_mailed():
+    made = paper_sized()
+    assert made.tables["steady"]["file"].nunique() == 1752
+    assert made.tables["steady"]["condition"].nunique() == 73
+    report = build_report(*made.arguments)
+    assert len(report.html.encode()) < 8e6
+    assert (
+        report.html.count("<img") == 12 + 12 + 9 + 6 + 2 + 1 + 1
+    )  # series, aging, channels, traces, errors, levels, shape
+
+
+def test_empty_tables_may_lack_columns():
+    made = aging_campaign(speeds=(1, 10), days=(4,))
+    made.tables["shapes"] = pd.DataFrame()
+    made.tables["aging_curves"] = empty("aging_curves")
+    assert "effect_shapes" not in build_report(*made.arguments).figures

@@ -1,0 +1,147 @@
+import pytest
+from report.made_campaigns import aging_campaign, torque_campaign
+from report.made_tables import empty, shapes
+
+from sealfit.config import Config
+from sealfit.report.words import acts, left_over, verdict, with_left_channels
+
+NUMBERS = {
+    "rmse_N": 1.3,
+    "rmse_runs_N": 0.9,
+    "heldout_rmse_N": 1.4212,
+    "max_abs_N": 4.0,
+    "mean_abs_pct": 3.0,
+    "lack_of_fit_p": 0.0001,
+}
+WARMING = {
+    "id": "warming_time",
+    "label": "warming by sliding, factor on mu",
+    "level": "trace",
+    "channels": ["time_s"],
+    "acts_on": "mu",
+    "operation": "multiply",
+    "form": "-A (1 - exp(-t / tau))",
+    "named": True,
+    "candidate": False,
+    "parameters": [
+        {"name": "A", "value": 0.061, "ci95": [0.055, 0.067], "unit": ""},
+        {"name": "tau", "value": 4.02, "ci95": [3.61, 4.48], "unit": "s"},
+    ],
+    "p_value": 0.0005,
+    "heldout_gain_N": 1.1,
+    "alternatives": [],
+}
+RIPPLE = {
+    **WARMING,
+    "id": "my_own",
+    "label": "ripple along displacement_mm, added to force",
+    "channels": ["displacement_mm"],
+    "acts_on": "force",
+    "operation": "add",
+    "parameters": [{"name": "lambda", "value": 5.02, "ci95": [5.01, 5.03], "unit": "mm"}],
+}
+
+
+def document(kind="closed", effects=(WARMING,), floor=0.2899, **left):
+    after = {**NUMBERS, "heldout_rmse_N": 0.3121, "rmse_N": 0.31} if effects else NUMBERS
+    left = {"rmse_N": 0.31, "level": None, "channel": None, "p_value": None, **left}
+    found = {"verdict": kind, "before": NUMBERS, "after": after, "noise_floor_N": floor, "heldout_unit": "run"}
+    return with_left_channels({**found, "effects": list(effects), "left": left}, {"displacement_mm", "oil temp"})
+
+
+def said(closure, table=None, config=None):
+    text = str(verdict(closure, shapes() if table is None else table, config or Config()))
+    return text.replace("\u00a0", " ").replace("<i>", "").replace("</i>", "").replace("p &lt; ", "p < ")
+
+
+def test_closed_says_what_was_missed_and_what_it_brings():
+    assert said(document()) == (
+        "The declared model missed warming by sliding (μ falls by 6.1 % [5.5, 6.7], time constant of warming τ = 4.0 s "
+        "[3.6, 4.5]); with it the error on runs the fit did not see falls from 1.42 N to 0.31 N; noise floor 0.29 N."
+    )
+
+
+def test_several_effects_are_counted_and_candidates_are_not():
+    text = said(document(effects=(WARMING, RIPPLE, {**RIPPLE, "candidate": True})))
+    assert text.startswith("The declared model missed two things: warming by sliding (")
+    assert "and ripple along displacement (λ = 5.020 mm [5.010, 5.030]); with them the error" in text
+
+
+def test_nothing_missing_gives_one_error():
+    text = said(document("nothing_missing", effects=()), empty("shapes"))
+    assert text == (
+        "The declared model misses nothing that these data can show: no channel orders what it leaves over. "
+        "The error on runs the fit did not see is 1.42 N; noise floor 0.29 N."
+    )
+
+
+def test_unexplained_says_where_it_sits():
+    left = {"channel": "displacement_mm oil temp", "level": "trace", "p_value": 0.0005}
+    assert said(document("unexplained", effects=(), **left)).startswith(
+        "The declared model misses something that no effect explains: the residual follows displacement (mm) and "
+        "oil temp within a trace (p < 0.001); the error"
+    )
+    text = said(document("unexplained", **left))
+    assert text.startswith("The declared model missed warming by sliding (")
+    assert "and something more that no effect explains: the residual follows displacement (mm)" in text
+    assert "so far the error on runs the fit did not see falls from 1.42 N to 0.31 N" in text
+
+
+def test_an_error_that_grows_is_not_called_falling():
+    closure = document()
+    closure["after"] = {**closure["after"], "heldout_rmse_N": 1.6}
+    assert "rises from 1.42 N to 1.60 N" in said(closure)
+
+
+def test_without_repeats_the_floor_is_unknown():
+    assert said(document(floor=None)).endswith("the noise floor is not known without repeats.")
+
+
+def test_without_held_out_errors_the_fitted_ones_are_named_so():
+    closure = document()
+    for stage in ("before", "after"):
+        closure[stage] = {**closure[stage], "heldout_rmse_N": None}
+    assert "the error on the data that were fitted (none could be held out) falls from 1.30 N to 0.31 N" in said(
+        closure
+    )
+
+
+def test_not_run_claims_nothing():
+    assert "has not been closed" in said(None)
+
+
+def test_the_units_are_the_declared_ones():
+    made = torque_campaign()
+    text = said(made.closure, made.tables["shapes"], made.config)
+    assert "1.5 mN m; noise floor 1.2 mN m" in text
+
+
+def test_labels_from_data_are_escaped():
+    assert "&lt;script&gt;" in said(document(effects=({**WARMING, "label": "<script>alert(1)</script>"},)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, "scales the friction coefficient <i>μ</i>"),
+        ({"acts_on": "force"}, "scales the whole friction force"),
+        ({"acts_on": "force", "operation": "add"}, "adds to the friction force"),
+        ({"acts_on": "v_s", "operation": "add"}, "adds to <i>v</i><sub>s</sub>"),
+    ],
+)
+def test_how_an_effect_acts(change, words):
+    assert str(acts({**WARMING, **change}, Config())) == words
+
+
+def test_what_is_left_is_called_scatter_only_if_it_is():
+    assert "it is scatter" in left_over(document(), Config())
+    left = {"channel": "displacement_mm", "level": "trace", "p_value": 0.0005}
+    text = left_over(document("unexplained", **left), Config())
+    assert "not only noise: the residual follows displacement (mm) within a trace (p &lt; 0.001)" in text
+    assert "scatter" not in text
+
+
+def test_made_campaign_reads_as_the_example():
+    made = aging_campaign()
+    text = said(made.closure, made.tables["shapes"])
+    assert text.startswith("The declared model missed warming by sliding (time; μ falls by 6.1 % [5.5, 6.7]")
