@@ -136,7 +136,7 @@ class Loop(_Strict):
     """How the loop is closed."""
 
     family_error: float = Field(0.005, gt=0, lt=0.5, description="chance of any false effect per campaign")
-    max_rounds: int = Field(8, ge=1)
+    max_rounds: int = Field(12, ge=1)
     folds: int = Field(5, ge=2)
     seed: int = 1
     ignore_channels: list[str] = Field(default_factory=list)

@@ -7,7 +7,7 @@ each of its levels in one group only (a serial number) is a grouping, never an e
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -27,6 +27,7 @@ class Channel:
     name: str
     values: np.ndarray  # (n,) float or str
     unit: str  # "sample" or a nesting level
+    grouping: bool = False  # each category in one unit only: it tells units apart and orders nothing
 
     @property
     def numeric(self) -> bool:
@@ -34,8 +35,13 @@ class Channel:
         return self.values.dtype.kind == "f"
 
 
-def find_channels(rows: Rows, ignore: Iterable[str] = (), *, rig_position: bool = True) -> list[Channel]:
+def find_channels(
+    rows: Rows, ignore: Iterable[str] = (), *, conditions: Iterable[str] = (), rig_position: bool = True
+) -> list[Channel]:
     """Return every channel of the rows that varies and is not a grouping.
+
+    A condition's own column is kept though it may be a grouping: an offset between directions may differ from one
+    condition to the next, and that is seen inside each of them.
 
     Parameters
     ----------
@@ -43,9 +49,12 @@ def find_channels(rows: Rows, ignore: Iterable[str] = (), *, rig_position: bool 
         The rows.
     ignore : iterable of str
         Names left out.
+    conditions : iterable of str
+        Columns that make a condition.
     rig_position : bool
         Whether displacement means the same place in every file.
     """
+    conditions = set(conditions)
     skip = set(ignore) | (set() if rig_position else {"displacement_mm"})
     found = []
     for name in rows.channels:
@@ -60,7 +69,9 @@ def find_channels(rows: Rows, ignore: Iterable[str] = (), *, rig_position: bool 
         unit = unit_of(values, rows)
         channel = Channel(name, values, unit)
         if not channel.numeric and _is_grouping(channel, rows):
-            continue
+            if name not in conditions:
+                continue
+            channel = replace(channel, grouping=True)
         found.append(channel)
     return found
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sealfit.closure.channels import FINER, unit_of
 from sealfit.closure.naming import Proposal, file_shifts
 from sealfit.closure.ripple import Peak
 from sealfit.fit.estimate import Fitted, fit, fitted_at
-from sealfit.fit.joint import Model, evaluate
+from sealfit.fit.joint import evaluate
+from sealfit.fit.mixed import whiten
 from sealfit.fit.rows import Rows
 
 LEAST_RUNS = 6  # below six runs whole files are held out, below six files strokes (design: held-out unit)
@@ -55,28 +57,54 @@ def _edge(rows: Rows, condition: int) -> bool:
     return bool(days.iloc[condition] in (0.0, own.max()))
 
 
-def heldout_force(model: Model, fitted: Fitted, level: str, count: int, seed: int) -> np.ndarray:
-    """Return each row's force by the model refitted without the row's group, shape (n,); NaN where never held out."""
-    rows = fitted.rows
-    force = np.full(rows.force.size, np.nan)
-    for out in folds(rows, level, count, seed):
-        kept = fit(model, rows.subset(~out), fitted.scatter, turns=0)
-        force[out] = evaluate(kept.model, rows.subset(out), jacobian=False)[0]
-    return force
+@dataclass(frozen=True)
+class Gain:
+    """What a proposal gains on held-out groups: in RMSE, and in the sum of squares with scatter accounted for."""
+
+    rmse_N: float
+    deviance: float  # fall of the whitened sum of squares: what a piece of scatter moves as a whole counts once
+
+    @property
+    def real(self) -> bool:
+        """Whether the held-out data speak for the proposal."""
+        return self.deviance > 0
 
 
-def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int) -> float:
-    """Return by how much a proposal lowers the RMSE on held-out groups of its own unit, in force units."""
-    after = proposal.fitted
+def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int) -> Gain:
+    """Return what a proposal gains on held-out groups of its own unit.
+
+    The RMSE of a rig whose files scatter by newtons does not see a ripple of a tenth; the whitened sum of squares of
+    the held-out groups does, as the offset and gain of a whole file or run cost it little. For the same reason the
+    RMSE is taken about the means of the groups inside which the effect's channels vary.
+    """
     if "shift" in proposal.term.fixed:
-        return _gain_within_files(before, proposal)
-    level = proposal.unit
-    old = heldout_force(before.model, before, level, count, seed)
-    new = heldout_force(after.model, after, level, count, seed)
-    known = np.isfinite(old) & np.isfinite(new)
-    weight = before.rows.weight[known] / before.rows.weight[known].sum()
-    measured = before.rows.force[known]
-    return float(np.sqrt(weight @ (measured - old[known]) ** 2) - np.sqrt(weight @ (measured - new[known]) ** 2))
+        gain = _gain_within_files(before, proposal)
+        return Gain(gain, gain)
+    rows, after, scatter = before.rows, proposal.fitted, before.scatter
+    squares, white, known = np.zeros(2), np.zeros(2), 0.0
+    for out in folds(rows, proposal.unit, count, seed):
+        train, test = rows.subset(~out), rows.subset(out)
+        weight = rows.weight[out]
+        known += float(weight.sum())
+        for k, model in enumerate((before.model, after.model)):
+            kept = fit(model, train, scatter, turns=0, loading=before.force[~out])
+            residual = test.force - evaluate(kept.model, test, jacobian=False)[0]
+            squares[k] += float(weight @ _about(residual, test, proposal) ** 2)
+            load = before.force[out]
+            part, _ = whiten(residual[:, None], scatter.noise_sd(load), load, test.groups, scatter.components)
+            white[k] += float((part**2).sum())
+    rmse = np.sqrt(squares / max(known, 1e-300))
+    return Gain(float(rmse[0] - rmse[1]), float(white[0] - white[1]))
+
+
+def _about(residual: np.ndarray, rows: Rows, proposal: Proposal) -> np.ndarray:
+    """Return a residual about the mean of its file, run or specimen: the finest whose groups the effect varies in."""
+    units = [unit_of(rows.values(name), rows) for name in proposal.term.channels]
+    finest = min(units, key=FINER.get)
+    around = {"sample": "file", "stroke": "file", "file": "run", "run": "specimen"}.get(finest)
+    if around is None or proposal.term.channels == ("direction",):
+        return residual
+    return residual - rows.groups.means(residual, around)[rows.codes(around)]
 
 
 def _gain_within_files(before: Fitted, proposal: Proposal) -> float:

@@ -12,6 +12,7 @@ from sealfit.closure.grow import Added, Grown, describe
 from sealfit.closure.intervals import effect_intervals
 from sealfit.closure.ripple import Peak
 from sealfit.config import Config
+from sealfit.effects.contract import fill_unit
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import Term, evaluate
 from sealfit.fit.rows import Rows
@@ -29,7 +30,7 @@ def effect_entries(after: Fitted, added: Sequence[Added], config: Config) -> lis
         intervals = effect_intervals(after, number, proposal.unit)
         parameters = [
             {
-                "name": p.name,
+                "name": p.symbol,
                 "value": intervals[p.name][0],
                 "ci95": [intervals[p.name][1], intervals[p.name][2]],
                 "unit": parameter_unit(p.unit, term, config.units),
@@ -100,7 +101,7 @@ def parameter_unit(unit: str, term: Term, units: Units) -> str:
         given = units.unit("speed")
     else:
         given = ""
-    return unit.replace("{x}", channel).replace("{y}", given).strip("/ ")
+    return fill_unit(unit, channel, given)
 
 
 def effect_table(entries: Sequence[dict], added: Sequence[Added]) -> pd.DataFrame:

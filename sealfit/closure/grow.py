@@ -77,9 +77,13 @@ def grow(
     """
     say = on_progress or (lambda text: None)
     rng = np.random.default_rng(config.loop.seed)
+    unit = config.units.unit("force")
     rig = config.position_origin == "rig"
     before = fitted = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
-    channels = {c.name: c for c in find_channels(rows, config.loop.ignore_channels, rig_position=rig)}
+    channels = {
+        c.name: c
+        for c in find_channels(rows, config.loop.ignore_channels, conditions=config.condition, rig_position=rig)
+    }
     alpha = config.loop.family_error
     added: list[Added] = []
     refused: set[tuple] = set()
@@ -101,13 +105,16 @@ def grow(
         proposals = propose(fitted, open_, channels, peak, effects)
         accepted = None
         for proposal in proposals[:TRIES]:
-            gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed) if confirm else np.nan
-            say(f"  {describe(proposal.term)}: held-out gain {gain:.4g}")
-            if not confirm or gain > 0:
-                accepted = Added(proposal, gain, tuple(rivals(proposal, proposals)), number)
+            gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed) if confirm else None
+            if gain is not None:
+                say(f"  {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
+            if gain is None or gain.real:
+                rmse = np.nan if gain is None else gain.rmse_N
+                accepted = Added(proposal, rmse, tuple(rivals(proposal, proposals)), number)
                 break
         if accepted is None:
-            refused |= {c.key for c in open_} | ({("peak", peak.axis)} if peak else set())
+            tried = {p.source for p in proposals[:TRIES]}
+            refused |= tried or {c.key for c in open_}
             continue
         added.append(accepted)
         fitted = fit(accepted.proposal.fitted.model, rows, fitted.scatter, turns=2)
@@ -126,13 +133,25 @@ def _drop_needless(fitted: Fitted, added: list[Added]) -> tuple[Fitted, list[Add
     k = 0
     while k < len(added) - 1:
         price = added[k].proposal.price
-        without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0)
+        if _wald(fitted, k) > 2 * price:  # far from needless: no refit is wanted to see that
+            k += 1
+            continue
+        without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, loading=fitted.force)
         if without.deviance - fitted.deviance < price:
             fitted = fit(without.model, fitted.rows, fitted.scatter, turns=1)
             added = [a for j, a in enumerate(added) if j != k]
         else:
             k += 1
     return fitted, added
+
+
+def _wald(fitted: Fitted, number: int) -> float:
+    """Return the squared standardised size of an effect's amplitudes, all together."""
+    at = fitted.model.theta.size + sum(len(t.effect.parameters) for t in fitted.model.terms[:number])
+    effect, values = fitted.model.terms[number].effect, fitted.model.values[number]
+    places = [at + k for k, p in enumerate(effect.parameters) if p.linear]
+    amplitude = np.array([values[p.name] for p in effect.parameters if p.linear])
+    return float(amplitude @ np.linalg.pinv(fitted.covariance[np.ix_(places, places)]) @ amplitude)
 
 
 def steady_samples(traces: pd.DataFrame, rows: Rows) -> pd.DataFrame:

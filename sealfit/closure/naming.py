@@ -24,7 +24,7 @@ from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.joint import Term, term_derivatives, term_slope
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
-REFITTED = 6  # proposals refitted jointly
+REFITTED = 8  # proposals refitted jointly
 TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
 RIVAL = 10.0  # an alternative: the data favour the chosen one by less than exp(5)
 SAME = 0.98  # correlation above which two candidates are one effect here
@@ -43,6 +43,7 @@ class Proposal:
     chi2: float
     p_value: float
     column: np.ndarray  # (n,) what it adds to the force, whitened and projected
+    source: tuple  # key of the candidate it stands for
     fitted: Fitted | None = None
 
     @property
@@ -92,30 +93,35 @@ def propose(
     """
     found: list[Proposal] = []
     if significant:
-        best = significant[0].chi2
+        best = significant[0]
         seen = set()
         for candidate in significant:
-            if candidate.chi2 < CONTENDER * best or candidate.key in seen:
+            if candidate.chi2 < CONTENDER * best.chi2 or candidate.key in seen:
                 continue
+            if best.channels == ("direction",) != candidate.channels:
+                continue  # a form that starts at zero would take a constant offset in along with its own shape
             seen.add(candidate.key)
             for term, search in _terms(candidate, channels, fitted, effects):
                 found += _linearised(fitted, term, search, candidate)
     if peak is not None:
         for term, search, candidate in _periodic(fitted, peak, effects):
-            found += _linearised(fitted, term, search, candidate)
+            found += [replace(p, source=("peak", peak.axis)) for p in _linearised(fitted, term, search, candidate)]
     found.sort(key=lambda p: p.criterion)
     found = [_refit(fitted, p) for p in _spread(found)]
     return _ordered(found)
 
 
 def _spread(found: list[Proposal]) -> list[Proposal]:
-    """Return the few best, each effect and target once, the best free shape always among them."""
-    kept, seen = [], set()
-    for proposal in found:
-        if proposal.term.key() in seen:
+    """Return the few best, each effect and target once, no effect on more than two; the best free shape among them.
+
+    A grid is coarse, so a mechanism gets the benefit of the doubt until it has been refitted.
+    """
+    kept: list[Proposal] = []
+    for proposal in sorted(found, key=lambda p: p.criterion - TIED * p.term.effect.physical):
+        same = [p for p in kept if p.term.effect.id == proposal.term.effect.id]
+        if len(same) >= 2 or any(p.term.key() == proposal.term.key() for p in same):
             continue
-        if len(kept) < REFITTED or (proposal.term.effect.id == "smooth" and not any(not p.named for p in kept)):
-            seen.add(proposal.term.key())
+        if len(kept) < REFITTED or (not proposal.named and not same):
             kept.append(proposal)
     return kept
 
@@ -147,14 +153,19 @@ def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
         p
         for p in found
         if p is not chosen
-        and p.fitted is not None
+        and not _identical(p, chosen)
         and (p.criterion - chosen.criterion < RIVAL or correlation(p, chosen) > SAME)
     ]
 
 
+def _identical(one: Proposal, other: Proposal) -> bool:
+    """Whether two proposals are one equation under two names, on the same channels and quantity."""
+    return one.term.key()[1:] == other.term.key()[1:] and abs(one.criterion - other.criterion) < 1e-3
+
+
 def _refit(fitted: Fitted, proposal: Proposal) -> Proposal:
     model = fitted.model.with_term(proposal.term, proposal.values)
-    return replace(proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0))
+    return replace(proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0, loading=fitted.force))
 
 
 def _terms(
@@ -176,8 +187,7 @@ def _terms(
             fixed = {"x_ref": reference(channel.values)}
             yield Term(effect, (name,), *target, fixed=fixed), _grids(effect, channel.values)
         elif name in effect.reads and effect.id != "ripple":
-            fixed = {f"{c}_ref": reference(np.abs(channels[c].values)) for c in effect.reads if c in channels}
-            fixed["x_ref"] = reference(np.abs(channel.values)) if channel.numeric else 0.0
+            fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
             yield Term(effect, effect.reads, *target, fixed=fixed), _grids(effect, np.abs(channel.values))
     if name != "direction":
         yield free_term(channel, *target), {}
@@ -297,5 +307,7 @@ def _linearised(fitted: Fitted, term: Term, search: Mapping[str, tuple], candida
             if best is None or chi2 > best.chi2:
                 named = {effect.parameters[i].name: float(a) for i, a in zip(linear, amplitude, strict=True)}
                 values = {p.name: {**effect.start(), **point, **named}[p.name] for p in effect.parameters}
-                best = Proposal(term, values, candidate.unit, candidate.units, chi2, candidate.p_value, column)
+                best = Proposal(
+                    term, values, candidate.unit, candidate.units, chi2, candidate.p_value, column, candidate.key
+                )
     return [best] if best is not None else []

@@ -15,7 +15,7 @@ import pandas as pd
 from scipy import stats
 from scipy.special import digamma
 
-LEAST_SAMPLES = 32  # a stroke with fewer steady samples says nothing of a ripple
+LEAST_SAMPLES = 16  # a stroke with fewer steady samples says nothing of a ripple
 NEIGHBOURS = 25  # frequencies on each side that make the local background
 LOBE = 4  # frequencies on each side that the taper smears a peak over
 ABOVE_BACKGROUND = 4.0  # a peak's power over the median of its neighbours: a smooth trend has no peak
@@ -65,8 +65,9 @@ def find_ripple(
         spectra = spectra_along(samples, axis)
         if spectra is None:
             continue
-        fixed = common_phase and axis == "displacement_mm"
-        peaks += _coherent(spectra, axis) if fixed else _incoherent(spectra, axis)
+        if common_phase and axis == "displacement_mm":
+            peaks += _coherent(spectra, axis)
+        peaks += _incoherent(spectra, axis)
     if not peaks:
         return None
     best = min(peaks, key=lambda peak: (peak.p_value, -peak.statistic))
@@ -142,7 +143,7 @@ def _coherent(spectra: Spectra, axis: str) -> list[Peak]:
         units = int((np.abs(by_unit) > 0).any(axis=1).sum())
         if units < 4 or not sharp.any():
             continue
-        k = int(np.argmax(np.where(sharp, statistic, 0)))
+        k = int(np.argmax(np.where(sharp & _tops(total), statistic, 0)))
         p = _coherence_p(statistic[k], units) * spectra.frequency.size * (2 if both else 1)
         present = spectra.known[:, k]
         amplitude = float(np.abs((turned[present, k]).mean()))
@@ -167,10 +168,21 @@ def _incoherent(spectra: Spectra, axis: str) -> list[Peak]:
     scale = power.sum(axis=1, keepdims=True) / np.maximum(spectra.known.sum(axis=1, keepdims=True), 1)
     mean = (power / np.maximum(scale, 1e-300)).sum(axis=0) / np.maximum(count, 1)
     ratio = mean / _smooth_background(mean, spectra.frequency, count)
-    k = int(np.argmax(ratio))
+    k = int(np.argmax(np.where(_tops(mean), ratio, 0)))
     p = float(stats.gamma.sf(ratio[k] * count[k], count[k])) * spectra.frequency.size
     amplitude = float(np.sqrt((power[:, k] * spectra.known[:, k]).sum() / max(count[k], 1)))
     return [Peak(axis, _refined(mean, spectra.frequency, k), True, False, float(ratio[k]), p, amplitude)]
+
+
+def _tops(power: np.ndarray) -> np.ndarray:
+    """Return where a spectrum is highest within a main lobe each side, its low end left out, shape (f,).
+
+    At the low end stand the smooth shapes of a stroke (warming, drift), which are no ripple.
+    """
+    padded = np.pad(power, LOBE, constant_values=np.inf)[: power.size + LOBE]
+    padded = np.r_[padded, np.zeros(LOBE)]
+    highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * LOBE + 1).max(axis=1)
+    return power >= highest
 
 
 def _smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarray) -> np.ndarray:

@@ -105,7 +105,7 @@ def _of_channel(fitted: Fitted, channel: Channel) -> Iterator[Candidate]:
     shapes = np.ones((rows.force.size, 1)) if channel.name == "direction" else free_columns(channel)
     slopes, places = [], []
     for acts_on, operation in TARGETS:
-        if not _allowed(channel, acts_on, both_ways):
+        if not (_allowed(channel, acts_on, operation, both_ways) and _declared(fitted, acts_on)):
             continue
         slope = term_slope(fitted.model, rows, acts_on, operation)
         if np.abs(slope).max() <= 0:
@@ -153,9 +153,17 @@ def _direction_unit(rows: Rows) -> str:
     return unit_of(np.sign(rows.speed), rows)
 
 
-def _allowed(channel: Channel, acts_on: str, both_ways: bool) -> bool:
+def _declared(fitted: Fitted, acts_on: str) -> bool:
+    """Whether the declared model holds the quantity here; mu_c alone is mu where no Stribeck curve is fitted."""
+    needs = {"mu_s": "v_s", "mu_c": "v_s", "v_s": "v_s", "sigma_2": "sigma_2", "a": "a_c", "b": "b_c"}.get(acts_on)
+    return needs is None or bool((fitted.model.declared.index[needs] >= 0).any())
+
+
+def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool) -> bool:
     if channel.name == "direction":
         return both_ways
+    if channel.grouping:
+        return both_ways and (acts_on, operation) == ("force", "add")
     if channel.name == "speed_mm_s":
         return acts_on in ("mu", "a")  # mu_s, mu_c, v_s and sigma_2 are themselves the dependence on speed
     return not (channel.name == "load_N" and acts_on == "force")

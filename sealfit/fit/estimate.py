@@ -14,13 +14,14 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import nnls
 
-from sealfit.fit.joint import LOGARITHMIC, JointParameter, Model, declare, evaluate
+from sealfit.fit.joint import LOGARITHMIC, SAME_SPEED, JointParameter, Model, declare, evaluate
 from sealfit.fit.mixed import Component, Scatter, reml, whiten
 from sealfit.fit.rows import LEVELS, Rows
 
 PRIOR_SD = 3.0
 LEAST_NOISE = 1e-6  # of the force: below what any sensor resolves; keeps noise-free data from weights without end
 MAX_STEPS = 60
+SETTLED = 1e-4  # of the whitened sum of squares: the estimates then lie within a hundredth of a standard error
 TURNS = 3  # of model and scatter; the third moves no estimate by a tenth of its standard error
 
 
@@ -100,7 +101,14 @@ def fit_declared(rows: Rows) -> Fitted:
     return fit(start_model(rows), rows)
 
 
-def fit(model: Model, rows: Rows, scatter: Scatter | None = None, *, turns: int = TURNS) -> Fitted:
+def fit(
+    model: Model,
+    rows: Rows,
+    scatter: Scatter | None = None,
+    *,
+    turns: int = TURNS,
+    loading: np.ndarray | None = None,
+) -> Fitted:
     """Return the model fitted to `rows`, physics and effects together.
 
     Parameters
@@ -113,6 +121,8 @@ def fit(model: Model, rows: Rows, scatter: Scatter | None = None, *, turns: int 
         Scatter to start from; with `turns=0` it is kept.
     turns : int
         How often scatter is estimated anew and the model refitted.
+    loading : ndarray, shape (n,), optional
+        Force that gains and noise load on, where `turns` is 0: fits to be compared must share it.
     """
     centre = model.vector()
     if scatter is None:
@@ -123,28 +133,32 @@ def fit(model: Model, rows: Rows, scatter: Scatter | None = None, *, turns: int 
         scatter = estimate_scatter(rows, force, jacobian, scatter if turn else None)
         model = _descend(model, rows, scatter, centre)
     if not turns:
-        model = _descend(model, rows, scatter, centre)
+        model = _descend(model, rows, scatter, centre, loading)
+        return fitted_at(model, rows, scatter, loading)
     return fitted_at(model, rows, scatter)
 
 
-def fitted_at(model: Model, rows: Rows, scatter: Scatter) -> Fitted:
+def fitted_at(model: Model, rows: Rows, scatter: Scatter, loading: np.ndarray | None = None) -> Fitted:
     """Return the `Fitted` of a model as it stands, nothing refitted."""
     force, jacobian = evaluate(model, rows)
+    load = force if loading is None else loading
     white, logdet = whiten(
-        np.column_stack([rows.force - force, jacobian]), scatter.noise_sd(force), force, rows.groups, scatter.components
+        np.column_stack([rows.force - force, jacobian]), scatter.noise_sd(load), load, rows.groups, scatter.components
     )
     residual = white[:, 0]
     return Fitted(model, scatter, rows, force, jacobian, residual, white[:, 1:], float(residual @ residual) + logdet)
 
 
-def _descend(model: Model, rows: Rows, scatter: Scatter, centre: np.ndarray) -> Model:
+def _descend(
+    model: Model, rows: Rows, scatter: Scatter, centre: np.ndarray, loading: np.ndarray | None = None
+) -> Model:
     """Return the model at the least whitened sum of squares, by Levenberg-Marquardt with the scatter held fixed."""
     precision = prior_precision(model)
     low, high = _bounds(model, rows)
     vector = np.clip(model.vector(), low, high)
     model = model.at(vector)
     force, jacobian = evaluate(model, rows)
-    loading = force  # gains load on the force at the start, so that the criterion does not move under the search
+    loading = force if loading is None else loading  # held, so that the criterion does not move under the search
     sd = scatter.noise_sd(loading)
 
     def white_of(columns: np.ndarray) -> np.ndarray:
@@ -182,18 +196,18 @@ def _descend(model: Model, rows: Rows, scatter: Scatter, centre: np.ndarray) -> 
         gain = cost - trial_cost
         vector, model, residual, cost = trial, trial_model, trial_residual, trial_cost
         damping /= 10
-        if gain < 1e-7 * max(1.0, abs(cost) * 1e-3):
+        if gain < SETTLED:
             return model
         _, jacobian = evaluate(model, rows)
     return model
 
 
 def _bounds(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    speeds = np.abs(rows.speed)[np.abs(rows.speed) > 0]
+    slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
     days = rows.days[rows.days > 0]
     first, last = (days.min(), days.max()) if days.size else (1.0, 1.0)
     limits = {
-        "v_s": (np.log(speeds.min() / 10), np.log(speeds.max() * 3)),
+        "v_s": (np.log(slowest), np.log(fastest)),
         "b_s": (np.log(first / 1000), np.log(last * 30)),
         "b_c": (np.log(first / 1000), np.log(last * 30)),
     }
@@ -203,6 +217,18 @@ def _bounds(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
         low += [p.bounds[0] for p in term.effect.parameters]
         high += [p.bounds[1] for p in term.effect.parameters]
     return np.array(low, dtype=float), np.array(high, dtype=float)
+
+
+def stribeck_range(speeds: np.ndarray) -> tuple[float, float]:
+    """Return where v_s is looked for: from half the second slowest speed to the fastest.
+
+    Below that range only the slowest speed would see mu_s, which could then be any size; above it the exponential is a
+    parabola that sigma_2 and mu_c make as well (v_s needs two speeds below about 2 v_s).
+    """
+    positive = np.sort(speeds[speeds > 0])
+    above = positive[positive > SAME_SPEED * positive[0]]
+    second = above[0] if above.size else positive[0]
+    return float(second / 2), float(positive[-1])
 
 
 # ---------------------------------------------------------------- where to start
@@ -259,7 +285,7 @@ def _per_condition(speed, load, size, condition, full: bool):
     """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of one series by a grid over v_s, the rest exact."""
     own = np.unique(condition)
     inside = (condition[:, None] == own[None, :]).astype(float) * load[:, None]
-    grid = np.geomspace(speed.min() / 3, speed.max() * 1.5, 80) if full else np.array([1.0])
+    grid = np.geomspace(*stribeck_range(speed), 80) if full else np.array([1.0])
     best, answer = np.inf, None
     for v_s in grid:
         decay = np.exp(-((speed / v_s) ** 2)) if full else np.zeros_like(speed)
@@ -325,7 +351,10 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
     if used and used[-1] == "specimen" and not _specimens_free(rows):
         used.pop()
     both = rows.speed.min() < 0 < rows.speed.max() or np.ptp(np.abs(rows.force)) > 0.2 * np.abs(rows.force).max()
-    return [(level, kind) for level in used for kind in (("offset", "gain") if both else ("offset",))]
+    kinds = {level: ("offset", "gain") if both else ("offset",) for level in used}
+    if both and "specimen" in kinds:
+        kinds["specimen"] = ("gain",)  # a piece of rubber has a friction of its own, not a zero of the sensor
+    return [(level, kind) for level in used for kind in kinds[level]]
 
 
 def _specimens_free(rows: Rows) -> bool:

@@ -61,6 +61,9 @@ class Term:
 
     def inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         """Return what the effect's shape reads, from the rows' channels."""
+        key = (self.key(), id(self.fixed))
+        if key in rows.cache:
+            return rows.cache[key][1]
         given = {}
         for name, channel in zip(self.effect.reads, self.channels, strict=True):
             values = rows.values(channel)
@@ -72,7 +75,8 @@ class Term:
             place = self.effect.reads[0]
             own = rows.table["file"].map(shift).to_numpy(dtype=float)
             given[place] = np.where(np.isfinite(own), given[place] + own, 0.0)
-        return {**given, **self.fixed}
+        rows.cache[key] = (self.fixed, {**given, **self.fixed})  # holding `fixed` keeps its id its own
+        return rows.cache[key][1]
 
     def key(self) -> tuple:
         """Return what makes two terms the same effect."""
@@ -206,7 +210,7 @@ def levels_of(speeds: np.ndarray) -> int:
 
 def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the model's force, shape (n,), and its tangent, shape (n, model.size), at every row."""
-    state = _state(model, rows)
+    state = _state(model, rows, slopes=jacobian)
     if not jacobian:
         return state["force"], None
     slopes = state["slopes"]
@@ -250,7 +254,7 @@ def term_derivatives(
     return result
 
 
-def _state(model: Model, rows: Rows) -> dict:
+def _state(model: Model, rows: Rows, *, slopes: bool = True) -> dict:
     declared, theta = model.declared, model.theta
     base = {}
     for quantity in QUANTITIES:
@@ -306,9 +310,11 @@ def _state(model: Model, rows: Rows) -> dict:
     friction = rows.load * mu_total * sign
     sliding = friction + now["sigma_2"] * speed
     force = sliding * on_force + added
+    if not slopes:
+        return {"force": force}
     drive = rows.load * sign * on_mu * on_force  # derivative with respect to mu before its factor
     log_s, log_c = np.log1p(days / now["b_s"]), np.log1p(days / now["b_c"])
-    slopes = {
+    slope_of = {
         "mu_s": drive * decay,
         "mu_c": drive * (1 - decay),
         "v_s": drive * (now["mu_s"] - now["mu_c"]) * decay * 2 * ratio**2 / now["v_s"],
@@ -316,15 +322,15 @@ def _state(model: Model, rows: Rows) -> dict:
     }
     for end, log in (("s", log_s), ("c", log_c)):
         factor = through.get(f"mu_{end}", 1.0)
-        slopes[f"mu_0{end}"] = slopes[f"mu_{end}"] * factor
-        slopes[f"a_{end}"] = -slopes[f"mu_{end}"] * factor * log
+        slope_of[f"mu_0{end}"] = slope_of[f"mu_{end}"] * factor
+        slope_of[f"a_{end}"] = -slope_of[f"mu_{end}"] * factor * log
         b = now[f"b_{end}"]
-        slopes[f"b_{end}"] = slopes[f"mu_{end}"] * factor * now[f"a_{end}"] * days / (b * (b + days))
+        slope_of[f"b_{end}"] = slope_of[f"mu_{end}"] * factor * now[f"a_{end}"] * days / (b * (b + days))
     state = {
         "base": base,
         "now": now,
         "through": through,
-        "slopes": slopes,
+        "slopes": slope_of,
         "force": force,
         "gained": sliding * on_force,
         "on_mu": on_mu,

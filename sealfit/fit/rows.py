@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -48,6 +48,7 @@ class Rows:
     has_load: bool
     has_aging: bool
     weight: np.ndarray  # (n,) sums to 1; each file weighs the same
+    cache: dict = field(default_factory=dict, compare=False, repr=False)  # arrays derived from the table, once
 
     @property
     def channels(self) -> list[str]:
@@ -56,10 +57,13 @@ class Rows:
 
     def values(self, channel: str) -> np.ndarray:
         """Return one channel as floats, or as strings if it is a category."""
-        column = self.table[channel]
-        if pd.api.types.is_numeric_dtype(column):
-            return column.to_numpy(dtype=float, na_value=np.nan)
-        return column.astype(str).to_numpy()
+        if channel not in self.cache:
+            column = self.table[channel]
+            if pd.api.types.is_numeric_dtype(column):
+                self.cache[channel] = column.to_numpy(dtype=float, na_value=np.nan)
+            else:
+                self.cache[channel] = column.astype(str).to_numpy(dtype=str)
+        return self.cache[channel]
 
     def codes(self, level: str) -> np.ndarray:
         """Return each row's group number at a level."""
@@ -79,6 +83,7 @@ class Rows:
             days=self.days[mask],
             condition=self.condition[mask],
             weight=weight / weight.sum(),
+            cache={name: values[mask] for name, values in self.cache.items() if isinstance(name, str)},
         )
 
 
