@@ -18,7 +18,7 @@ from sealfit.errors import ConfigError, OutError, StaleError
 from sealfit.fingerprint import STEPS, fingerprint, fingerprints, seen_config, step_keys
 from sealfit.lock import LOCK, only_writer
 from sealfit.provenance import provenance
-from sealfit.staging import STAGING, Staged, disk, sync
+from sealfit.staging import STAGING, Staged, disk, sync, undisturbed
 from sealfit.state import STATE, ConfigCopy, Done, State, to_json
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ class Store:
         staged.text("ended.json", to_json(ended.as_dict()))
         staged.text(PROVENANCE, to_json(provenance(ended)))
         old = self.state.steps[name].files if name in self.state.steps else {}
-        with disk(self.out):
+        with undisturbed(), disk(self.out):
             staged.move("begun.json", STATE)
             sync(self.out)
             for file in files:
@@ -238,7 +238,7 @@ class Store:
             sync(self.out)
             staged.move("ended.json", STATE)
             sync(self.out)
-        self.state, self.known = ended, True
+            self.state, self.known = ended, True
         if staged.inputs is not None:
             self._now = dict(inputs)
 

@@ -481,6 +481,28 @@ def test_a_kill_at_any_moment_leaves_complete_tables(out, campaign):
     assert not reached_end[len(reached_end) // 2]
 
 
+def test_a_ctrl_c_while_files_are_moved_waits_until_they_are(out, campaign, monkeypatch):
+    real, moved = staging.Staged.move, []
+
+    def interrupted(self, *names):
+        moved.append(names)
+        if len(moved) == 2:
+            signal.raise_signal(signal.SIGINT)
+        real(self, *names)
+
+    def ingest():
+        with Store.writing(out, campaign, ConfigCopy.at(None)) as store:
+            do(store, "ingest")
+
+    monkeypatch.setattr(staging.Staged, "move", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        ingest()
+    assert signal.getsignal(signal.SIGINT) is before
+    monkeypatch.undo()
+    assert not Store.open(out).why_stale("ingest")
+
+
 def full(*_args, **_kwargs):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

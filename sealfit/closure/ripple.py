@@ -17,6 +17,7 @@ from scipy.special import digamma
 
 LEAST_SAMPLES = 16  # a stroke with fewer steady samples says nothing of a ripple
 NEIGHBOURS = 25  # frequencies on each side that make the local background
+SHARED = 1e-3  # p-value below which the phase is taken to be common to all files
 LOBE = 4  # frequencies on each side that the taper smears a peak over
 ABOVE_BACKGROUND = 4.0  # a peak's power over the median of its neighbours: a smooth trend has no peak
 
@@ -71,6 +72,9 @@ def find_ripple(
     if not peaks:
         return None
     best = min(peaks, key=lambda peak: (peak.p_value, -peak.statistic))
+    # A phase that all files share says more than power alone: where it is there, the ripple is the rig's.
+    shared = [p for p in peaks if p.common_phase and p.axis == best.axis and p.p_value < SHARED]
+    best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
 
 

@@ -40,7 +40,10 @@ def test_odd_in_speed_and_between_static_and_coulomb(speed, load, mu_s, mu_c, v_
 def test_proportional_to_load_without_viscosity(load, factor):
     model = PAPER | {"sigma_2": 0.0}
     npt.assert_allclose(
-        stribeck_force(3.0, factor * load, **model), factor * stribeck_force(3.0, load, **model), rtol=1e-12, atol=1e-300
+        stribeck_force(3.0, factor * load, **model),
+        factor * stribeck_force(3.0, load, **model),
+        rtol=1e-12,
+        atol=1e-300,
     )
 
 
