@@ -28,11 +28,10 @@ PROVENANCE = "provenance.json"
 
 
 class Store:
-    """One OUT folder with the campaign and the config it belongs to."""
+    """One OUT folder with the campaign and the config it belongs to; `known` if it holds results already."""
 
     def __init__(self, out: Path, state: State, *, known: bool):
         self.out, self.state = out, state
-        self.known = known  # false for a folder that holds no results yet
         self.config: Config = state.config.parse()
         self.warnings: list[str] = []
         if state.campaign.is_dir():
@@ -238,7 +237,7 @@ class Store:
             sync(self.out)
             staged.move("ended.json", STATE)
             sync(self.out)
-            self.state, self.known = ended, True
+            self.state = ended
         if staged.inputs is not None:
             self._now = dict(inputs)
 
