@@ -308,7 +308,7 @@ LEVELS = Schema(
         Column("sd_N", "N", FLOAT, "standard deviation of the residual at this level (or that the channel orders)"),
         Column("share", "", FLOAT, "share of the residual's variance"),
         Column("df", "", FLOAT, "degrees of freedom"),
-        Column("p_value", "", FLOAT, "that the channel orders the residual, adjusted over the search; null for a level"),
+        Column("p_value", "", FLOAT, "that the channel orders it, adjusted over the search; null for a level"),
     ),
 )
 CHANNELS = Schema(
