@@ -101,18 +101,25 @@ def _about(residual: np.ndarray, rows: Rows, proposal: Proposal) -> np.ndarray:
     """Return a residual about the mean of its file, run or specimen: the finest whose groups the effect varies in."""
     units = [unit_of(rows.values(name), rows) for name in proposal.term.channels]
     finest = min(units, key=FINER.get)
-    around = {"sample": "file", "stroke": "file", "file": "run", "run": "specimen"}.get(finest)
+    around = {"sample": "stroke", "stroke": "file", "file": "run", "run": "specimen"}.get(finest)
     if around is None or proposal.term.channels == ("direction",):
         return residual
-    return residual - rows.groups.means(residual, around)[rows.codes(around)]
+    code = rows.codes(around) * 2 + (rows.speed > 0)  # in each direction apart: an offset between them is no shape
+    return residual - (np.bincount(code, residual) / np.maximum(np.bincount(code), 1))[code]
 
 
 def _gain_within_files(before: Fitted, proposal: Proposal) -> float:
-    """Return the gain on one half of every stroke with each file's phase taken from the other half."""
+    """Return the gain on one half of every file with each file's phase taken from the other half.
+
+    Halves are pairs of strokes there and back, taken in turn, or halves of the stroke in a file of one or two.
+    """
     rows, after = before.rows, proposal.fitted
     start, code = rows.groups.starts["stroke"], rows.codes("stroke")
     count = np.diff(np.r_[start, code.size])
     first = np.arange(code.size) - start[code] < count[code] / 2
+    stroke = rows.table["stroke"].to_numpy()
+    if stroke[start].min() < stroke[start].max() and stroke.max() >= 4:
+        first = (stroke - 1) // 2 % 2 == 0
     length = after.model.values[-1]["lambda_"]
     peak = Peak(proposal.term.channels[0], length, True, False, 0.0, 0.0, 0.0)
     old, new = 0.0, 0.0

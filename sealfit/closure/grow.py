@@ -19,6 +19,8 @@ from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import Term, evaluate
 from sealfit.fit.rows import Rows
 
+PERIODIC = ("ripple", "sinusoid")
+CALENDAR = {"run_order", "elapsed_h"}
 TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
 
 
@@ -51,7 +53,6 @@ def grow(
     config: Config,
     effects: Mapping[str, Effect],
     *,
-    confirm: bool = True,
     start: Fitted | None = None,
     on_progress: Callable[[str], None] | None = None,
 ) -> Grown:
@@ -67,9 +68,6 @@ def grow(
         Levels of error, rounds, folds.
     effects : mapping
         The catalogue.
-    confirm : bool
-        Whether a proposal must also gain on held-out units; left out inside the outer folds, where the outer fold
-        itself is the held-out data.
     start : Fitted, optional
         The declared model fitted to more rows: where the fit begins, so that it need not search again.
     on_progress : callable, optional
@@ -90,11 +88,16 @@ def grow(
     first: tuple[Candidate, ...] = ()
     last: tuple[Candidate, ...] = ()
     left: Candidate | Peak | None = None
+    strongest: Peak | None = None
+    periodic: tuple | None = None
     for number in range(1, config.loop.max_rounds + 2):
         candidates = search(fitted, list(channels.values()), rng)
         last = tuple(candidates)
         first = first or last
-        peak = find_ripple(_residual_samples(samples, fitted), common_phase=rig)
+        if periodic != _periodic_terms(fitted):  # only these change what the spectrum sees
+            periodic = _periodic_terms(fitted)
+            strongest = find_ripple(_residual_samples(samples, fitted), common_phase=rig)
+        peak = strongest
         peak = peak if peak is not None and peak.p_value <= alpha and ("peak", peak.axis) not in refused else None
         significant = [c for c in candidates if c.p_value <= alpha]
         say(f"round {number}: {len(candidates)} candidates on {len(channels)} channels, {len(significant)} significant")
@@ -102,15 +105,13 @@ def grow(
         open_ = [c for c in significant if c.key not in refused]
         if (not open_ and peak is None) or number > config.loop.max_rounds:
             break
-        proposals = propose(fitted, open_, channels, peak, effects)
+        proposals = propose(fitted, _declared_first(open_, config), channels, peak, effects)
         accepted = None
         for proposal in proposals[:TRIES]:
-            gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed) if confirm else None
-            if gain is not None:
-                say(f"  {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
-            if gain is None or gain.real:
-                rmse = np.nan if gain is None else gain.rmse_N
-                accepted = Added(proposal, rmse, tuple(rivals(proposal, proposals)), number)
+            gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed)
+            say(f"  {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
+            if gain.real:
+                accepted = Added(proposal, gain.rmse_N, tuple(rivals(proposal, proposals)), number)
                 break
         if accepted is None:
             tried = {p.source for p in proposals[:TRIES]}
@@ -120,6 +121,18 @@ def grow(
         fitted = fit(accepted.proposal.fitted.model, rows, fitted.scatter, turns=2)
         fitted, added = _drop_needless(fitted, added)
     return Grown(before, fitted if added else before, tuple(added), first, last, left, channels)
+
+
+def _declared_first(significant: list[Candidate], config: Config) -> list[Candidate]:
+    """Return the candidates without the calendar's where a condition's own column explains at least half as much.
+
+    Conditions are tested one after the other, so the calendar follows them; what the model knows comes first.
+    """
+    calendar = [c for c in significant if set(c.channels) & CALENDAR]
+    own = [c for c in significant if set(c.channels) & set(config.condition)]
+    if calendar and own and max(c.chi2 for c in own) >= 0.5 * max(c.chi2 for c in calendar):
+        return [c for c in significant if not set(c.channels) & CALENDAR]
+    return significant
 
 
 def describe(term: Term) -> str:
@@ -169,16 +182,18 @@ def steady_samples(traces: pd.DataFrame, rows: Rows) -> pd.DataFrame:
     return traces.loc[traces["steady"], columns].merge(keys, on=["file", "stroke"], how="inner")
 
 
+def _periodic_terms(fitted: Fitted) -> tuple:
+    """Return the periodic effects of a model with their values."""
+    pairs = zip(fitted.model.terms, fitted.model.values, strict=True)
+    return tuple((t.key(), *v.values()) for t, v in pairs if t.effect.id in PERIODIC)
+
+
 def _residual_samples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
     """Return the samples with `residual_N`: force less the periodic effects already in the model.
 
     Everything slow is taken out of each stroke by the spectrum itself; what is periodic is evaluated at the samples.
     """
-    periodic = [
-        (t, v)
-        for t, v in zip(fitted.model.terms, fitted.model.values, strict=True)
-        if t.effect.id in ("ripple", "sinusoid")
-    ]
+    periodic = [(t, v) for t, v in zip(fitted.model.terms, fitted.model.values, strict=True) if t.effect.id in PERIODIC]
     residual = samples["force_N"].to_numpy(dtype=float)
     if periodic:
         rows = fitted.rows

@@ -17,6 +17,8 @@ from sealfit.closure.levels import errors, lack_of_fit, level_table, noise_floor
 from sealfit.closure.record import to_record
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
+from sealfit.effects.contract import Effect
+from sealfit.engine import run_map
 from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.rows import Rows, make_rows, thin
 
@@ -38,6 +40,7 @@ def close_loop(
     traces: pd.DataFrame,
     config: Config,
     *,
+    workers: int = 1,
     on_progress: Callable[[str], None] | None = None,
 ) -> Closure:
     """Return the closed loop of one campaign.
@@ -50,6 +53,8 @@ def close_loop(
         Table `traces`: the raw samples, for what is finer than the bins.
     config : Config
         The rig.
+    workers : int
+        Processes for the folds.
     on_progress : callable, optional
         Told in words what is being done.
     """
@@ -71,7 +76,7 @@ def close_loop(
         after = grown.after if coarse is rows else fit(grown.after.model, rows, grown.after.scatter, turns=2)
     level = heldout_level(rows)
     say(f"held out by {level}: the search repeated without each fold")
-    held_before, held_after = _heldout(rows, coarse, samples, config, effects, level, grown, say)
+    held_before, held_after = _heldout(rows, coarse, samples, config, effects, level, grown, workers, say)
     document = _document(config, grown, before, after, held_before, held_after, level)
     tables = {
         "effects": effect_table(document["effects"], grown.added),
@@ -89,25 +94,67 @@ def close_loop(
 
 
 def _heldout(
-    rows: Rows, coarse: Rows, samples: pd.DataFrame, config: Config, effects, level: str, grown: Grown, say
+    rows: Rows,
+    coarse: Rows,
+    samples: pd.DataFrame,
+    config: Config,
+    effects,
+    level: str,
+    grown: Grown,
+    workers: int,
+    say,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return each row's force, before and after, by fits and a search that did not see its group; NaN if never out."""
     before, after = np.full(rows.force.size, np.nan), np.full(rows.force.size, np.nan)
-    for k, out in enumerate(folds(rows, level, config.loop.folds, config.loop.seed)):
-        say(f"  fold {k + 1}")
-        names = rows.table[["file", "stroke"]].assign(out=out).drop_duplicates()
-        away = coarse.table[["file", "stroke"]].merge(names, on=["file", "stroke"], how="left")["out"].to_numpy(bool)
-        train = coarse.subset(~away)
-        test = rows.subset(out)
-        if not grown.added:
-            kept = fit(grown.before.model, train, grown.before.scatter, turns=1)
-            before[out] = after[out] = predict_rows(kept, test)
-            continue
-        seen = samples.merge(names.loc[~names["out"], ["file", "stroke"]], on=["file", "stroke"])
-        part = grow(train, seen, config, effects, confirm=False, start=grown.before)
-        before[out] = predict_rows(part.before, test)
-        after[out] = predict_rows(part.after, test)
+    masks = list(folds(rows, level, config.loop.folds, config.loop.seed))
+    work = [
+        _Fold(
+            out,
+            *_without(coarse, samples, rows, out),
+            rows.subset(out),
+            config,
+            effects,
+            grown.before,
+            bool(grown.added),
+        )
+        for out in masks
+    ]
+    for k, (out, parts) in enumerate(zip(masks, run_map(_held_out, work, workers=workers), strict=True)):
+        say(f"  fold {k + 1} of {len(masks)}")
+        before[out], after[out] = parts
     return before, after
+
+
+@dataclass(frozen=True)
+class _Fold:
+    """One fold: the rows and samples the fit may see, and those it is asked for."""
+
+    out: np.ndarray
+    train: Rows
+    seen: pd.DataFrame
+    test: Rows
+    config: Config
+    effects: dict[str, Effect]
+    start: Fitted
+    search: bool
+
+
+def _without(coarse: Rows, samples: pd.DataFrame, rows: Rows, out: np.ndarray) -> tuple[Rows, pd.DataFrame]:
+    """Return the (merged) rows and the samples without the strokes of a fold."""
+    keys = ["file", "stroke"]
+    names = rows.table[keys].assign(out=out).drop_duplicates()
+    away = coarse.table[keys].merge(names, on=keys, how="left")["out"].to_numpy(bool)
+    return coarse.subset(~away), samples.merge(names.loc[~names["out"], keys], on=keys)
+
+
+def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
+    """Return the forces before and after at a fold's rows; before twice where the whole campaign lacks nothing."""
+    if not fold.search:
+        kept = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
+        force = predict_rows(kept, fold.test)
+        return force, force
+    part = grow(fold.train, fold.seen, fold.config, fold.effects, start=fold.start)
+    return predict_rows(part.before, fold.test), predict_rows(part.after, fold.test)
 
 
 def _document(config, grown: Grown, before: Fitted, after: Fitted, held_before, held_after, level: str) -> dict:

@@ -21,6 +21,7 @@ from sealfit.fit.rows import LEVELS, Rows
 PRIOR_SD = 3.0
 LEAST_NOISE = 1e-6  # of the force: below what any sensor resolves; keeps noise-free data from weights without end
 MAX_STEPS = 60
+STRIBECK_GRID = 24  # points of log v_s tried when an effect has come in
 SETTLED = 1e-4  # of the whitened sum of squares: the estimates then lie within a hundredth of a standard error
 TURNS = 3  # of model and scatter; the third moves no estimate by a tenth of its standard error
 
@@ -128,6 +129,8 @@ def fit(
     if scatter is None:
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
         model = _descend(model, rows, scatter, centre)
+    if turns and model.terms:
+        model = _search_stribeck(model, rows, scatter)
     for turn in range(turns):
         force, jacobian = evaluate(model, rows)
         scatter = estimate_scatter(rows, force, jacobian, scatter if turn else None)
@@ -147,6 +150,32 @@ def fitted_at(model: Model, rows: Rows, scatter: Scatter, loading: np.ndarray | 
     )
     residual = white[:, 0]
     return Fitted(model, scatter, rows, force, jacobian, residual, white[:, 1:], float(residual @ residual) + logdet)
+
+
+def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
+    """Return the model with each v_s at the best point of a grid, everything linear solved anew at each.
+
+    What an effect explains may have stood in v_s before, and the way out of there can lead over a hill.
+    """
+    slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
+    held = prior_precision(model) > 0
+    for k, parameter in enumerate(model.declared.parameters):
+        if parameter.quantity != "v_s":
+            continue
+        best, chosen = np.inf, model.vector()
+        for value in (model.theta[k], *np.linspace(np.log(slowest), np.log(fastest), STRIBECK_GRID)):
+            vector = model.vector()
+            vector[k] = value
+            force, jacobian = evaluate(model.at(vector), rows)
+            columns = np.column_stack([rows.force - force, jacobian[:, ~held]])
+            white, _ = whiten(columns, scatter.noise_sd(rows.force), rows.force, rows.groups, scatter.components)
+            step, *_ = np.linalg.lstsq(white[:, 1:].T @ white[:, 1:], white[:, 1:].T @ white[:, 0], rcond=1e-10)
+            cost = float(white[:, 0] @ white[:, 0] - step @ (white[:, 1:].T @ white[:, 0]))
+            if cost < best - 1e-9:
+                vector[~held] += step
+                best, chosen = cost, vector
+        model = model.at(chosen)
+    return model
 
 
 def _descend(

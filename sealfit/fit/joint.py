@@ -225,7 +225,9 @@ def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.nda
             tangent[every[has], number[has]] += (slopes[quantity] * state["through"].get(quantity, 1.0) * base)[has]
     column = model.theta.size
     for term, values, slope in zip(model.terms, model.values, state["term_slopes"], strict=True):
-        for derivative in term_derivatives(term, values, term.inputs(rows)):
+        key = ("columns", term.key(), id(term.fixed))
+        known = rows.cache[key][1].T if key in rows.cache else term_derivatives(term, values, term.inputs(rows))
+        for derivative in known:
             tangent[:, column] = slope * derivative
             column += 1
     return state["force"], tangent
@@ -241,6 +243,8 @@ def term_derivatives(
     term: Term, values: Mapping[str, float], inputs: Mapping[str, np.ndarray], *, only_linear: bool = False
 ) -> list[np.ndarray]:
     """Return the shape's derivative in each of the effect's parameters (or amplitudes alone), each of shape (n,)."""
+    if not term.effect.nonlinear and not only_linear:
+        return list(_linear_columns(term, inputs).T)
     result = []
     zero = {name: 0.0 for name in term.effect.linear}
     for p in term.effect.parameters:
@@ -254,6 +258,24 @@ def term_derivatives(
     return result
 
 
+def _linear_columns(term: Term, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the shape's columns of an effect that is linear in all its parameters, shape (n, parameters)."""
+    names = [p.name for p in term.effect.parameters]
+    zero = dict.fromkeys(names, 0.0)
+    return np.column_stack([np.asarray(term.effect.shape(inputs, **{**zero, name: 1.0})) for name in names])
+
+
+def _shape(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
+    """Return the term's shape at the rows, shape (n,); columns that do not change are made once."""
+    inputs = term.inputs(rows)
+    if term.effect.nonlinear:
+        return term.effect.shape(inputs, **values)
+    key = ("columns", term.key(), id(term.fixed))
+    if key not in rows.cache:
+        rows.cache[key] = (term.fixed, _linear_columns(term, inputs))
+    return rows.cache[key][1] @ np.array([values[p.name] for p in term.effect.parameters])
+
+
 def _state(model: Model, rows: Rows, *, slopes: bool = True) -> dict:
     declared, theta = model.declared, model.theta
     base = {}
@@ -263,7 +285,7 @@ def _state(model: Model, rows: Rows, *, slopes: bool = True) -> dict:
         fitted = np.where(number >= 0, theta[np.maximum(number, 0)], 0.0)
         value = np.where(number >= 0, np.exp(fitted), start) if quantity in LOGARITHMIC else fitted
         base[quantity] = value[rows.condition]
-    shapes = [t.effect.shape(t.inputs(rows), **v) for t, v in zip(model.terms, model.values, strict=True)]
+    shapes = [_shape(t, v, rows) for t, v in zip(model.terms, model.values, strict=True)]
     through: dict[str, np.ndarray] = {}
     now = dict(base)
 
