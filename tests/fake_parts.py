@@ -5,7 +5,7 @@ from types import ModuleType, SimpleNamespace
 
 import pandas as pd
 from matplotlib.figure import Figure
-from store_helpers import small
+from small_tables import small
 
 from sealfit.errors import Fault
 from sealfit.fingerprint import fingerprint

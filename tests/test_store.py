@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from store_helpers import small
+from small_tables import small
 
 from sealfit import parquet, staging
 from sealfit.config import parse_config
