@@ -167,7 +167,11 @@ def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) ->
     from sealfit.closure.loop import close_loop
 
     closure = close_loop(
-        store.read("bins"), store.read("traces"), store.seen_config("close-loop"), on_progress=progress.say
+        store.read("bins"),
+        store.read("traces"),
+        store.seen_config("close-loop"),
+        workers=workers,
+        on_progress=progress.say,
     )
     for name in CLOSED:
         staged.table(name, closure.tables[name])
