@@ -28,9 +28,7 @@ Campaign = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign fol
 Results = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results that `ingest` or `run` made.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder of results; made if it is not there.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Rig config (TOML); default: as the README's table.")]
-Workers = Annotated[
-    int | None, typer.Option("--workers", min=1, help="Processes that read files. [default: all cores]")
-]
+Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Processes to use. [default: all cores]")]
 Force = Annotated[bool, typer.Option("--force", help="Do it again even if it is current.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
@@ -78,9 +76,9 @@ def fit_aging(out: Results, force: Force = False, as_json: Json = False) -> None
 
 
 @app.command("close-loop")
-def close_loop(out: Results, force: Force = False, as_json: Json = False) -> None:
+def close_loop(out: Results, workers: Workers = None, force: Force = False, as_json: Json = False) -> None:
     """Find, name and add what the model lacks."""
-    _single("close-loop", out, force, as_json)
+    _single("close-loop", out, force, as_json, workers)
 
 
 @app.command()
@@ -190,10 +188,11 @@ def _run(
     _end("ingest" if len(names) == 1 else "run", made, summary.lines, as_json)
 
 
-def _single(step: str, out: Path, force: bool, as_json: bool) -> None:
-    from sealfit import progress, steps, summary
+def _single(step: str, out: Path, force: bool, as_json: bool, workers: int | None = None) -> None:
+    from sealfit import engine, progress, steps, summary
 
-    _end(step, steps.single(step, out, force=force, progress=progress.to_stderr()), summary.lines, as_json)
+    made = steps.single(step, out, workers=workers or engine.cores(), force=force, progress=progress.to_stderr())
+    _end(step, made, summary.lines, as_json)
 
 
 def _end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: bool) -> None:

@@ -44,7 +44,7 @@ def run(
     config : Path or None
         A rig config, or None for the default.
     workers : int
-        Processes that read trace files.
+        Processes that read trace files and repeat the search.
     force : bool
         Do current steps too.
     strict : bool
@@ -68,7 +68,7 @@ def ingest(campaign: Path, out: Path, config: Path | None = None, **options) -> 
     return run(campaign, out, config, steps=("ingest",), **options)
 
 
-def single(step: str, out: Path, *, force: bool = False, progress: Silent | None = None) -> dict:
+def single(step: str, out: Path, *, workers: int = 1, force: bool = False, progress: Silent | None = None) -> dict:
     """Do one step after the first in an OUT whose earlier steps are current, and return its summary.
 
     Raises
@@ -78,7 +78,7 @@ def single(step: str, out: Path, *, force: bool = False, progress: Silent | None
     """
     with Store.writing(existing_out(out)) as store:
         store.require(STEPS[STEPS.index(step) - 1])
-        return _do_steps(store, (step,), workers=1, force=force, strict=False, progress=progress or Silent())
+        return _do_steps(store, (step,), workers=workers, force=force, strict=False, progress=progress or Silent())
 
 
 def _do_steps(

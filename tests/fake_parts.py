@@ -54,7 +54,7 @@ class Parts:
     """The stand-ins and what they were called with; set `faults` or `raises` to see a campaign at fault."""
 
     def __init__(self):
-        self.calls, self.configs, self.faults, self.raises = [], {}, [], {}
+        self.calls, self.configs, self.faults, self.raises, self.workers = [], {}, [], {}, None
         self.closure = CLOSURE
 
     def _called(self, name, config=None):
@@ -91,8 +91,9 @@ class Parts:
     def aging_curves(self, aging_fit, days=None):
         return small("aging_curves")
 
-    def close_loop(self, bins, traces, config, *, on_progress=None):
+    def close_loop(self, bins, traces, config, *, workers=1, on_progress=None):
         self._called("close-loop", config)
+        self.workers = workers
         on_progress("trying ripple along displacement_mm")
         names = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
         return SimpleNamespace(

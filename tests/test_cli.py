@@ -213,6 +213,13 @@ def test_the_steps_one_by_one_are_the_run(sealfit, parts, campaign, out, tmp_pat
     assert said == whole.stdout.replace(str(tmp_path / "whole"), str(out))
 
 
+def test_workers_reach_the_loop(sealfit, parts, campaign, out):
+    sealfit("run", campaign, "--out", out, "--workers", 3)
+    assert parts.workers == 3
+    sealfit("close-loop", out, "--force", "--workers", 5)
+    assert parts.workers == 5
+
+
 def test_a_step_without_its_predecessor_names_the_command(sealfit, parts, campaign, out):
     sealfit("ingest", campaign, "--out", out)
     ended = sealfit("close-loop", out)

@@ -200,9 +200,10 @@ def test_kills_lose_nothing_and_the_next_run_goes_on(first, campaign, tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
-def test_ctrl_c_ends_at_once_with_one_line(campaign, tmp_path):
+@pytest.mark.parametrize("share", [0.15, 0.5])
+def test_ctrl_c_ends_at_once_with_one_line(first, campaign, tmp_path, share):
     run = started("run", campaign, "--out", tmp_path / "out")
-    time.sleep(1.5)
+    time.sleep(max(0.5, share * first[1].seconds))
     os.killpg(run.pid, signal.SIGINT)
     began = time.monotonic()
     _, stderr = run.communicate(timeout=30)
