@@ -53,9 +53,9 @@ def write(frame: pd.DataFrame, schema: Schema, units: Units, path: Path) -> None
         pq.write_table(table, file, compression="zstd")
 
 
-def read(path: Path) -> pd.DataFrame:
-    """Return the table at `path`, a file or a partitioned folder."""
-    return pq.read_table(path).to_pandas()
+def read(path: Path, columns: list[str] | None = None) -> pd.DataFrame:
+    """Return the table at `path`, a file or a partitioned folder, or those columns of it."""
+    return pq.read_table(path, columns=columns).to_pandas(self_destruct=True)
 
 
 def _array(values: pd.Series, column: Column, table: str) -> pa.Array:

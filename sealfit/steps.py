@@ -168,7 +168,7 @@ def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) ->
 
     closure = close_loop(
         store.read("bins"),
-        store.read("traces"),
+        store.read("traces", ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]),
         store.seen_config("close-loop"),
         workers=workers,
         on_progress=progress.say,

@@ -169,11 +169,11 @@ class Store:
         return f"sealfit ingest {shlex.quote(str(self.state.campaign))} --out {out}{config}"
 
     # ------------------------------------------------------------ reading
-    def read(self, table: str) -> pd.DataFrame:
-        """Return a table."""
+    def read(self, table: str, columns: list[str] | None = None) -> pd.DataFrame:
+        """Return a table, or those columns of it."""
         from sealfit import parquet
 
-        return parquet.read(self.out / f"{table}.parquet")
+        return parquet.read(self.out / f"{table}.parquet", columns)
 
     def read_json(self, name: str) -> dict:
         """Return `<name>.json`."""

@@ -63,7 +63,7 @@ def grow(
     rows : Rows
         Bins as arrays.
     samples : DataFrame
-        Steady samples for the ripple search: file, stroke, direction, unit, displacement_mm, time_s, force_N.
+        Steady samples for the ripple search: as `steady_samples` gives them.
     config : Config
         Levels of error, rounds, folds.
     effects : mapping
@@ -167,19 +167,46 @@ def _wald(fitted: Fitted, number: int) -> float:
     return float(amplitude @ np.linalg.pinv(fitted.covariance[np.ix_(places, places)]) @ amplitude)
 
 
+def numbered(bins: pd.DataFrame) -> pd.DataFrame:
+    """Return `bins` with `stroke_id`, a number per stroke that samples and every part of the rows share."""
+    return bins.assign(stroke_id=bins.groupby(["file", "stroke"], sort=False).ngroup().to_numpy())
+
+
 def steady_samples(traces: pd.DataFrame, rows: Rows) -> pd.DataFrame:
-    """Return the steady samples of the strokes in `rows`, with direction and unit, for the ripple search."""
-    table = rows.table
-    keys = pd.DataFrame(
+    """Return the steady samples of the strokes in `rows`, for the ripple search.
+
+    Parameters
+    ----------
+    traces : DataFrame
+        Table `traces`, the samples of a stroke one after the other.
+    rows : Rows
+        Rows made from `numbered` bins.
+
+    Returns
+    -------
+    DataFrame
+        stroke_id, direction, unit (number of the file), displacement_mm, time_s, force_N.
+    """
+    first = rows.groups.starts["stroke"]
+    strokes = rows.table.iloc[first]
+    steady = traces[traces["steady"].to_numpy(dtype=bool)]
+    file, stroke = steady["file"].to_numpy(), steady["stroke"].to_numpy()
+    change = np.flatnonzero(np.r_[True, (file[1:] != file[:-1]) | (stroke[1:] != stroke[:-1])])
+    own = pd.MultiIndex.from_frame(strokes[["file", "stroke"]]).get_indexer(
+        pd.MultiIndex.from_arrays([file[change], stroke[change]])
+    )
+    place = np.repeat(own, np.diff(np.r_[change, file.size]))
+    known = place >= 0
+    place = place[known]
+    table = {name: steady[name].to_numpy()[known] for name in ("displacement_mm", "time_s", "force_N")}
+    return pd.DataFrame(
         {
-            "file": table["file"],
-            "stroke": table["stroke"],
-            "direction": table["direction"],
-            "unit": rows.codes("file"),
+            "stroke_id": strokes["stroke_id"].to_numpy()[place],
+            "direction": strokes["direction"].to_numpy()[place],
+            "unit": rows.codes("file")[first][place],
+            **table,
         }
-    ).drop_duplicates(["file", "stroke"])
-    columns = ["file", "stroke", "time_s", "displacement_mm", "force_N"]
-    return traces.loc[traces["steady"], columns].merge(keys, on=["file", "stroke"], how="inner")
+    )
 
 
 def _periodic_terms(fitted: Fitted) -> tuple:
@@ -193,21 +220,23 @@ def _residual_samples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
 
     Everything slow is taken out of each stroke by the spectrum itself; what is periodic is evaluated at the samples.
     """
-    periodic = [(t, v) for t, v in zip(fitted.model.terms, fitted.model.values, strict=True) if t.effect.id in PERIODIC]
     residual = samples["force_N"].to_numpy(dtype=float)
-    if periodic:
+    terms = [(t, v) for t, v in zip(fitted.model.terms, fitted.model.values, strict=True) if t.effect.id in PERIODIC]
+    if terms:
         rows = fitted.rows
-        level = rows.groups.means(fitted.force, "stroke")
-        first = rows.table.iloc[rows.groups.starts["stroke"]][["file", "stroke"]].assign(level=level)
-        per_sample = samples[["file", "stroke"]].merge(first, on=["file", "stroke"], how="left")["level"].to_numpy()
-        for term, values in periodic:
+        strokes = rows.table.iloc[rows.groups.starts["stroke"]]
+        ids, own = strokes["stroke_id"].to_numpy(), samples["stroke_id"].to_numpy()
+        level = np.zeros(max(ids.max(), own.max()) + 1)
+        level[ids] = rows.groups.means(fitted.force, "stroke")
+        for term, values in terms:
             place = samples[term.channels[0]].to_numpy(dtype=float)
             shift = term.fixed.get("shift")
             if shift is not None:
-                place = place + samples["file"].map(shift).to_numpy(dtype=float)
-            name = term.effect.reads[0]
-            shape = term.effect.shape({name: place, **term.fixed}, **values)
-            residual = residual - shape * (1.0 if term.operation == "add" else per_sample)
+                shifts = np.zeros_like(level)
+                shifts[ids] = strokes["file"].map(shift).to_numpy(dtype=float)
+                place = place + shifts[own]
+            shape = term.effect.shape({term.effect.reads[0]: place, **term.fixed}, **values)
+            residual = residual - shape * (1.0 if term.operation == "add" else level[own])
     return samples.assign(residual_N=residual)
 
 

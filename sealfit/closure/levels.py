@@ -10,6 +10,7 @@ from scipy import stats
 
 from sealfit.closure.search import Candidate
 from sealfit.fit.estimate import Fitted
+from sealfit.fit.mixed import orthonormal
 from sealfit.fit.rows import LEVELS, Rows
 
 
@@ -79,7 +80,10 @@ def noise_floor(fitted: Fitted) -> float | None:
 
 
 def lack_of_fit(fitted: Fitted) -> float | None:
-    """Return the p-value of run means against the scatter of files within runs (F test); None without repeats."""
+    """Return the p-value of run means against the scatter of files within runs (F test); None without repeats.
+
+    What a piece of rubber moves as a whole is scatter, not lack of fit, and is taken out with the model.
+    """
     rows = fitted.rows
     clean = without_repeat_pattern(rows, fitted.residual)
     keys = rows.table[["run_id", "file"]].assign(residual=clean, force=fitted.force)
@@ -90,15 +94,35 @@ def lack_of_fit(fitted: Fitted) -> float | None:
     scale = np.sqrt(spread**2 + noise**2 / per_file)
     files["z"] = files["residual"] / scale
     by_run = files.groupby("run_id")["z"]
-    count, mean = by_run.count().to_numpy(), by_run.mean().to_numpy()
+    count = by_run.transform("count").to_numpy()
     pattern = max(rows.table["repeat"].nunique() - 1, 0)
-    df_pure = float((count - 1).sum() - pattern)
-    df_fit = float(count.size - fitted.basis.shape[1])
+    runs = files["run_id"].nunique()
+    df_pure = float(len(files) - runs - pattern)
+    pure = float(((files["z"] - by_run.transform("mean")) ** 2).sum())
+    mean = by_run.transform("mean").to_numpy()
+    first = ~files["run_id"].duplicated().to_numpy()
+    root = np.sqrt(count[first])
+    tangent = _file_tangent(fitted, files)[first] * (root / np.asarray(scale)[first])[:, None]
+    basis = orthonormal(tangent / np.maximum(np.linalg.norm(tangent, axis=0), 1e-300))
+    size = mean[first] * root
+    left = size - basis @ (basis.T @ size)
+    df_fit = float(runs - basis.shape[1])
     if df_pure < 1 or df_fit < 1:
         return None
-    pure = float(((files["z"] - by_run.transform("mean")) ** 2).sum()) / df_pure
-    lack = float((count * mean**2).sum()) / df_fit
-    return float(stats.f.sf(lack / max(pure, 1e-300), df_fit, df_pure))
+    return float(stats.f.sf((left @ left / df_fit) / max(pure / df_pure, 1e-300), df_fit, df_pure))
+
+
+def _file_tangent(fitted: Fitted, files: pd.DataFrame) -> np.ndarray:
+    """Return the model's tangent at each file, and one column per specimen that scatters, shape (files, p)."""
+    number = fitted.rows.table.groupby(["run_id", "file"], sort=False).ngroup().to_numpy()
+    order = np.argsort(number, kind="stable")
+    start = np.flatnonzero(np.r_[True, np.diff(number[order]) > 0])
+    tangent = np.add.reduceat(fitted.jacobian[order], start, axis=0) / np.bincount(number)[:, None]
+    if not any(c.level == "specimen" and c.variance > 0 for c in fitted.scatter.components):
+        return tangent
+    specimen = fitted.rows.codes("specimen")[order][start]
+    own = (specimen[:, None] == np.unique(specimen)[None, :]) * files["force"].to_numpy()[:, None]
+    return np.column_stack([tangent, own])
 
 
 def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.DataFrame:

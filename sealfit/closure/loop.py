@@ -12,9 +12,10 @@ import pandas as pd
 from sealfit.closure.confirm import folds, heldout_level
 from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import effect_entries, effect_table, left_entry, next_runs
-from sealfit.closure.grow import Grown, grow, predict_rows, steady_samples
+from sealfit.closure.grow import Grown, grow, numbered, predict_rows, steady_samples
 from sealfit.closure.levels import errors, lack_of_fit, level_table, noise_floor, scatter_list
 from sealfit.closure.record import to_record
+from sealfit.closure.ripple import find_ripple
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
@@ -23,7 +24,7 @@ from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.rows import Rows, make_rows, thin
 
 MOST_ROWS = 12_000  # rows the search works on; more are merged along their strokes
-FINE_BINS = 8  # a ripple needs this many bins in a wavelength, so rows are then not merged
+MOST_ROWS_OF_RIPPLE = 40_000  # as above where a ripple is there, which coarse bins would blur
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,13 @@ def close_loop(
 
         effects |= load_user_effects(Path(config.loop.effects_folder))
     bins = bins.reset_index(drop=True)
-    rows = make_rows(bins, has_aging=config.aging)
-    coarse = rows if len(bins) <= MOST_ROWS else make_rows(thin(bins, MOST_ROWS), has_aging=config.aging)
+    counted = numbered(bins)
+    rows = make_rows(counted, has_aging=config.aging)
     samples = steady_samples(traces, rows)
+    peak = find_ripple(samples.assign(residual_N=samples["force_N"]), common_phase=config.position_origin == "rig")
+    ripple = peak is not None and peak.p_value <= config.loop.family_error
+    most = MOST_ROWS_OF_RIPPLE if ripple else MOST_ROWS
+    coarse = rows if len(bins) <= most else make_rows(thin(counted, most), has_aging=config.aging)
     grown = grow(coarse, samples, config, effects, on_progress=say)
     say("before and after on all rows")
     before = grown.before if coarse is rows else fit_declared(rows)
@@ -107,7 +112,7 @@ def _heldout(
     """Return each row's force, before and after, by fits and a search that did not see its group; NaN if never out."""
     before, after = np.full(rows.force.size, np.nan), np.full(rows.force.size, np.nan)
     masks = list(folds(rows, level, config.loop.folds, config.loop.seed))
-    work = [
+    work = (
         _Fold(
             out,
             *_without(coarse, samples, rows, out),
@@ -118,7 +123,7 @@ def _heldout(
             bool(grown.added),
         )
         for out in masks
-    ]
+    )
     for k, (out, parts) in enumerate(zip(masks, run_map(_held_out, work, workers=workers), strict=True)):
         say(f"  fold {k + 1} of {len(masks)}")
         before[out], after[out] = parts
@@ -141,10 +146,8 @@ class _Fold:
 
 def _without(coarse: Rows, samples: pd.DataFrame, rows: Rows, out: np.ndarray) -> tuple[Rows, pd.DataFrame]:
     """Return the (merged) rows and the samples without the strokes of a fold."""
-    keys = ["file", "stroke"]
-    names = rows.table[keys].assign(out=out).drop_duplicates()
-    away = coarse.table[keys].merge(names, on=keys, how="left")["out"].to_numpy(bool)
-    return coarse.subset(~away), samples.merge(names.loc[~names["out"], keys], on=keys)
+    gone = rows.table["stroke_id"].to_numpy()[out]
+    return coarse.subset(~coarse.table["stroke_id"].isin(gone).to_numpy()), samples[~samples["stroke_id"].isin(gone)]
 
 
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:

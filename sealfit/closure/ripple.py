@@ -55,7 +55,7 @@ def find_ripple(
     Parameters
     ----------
     samples : DataFrame
-        Steady samples in order: file, stroke, direction, unit, the axes, `residual_N`.
+        Steady samples, those of a stroke one after the other: stroke_id, direction, unit, the axes, `residual_N`.
     common_phase : bool
         Whether displacement means the same place in every file (`position_origin = "rig"`).
     axes : tuple of str
@@ -86,7 +86,7 @@ def spectra_along(samples: pd.DataFrame, axis: str) -> Spectra | None:
     """
     place = samples[axis].to_numpy(dtype=float)
     residual = samples["residual_N"].to_numpy(dtype=float)
-    stroke = pd.factorize(pd.Series(list(zip(samples["file"], samples["stroke"], strict=True))))[0]
+    stroke = samples["stroke_id"].to_numpy()
     starts = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]])
     ends = np.r_[starts[1:], stroke.size]
     good = [(a, b) for a, b in zip(starts, ends, strict=True) if b - a >= LEAST_SAMPLES and np.ptp(place[a:b]) > 0]

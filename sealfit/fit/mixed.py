@@ -147,7 +147,7 @@ def reml(
     """
     if not kinds:
         return ()
-    basis = _orthonormal(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300))
+    basis = orthonormal(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300))
     stacked = np.column_stack([basis, residual])
     scale_force = max(float(np.sqrt(np.mean(force**2))), 1e-12)
     total = max(float(np.var(residual)), float(np.mean(variance)), 1e-20)
@@ -179,7 +179,7 @@ def reml(
     return tuple(Component(level, kind, float(v)) for (level, kind), v in zip(kinds, variances, strict=True))
 
 
-def _orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
+def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
     """Return an orthonormal basis of the columns' span, shape (m, rank)."""
     left, size, _ = np.linalg.svd(columns, full_matrices=False)
     return left[:, size > tolerance * max(size.max(initial=0.0), 1e-300)]

@@ -17,6 +17,7 @@ NOT_CHANNELS = {
     "file",
     "run_id",
     "bin",
+    "stroke_id",
     "n",
     "force_N",
     "force_sd_N",

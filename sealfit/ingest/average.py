@@ -9,6 +9,7 @@ from sealfit.config import Bins
 from sealfit.tables import TRACES_MEAN
 
 MAX_CELLS = 2000  # per run, in traces_mean: finer than any screen shows
+SAME_TRAVEL = 2  # cells by which strokes that are averaged before they slide steadily may differ in travel
 BRIDGED = 3  # empty cells in a row that are filled by a straight line: scarce samples, not a gap
 
 
@@ -177,8 +178,10 @@ def mean_traces(samples: pd.DataFrame, strokes: pd.DataFrame) -> pd.DataFrame:
             "file": pd.factorize(strokes["file"])[0][owner[known]],
             "force_N": force[known],
             "steady": steady[known],
+            "travel": _travel(cell, known, owner, strokes["direction"].to_numpy()),
         }
     )
+    table = table[_comparable(table)]
     files = table.groupby(["run", "cell", "file"], sort=True).agg(
         force_N=("force_N", "mean"), steady=("steady", "min"), n=("force_N", "size")
     )
@@ -200,6 +203,29 @@ def mean_traces(samples: pd.DataFrame, strokes: pd.DataFrame) -> pd.DataFrame:
             "steady": means["steady"].to_numpy() >= 1.0,
         }
     )
+
+
+def _travel(cell: np.ndarray, known: np.ndarray, owner: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return how many cells each known cell lies behind its stroke's start, along the motion."""
+    first, last = np.full(len(direction), np.iinfo(int).max), np.full(len(direction), -1)
+    np.minimum.at(first, owner[known], cell[known])
+    np.maximum.at(last, owner[known], cell[known])
+    own = owner[known]
+    return np.where(direction[own] > 0, cell[known] - first[own], last[own] - cell[known])
+
+
+def _comparable(table: pd.DataFrame) -> np.ndarray:
+    """Return which cells of which strokes may be averaged with the others at the same place of their run.
+
+    Repeats need not start at the same place: where one slides steadily, another may just be starting, and its
+    pre-sliding rise would be a dip in the mean. So steady strokes are averaged where there are any, and elsewhere those
+    that have come equally far from their own start.
+    """
+    place = [table["run"], table["cell"]]
+    steady = table["steady"] >= 1.0
+    somewhere = steady.groupby(place).transform("max")
+    furthest = table["travel"].groupby(place).transform("max")
+    return np.where(somewhere, steady, table["travel"] >= furthest - SAME_TRAVEL)
 
 
 def _grid(x: np.ndarray, row: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

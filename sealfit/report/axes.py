@@ -6,11 +6,35 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from sealfit.report.symbols import plain, short
 
 MOST_TICKS = 8  # names of categories that fit below a panel
+TICK_APART = 0.11  # of the axis: closer ticks would write over each other
+
+
+def is_logarithmic(x: np.ndarray, span: float) -> bool:
+    """Return whether values that span more than a factor lie more evenly on a logarithmic axis than on a linear one."""
+    x = np.unique(x[np.isfinite(x)])
+    if len(x) < 3 or x[0] <= 0 or x[-1] / x[0] <= span:
+        return False
+    gap, log_gap = np.diff(x).max() / np.ptp(x), np.diff(np.log(x)).max() / np.ptp(np.log(x))
+    return bool(log_gap < 1.5 * gap)  # speeds and times are usually chosen by factors
+
+
+def value_ticks(ax: Axes, x: np.ndarray) -> None:
+    """Put the ticks at the values themselves where they are few and far enough apart, else at round numbers."""
+    x = np.unique(x)
+    if 1 < len(x) <= MOST_TICKS and np.diff(x).min() > TICK_APART * np.ptp(x):
+        ax.set_xticks(x, [f"{value:.4g}".replace("-", "−") for value in x])
+    else:
+        ax.xaxis.set_major_locator(round_ticks(integer=bool(np.array_equal(x, np.round(x)))))
+
+
+def round_ticks(*, integer: bool = False) -> MaxNLocator:
+    """Return a locator of round numbers, few enough for their labels to stand side by side."""
+    return MaxNLocator(5, steps=[1, 2, 5, 10], integer=integer)
 
 
 def log_axis(ax: Axes) -> None:

@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from sealfit.config import Config
-from sealfit.report.axes import natural, padded
+from sealfit.report.axes import natural, padded, round_ticks
 from sealfit.report.numbers import count, given, number
-from sealfit.report.style import AFTER, CYCLE, FLOOR, QUIET, Key, Panel, Plot
+from sealfit.report.style import AFTER, CYCLE, FLOOR, QUIET, SKY, Key, Panel, Plot
 from sealfit.report.symbols import ConditionNames, is_unaged, joined, plain, short, symbol_plain
 from sealfit.tables import Units
 
@@ -53,7 +52,7 @@ def draw_aging(ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Unit
             capsize=1.5,
             elinewidth=0.8,
         )
-    ax.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
+    ax.xaxis.set_major_locator(round_ticks(integer=True))
     ax.set_xlabel(plain(units.label("aging_days")))
     ax.set_ylabel(
         "friction coefficient" if "mu_s" in quantities or "mu_c" in quantities else plain(units.label("force_N"))
@@ -96,7 +95,8 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
 
 def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str], names: ConditionNames) -> pd.DataFrame:
     """Return the identified coefficients of every condition with the days they belong to."""
-    rows = steady_fit[steady_fit["parameter"].isin(list(quantities)) & steady_fit["identified"].astype(bool)]
+    rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["identified"].astype(bool)]
+    rows = rows[rows["parameter"].isin(list(quantities))]
     days = [0.0 if is_unaged(c) else float(names.parts(c).get("aging_days", "nan")) for c in rows["condition"]]
     columns = ["series", "rubber", "value", "lo95", "hi95"]
     return rows[columns].assign(quantity=rows["parameter"], aging_days=days)
@@ -104,8 +104,18 @@ def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str], names: Con
 
 # ---------------------------------------------------------------- averaged traces
 def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
-    """Draw one run's mean force along its displacement with its standard error; the steady window is shaded."""
-    thin = envelope(trace)
+    """Draw one run's mean force along its displacement with its standard error; the steady window is shaded.
+
+    Parameters
+    ----------
+    ax : Axes
+        Drawn on; the caller owns the figure.
+    trace : DataFrame
+        Rows of table `traces_mean` of this run; the force is drawn in the direction of motion.
+    units : Units
+        Give the labels their true units.
+    """
+    thin = envelope(along_motion(trace))
     ax.fill_between(
         thin["displacement_mm"],
         thin["force_N"] - thin["force_se_N"].fillna(0),
@@ -114,12 +124,19 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
         alpha=0.25,
         linewidth=0,
     )
-    ax.plot(thin["displacement_mm"], thin["force_N"], color=AFTER, linewidth=0.9)
+    whole = thin["n"] == thin["n"].max()  # where a repeat begins later, its own start pulls the mean
+    ax.plot(thin["displacement_mm"], thin["force_N"], color=SKY, linewidth=0.8)
+    ax.plot(thin["displacement_mm"], thin["force_N"].where(whole), color=AFTER, linewidth=0.9)
     steady = trace.loc[trace["steady"].astype(bool), "displacement_mm"]
     if len(steady):
         ax.axvspan(steady.min(), steady.max(), color=QUIET, alpha=0.12, linewidth=0, zorder=0)
     ax.set_xlabel(plain(units.label("displacement_mm")))
     ax.set_ylabel(plain(units.label("force_N")))
+
+
+def along_motion(traces: pd.DataFrame) -> pd.DataFrame:
+    """Return traces with the force counted in the direction of motion: a force that opposes it is positive."""
+    return traces.assign(force_N=traces["force_N"] * traces["direction"])
 
 
 def envelope(trace: pd.DataFrame, buckets: int = TRACE_BUCKETS) -> pd.DataFrame:
@@ -140,7 +157,7 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     if chosen.empty:
         return None
     names, units = ConditionNames.of(config), config.units
-    shown = traces.loc[traces["run_id"].isin(chosen["run_id"]), "force_N"].dropna()
+    shown = along_motion(traces[traces["run_id"].isin(chosen["run_id"])])["force_N"].dropna()
     span = padded(shown.min(), shown.max())
     panels = []
     for run in chosen.itertuples():
@@ -156,8 +173,11 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         alt = f"Mean trace of {title}, {count(repeats, 'stroke')} averaged: {units.quantity('force')} from "
         alt += f"{number(trace['force_N'].min())} to {number(trace['force_N'].max())} {units.unit('force')}."
         panels.append(Panel(short(title, 40), alt, draw))
+    counts = traces[traces["run_id"].isin(chosen["run_id"])].groupby("run_id")["n"]
+    fewer = bool((counts.min() < counts.max()).any())
     legend = (
-        Key("mean of the repeats", AFTER),
+        Key("mean of all repeats", AFTER),
+        *([Key("of fewer repeats", SKY)] if fewer else []),
         Key("± standard error", AFTER, "band"),
         Key("steady window", QUIET, "band"),
     )

@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from sealfit.config import Config
-from sealfit.report.axes import capital, category_ticks, log_axis
+from sealfit.report.axes import capital, category_ticks, is_logarithmic, log_axis, value_ticks
+from sealfit.report.figures_speed import LOG_SPAN as SPEED_SPAN
 from sealfit.report.numbers import number, p_value
 from sealfit.report.style import AFTER, BEFORE, FLOOR, QUIET, Key, Panel, Plot
 from sealfit.report.symbols import channel_label, channel_words, effect_label, plain, short, symbol_math, symbol_plain
@@ -37,9 +37,11 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
     units : Units
         Give the labels their true units.
     """
-    numeric = rows["x"].notna().all()
+    numeric = rows["x"].notna().all() and channel != "direction"
     x = rows["x"].to_numpy(float) if numeric else np.arange(len(rows), dtype=float)
-    log = numeric and x.min() > 0 and x.max() / x.min() > LOG_SPAN
+    log = numeric and is_logarithmic(x, LOG_SPAN)
+    if numeric and channel in ("speed_mm_s", "speed_set_mm_s"):  # as force against speed is drawn
+        log = bool(x.min() > 0 and x.max() / x.min() > SPEED_SPAN)
     # side by side, a little apart on the page, so that neither hides the other
     apart = 0.008 * (np.ptp(np.log(x)) if log else np.ptp(x)) if numeric else 0.09
     ax.axhline(0.0, color=QUIET, linewidth=0.8, zorder=1)
@@ -63,12 +65,19 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
         )
     if log:
         log_axis(ax)
-    elif numeric and np.array_equal(x, np.round(x)):
-        ax.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
-    if not numeric:
-        category_ticks(ax, rows["label"].astype(str).tolist())
+    elif numeric:
+        value_ticks(ax, x)
+    else:
+        category_ticks(ax, categories(rows, channel))
     ax.set_xlabel(plain(short(channel_label(channel, units), 44)))
     ax.set_ylabel(f"residual ({plain(units.unit('force'))})")
+
+
+def categories(rows: pd.DataFrame, channel: str) -> list[str]:
+    """Return the names of a category's rows; both directions in words."""
+    if channel == "direction":
+        return ["forward" if value > 0 else "backward" for value in rows["x"].fillna(rows["label"]).astype(float)]
+    return rows["label"].astype(str).tolist()
 
 
 def channel_order(channels: pd.DataFrame) -> list[str]:
@@ -134,28 +143,31 @@ def draw_shape(ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units) -> N
     units : Units
         Give the labels their true units.
     """
-    channel, scale = rows["channel"].iloc[0], shape_scale(rows, effect)
+    channel, scale = rows["channel"].iloc[0], shape_scale(effect)
+    numeric = rows["x"].notna().all() and channel != "direction"
+    if channel == "direction" and rows["x"].notna().all():
+        rows = rows[rows["x"].abs() == 1.0]  # there is nothing between forward and backward
     value, lo, hi, free = (scale * rows[name].to_numpy(float) for name in ("value", "lo95", "hi95", "free"))
     ax.axhline(0.0, color=QUIET, linewidth=0.8, zorder=1)
-    if rows["x"].notna().all():
+    if numeric:
         x = rows["x"].to_numpy(float)
         ax.fill_between(x, lo, hi, color=AFTER, alpha=0.2, linewidth=0)
         ax.plot(x, free, color=FLOOR, linestyle="--", linewidth=1.1)
         ax.plot(x, value, color=AFTER)
         ax.set_xlim(x.min(), x.max() if x.max() > x.min() else x.min() + 1)
-        if x.min() > 0 and x.max() / x.min() > LOG_SPAN:
+        if is_logarithmic(x, LOG_SPAN):
             log_axis(ax)
     else:
         x = np.arange(len(rows))
         spread = np.nan_to_num(np.abs(np.stack([value - lo, hi - value])))
         ax.errorbar(x, value, spread, color=AFTER, marker="o", linestyle="", capsize=2)
         ax.plot(x, free, color=FLOOR, marker="_", linestyle="", markersize=12)
-        category_ticks(ax, rows["label"].astype(str).tolist())
+        category_ticks(ax, categories(rows, channel))
     ax.set_xlabel(plain(short(channel_label(channel, units), 44)))
     ax.set_ylabel(shape_label(rows, effect, units, symbol_math))
 
 
-def shape_scale(rows: pd.DataFrame, effect: Mapping) -> float:
+def shape_scale(effect: Mapping) -> float:
     """Return 100 where a shape is a factor minus one, drawn in percent, else 1."""
     return 100.0 if effect.get("operation") == "multiply" else 1.0
 
@@ -186,7 +198,7 @@ def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, c
         def draw(ax: Axes, rows=rows, effect=effect) -> None:
             draw_shape(ax, rows, effect, config.units)
 
-        scale = shape_scale(rows, effect)
+        scale = shape_scale(effect)
         words = effect_label(effect, config.units)
         alt = f"Shape of {words} along {channel_words(channel, config.units)}: "
         alt += f"{shape_label(rows, effect, config.units)} from {number(scale * rows['value'].min())} to "

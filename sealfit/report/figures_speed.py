@@ -12,11 +12,12 @@ from matplotlib.axes import Axes
 from sealfit.config import Config
 from sealfit.report.axes import capital, in_order, is_number, log_axis, natural, padded
 from sealfit.report.numbers import count, number
-from sealfit.report.style import BLACK, CYCLE, FLOOR, Key, Panel, Plot, shades
+from sealfit.report.style import BLACK, CYCLE, FLOOR, HEIGHT, Key, Panel, Plot, shades
 from sealfit.report.symbols import ConditionNames, channel_words, is_unaged, plain, short
 from sealfit.tables import Units
 
 MOST_COLOURS = 10  # in one panel; with more, each value of the last condition column has its own
+TALL = 3.1  # inches, where one or two panels hold everything
 LOG_SPAN = 20.0  # speeds that span this factor are drawn on a logarithmic axis
 
 
@@ -115,7 +116,12 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
             for c in [*shared, *group]
         ]
         panels.append(
-            Panel(short(title), _force_alt(title, lines, config), _force_drawer(lines, config, log, span, x_span))
+            Panel(
+                short(title),
+                _force_alt(title, lines, config),
+                _force_drawer(lines, config, log, span, x_span),
+                height=HEIGHT if len(groups) > 2 else TALL,
+            )
         )
     legend = [Key(short(names(c)), BLACK) for c in unaged]
     legend += [Key(short(_level_label(last, level, names)), colour[level]) for level in levels]
@@ -201,7 +207,7 @@ def _steady_curves(fit: pd.DataFrame, steady: pd.DataFrame) -> pd.DataFrame:
 
     columns = ["condition", "direction", "load", "speed", "before", "after", "lo", "hi"]
     found = []
-    for condition, rows in fit.groupby("condition", sort=False):
+    for condition, rows in fit[fit["quantity"] == "steady"].groupby("condition", sort=False):
         values = rows.set_index("parameter")["value"].to_dict()
         here = steady[(steady["condition"] == condition) & steady["used"].astype(bool)]
         load = here["load_N"].mean() if here["load_N"].notna().any() else np.nan

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import pandas as pd
 from markupsafe import Markup
@@ -16,12 +16,14 @@ from sealfit.report.symbols import (
     channel_words,
     effect_label,
     joined,
+    split_channels,
     symbol_html,
     true_units,
 )
-from sealfit.report.words import PARTS, acts, meaning
+from sealfit.report.words import PARTS, acts, meaning, target_html
 
 MOST_TESTS = 40
+FREE = {"smooth": "a free smooth shape", "levels": "a level of its own for each category"}
 
 
 def error_rows(closure: Mapping, config: Config) -> list[dict]:
@@ -41,7 +43,7 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
         change = _change(before, after) if known(before) and known(after) and before else NOTHING
         found.append({"label": label, "unit": of, "before": texts[0], "after": texts[1], "change": change})
     p = [closure[stage].get("lack_of_fit_p") for stage in ("before", "after")]
-    texts = [p_value(value).removeprefix("= ") for value in p]
+    texts = [p_value(value).removeprefix("= ") if known(value) else NOTHING for value in p]
     return [*found, {"label": "lack of fit, p", "unit": "", "before": texts[0], "after": texts[1], "change": ""}]
 
 
@@ -72,7 +74,7 @@ def effect_cards(closure: Mapping, config: Config) -> list[dict]:
                 "parameters": [_parameter(p, effect) for p in effect["parameters"]],
                 "p": p_value(effect.get("p_value")),
                 "gain": of_unit(number(gain, 2), config.units.unit("force")) if known(gain) else "",
-                "rivals": [_rival(rival, config) for rival in effect.get("alternatives") or []],
+                "rivals": list(dict.fromkeys(_rival(rival, config) for rival in effect.get("alternatives") or [])),
             }
         )
     return cards
@@ -97,8 +99,10 @@ def _rival(rival: Mapping, config: Config) -> Markup:
 
     known_effect = EFFECTS.get(rival["id"])
     channels = joined([channel_words(name, config.units) for name in rival.get("channels") or []])
-    label = known_effect.label.replace("{x}", channels) if known_effect else str(rival["id"]).replace("_", " ")
-    target = config.units.quantity("force") if rival["acts_on"] == "force" else symbol_html(rival["acts_on"])
+    label = FREE.get(rival["id"], str(rival["id"]).replace("_", " "))
+    if known_effect is not None:
+        label = known_effect.label.replace("{x}", channels)
+    target = target_html(rival["acts_on"], config)
     text = Markup("{}, acting on {}").format(label, target)
     if channels and channels not in label:
         text += Markup(" along {}").format(channels)
@@ -122,17 +126,15 @@ def scatter_rows(closure: Mapping, config: Config) -> list[dict]:
     ]
 
 
-def channel_tests(levels: pd.DataFrame, config: Config) -> list[dict]:
+def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config: Config) -> list[dict]:
     """Return what each channel orders of the residual, before and after, the most significant first."""
     tested = levels[levels["channel"].notna()]
     if tested.empty:
         return []
     rows: dict[tuple, dict] = {}
-    known_names = set(tested["channel"])
+    names = set(known_channels) | {"direction"}
     for row in tested.itertuples():
-        words = channel_words(row.channel, config.units)
-        if " " in row.channel and all(part in known_names for part in row.channel.split(" ")):
-            words = joined([channel_words(part, config.units) for part in row.channel.split(" ")])
+        words = joined([channel_words(part, config.units) for part in split_channels(row.channel, names)])
         entry = rows.setdefault(
             (row.channel, row.level),
             {"channel": words, "level": PARTS.get(row.level, row.level), "rank": 1.0}
@@ -165,6 +167,8 @@ def _wanted(one: object, names: ConditionNames, config: Config) -> str:
     parts = []
     for name, value in one.items():
         text = given(float(value)) if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
+        if name == "direction" and text in ("1", "−1"):
+            text = "forward" if text == "1" else "backward"
         unit = config.units.of(name)
         parts.append(f"{channel_words(name, config.units)} {text}{' ' + unit if unit else ''}")
     return ", ".join(parts)

@@ -93,7 +93,7 @@ def _content(
         "scatter": scatter_rows(closure, config) if closure else [],
         "left": left_over(closure, config) if closure else "",
         "next_runs": next_runs(closure, config) if closure else [],
-        "tests": channel_tests(tables["levels"], config),
+        "tests": channel_tests(tables["levels"], tables["channels"]["channel"].dropna(), config),
         "more_channels": max(0, tables["channels"]["channel"].nunique() - MOST_CHANNELS),
         "parameter_tables": sorted(fitted, key=lambda table: table.single),  # how well the fits do comes last
         "aging_fitted": len(tables["aging_fit"]) > 0,

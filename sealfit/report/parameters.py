@@ -2,38 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
 from markupsafe import Markup
 
 from sealfit.config import Config
-from sealfit.report.numbers import NOTHING, known, measured, number
-from sealfit.report.symbols import ConditionNames, quantity_words, symbol_html, true_units
+from sealfit.report.axes import natural
+from sealfit.report.numbers import NOTHING, given, known, measured, number
+from sealfit.report.symbols import ConditionNames, is_unaged, quantity_words, symbol_html, true_units
 
-STATISTICS = ("rmse_N", "reduced_chi2", "lack_of_fit_p", "df", "n_runs", "n_files", "n_speeds")
+STATISTICS = (
+    "rmse_N", "rmse", "max_error_pct", "specimen_sd_pct", "reduced_chi2", "lack_of_fit_p", "df",
+    "n_runs", "n_files", "n_speeds", "n_days", "last_day",
+)  # fmt: skip
 HIDDEN = ("covariance", "sensor_shift")  # for programs; they stand in the Parquet tables
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One parameter of one row; `words` says in its place why these data do not determine it."""
+    """One parameter of one row; `words` stands in its place where these data do not determine it."""
 
     value: str = NOTHING
     interval: str = NOTHING
     u_sys: str = NOTHING
-    words: str | Markup = ""
+    words: str = ""
 
 
 @dataclass(frozen=True)
 class ParameterTable:
-    """A table ready to be written: heads of the key columns, (symbol, unit) of each parameter, rows, remarks."""
+    """A table ready to be written: heads of the key columns, (symbol, unit) of each parameter, rows, notes.
+
+    A row is its keys, its cells, and what there is to say about it: why a parameter is not identified, remarks.
+    """
 
     title: str
     heads: tuple[str, ...]
     groups: tuple[tuple[Markup, str], ...]
-    rows: tuple[tuple[tuple[str | Markup, ...], tuple[Cell, ...], str], ...]
+    rows: tuple[tuple[tuple[str | Markup, ...], tuple[Cell, ...], Markup], ...]
     single: bool = False  # values only: statistics have neither interval nor u_sys
 
 
@@ -81,11 +88,11 @@ def _table(
 ) -> ParameterTable:
     several = len(quantities) > 1 or key == "series"
     found = []
-    for (name, quantity), rows in fit.groupby([key, "quantity"], sort=False):
+    for (name, quantity), rows in _ordered(fit.groupby([key, "quantity"], sort=False), names):
         by = {(row["parameter"], row["unit"] or ""): row for row in _records(rows)}
-        cells = tuple(_cell(by.get(parameter), config) for parameter in parameters)
+        cells = tuple(_cell(by.get(parameter)) for parameter in parameters)
         keys = (names(name), symbol_html(quantity)) if several else (names(name),)
-        found.append((keys, cells, _remark(by, config)))
+        found.append((keys, cells, _note(by, config)))
     heads = (_head(key), "of") if several else (_head(key),)
     return ParameterTable(
         _title(key, quantities), heads, tuple((symbol_html(p), u) for p, u in parameters), tuple(found)
@@ -93,23 +100,23 @@ def _table(
 
 
 def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Config) -> ParameterTable:
+    split = fit["parameter"].str.rpartition(":")  # "mu_s:lack_of_fit_p" is about mu_s alone
+    fit = fit.assign(of=split[0], parameter=split[2])
+    several = fit["of"].ne("").any()
     present = {(row["parameter"], row["unit"] or "") for row in _records(fit)}
     shown = [(name, unit) for name in STATISTICS for found, unit in sorted(present) if found == name]
     shown = shown or sorted(present)
     found = []
-    for name, rows in fit.groupby(key, sort=False):
+    for (name, of), rows in _ordered(fit.groupby([key, "of"], sort=False), names):
         by = {(row["parameter"], row["unit"] or ""): row for row in _records(rows)}
-        cells = tuple(Cell(number(by[p]["value"]) if p in by else NOTHING) for p in shown)
+        cells = tuple(Cell(_statistic(by[p]) if p in by else NOTHING) for p in shown)
         lack = {p: row for p, row in by.items() if p[0] == "lack_of_fit_p"}
-        found.append(((names(name),), cells, _remark(lack, config, named=False)))
+        keys = (names(name), symbol_html(of)) if several else (names(name),)
+        found.append((keys, cells, _note(lack, config, named=False)))
     groups = tuple((Markup("{}").format(quantity_words(p)), u) for p, u in shown)
-    return ParameterTable(
-        "How well the fits do" if key == "condition" else "How well the aging law does",
-        (_head(key),),
-        groups,
-        tuple(found),
-        single=True,
-    )
+    title = "How well the fits do" if key == "condition" else "How well the aging law does"
+    heads = (_head(key), "of") if several else (_head(key),)
+    return ParameterTable(title, heads, groups, tuple(found), single=True)
 
 
 def _records(rows: pd.DataFrame) -> list[dict]:
@@ -117,31 +124,44 @@ def _records(rows: pd.DataFrame) -> list[dict]:
     return plain.where(plain.notna(), None).to_dict("records")
 
 
-def _cell(row: Mapping | None, config: Config) -> Cell:
+def _ordered(groups: Iterable[tuple], names: ConditionNames) -> list[tuple]:
+    """Return groups with unaged rubber first, then by temperature, ..., days, numbers by their size."""
+
+    def place(group: tuple) -> tuple:
+        name = group[0][0] if isinstance(group[0], tuple) else group[0]
+        return (not is_unaged(name), natural((names(name), None)))
+
+    return sorted(groups, key=place)
+
+
+def _statistic(row: Mapping) -> str:
+    """Return a count as a count, a measure with its digits."""
+    whole = known(row["value"]) and float(row["value"]).is_integer() and abs(row["value"]) >= 1
+    return given(row["value"], 9) if whole else number(row["value"])
+
+
+def _cell(row: Mapping | None) -> Cell:
     if row is None:
         return Cell()
     if not row["identified"]:
-        why = row["reason"] or "these data do not determine it"
-        return Cell(words=f"not identified: {true_units(why, config.units)}")
+        return Cell(words="not identified")
     value, interval = measured(row["value"], row["lo95"], row["hi95"])
     return Cell(value, interval, number(row["u_sys"], 2) if known(row["u_sys"]) else NOTHING)
 
 
-def _remark(rows: Mapping[tuple[str, str], Mapping], config: Config, *, named: bool = True) -> Markup:
-    """Return every remark on a row once, with the parameters it is about."""
-    about: dict[str, list[str]] = {}
+def _note(rows: Mapping[tuple[str, str], Mapping], config: Config, *, named: bool = True) -> Markup:
+    """Return what there is to say about a row, each thing once, with the parameters that it is about."""
+    about: dict[tuple[bool, str], list[str]] = {}
     for (parameter, _), row in rows.items():
-        if row["reason"] and row["identified"]:  # what is not identified says so, and why, in its own cell
-            about.setdefault(str(row["reason"]), []).append(parameter)
-    said = [
-        Markup("{}: {}").format(
-            Markup(", ").join([symbol_html(p) for p in parameters]), true_units(reason, config.units)
-        )
-        if named
-        else Markup("{}").format(true_units(reason, config.units))
-        for reason, parameters in about.items()
-    ]
-    return Markup("; ").join(said)
+        why = row["reason"] or ("" if row["identified"] else "these data do not determine it")
+        if why:
+            about.setdefault((bool(row["identified"]), str(why)), []).append(parameter)
+    said = []
+    for (identified, why), parameters in about.items():
+        lead = Markup(", ").join([symbol_html(p) for p in parameters]) if named else Markup("")
+        lead += Markup("" if identified else " not identified")
+        said.append(Markup("{}{}{}").format(lead, ": " if lead else "", true_units(why, config.units)))
+    return Markup("<br>").join(said)
 
 
 def _head(key: str) -> str:

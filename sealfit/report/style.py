@@ -17,7 +17,9 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import AutoLocator
 
+from sealfit.report.axes import round_ticks
 from sealfit.report.symbols import plain, symbol_math
 
 # Okabe & Ito, Color Universal Design (2008): told apart by all common kinds of colour vision. Yellow is left out: too
@@ -167,6 +169,8 @@ def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> None:
     )
     ax = figure.add_axes(box)
     panel.draw(ax)
+    if ax.get_xscale() == "linear" and isinstance(ax.xaxis.get_major_locator(), AutoLocator):
+        ax.xaxis.set_major_locator(round_ticks())
     if panel.title:
         ax.set_title(plain(panel.title), x=-(panel.left - _EDGE) / (WIDTH - panel.left - _EDGE))
 

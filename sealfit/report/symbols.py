@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from markupsafe import Markup, escape
@@ -21,7 +21,9 @@ _SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])(?:_?([0-9]+)|_([A-Za-z0-9]{
 _SLOTS = ("speed_set_mm_s", "displacement_from_mm", "displacement_to_mm", "displacement_mm", "distance_mm",
           "speed_mm_s", "force_N", "load_N")  # fmt: skip
 _SLOT = re.compile(rf"\b(?:{'|'.join(_SLOTS)})\b")
-_ERRORS = {"rmse_N": "rms error", "chi2": "χ²", "chi2_red": "reduced χ²", "r2": "R²", "n": "points", "df": "df"}
+_STATISTICS = {"rmse_N": "rms error", "reduced_chi2": "χ² / df", "lack_of_fit_p": "lack of fit, p", "n_runs": "runs",
+               "n_files": "files", "n_speeds": "speeds", "n_days": "days tested", "last_day": "last day",
+               "rmse": "rms error", "max_error_pct": "largest error", "specimen_sd_pct": "specimen scatter"}  # fmt: skip
 
 
 def symbol_html(name: str) -> Markup:
@@ -122,6 +124,24 @@ def channel_words(name: str, units: Units) -> str:
     return label.removesuffix(f" ({unit})") if unit else label
 
 
+def split_channels(text: str | None, known: Collection[str]) -> list[str]:
+    """Return the channels whose names, joined by spaces, `text` is.
+
+    A column's own name may hold spaces, so the names that are known decide where to cut.
+
+    Examples
+    --------
+    >>> split_channels("direction oil temp", {"direction", "oil temp"})
+    ['direction', 'oil temp']
+    """
+    names, words = [], text.split(" ") if text else []
+    while words:
+        n = next((n for n in range(len(words), 0, -1) if " ".join(words[:n]) in known), 1)
+        names.append(" ".join(words[:n]))
+        words = words[n:]
+    return names
+
+
 def effect_label(effect: Mapping, units: Units) -> str:
     """Return an effect's label in words, slots by their true quantity; how it acts is said elsewhere.
 
@@ -137,7 +157,7 @@ def effect_label(effect: Mapping, units: Units) -> str:
 
 def quantity_words(name: str) -> str:
     """Return what a fit's statistic is called."""
-    return _ERRORS.get(name, name.removesuffix("_N").replace("_", " "))
+    return _STATISTICS.get(name, name.removesuffix("_N").replace("_", " "))
 
 
 @dataclass(frozen=True)

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
+import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
 from sealfit.config import Config
 from sealfit.report.numbers import NOTHING, known, measured, number, of_unit, p_value, together
-from sealfit.report.symbols import channel_label, channel_words, effect_label, joined, symbol_html
+from sealfit.report.symbols import channel_label, channel_words, effect_label, joined, split_channels, symbol_html
 
-FALLS = 0.02  # of its span: a shape that turns back by less is called falling or rising
-STARTS = 0.1  # of its span: a shape that starts nearer to zero than this is told by its end
+FLAT = 0.02  # of its span: a shape that crosses zero by less is of one sign
+STARTS = (
+    0.1  # of its span: a shape that starts nearer to zero than this and ends at its largest is told without "up to"
+)
 PARTS = {"trace": "within a trace", "stroke": "between strokes", "repeat": "between repeats", "run": "between runs",
          "condition": "between conditions", "campaign": "along the campaign", "file": "between files",
          "specimen": "between specimens", "sample": "within a stroke"}  # fmt: skip
-COUNTED = {2: "two", 3: "three", 4: "four", 5: "five", 6: "six"}
+COUNTED = dict(enumerate(["two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"], start=2))
+DETAILED = 2  # effects of which the verdict says how large they are; with more, the cards below do
 
 
 def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Markup:
@@ -40,23 +44,29 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
         )
         return text + Markup(" {}").format(_sentence(errors))
     added = [(k, e) for k, e in enumerate(closure["effects"]) if not e["candidate"]]
-    missed = [_missed(effect_label(e, config.units), does(k, e, shapes, config)) for k, e in added]
-    lead = (
-        Markup("{} {}").format(f"{COUNTED.get(len(missed), len(missed))} things:", _joined(missed))
-        if len(missed) > 1
-        else None
-    )
+    missed = _missed_effects(added, shapes, config)
+    many = COUNTED.get(len(added), str(len(added)))
+    lead = Markup("{} things: {}").format(many, _joined(missed)) if len(added) > 1 else _joined(missed)
     if closure["verdict"] == "closed":
         if not missed:
             return _sentence(errors)
-        them = "them" if len(missed) > 1 else "it"
-        return Markup("The declared model missed {}; with {} {}.").format(lead or missed[0], them, errors)
+        them = "them" if len(added) > 1 else "it"
+        return Markup("The declared model missed {}; with {} {}.").format(lead, them, errors)
     where = _where(closure["left"], config)
     if missed:
         return Markup(
             "The declared model missed {}, and something more that no effect explains: {}; so far {}."
-        ).format(lead or missed[0], where, errors)
+        ).format(lead, where, errors)
     return Markup("The declared model misses something that no effect explains: {}; {}.").format(where, errors)
+
+
+def _missed_effects(added: Sequence[tuple[int, Mapping]], shapes: pd.DataFrame, config: Config) -> list[Markup]:
+    """Return each effect with what it does; of many only the names, each once, so that the verdict stays a sentence."""
+    labels = [effect_label(effect, config.units) for _, effect in added]
+    if len(added) <= DETAILED:
+        return [_missed(label, does(k, e, shapes, config)) for label, (k, e) in zip(labels, added, strict=True)]
+    times = {label: labels.count(label) for label in labels}
+    return [Markup("{}").format(label if n == 1 else f"{label} ({n} of them)") for label, n in times.items()]
 
 
 def _missed(label: str, does: Markup) -> Markup:
@@ -85,12 +95,11 @@ def error_clause(closure: Mapping, config: Config) -> Markup:
 
 
 def does(index: int, effect: Mapping, shapes: pd.DataFrame, config: Config) -> Markup:
-    """Return what an effect does, in a clause: the change along its channel, then its other parameters."""
+    """Return what an effect does, in a clause: by how much it changes its target, then its other parameters."""
     change = _change(effect, shapes[shapes["effect"] == index] if len(shapes) else shapes, config)
-    linear = _amplitudes(effect)
-    rest = [p for p in effect["parameters"] if p["name"] not in linear] if change else effect["parameters"]
-    said = [parameter(p, effect) for p in rest[:3]]
-    return Markup(", ").join([part for part in (change, *said) if part])
+    linear = _amplitudes(effect) if change else set()
+    rest = [p for p in effect["parameters"] if p["name"].rstrip("_") not in linear and p.get("unit") != "rad"]
+    return Markup(", ").join([part for part in (change, *(parameter(p, effect) for p in rest[:2])) if part])
 
 
 def parameter(p: Mapping, effect: Mapping) -> Markup:
@@ -106,30 +115,31 @@ def _measured(value: float | None, ends: Sequence[float | None] | None, unit: st
 
 
 def _change(effect: Mapping, shape: pd.DataFrame, config: Config) -> Markup:
-    """Return by how much the effect changes its target along its first channel; nothing if there is no such shape."""
+    """Return by how much the effect changes its target along its first channel; nothing where it changes nothing."""
     shape = shape[shape["x"].notna() & shape["value"].notna()]
-    if shape.empty or len(shape) < 2:
+    if len(shape) < 2:
         return Markup("")
-    shape = shape[shape["channel"] == shape["channel"].iloc[0]].sort_values("x")
+    channel = shape["channel"].iloc[0]
+    shape = shape[shape["channel"] == channel].sort_values("x")
     value, lo, hi = (shape[name].to_numpy(float) for name in ("value", "lo95", "hi95"))
+    span = value.max() - value.min()
+    if not span > 0:
+        return Markup("")
     factor = effect["operation"] == "multiply"
     scale, unit = (100.0, "%") if factor else (1.0, next((u for u in shape["unit"] if isinstance(u, str) and u), ""))
     what = target_html(effect["acts_on"], config)
-    span = value.max() - value.min()
-    end = value[-1]
-    turns_back = min(
-        abs(value.max() - end) + abs(value[0] - value.min()), abs(end - value.min()) + abs(value.max() - value[0])
-    )
-    if span > 0 and turns_back <= FALLS * span:
-        way = "falls" if end < value[0] else "rises"
-        if abs(value[0]) <= STARTS * span:
-            sign = 1.0 if end > 0 else -1.0
-            ends = sorted((scale * sign * lo[-1], scale * sign * hi[-1]))
-            return Markup("{} {} by {}").format(what, way, _measured(scale * abs(end), ends, unit))
-    else:
-        way = "varies"
-    size = of_unit(number(scale * span, 2), unit)
-    return Markup("{} {} by {} along {}").format(what, way, size, channel_words(shape["channel"].iloc[0], config.units))
+    if channel == "direction":
+        return Markup("{} differs by {} between directions").format(what, of_unit(number(scale * span, 2), unit))
+    if max(-value.min(), 0.0) > FLAT * span and max(value.max(), 0.0) > FLAT * span:
+        size = of_unit(number(scale * span, 2), unit)
+        return Markup("{} varies by {} along {}").format(what, size, channel_words(channel, config.units))
+    k = int(np.argmax(np.abs(value)))  # of one sign: told by its largest size, against the model without the effect
+    sign = 1.0 if value[k] > 0 else -1.0
+    ends = sorted((scale * sign * lo[k], scale * sign * hi[k]))
+    way = "rises" if sign > 0 else "falls"
+    settled = k == len(value) - 1 and abs(value[0]) <= STARTS * span
+    size = _measured(scale * abs(value[k]), ends, unit)
+    return Markup("{} {} by {}{}").format(what, way, "" if settled else "up to ", size)
 
 
 def target_html(target: str, config: Config) -> Markup:
@@ -152,14 +162,14 @@ def meaning(effect_id: str, name: str) -> str:
     from sealfit.effects import EFFECTS
 
     effect = EFFECTS.get(effect_id)
-    return next((p.meaning for p in effect.parameters if p.name == name), "") if effect else ""
+    return next((p.meaning for p in effect.parameters if p.name.rstrip("_") == name.rstrip("_")), "") if effect else ""
 
 
 def _amplitudes(effect: Mapping) -> set[str]:
     from sealfit.effects import EFFECTS
 
     found = EFFECTS.get(effect["id"])
-    return set(found.linear) if found else set()
+    return {name.rstrip("_") for name in found.linear} if found else set()
 
 
 def left_over(closure: Mapping, config: Config) -> Markup:
@@ -194,17 +204,9 @@ def _where(left: Mapping, config: Config) -> str:
 
 
 def with_left_channels(closure: Mapping, channels: Collection[str]) -> dict:
-    """Return closure.json with `left.channels`: the channels whose names, joined by spaces, `left.channel` is.
-
-    A column's own name may hold spaces, so the names that are known decide where to cut.
-    """
-    text = closure["left"].get("channel") or ""
-    names, words = [], text.split(" ") if text else []
-    while words:
-        n = next((n for n in range(len(words), 0, -1) if " ".join(words[:n]) in channels), 1)
-        names.append(" ".join(words[:n]))
-        words = words[n:]
-    return {**closure, "left": {**closure["left"], "channels": names}}
+    """Return closure.json with `left.channels`, the names that `left.channel` joins; `channels` are those known."""
+    left = closure["left"]
+    return {**closure, "left": {**left, "channels": split_channels(left.get("channel"), channels)}}
 
 
 def _units_of(closure: Mapping) -> str:
@@ -212,7 +214,7 @@ def _units_of(closure: Mapping) -> str:
 
 
 def _joined(parts: Sequence[Markup]) -> Markup:
-    return Markup(" and ").join([Markup(", ").join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
+    return Markup(" and ").join([Markup(", ").join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
 
 
 def _sentence(clause: Markup) -> Markup:

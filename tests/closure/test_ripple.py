@@ -24,8 +24,7 @@ def make_samples(
             tables.append(
                 pd.DataFrame(
                     {
-                        "file": f"f{k}",
-                        "stroke": stroke,
+                        "stroke_id": 2 * k + stroke,
                         "direction": direction,
                         "unit": k,
                         "displacement_mm": x,
@@ -76,4 +75,4 @@ def test_correlated_noise_is_not_a_ripple():
 
 def test_too_few_samples_say_nothing():
     samples = make_samples(files=2)
-    assert find_ripple(samples[samples.groupby(["file", "stroke"]).cumcount() < 10], common_phase=True) is None
+    assert find_ripple(samples[samples.groupby("stroke_id").cumcount() < 10], common_phase=True) is None

@@ -121,7 +121,7 @@ def test_one_repeat_has_no_standard_error_and_strokes_of_one_file_are_no_repeats
     npt.assert_allclose(one["force_N"].iloc[10], 1.0 + 1.05, atol=0.06)
 
 
-def test_a_gap_stays_a_gap_and_a_cell_is_steady_only_if_every_stroke_is():
+def test_a_gap_stays_a_gap_and_steady_strokes_are_averaged_with_steady_ones_only():
     x = np.linspace(0.0, 10.0, 101)
     table = samples((np.delete(x, slice(40, 60)), np.zeros(81)), (x, np.ones(101)))
     table.loc[table["displacement_mm"] < 2.0, "steady"] = False
@@ -132,8 +132,22 @@ def test_a_gap_stays_a_gap_and_a_cell_is_steady_only_if_every_stroke_is():
     assert (gap["force_N"] == 1.0).all()
     assert gap["force_se_N"].isna().all()
     assert not made.loc[made["displacement_mm"] < 1.9, "steady"].any()
-    assert not made.loc[made["displacement_mm"] > 8.2, "steady"].any()
+    late = made[made["displacement_mm"] > 8.2]
+    assert late["steady"].all()
+    assert (late["n"] == 1).all()
+    assert (late["force_N"] == 0.0).all()
     assert made.loc[made["displacement_mm"].between(2.2, 3.8), "steady"].all()
+
+
+def test_a_repeat_that_starts_later_makes_no_dip_in_the_mean():
+    x = np.linspace(0.0, 20.0, 201)
+    rise = 20.0 * (1.0 - np.exp(-x / 0.3))
+    table = samples((x, rise), (x + 5.0, rise))
+    travel = table["displacement_mm"] - np.where(table["row"] == 1, 5.0, 0.0)
+    made = mean_traces(table.assign(steady=travel > 2.0), strokes(run_id=["a", "a"]))
+    inside = made[made["displacement_mm"] > 2.5]
+    assert inside["force_N"].min() > 19.9
+    assert (inside.loc[inside["displacement_mm"].between(7.5, 19.5), "n"] == 2).all()
 
 
 def test_runs_are_averaged_apart():

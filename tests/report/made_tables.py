@@ -61,18 +61,11 @@ def steady_rows(temperature, compression, day, values, rng):
                 "reason": None if known else "fewer than two speeds lie below 2 v_s",
             }
         )
-    rows.append(
-        {
-            "temperature_C": temperature,
-            "compression_ratio_pct": compression,
-            "aging_days": day,
-            "quantity": "statistics",
-            "parameter": "rmse_N",
-            "value": 0.31,
-            "unit": "N",
-            "identified": True,
-        }
-    )
+    shared = {"temperature_C": temperature, "compression_ratio_pct": compression, "aging_days": day, "identified": True}
+    rows.append({**shared, "quantity": "statistics", "parameter": "rmse_N", "value": 0.31, "unit": "N"})
+    # the same names stand in rows that are no coefficients
+    rows.append({**shared, "quantity": "sensor_shift", "parameter": "mu_s", "value": 0.0024, "unit": ""})
+    rows.append({**shared, "quantity": "covariance", "parameter": "mu_s,mu_s", "value": 3.6e-5, "unit": ""})
     return rows
 
 

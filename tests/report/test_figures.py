@@ -9,6 +9,7 @@ from report.made_campaigns import Made, aging_campaign, not_run, paper_sized, to
 from report.made_tables import DROP, empty, shapes, table
 
 from sealfit.config import Config
+from sealfit.report.axes import is_logarithmic, value_ticks
 from sealfit.report.figures import draw_all
 from sealfit.report.figures_curves import draw_aging, draw_trace, envelope
 from sealfit.report.figures_loop import draw_errors, draw_levels, run_means
@@ -89,7 +90,7 @@ def test_without_the_loop_the_steady_fit_is_drawn():
     made = not_run()
     curves = curve_lines(made.tables, made.config)
     fit = made.tables["steady_fit"]
-    values = fit[fit["condition"] == "unaged"].set_index("parameter")["value"]
+    values = fit[(fit["condition"] == "unaged") & (fit["quantity"] == "steady")].set_index("parameter")["value"]
     line = curves[curves["condition"] == "unaged"].iloc[0]
     # Eq. 14 by hand at the slowest point
     mu = values["mu_c"] + (values["mu_s"] - values["mu_c"]) * np.exp(-((line["speed"] / values["v_s"]) ** 2))
@@ -126,6 +127,7 @@ def test_unaged_rubber_starts_every_series(made):
     for panel in plot.panels:
         bars = panel_figure(panel).axes[0].containers
         assert [min(bar.lines[0].get_xdata()) for bar in bars] == [0.0, 0.0]
+        assert [len(bar.lines[0].get_xdata()) for bar in bars] == [4, 4]  # a point a day, and nothing else
 
 
 def test_thinned_traces_keep_every_peak():
@@ -141,8 +143,13 @@ def test_thinned_traces_keep_every_peak():
 
 def test_trace_shades_its_steady_window(ax):
     x = np.linspace(0, 40, 81)
-    trace = pd.DataFrame({"displacement_mm": x, "force_N": 1.0, "force_se_N": np.nan, "steady": (x >= 5) & (x <= 30)})
+    trace = pd.DataFrame(
+        {"displacement_mm": x, "direction": -1, "force_N": -1.0, "force_se_N": np.nan, "steady": (x >= 5) & (x <= 30)}
+    )
     draw_trace(ax, trace, TORQUE)
+    npt.assert_array_equal(ax.lines[0].get_ydata(), 1.0)  # in the direction of motion
+    drawn = ax.lines[1].get_ydata()
+    npt.assert_array_equal(np.isnan(drawn), x < 10)  # where every repeat is there
     (window,) = ax.patches
     assert (window.get_x(), window.get_x() + window.get_width()) == (5.0, 30.0)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("angle (turn)", "torque (mN m)")
@@ -197,6 +204,32 @@ def test_an_added_force_has_its_unit(ax, made):
     rows = shapes().assign(unit="mN m")
     draw_shape(ax, rows, {**made.closure["effects"][0], "acts_on": "force", "operation": "add"}, TORQUE)
     assert ax.get_ylabel() == "added torque (mN m)"
+
+
+def test_directions_are_two_and_named(ax, made):
+    x = np.linspace(-1, 1, 5)
+    rows = shapes().head(5).assign(channel="direction", x=x, value=0.1 * x, lo95=0.1 * x - 0.02, hi95=0.1 * x + 0.02)
+    draw_shape(ax, rows, made.closure["effects"][0], Units())
+    assert [tick.get_text() for tick in ax.get_xticklabels()] == ["backward", "forward"]
+    npt.assert_allclose(ax.containers[0].lines[0].get_ydata(), [-10.0, 10.0])
+
+
+@pytest.mark.parametrize(
+    ("values", "logarithmic"),
+    [
+        ([0.5, 1, 2, 5, 10, 20, 50], True),
+        ([0.4, 17, 20, 100, 110, 200], False),
+        ([1, 2, 5], False),
+        ([-1, 1, 99], False),
+    ],
+)
+def test_an_axis_is_logarithmic_where_the_values_are(values, logarithmic):
+    assert is_logarithmic(np.array(values, float), 20.0) is logarithmic
+
+
+def test_ticks_stand_at_the_values_where_they_fit(ax):
+    value_ticks(ax, np.array([20.0, 60.0, 80.0]))
+    assert [tick.get_text() for tick in ax.get_xticklabels()] == ["20", "60", "80"]
 
 
 # ---------------------------------------------------------------- style

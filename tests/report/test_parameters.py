@@ -1,6 +1,6 @@
 import pandas as pd
 from report.made_campaigns import aging_campaign, torque_campaign
-from report.made_tables import empty
+from report.made_tables import empty, table
 
 from sealfit.config import Config
 from sealfit.report.parameters import parameter_tables
@@ -25,9 +25,9 @@ def test_a_row_per_condition_with_u_sys_apart():
 def test_what_is_not_identified_says_why_and_gives_no_number():
     made = aging_campaign()
     steady = parameter_tables(made.tables["steady_fit"], "condition", made.config)[0]
-    cells = {keys[0]: cells for keys, cells, _ in steady.rows}["60 °C · 80 % · 16 d"]
-    assert cells[2].words == "not identified: fewer than two speeds lie below 2 v_s"
-    assert cells[2].value == "–"
+    cells, note = {keys[0]: (cells, note) for keys, cells, note in steady.rows}["60 °C · 80 % · 16 d"]
+    assert (cells[2].words, cells[2].value) == ("not identified", "–")
+    assert note == "<i>v</i><sub>s</sub> not identified: fewer than two speeds lie below 2 v_s"
 
 
 def test_coefficients_of_one_law_share_a_table():
@@ -43,12 +43,43 @@ def test_forces_carry_the_declared_unit():
     assert [unit for _, unit in table.groups] == ["mN m", "mN m", "rpm", "mN m/rpm"]
 
 
-def test_covariances_are_for_programs():
-    made = aging_campaign()
+def test_covariances_and_shifts_are_for_programs():
+    made = aging_campaign(speeds=(1, 10))
+    tables = parameter_tables(made.tables["steady_fit"], "condition", made.config)
+    assert [len(table.groups) for table in tables] == [4, 1]
+
+
+def test_conditions_stand_in_the_order_of_their_numbers():
+    made = aging_campaign(days=(1, 16, 4), compressions=(100, 80), speeds=(1, 10))
+    rows = parameter_tables(made.tables["steady_fit"], "condition", made.config)[0].rows
+    assert [keys[0] for keys, _, _ in rows] == [
+        "unaged",
+        *(f"60 °C · {compression} % · {day} d" for compression in (80, 100) for day in (1, 4, 16)),
+    ]
+
+
+def test_counts_are_whole():
+    made = aging_campaign(speeds=(1, 10))
     fit = made.tables["steady_fit"]
-    more = fit.head(1).assign(quantity="covariance", parameter="mu_s,mu_c")
-    tables = parameter_tables(pd.concat([fit, more]), "condition", made.config)
-    assert all("," not in str(symbol) for table in tables for symbol, _ in table.groups)
+    runs = fit[fit["quantity"] == "statistics"].assign(parameter="n_runs", value=6.0, unit="")
+    statistics = parameter_tables(pd.concat([fit, runs]), "condition", made.config)[1]
+    assert [cell.value for cell in statistics.rows[0][1]] == ["0.310", "6"]
+
+
+def test_statistics_of_several_quantities_stand_apart():
+    rows = [
+        ("mu_s:lack_of_fit_p", 0.026, "specimens differ"),
+        ("mu_c:lack_of_fit_p", 0.39, ""),
+        ("mu_c:n_days", 5.0, ""),
+    ]
+    fit = table("aging_fit", [{"series": "all", "quantity": "statistics", "parameter": p, "value": v, "reason": r,
+                               "unit": "", "identified": True} for p, v, r in rows])  # fmt: skip
+    (found,) = parameter_tables(fit, "series", Config())
+    assert [str(symbol) for symbol, _ in found.groups] == ["lack of fit, p", "days tested"]
+    assert [(keys[1], [c.value for c in cells], note) for keys, cells, note in found.rows] == [
+        ("<i>μ</i><sub>s</sub>", ["0.0260", "–"], "specimens differ"),
+        ("<i>μ</i><sub>c</sub>", ["0.390", "5"], ""),
+    ]
 
 
 def test_remarks_on_identified_parameters_stand_apart():

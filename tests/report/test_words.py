@@ -1,9 +1,10 @@
+import numpy as np
 import pytest
 from report.made_campaigns import aging_campaign, torque_campaign
 from report.made_tables import empty, shapes
 
 from sealfit.config import Config
-from sealfit.report.words import acts, left_over, verdict, with_left_channels
+from sealfit.report.words import acts, does, left_over, verdict, with_left_channels
 
 NUMBERS = {
     "rmse_N": 1.3,
@@ -65,6 +66,38 @@ def test_several_effects_are_counted_and_candidates_are_not():
     text = said(document(effects=(WARMING, RIPPLE, {**RIPPLE, "candidate": True})))
     assert text.startswith("The declared model missed two things: warming by sliding (")
     assert "and ripple along displacement (λ = 5.020 mm [5.010, 5.030]); with them the error" in text
+
+
+def test_many_effects_are_named_once_each():
+    text = said(document(effects=(WARMING, RIPPLE, RIPPLE, RIPPLE)))
+    assert text.startswith(
+        "The declared model missed four things: warming by sliding and ripple along displacement (3 of them); with them"
+    )
+
+
+def shape(values, **more):
+    rows = (
+        shapes()
+        .head(len(values))
+        .assign(value=values, lo95=np.subtract(values, 0.5), hi95=np.add(values, 0.5), unit="N")
+    )
+    return rows.assign(**more)
+
+
+@pytest.mark.parametrize(
+    ("values", "more", "words"),
+    [
+        ([0.0, 1.0, 3.0], {}, "the friction force rises by 3.0 N [2.5, 3.5]"),
+        ([-3.0, -1.0, -0.1], {}, "the friction force falls by up to 3.0 N [2.5, 3.5]"),
+        ([0.0, -3.0, 0.0], {}, "the friction force falls by up to 3.0 N [2.5, 3.5]"),
+        ([-1.0, 2.0, -1.0], {}, "the friction force varies by 3.0 N along time"),
+        ([-1.0, 0.0, 1.0], {"channel": "direction"}, "the friction force differs by 2.0 N between directions"),
+        ([0.7, 0.7, 0.7], {}, "λ = 5.020 mm [5.010, 5.030]"),  # flat: only its parameters say how large it is
+    ],
+)
+def test_the_size_of_an_effect_is_read_off_its_shape(values, more, words):
+    text = str(does(0, RIPPLE, shape(values, **more), Config())).replace("\u00a0", " ")
+    assert text.replace("<i>", "").replace("</i>", "").startswith(words)
 
 
 def test_nothing_missing_gives_one_error():
