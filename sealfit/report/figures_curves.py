@@ -127,9 +127,12 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
     whole = thin["n"] == thin["n"].max()  # where a repeat begins later, its own start pulls the mean
     ax.plot(thin["displacement_mm"], thin["force_N"], color=SKY, linewidth=0.8)
     ax.plot(thin["displacement_mm"], thin["force_N"].where(whole), color=AFTER, linewidth=0.9)
-    steady = trace.loc[trace["steady"].astype(bool), "displacement_mm"]
-    if len(steady):
-        ax.axvspan(steady.min(), steady.max(), color=QUIET, alpha=0.12, linewidth=0, zorder=0)
+    trace = trace.sort_values("displacement_mm")
+    steady = trace["steady"].astype(bool)
+    ax.fill_between(
+        trace["displacement_mm"], 0, 1, where=steady, transform=ax.get_xaxis_transform(), color=QUIET, alpha=0.12,
+        linewidth=0, zorder=0,
+    )  # fmt: skip
     ax.set_xlabel(plain(units.label("displacement_mm")))
     ax.set_ylabel(plain(units.label("force_N")))
 

@@ -23,7 +23,8 @@ _SLOTS = ("speed_set_mm_s", "displacement_from_mm", "displacement_to_mm", "displ
 _SLOT = re.compile(rf"\b(?:{'|'.join(_SLOTS)})\b")
 _STATISTICS = {"rmse_N": "rms error", "reduced_chi2": "χ² / df", "lack_of_fit_p": "lack of fit, p", "n_runs": "runs",
                "n_files": "files", "n_speeds": "speeds", "n_days": "days tested", "last_day": "last day",
-               "rmse": "rms error", "max_error_pct": "largest error", "specimen_sd_pct": "specimen scatter"}  # fmt: skip
+               "rmse": "rms error", "max_error_pct": "largest error",
+               "specimen_sd_pct": "specimen scatter"}  # fmt: skip
 
 
 def symbol_html(name: str) -> Markup:
