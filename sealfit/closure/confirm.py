@@ -15,6 +15,7 @@ from sealfit.fit.joint import evaluate
 from sealfit.fit.mixed import whiten
 from sealfit.fit.rows import Rows
 
+SURE = 3.0  # standard errors, over files, by which a ripple of free phase must help the half it was not fitted to
 LEAST_RUNS = 6  # below six runs whole files are held out, below six files strokes (design: held-out unit)
 
 
@@ -78,8 +79,7 @@ def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int) -> G
     RMSE is taken about the means of the groups inside which the effect's channels vary.
     """
     if "shift" in proposal.term.fixed:
-        gain = _gain_within_files(before, proposal)
-        return Gain(gain, gain)
+        return _gain_within_files(before, proposal)
     rows, after, scatter = before.rows, proposal.fitted, before.scatter
     squares, white, known = np.zeros(2), np.zeros(2), 0.0
     for out in folds(rows, proposal.unit, count, seed):
@@ -108,7 +108,7 @@ def _about(residual: np.ndarray, rows: Rows, proposal: Proposal) -> np.ndarray:
     return residual - (np.bincount(code, residual) / np.maximum(np.bincount(code), 1))[code]
 
 
-def _gain_within_files(before: Fitted, proposal: Proposal) -> float:
+def _gain_within_files(before: Fitted, proposal: Proposal) -> Gain:
     """Return the gain on one half of every file with each file's phase taken from the other half.
 
     Halves are pairs of strokes there and back, taken in turn, or halves of the stroke in a file of one or two.
@@ -122,19 +122,19 @@ def _gain_within_files(before: Fitted, proposal: Proposal) -> float:
         first = (stroke - 1) // 2 % 2 == 0
     length = after.model.values[-1]["lambda_"]
     peak = Peak(proposal.term.channels[0], length, True, False, 0.0, 0.0, 0.0)
-    old, new = 0.0, 0.0
+    squares = np.zeros((2, rows.groups.starts["file"].size))  # of each file, before and after
     for out in (first, ~first):
         train = rows.subset(~out)
         shift = file_shifts(fitted_at(before.model, train, before.scatter), peak)
         term = replace(proposal.term, fixed={**proposal.term.fixed, "shift": shift})
         model = replace(after.model, terms=(*after.model.terms[:-1], term))
         test = rows.subset(out)
-        for which, m in (("old", before.model), ("new", model)):
+        for which, m in enumerate((before.model, model)):
             residual = test.force - evaluate(m, test, jacobian=False)[0]
             level = test.groups.means(residual, "stroke")[test.codes("stroke")]
-            error = float(test.weight @ (residual - level) ** 2)
-            if which == "old":
-                old += error
-            else:
-                new += error
-    return float(np.sqrt(old / 2) - np.sqrt(new / 2))
+            file = rows.codes("file")[out]
+            squares[which] += np.bincount(file, rows.weight[out] * (residual - level) ** 2, squares.shape[1])
+    gain = squares[0] - squares[1]
+    size = float(gain.mean() / max(gain.std(ddof=1) / np.sqrt(gain.size), 1e-300))
+    rmse = np.sqrt(squares.sum(axis=1))
+    return Gain(float(rmse[0] - rmse[1]), float(gain.sum()) if size > SURE else -1.0)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sealfit.closure.channels import FREE_DF, WIDE, Channel
+from sealfit.closure.intervals import robust_covariance
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import Candidate, project
 from sealfit.effects import EFFECTS
@@ -27,6 +28,7 @@ CONTENDER = 0.6  # share of the best explained sum of squares from which a rival
 REFITTED = 8  # proposals refitted jointly
 TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
 RIVAL = 10.0  # an alternative: the data favour the chosen one by less than exp(5)
+HELD = 0.5  # relative standard error beyond which a form's own number is not determined
 SAME = 0.98  # correlation above which two candidates are one effect here
 PHASES = tuple(np.arange(4) * np.pi / 4)
 PREFERRED = ("mu", "mu_c", "mu_s", "v_s", "sigma_2", "a", "b", "mu_0", "force")
@@ -98,7 +100,7 @@ def propose(
         for candidate in significant:
             if candidate.chi2 < CONTENDER * best.chi2 or candidate.key in seen:
                 continue
-            if best.channels == ("direction",) != candidate.channels:
+            if best.channels == ("direction",) and "direction" not in candidate.channels:
                 continue  # a form that starts at zero would take a constant offset in along with its own shape
             seen.add(candidate.key)
             for term, search in _terms(candidate, channels, fitted, effects):
@@ -133,8 +135,26 @@ def _ordered(found: list[Proposal]) -> list[Proposal]:
     found = sorted(found, key=lambda p: p.criterion)
     best = found[0]
     equals = [p for p in found if p.criterion - best.criterion < TIED or _same(p, best, TIED * 2)]
+    equals = [p for p in equals if determined(p)] or equals
     first = min(equals, key=lambda p: (p.rank, p.criterion))
     return [first, *(p for p in found if p is not first)]
+
+
+def determined(proposal: Proposal) -> bool:
+    """Whether the data hold the form's own numbers: a time constant known to worse than half of itself is not one.
+
+    Such a form is a straight line or a constant under another name, and the plain one says so better.
+    """
+    fitted, effect = proposal.fitted, proposal.term.effect
+    first = fitted.model.size - len(effect.parameters)
+    covariance = np.maximum(fitted.covariance, robust_covariance(fitted, proposal.unit))
+    for k, parameter in enumerate(effect.parameters):
+        if parameter.linear or parameter.name == "phi":
+            continue
+        error = float(np.sqrt(covariance[first + k, first + k]))
+        if error > HELD * abs(fitted.model.values[-1][parameter.name]):
+            return False
+    return True
 
 
 def _same(one: Proposal, other: Proposal, margin: float) -> bool:

@@ -225,7 +225,7 @@ def _descend(
         gain = cost - trial_cost
         vector, model, residual, cost = trial, trial_model, trial_residual, trial_cost
         damping /= 10
-        if gain < SETTLED:
+        if gain < SETTLED and damping < 1e-3:  # a short step under heavy damping gains little anywhere
             return model
         _, jacobian = evaluate(model, rows)
     return model
