@@ -20,6 +20,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 
+REVIVED = 0.03  # share at which a component starts though it was nothing before: from zero it could not come back
+
+
 @dataclass(frozen=True, slots=True)
 class Component:
     """Variance of one kind of random effect at one level: an `offset` in force units, or a relative `gain`."""
@@ -166,7 +169,7 @@ def reml(
         return 0.5 * (logdet + 2.0 * np.log(np.diag(chol)).sum() + gram[p, p] - half @ half)
 
     low, high = np.log(1e-7), np.log(30.0)
-    first = np.full(len(kinds), np.log(0.2)) if start is None else np.log(np.maximum(np.asarray(start) / unit, 2e-4))
+    first = np.full(len(kinds), np.log(0.2)) if start is None else np.log(np.maximum(np.asarray(start) / unit, REVIVED))
     best = minimize(
         objective,
         np.clip(first, low + 1.0, high - 1.0),
