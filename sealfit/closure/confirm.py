@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from sealfit.closure.channels import FINER, unit_of
 from sealfit.closure.naming import Proposal, file_shifts
@@ -15,7 +16,7 @@ from sealfit.fit.joint import evaluate
 from sealfit.fit.mixed import whiten
 from sealfit.fit.rows import Rows
 
-SURE = 3.0  # standard errors, over files, by which a ripple of free phase must help the half it was not fitted to
+SURE = 0.005  # p-value, over files (Wilcoxon), at which a ripple of free phase helps the half it was not fitted to
 LEAST_RUNS = 6  # below six runs whole files are held out, below six files strokes (design: held-out unit)
 
 
@@ -135,6 +136,6 @@ def _gain_within_files(before: Fitted, proposal: Proposal) -> Gain:
             file = rows.codes("file")[out]
             squares[which] += np.bincount(file, rows.weight[out] * (residual - level) ** 2, squares.shape[1])
     gain = squares[0] - squares[1]
-    size = float(gain.mean() / max(gain.std(ddof=1) / np.sqrt(gain.size), 1e-300))
+    helped = np.any(gain != 0) and stats.wilcoxon(gain, alternative="greater").pvalue < SURE
     rmse = np.sqrt(squares.sum(axis=1))
-    return Gain(float(rmse[0] - rmse[1]), float(gain.sum()) if size > SURE else -1.0)
+    return Gain(float(rmse[0] - rmse[1]), float(gain.sum()) if helped else -1.0)

@@ -135,8 +135,11 @@ def _ordered(found: list[Proposal]) -> list[Proposal]:
     found = sorted(found, key=lambda p: p.criterion)
     best = found[0]
     equals = [p for p in found if p.criterion - best.criterion < TIED or _same(p, best, TIED * 2)]
-    equals = [p for p in equals if determined(p)] or equals
-    first = min(equals, key=lambda p: (p.rank, p.criterion))
+    held = [p for p in equals if determined(p)]
+    if held:
+        first = min(held, key=lambda p: (p.rank, p.criterion))
+    else:
+        first = next((p for p in found if p.criterion - best.criterion < RIVAL and determined(p)), best)
     return [first, *(p for p in found if p is not first)]
 
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-
 REVIVED = 0.03  # share at which a component starts though it was nothing before: from zero it could not come back
 
 
