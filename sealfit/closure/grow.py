@@ -16,7 +16,7 @@ from sealfit.closure.search import Candidate, search
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit, fit_declared
-from sealfit.fit.joint import Term, evaluate
+from sealfit.fit.joint import Term, evaluate, passes
 from sealfit.fit.rows import Rows
 
 PERIODIC = ("ripple", "sinusoid")
@@ -233,7 +233,7 @@ def _residual_samples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
             shift = term.fixed.get("shift")
             if shift is not None:
                 shifts = np.zeros_like(level)
-                shifts[ids] = strokes["file"].map(shift).to_numpy(dtype=float)
+                shifts[ids] = passes(strokes).map(shift).to_numpy(dtype=float)
                 place = place + shifts[own]
             shape = term.effect.shape({term.effect.reads[0]: place, **term.fixed}, **values)
             residual = residual - shape * (1.0 if term.operation == "add" else level[own])

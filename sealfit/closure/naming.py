@@ -22,7 +22,7 @@ from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.effects.free import free_effect
 from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.joint import Term, term_derivatives, term_slope
+from sealfit.fit.joint import Term, mean_derivatives, passes, term_slope
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly
@@ -257,13 +257,13 @@ def _periodic(fitted: Fitted, peak: Peak, effects: Mapping[str, Effect]) -> Iter
 
 
 def file_shifts(fitted: Fitted, peak: Peak) -> dict[str, float]:
-    """Return per file how far its own origin lies from the ripple's, from the phase of its residual."""
+    """Return per file and direction how far its own origin lies from the ripple's, from the phase of its residual."""
     rows = fitted.rows
     place = rows.table[peak.axis].to_numpy()
     turn = 2 * np.pi * place / peak.wavelength
     inside = fitted.residual - rows.groups.means(fitted.residual, "stroke")[rows.codes("stroke")]
     shifts = {}
-    for name, index in rows.table.groupby("file").indices.items():
+    for name, index in passes(rows.table).to_frame("pass").groupby("pass").indices.items():
         columns = np.column_stack([np.sin(turn[index]), np.cos(turn[index])])
         (a, b), *_ = np.linalg.lstsq(columns, inside[index], rcond=None)
         shifts[name] = float(np.arctan2(b, a) * peak.wavelength / (2 * np.pi))
@@ -306,7 +306,6 @@ def _linearised(fitted: Fitted, term: Term, search: Mapping[str, tuple], candida
     """Return the term at the best point of its grid, its amplitudes exact; nothing where none is left of it here."""
     effect = term.effect
     slope = term_slope(fitted.model, fitted.rows, term.acts_on, term.operation)
-    inputs = term.inputs(fitted.rows)
     names = list(search)
     points = [dict(zip(names, point, strict=True)) for point in itertools.product(*search.values())] or [{}]
     linear = [k for k, p in enumerate(effect.parameters) if p.linear]
@@ -316,7 +315,7 @@ def _linearised(fitted: Fitted, term: Term, search: Mapping[str, tuple], candida
         columns = []
         for point in some:
             values = {**effect.start(), **point}
-            derivatives = term_derivatives(term, values, inputs, only_linear=True)
+            derivatives = mean_derivatives(term, values, fitted.rows, only_linear=True)
             columns += [slope * derivatives[k] for k in range(len(linear))]
         with np.errstate(all="ignore"):
             left = project(fitted, np.column_stack(columns))

@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pandas as pd
 
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.rows import Rows
@@ -26,6 +27,10 @@ LOGARITHMIC = ("b_s", "b_c", "v_s")
 SPEEDS_FOR_STRIBECK = 4  # mu_s, mu_c, v_s and sigma_2 are four numbers
 SPEEDS_FOR_VISCOUS = 2
 DAYS_FOR_LAW = 3  # mu_0, a and b are three numbers
+ALONG = ("displacement_mm", "distance_mm", "time_s")
+FINE = ("ripple", "sinusoid", "bump")  # effects that may be as fine as a bin
+GAUSS = tuple(zip(*(part.tolist() for part in np.polynomial.legendre.leggauss(4)), strict=True))
+GAUSS = tuple((place, weight / 2) for place, weight in GAUSS)
 SAME_SPEED = 1.25  # measured speeds within 25 % are one setting: rigs without speed control wander that much
 
 
@@ -71,11 +76,32 @@ class Term:
                 values = np.abs(values)  # a form of the speed is one of its size
             given[name] = values
         shift = self.fixed.get("shift")
-        if shift is not None:  # each file's own origin; where it is unknown the shape is given as zero
+        if shift is not None:  # each pass has its own origin; where that is unknown the shape is given as zero
             place = self.effect.reads[0]
-            own = rows.table["file"].map(shift).to_numpy(dtype=float)
+            own = passes(rows.table).map(shift).to_numpy(dtype=float)
             given[place] = np.where(np.isfinite(own), given[place] + own, 0.0)
         rows.cache[key] = (self.fixed, {**given, **self.fixed})  # holding `fixed` keeps its id its own
+        return rows.cache[key][1]
+
+    def nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
+        """Return (weight, inputs) at the points of each row where the shape is averaged.
+
+        A row is the mean over a bin, and the mean of a short wave is smaller than its value in the middle: what may be
+        as fine as the bins is averaged by Gauss-Legendre quadrature along the bin, the rest taken in the middle.
+        """
+        inputs = self.inputs(rows)
+        if self.effect.id not in FINE or not set(self.channels) & set(ALONG):
+            return [(1.0, inputs)]
+        key = ("nodes", self.key(), id(self.fixed))
+        if key not in rows.cache:
+            found = []
+            for place, weight in GAUSS:
+                moved = dict(inputs)
+                for name, channel in zip(self.effect.reads, self.channels, strict=True):
+                    if channel in ALONG:
+                        moved[name] = inputs[name] + 0.5 * place * rows.bin_width(channel)
+                found.append((weight, moved))
+            rows.cache[key] = (self.fixed, found)
         return rows.cache[key][1]
 
     def key(self) -> tuple:
@@ -119,6 +145,12 @@ class Model:
         """Return the model without one of its terms."""
         keep = [k for k in range(len(self.terms)) if k != number]
         return replace(self, terms=tuple(self.terms[k] for k in keep), values=tuple(self.values[k] for k in keep))
+
+
+def passes(table: pd.DataFrame) -> pd.Series:
+    """Return the name of each row's pass: its file and the direction in it, as play in a drive shifts one against the
+    other."""
+    return table["file"] + np.where(table["speed_mm_s"] >= 0, "+", "-") if len(table) else table["file"]
 
 
 def declare(rows: Rows) -> Declared:
@@ -226,7 +258,7 @@ def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.nda
     column = model.theta.size
     for term, values, slope in zip(model.terms, model.values, state["term_slopes"], strict=True):
         key = ("columns", term.key(), id(term.fixed))
-        known = rows.cache[key][1].T if key in rows.cache else term_derivatives(term, values, term.inputs(rows))
+        known = rows.cache[key][1].T if key in rows.cache else mean_derivatives(term, values, rows)
         for derivative in known:
             tangent[:, column] = slope * derivative
             column += 1
@@ -237,6 +269,16 @@ def term_slope(model: Model, rows: Rows, acts_on: str, operation: str) -> np.nda
     """Return the force's derivative with respect to the shape of a term that is not there yet, shape (n,)."""
     state = _state(model, rows)
     return _slope_of(acts_on, operation, state)
+
+
+def mean_derivatives(
+    term: Term, values: Mapping[str, float], rows: Rows, *, only_linear: bool = False
+) -> list[np.ndarray]:
+    """Return the derivatives of a term's shape, averaged over each row's bin, each of shape (n,)."""
+    parts = [
+        (weight, term_derivatives(term, values, inputs, only_linear=only_linear)) for weight, inputs in term.nodes(rows)
+    ]
+    return [sum(weight * part[k] for weight, part in parts) for k in range(len(parts[0][1]))]
 
 
 def term_derivatives(
@@ -267,9 +309,9 @@ def _linear_columns(term: Term, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def _shape(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
     """Return the term's shape at the rows, shape (n,); columns that do not change are made once."""
-    inputs = term.inputs(rows)
     if term.effect.nonlinear:
-        return term.effect.shape(inputs, **values)
+        return sum(weight * term.effect.shape(inputs, **values) for weight, inputs in term.nodes(rows))
+    inputs = term.inputs(rows)
     key = ("columns", term.key(), id(term.fixed))
     if key not in rows.cache:
         rows.cache[key] = (term.fixed, _linear_columns(term, inputs))

@@ -66,6 +66,18 @@ class Rows:
                 self.cache[channel] = column.astype(str).to_numpy(dtype=str)
         return self.cache[channel]
 
+    def bin_width(self, channel: str) -> np.ndarray:
+        """Return how far a channel goes within each row's bin, shape (n,): the step from bin to bin of its stroke."""
+        key = ("width", channel)
+        if key not in self.cache:
+            values, code = self.values(channel), self.codes("stroke")
+            step = np.diff(values)
+            inside = np.diff(code) == 0
+            left = np.r_[0.0, np.where(inside, step, 0.0)]
+            right = np.r_[np.where(inside, step, 0.0), 0.0]
+            self.cache[key] = np.where(left == 0, right, np.where(right == 0, left, (left + right) / 2))
+        return self.cache[key]
+
     def codes(self, level: str) -> np.ndarray:
         """Return each row's group number at a level."""
         return self.groups.codes[level]
@@ -84,7 +96,9 @@ class Rows:
             days=self.days[mask],
             condition=self.condition[mask],
             weight=weight / weight.sum(),
-            cache={name: values[mask] for name, values in self.cache.items() if isinstance(name, str)},
+            cache={
+                name: values[mask] for name, values in self.cache.items() if isinstance(name, str) or name[0] == "width"
+            },
         )
 
 
