@@ -10,7 +10,6 @@ from scipy import stats
 
 from sealfit.closure.channels import FINER, unit_of
 from sealfit.closure.naming import Proposal, file_shifts
-from sealfit.closure.ripple import Peak
 from sealfit.fit.estimate import Fitted, fit, fitted_at
 from sealfit.fit.joint import evaluate
 from sealfit.fit.mixed import whiten
@@ -122,20 +121,24 @@ def _gain_within_files(before: Fitted, proposal: Proposal) -> Gain:
     if stroke[start].min() < stroke[start].max() and stroke.max() >= 4:
         first = (stroke - 1) // 2 % 2 == 0
     length = after.model.values[-1]["lambda_"]
-    peak = Peak(proposal.term.channels[0], length, True, False, 0.0, 0.0, 0.0)
-    squares = np.zeros((2, rows.groups.starts["file"].size))  # of each file, before and after
+    files = rows.groups.starts["file"].size
+    squares, agreement = np.zeros(2), np.zeros(files)
     for out in (first, ~first):
-        train = rows.subset(~out)
-        shift = file_shifts(fitted_at(before.model, train, before.scatter), peak)
+        train, test = rows.subset(~out), rows.subset(out)
+        shift = file_shifts(fitted_at(before.model, train, before.scatter), length, proposal.term.channels[0])
         term = replace(proposal.term, fixed={**proposal.term.fixed, "shift": shift})
         model = replace(after.model, terms=(*after.model.terms[:-1], term))
-        test = rows.subset(out)
-        for which, m in enumerate((before.model, model)):
-            residual = test.force - evaluate(m, test, jacobian=False)[0]
-            level = test.groups.means(residual, "stroke")[test.codes("stroke")]
-            file = rows.codes("file")[out]
-            squares[which] += np.bincount(file, rows.weight[out] * (residual - level) ** 2, squares.shape[1])
-    gain = squares[0] - squares[1]
-    helped = np.any(gain != 0) and stats.wilcoxon(gain, alternative="greater").pvalue < SURE
-    rmse = np.sqrt(squares.sum(axis=1))
-    return Gain(float(rmse[0] - rmse[1]), float(gain.sum()) if helped else -1.0)
+        old, new = (_inside(test, evaluate(m, test, jacobian=False)[0]) for m in (before.model, model))
+        weight = rows.weight[out]
+        squares += weight @ old**2, weight @ new**2
+        agreement += np.bincount(rows.codes("file")[out], weight * old * (old - new), files)
+    # Files differ in how strong their ripple is, so each is asked whether it is there at all, with the phase foretold.
+    there = np.any(agreement != 0) and stats.wilcoxon(agreement, alternative="greater").pvalue < SURE
+    rmse = np.sqrt(squares)
+    return Gain(float(rmse[0] - rmse[1]), float(squares[0] - squares[1]) if there else -1.0)
+
+
+def _inside(rows: Rows, force: np.ndarray) -> np.ndarray:
+    """Return measured minus model about its mean in each stroke, shape (n,)."""
+    residual = rows.force - force
+    return residual - rows.groups.means(residual, "stroke")[rows.codes("stroke")]

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 
 from sealfit.closure.channels import FREE_DF, WIDE, Channel
 from sealfit.closure.intervals import robust_covariance
@@ -241,11 +242,11 @@ def _periodic(fitted: Fitted, peak: Peak, effects: Mapping[str, Effect]) -> Iter
     if not both or not peak.sign_symmetric:
         ways += [("mu", "multiply"), ("force", "multiply")]
     fixed: dict = {"x_ref": 0.0}
-    phases = PHASES
+    phases, lengths = PHASES, (peak.wavelength,)
     if not peak.common_phase:
-        fixed["shift"] = file_shifts(fitted, peak)
+        lengths = (common_wavelength(fitted, peak),)
+        fixed["shift"] = file_shifts(fitted, lengths[0], peak.axis)
         phases = (0.0,)
-    lengths = (peak.wavelength,)
     names = {
         p.name: (lengths if p.name == "lambda_" or p.name.startswith("lambda") else phases) for p in effect.nonlinear
     }
@@ -256,18 +257,35 @@ def _periodic(fitted: Fitted, peak: Peak, effects: Mapping[str, Effect]) -> Iter
             yield Term(effect, (peak.axis,), *way, fixed=fixed), names, candidate
 
 
-def file_shifts(fitted: Fitted, peak: Peak) -> dict[str, float]:
+def file_shifts(fitted: Fitted, wavelength: float, axis: str) -> dict[str, float]:
     """Return per file and direction how far its own origin lies from the ripple's, from the phase of its residual."""
+    return {
+        name: float(np.arctan2(b, a) * wavelength / (2 * np.pi))
+        for name, (a, b, _) in _waves(fitted, wavelength, axis).items()
+    }
+
+
+def common_wavelength(fitted: Fitted, peak: Peak) -> float:
+    """Return the wavelength near a peak that explains most when every pass has its own phase and amplitude."""
+    grid = peak.wavelength * np.linspace(0.96, 1.04, 81)
+    explained = [sum(part for *_, part in _waves(fitted, w, peak.axis).values()) for w in grid]
+    return float(grid[int(np.argmax(explained))])
+
+
+def _waves(fitted: Fitted, wavelength: float, axis: str) -> dict[str, tuple[float, float, float]]:
+    """Return per pass the sine and cosine amplitude of its residual in its strokes, and the share they explain."""
     rows = fitted.rows
-    place = rows.table[peak.axis].to_numpy()
-    turn = 2 * np.pi * place / peak.wavelength
+    turn = 2 * np.pi * rows.values(axis) / wavelength
     inside = fitted.residual - rows.groups.means(fitted.residual, "stroke")[rows.codes("stroke")]
-    shifts = {}
-    for name, index in passes(rows.table).to_frame("pass").groupby("pass").indices.items():
-        columns = np.column_stack([np.sin(turn[index]), np.cos(turn[index])])
-        (a, b), *_ = np.linalg.lstsq(columns, inside[index], rcond=None)
-        shifts[name] = float(np.arctan2(b, a) * peak.wavelength / (2 * np.pi))
-    return shifts
+    sine, cosine = np.sin(turn), np.cos(turn)
+    number, names = pd.factorize(passes(rows.table))
+    ss, cc, sc, sy, cy = (
+        np.bincount(number, part) for part in (sine**2, cosine**2, sine * cosine, sine * inside, cosine * inside)
+    )
+    det = np.maximum(ss * cc - sc**2, 1e-12 * ss * cc + 1e-300)
+    a, b = (cc * sy - sc * cy) / det, (ss * cy - sc * sy) / det
+    share = (a * sy + b * cy) / np.maximum(np.bincount(number, inside**2), 1e-300)
+    return {name: (a[k], b[k], share[k]) for k, name in enumerate(names)}
 
 
 def reference(values: np.ndarray) -> float:
