@@ -96,7 +96,7 @@ def grow(
         first = first or last
         if periodic != _periodic_terms(fitted):  # only these change what the spectrum sees
             periodic = _periodic_terms(fitted)
-            strongest = find_ripple(_residual_samples(samples, fitted), common_phase=rig)
+            strongest = find_ripple(_residual_samples(samples, fitted), common_phase=rig, known=_wavelengths(fitted))
         peak = strongest
         peak = peak if peak is not None and peak.p_value <= alpha and ("peak", peak.axis) not in refused else None
         significant = [c for c in candidates if c.p_value <= alpha]
@@ -119,7 +119,11 @@ def grow(
             continue
         added.append(accepted)
         fitted = fit(accepted.proposal.fitted.model, rows, fitted.scatter, turns=2)
-        fitted, added = _drop_needless(fitted, added)
+        fitted, kept = _drop_needless(fitted, added)
+        refused |= {
+            a.proposal.source for a in added if all(a is not k for k in kept)
+        }  # what came and went does not come again
+        added = kept
     return Grown(before, fitted if added else before, tuple(added), first, last, left, channels)
 
 
@@ -213,6 +217,12 @@ def _periodic_terms(fitted: Fitted) -> tuple:
     """Return the periodic effects of a model with their values."""
     pairs = zip(fitted.model.terms, fitted.model.values, strict=True)
     return tuple((t.key(), *v.values()) for t, v in pairs if t.effect.id in PERIODIC)
+
+
+def _wavelengths(fitted: Fitted) -> list[tuple[str, float]]:
+    """Return (axis, wavelength) of the periodic effects of a model."""
+    pairs = zip(fitted.model.terms, fitted.model.values, strict=True)
+    return [(t.channels[0], v["lambda_"]) for t, v in pairs if t.effect.id in PERIODIC]
 
 
 def _residual_samples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:

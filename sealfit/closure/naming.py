@@ -30,6 +30,7 @@ REFITTED = 8  # proposals refitted jointly
 TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
 RIVAL = 10.0  # an alternative: the data favour the chosen one by less than exp(5)
 HELD = 0.5  # relative standard error beyond which a form's own number is not determined
+ALIKE = 0.5  # correlation below which two candidates explain different things
 SAME = 0.98  # correlation above which two candidates are one effect here
 PHASES = tuple(np.arange(4) * np.pi / 4)
 PREFERRED = ("mu", "mu_c", "mu_s", "v_s", "sigma_2", "a", "b", "mu_0", "force")
@@ -172,14 +173,13 @@ def correlation(one: Proposal, other: Proposal) -> float:
 
 
 def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
-    """Return the proposals that these data cannot tell from the chosen one."""
-    return [
-        p
-        for p in found
-        if p is not chosen
-        and not _identical(p, chosen)
-        and (p.criterion - chosen.criterion < RIVAL or correlation(p, chosen) > SAME)
-    ]
+    """Return the proposals that these data cannot tell from the chosen one: they add much the same to the force."""
+    return [p for p in found if p is not chosen and not _identical(p, chosen) and _rival(p, chosen)]
+
+
+def _rival(proposal: Proposal, chosen: Proposal) -> bool:
+    alike = correlation(proposal, chosen)
+    return alike > SAME or (alike > ALIKE and proposal.criterion - chosen.criterion < RIVAL)
 
 
 def _identical(one: Proposal, other: Proposal) -> bool:

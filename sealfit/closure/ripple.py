@@ -8,6 +8,7 @@ Where each file has an origin of its own only the power is shared: it is held ag
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,7 +49,11 @@ class Spectra:
 
 
 def find_ripple(
-    samples: pd.DataFrame, *, common_phase: bool, axes: tuple[str, ...] = ("displacement_mm", "time_s")
+    samples: pd.DataFrame,
+    *,
+    common_phase: bool,
+    known: Sequence[tuple[str, float]] = (),
+    axes: tuple[str, ...] = ("displacement_mm", "time_s"),
 ) -> Peak | None:
     """Return the strongest periodic component of the samples' residual, or None where there is none to test.
 
@@ -58,6 +63,8 @@ def find_ripple(
         Steady samples, those of a stroke one after the other: stroke_id, direction, unit, the axes, `residual_N`.
     common_phase : bool
         Whether displacement means the same place in every file (`position_origin = "rig"`).
+    known : sequence of (axis, wavelength)
+        Components already in the model: what is left around them is their own scatter from file to file.
     axes : tuple of str
         Axes to look along; time is the rival of displacement (mains, servo).
     """
@@ -66,6 +73,7 @@ def find_ripple(
         spectra = spectra_along(samples, axis)
         if spectra is None:
             continue
+        spectra = _without(spectra, [wavelength for place, wavelength in known if place == axis])
         if common_phase and axis == "displacement_mm":
             peaks += _coherent(spectra, axis)
         peaks += _incoherent(spectra, axis)
@@ -126,6 +134,18 @@ def spectra_along(samples: pd.DataFrame, axis: str) -> Spectra | None:
         return None
     amplitude = np.where(weight > 0, total / np.maximum(weight, 1), 0.0)
     return Spectra(frequency[use], amplitude[:, use], weight[:, use] > 0, keys[:, 1], keys[:, 0], strokes)
+
+
+def _without(spectra: Spectra, wavelengths: Sequence[float]) -> Spectra:
+    """Return the spectra with nothing within a main lobe of some wavelengths."""
+    step = spectra.frequency[1] - spectra.frequency[0]
+    near = np.zeros(spectra.frequency.size, dtype=bool)
+    for wavelength in wavelengths:
+        near |= np.abs(spectra.frequency - 1 / wavelength) <= LOBE * step
+    if not near.any() or near.all():
+        return spectra
+    power = np.median(np.abs(spectra.amplitude[:, ~near]), axis=1, keepdims=True)
+    return replace(spectra, amplitude=np.where(near, 0.1 * power, spectra.amplitude))
 
 
 def _coherent(spectra: Spectra, axis: str) -> list[Peak]:

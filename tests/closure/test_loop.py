@@ -1,0 +1,128 @@
+import json
+
+import numpy as np
+import numpy.testing as npt
+import pytest
+from bins_helpers import make_bins, make_traces
+
+from sealfit.closure.loop import close_loop
+from sealfit.closure.predict import predict
+from sealfit.config import Config
+from sealfit.errors import RequestError
+from sealfit.tables import RESIDUALS_AFTER, SCHEMAS
+
+CHANNELS = {"lab_temperature_C": lambda rng: 22 + rng.normal(), "batch": lambda rng: str(rng.choice(list("ABC")))}
+SCATTER = {"setup": 0.005, "specimen": 0.01, "run_channels": CHANNELS}
+
+
+def warm(table, force):
+    return force * (1 - 0.05 * (1 - np.exp(-table["time_s"].to_numpy() / 3)))
+
+
+def close(bins):
+    return close_loop(bins, make_traces(bins), Config())
+
+
+@pytest.fixture(scope="module")
+def null():
+    bins = make_bins(3, **SCATTER)
+    return bins, close(bins)
+
+
+@pytest.fixture(scope="module")
+def warming():
+    bins = make_bins(3, effect=warm, **SCATTER)
+    return bins, close(bins)
+
+
+def test_nothing_is_claimed_where_nothing_is_missing(null):
+    document = null[1].document
+    assert document["verdict"] == "nothing_missing"
+    assert document["effects"] == []
+    assert document["after"] == document["before"]
+    assert document["left"]["channel"] is None
+    assert {s["level"] for s in document["scatter"]} >= {"file", "run", "specimen"}
+    assert document["noise_floor_N"] == pytest.approx(0.37, abs=0.03)  # 0.3 N a bin, 0.5 % a file, 0.5 % a run
+
+
+def test_scatter_is_what_was_put_in(null):
+    found = {s["level"]: s["sd_rel"] for s in null[1].document["scatter"]}
+    assert found["file"] == pytest.approx(0.005, rel=0.25)
+    assert found["run"] == pytest.approx(0.005, rel=0.4)
+    assert found["specimen"] == pytest.approx(0.01, rel=0.7)  # nine pieces of rubber
+
+
+def test_warming_is_found_named_and_confirmed(warming):
+    document = warming[1].document
+    assert document["verdict"] == "closed"
+    (effect,) = document["effects"]
+    assert (effect["id"], effect["channels"], effect["acts_on"]) == ("warming_time", ["time_s"], "mu")
+    assert (effect["operation"], effect["level"], effect["named"]) == ("multiply", "trace", True)
+    values = {p["name"]: p for p in effect["parameters"]}
+    assert values["A"]["value"] == pytest.approx(0.05, abs=0.003)
+    assert values["tau"]["value"] == pytest.approx(3.0, rel=0.15)
+    assert values["A"]["ci95"][0] < values["A"]["value"] < values["A"]["ci95"][1]
+    assert effect["p_value"] <= 0.005
+    assert document["after"]["heldout_rmse_N"] < 0.9 * document["before"]["heldout_rmse_N"]
+    assert effect["heldout_gain_N"] > 0
+
+
+def test_document_is_json_and_tables_keep_their_schemas(warming):
+    bins, closure = warming
+    json.dumps(closure.document, allow_nan=False)
+    json.dumps(closure.model, allow_nan=False)
+    for name, table in closure.tables.items():
+        missing = set(SCHEMAS[name].names()) - set(table.columns) - {"run_order", "elapsed_h"}
+        assert not missing, (name, missing)
+    after = closure.tables["residuals_after"]
+    assert len(after) == len(bins)
+    npt.assert_array_equal(after["file"], bins["file"])
+    npt.assert_allclose(after["residual_N"], after["force_N"] - after["model_N"], atol=1e-12)
+    assert after["weight"].sum() == pytest.approx(1.0)
+    rmse = np.sqrt(after["weight"] @ after["residual_N"] ** 2)
+    assert rmse == pytest.approx(closure.document["after"]["rmse_N"])
+    assert set(RESIDUALS_AFTER.names()) <= set(after.columns)
+
+
+def test_a_repeat_of_the_loop_gives_the_same_to_the_last_digit(null):
+    bins, closure = null
+    again = close(bins)
+    assert json.dumps(again.document) == json.dumps(closure.document)
+
+
+def points_of(bins):
+    return bins.groupby("run_id", sort=False).first().reset_index()
+
+
+def test_predict_carries_the_effect_and_agrees_with_the_fit(warming):
+    bins, closure = warming
+    points = points_of(bins)
+    answer = predict(closure.model, points)
+    after = closure.tables["residuals_after"].groupby("run_id", sort=False).first()
+    npt.assert_allclose(answer["force_after_N"], after["model_N"], rtol=1e-9)
+    assert (answer["force_after_lo95_N"] < answer["force_after_N"]).all()
+    assert (
+        answer["meas_hi95_N"] - answer["meas_lo95_N"] > answer["force_after_hi95_N"] - answer["force_after_lo95_N"]
+    ).all()
+    assert not answer["extrapolated"].any()
+    assert (answer["note"] == "").all()
+
+
+def test_predict_follows_the_law_between_days_and_says_where_it_ends(warming):
+    bins, closure = warming
+    points = points_of(bins).iloc[[20, 20, 20, 20]].reset_index(drop=True)
+    points["aging_days"] = [6.0, 40.0, 4.0, 4.0]
+    points["temperature_C"] = [60.0, 60.0, 70.0, 60.0]
+    points["compression_ratio_pct"] = 80.0
+    points.loc[3, "speed_mm_s"] = np.nan
+    answer = predict(closure.model, points)
+    assert answer["extrapolated"].tolist() == [False, True, False, False]
+    assert answer["force_after_N"].isna().tolist() == [False, False, True, True]
+    assert "was not tested" in answer["note"][2]
+    assert "speed_mm_s" in answer["note"][3]
+
+
+def test_predict_refuses_a_request_without_a_channel_of_the_model(warming):
+    points = points_of(warming[0]).drop(columns=["time_s"])
+    with pytest.raises(RequestError, match=r"time_s.*missing"):
+        predict(warming[1].model, points)

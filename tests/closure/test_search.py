@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+from bins_helpers import make_bins
+
+from sealfit.closure.channels import find_channels, flip_level, free_columns, unit_of
+from sealfit.closure.search import log_p_of, search
+from sealfit.fit.estimate import fit_declared
+from sealfit.fit.rows import make_rows
+
+CHANNELS = {"lab_temperature_C": lambda rng: 22 + rng.normal(), "batch": lambda rng: str(rng.choice(list("ABC")))}
+
+
+def rows_of(seed=0, **options):
+    return make_rows(make_bins(seed, run_channels=CHANNELS, setup=0.01, specimen=0.02, **options), has_aging=True)
+
+
+def test_units_of_evidence():
+    rows = rows_of(repeats=2, bins=4)
+    units = {c.name: c.unit for c in find_channels(rows)}
+    assert units["time_s"] == "sample"
+    assert units["repeat"] == "file"
+    assert units["lab_temperature_C"] == units["batch"] == "run"
+    assert units["aging_days"] == "specimen"
+
+
+def test_a_serial_number_is_a_grouping_and_not_a_channel():
+    bins = make_bins(repeats=2, bins=4)
+    bins["serial"] = "no " + bins["file"]
+    names = {c.name for c in find_channels(make_rows(bins, has_aging=True))}
+    assert "serial" not in names
+    assert "run_order" in names
+
+
+def test_contrasts_inside_files_are_judged_between_runs_where_there_are_ten():
+    rows = rows_of(repeats=2, bins=4)
+    assert flip_level("sample", rows) == "run"
+    assert flip_level("specimen", rows) == "specimen"
+    few = rows.subset(rows.codes("run") < 6)
+    assert flip_level("sample", few) == "file"
+
+
+def test_free_columns_hold_a_straight_line_first():
+    rows = rows_of(repeats=1, bins=8)
+    channel = next(c for c in find_channels(rows) if c.name == "displacement_mm")
+    columns = free_columns(channel)
+    assert abs(np.corrcoef(columns[:, 0], channel.values)[0, 1]) == pytest.approx(1.0)
+    assert columns.mean(axis=0) == pytest.approx(np.zeros(columns.shape[1]), abs=1e-9)
+
+
+def test_hotelling_p_is_students_t_for_one_column():
+    from scipy import stats
+
+    # Scores 1..6 all of one sign: T = (sum)^2 / sum of squares = 441/91; t = mean/(sd/sqrt 6).
+    scores = np.arange(1.0, 7.0)
+    t = stats.ttest_1samp(scores, 0.0)
+    assert np.exp(log_p_of(np.array([441 / 91]), 1, 6)[0]) == pytest.approx(t.pvalue, rel=1e-9)
+
+
+def test_p_values_of_nulls_are_not_too_small():
+    smallest = []
+    for seed in range(24):
+        rows = rows_of(seed + 100, bins=8, autocorrelation=0.5 * (seed % 2))
+        found = search(fit_declared(rows), find_channels(rows), np.random.default_rng(seed))
+        smallest.append(min(c.p_value for c in found))
+    # Each campaign's smallest adjusted p is uniform: of 24, two below 0.1 on average, and more than seven with p 0.003.
+    assert sum(p < 0.1 for p in smallest) <= 7
+    assert min(smallest) > 0.001
+
+
+def test_a_channel_that_orders_the_residual_is_found_at_its_unit():
+    rows = rows_of(bins=6, effect=lambda t, f: f * (1 + 0.02 * (t["lab_temperature_C"].to_numpy() - 22)))
+    best = search(fit_declared(rows), find_channels(rows), np.random.default_rng(0))[0]
+    assert best.channels == ("lab_temperature_C",)
+    assert best.unit == "run"
+    assert best.p_value <= 0.001
+
+
+def test_unit_of_a_constant_is_the_coarsest_level():
+    rows = rows_of(repeats=1, bins=4)
+    assert unit_of(np.ones(rows.force.size), rows) == "specimen"
