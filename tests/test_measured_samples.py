@@ -1,0 +1,81 @@
+"""The measured campaigns in sample_data: before and after, with tolerances (their READMEs say what is in them)."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealfit.closure.loop import close_loop
+from sealfit.config import load_config
+from sealfit.ingest.campaign import ingest_campaign
+
+ROOT = Path(__file__).parents[1]
+
+
+def close(campaign, config):
+    checked = load_config(ROOT / "configs" / config)
+    ingested = ingest_campaign(ROOT / "sample_data" / campaign, checked)
+    return ingested, close_loop(ingested.tables["bins"], ingested.tables["traces"], checked)
+
+
+@pytest.fixture(scope="module")
+def screwdrive():
+    return close("measured/screwdrive", "screwdrive.toml")
+
+
+@pytest.fixture(scope="module")
+def pneuseal():
+    return close("measured/pneuseal-repeats", "pneuseal.toml")
+
+
+def rmse_runs(table, drive):
+    own = table[table["drive"] == drive]
+    return float(np.sqrt((own.groupby("run_id")["residual_N"].mean() ** 2).mean()))
+
+
+@pytest.mark.parametrize(
+    ("drive", "before", "after"), [("lead screw", 0.357, 0.047), ("worm", 0.482, 0.079)]
+)  # mN m: symmetric Eq. 14, and the same with a constant offset, by the folder's README
+def test_screw_drives_fall_at_least_as_far_as_a_constant_offset_takes_them(screwdrive, drive, before, after):
+    tables = screwdrive[1].tables
+    assert rmse_runs(tables["residuals_before"], drive) == pytest.approx(before, abs=0.005)
+    assert rmse_runs(tables["residuals_after"], drive) <= after + 0.0005
+
+
+def test_screw_drives_lack_an_offset_between_directions_and_ripple_once_a_turn(screwdrive):
+    document = screwdrive[1].document
+    effects = {e["id"]: e for e in reversed(document["effects"])}
+    offset = effects["zero_offset"]["parameters"][0]
+    assert offset["unit"] == "mN m"
+    assert offset["value"] == pytest.approx(-0.354, abs=0.05)
+    ripple = {p["name"]: p for p in effects["ripple"]["parameters"]}
+    assert ripple["lambda"]["value"] == pytest.approx(1.0, rel=0.01)
+    assert 0.11 <= ripple["A"]["value"] <= 0.32
+    assert document["units"]["force_N"] == "mN m"
+    assert document["after"]["heldout_rmse_N"] < 0.6 * document["before"]["heldout_rmse_N"]
+    assert document["after"]["lack_of_fit_p"] is None  # no repeats
+
+
+def test_hand_edited_cells_of_the_worm_drive_are_named(screwdrive):
+    remarks = [f for f in screwdrive[0].faults if "remark" in f.reason]
+    assert {Path(f.file).name for f in remarks} == {"1.csv", "2.csv", "n1.csv"}
+    assert {str(f.value).split(",")[0] for f in remarks} == {"-1200", "-800", "-400"}
+
+
+def test_pneumatic_seal_lacks_an_offset_and_a_ripple(pneuseal):
+    document = pneuseal[1].document
+    effects = {e["id"]: e for e in reversed(document["effects"])}
+    offset = effects["zero_offset"]["parameters"][0]
+    assert offset["value"] == pytest.approx(3.1, abs=0.5)  # 1.2 to 4.4 N, by pressure and set-up
+    ripples = [p for e in document["effects"] if e["id"] == "ripple" for p in e["parameters"] if p["name"] == "lambda"]
+    lengths = [p["value"] for p in ripples]
+    assert any(abs(x - 3.0) < 0.12 for x in lengths), lengths
+    assert any(abs(x - 1.5) < 0.06 for x in lengths), lengths
+    assert document["after"]["rmse_N"] < 0.5 * document["before"]["rmse_N"]
+
+
+def test_pneumatic_seal_has_no_stribeck_speed_and_no_effect_of_scatter_between_files(pneuseal):
+    closure = pneuseal[1]
+    assert set(closure.model["declared"]["stribeck"].values()) == {"constant"}
+    for effect in closure.document["effects"]:
+        assert not {"mounting", "setup", "repeat"} & set(effect["channels"]) or "direction" in effect["channels"]
