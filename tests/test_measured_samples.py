@@ -7,6 +7,7 @@ import pytest
 
 from sealfit.closure.loop import close_loop
 from sealfit.config import load_config
+from sealfit.engine import cores
 from sealfit.ingest.campaign import ingest_campaign
 
 ROOT = Path(__file__).parents[1]
@@ -15,7 +16,8 @@ ROOT = Path(__file__).parents[1]
 def close(campaign, config):
     checked = load_config(ROOT / "configs" / config)
     ingested = ingest_campaign(ROOT / "sample_data" / campaign, checked)
-    return ingested, close_loop(ingested.tables["bins"], ingested.tables["traces"], checked)
+    loop = close_loop(ingested.tables["bins"], ingested.tables["traces"], checked, workers=cores())
+    return ingested, loop
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ PRIOR_SD = 3.0
 LEAST_NOISE = 1e-6  # of the force: below what any sensor resolves; keeps noise-free data from weights without end
 MAX_STEPS = 60
 STRIBECK_GRID = 24  # points of log v_s tried when an effect has come in
+CREEPING = 1e-2  # several such steps in a row go along a valley in which the data hold nothing
 SETTLED = 1e-4  # of the whitened sum of squares: the estimates then lie within a hundredth of a standard error
 TURNS = 3  # of model and scatter; the third moves no estimate by a tenth of its standard error
 
@@ -198,7 +199,7 @@ def _descend(
 
     residual = white_of((rows.force - force)[:, None])[:, 0]
     cost = cost_of(residual, vector)
-    damping = 1e-4
+    damping, crept = 1e-4, 0
     for _ in range(MAX_STEPS):
         white = white_of(jacobian)
         gradient = white.T @ residual - precision * (vector - centre)
@@ -225,7 +226,8 @@ def _descend(
         gain = cost - trial_cost
         vector, model, residual, cost = trial, trial_model, trial_residual, trial_cost
         damping /= 10
-        if gain < SETTLED and damping < 1e-3:  # a short step under heavy damping gains little anywhere
+        crept = crept + 1 if gain < CREEPING else 0
+        if crept > 3 or (gain < SETTLED and damping < 1e-3):  # a step under heavy damping gains little anywhere
             return model
         _, jacobian = evaluate(model, rows)
     return model
