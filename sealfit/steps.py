@@ -175,7 +175,8 @@ def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) ->
     )
     for name in CLOSED:
         staged.table(name, closure.tables[name])
-    staged.json("model", closure.model)
+    started = store.read("runs", ["started_at"])["started_at"].dropna()
+    staged.json("model", {**closure.model, "first_started_at": min(started) if len(started) else None})
     staged.json("closure", closure.document)
 
 

@@ -202,11 +202,18 @@ def closure_lines(part: Mapping) -> list[str]:
     found.append(_line(f"error ({unit})", "; ".join(texts)))
     if part["noise_floor_N"] is not None:
         found.append(_line("noise floor", f"{_number(part['noise_floor_N'])} {unit}"))
-    if part["verdict"] == "unexplained" and part["left"]["rmse_N"] is not None:
-        found.append(_line("left", f"rmse {_number(part['left']['rmse_N'])} {unit}"))
+    if part["left"]["channel"] is not None:
+        found.append(_line("left", _left(part["left"], part["verdict"], unit)))
     for run in part["next_runs"][:3]:
         found.append(_line("next runs", run["why"]))
     return found
+
+
+def _left(left: Mapping, verdict: str, unit: str) -> str:
+    """Return what is left: how much above the floor, along which channels, and whether chance could have made it."""
+    above = f"rmse {_number(left['rmse_N'])} {unit} above the floor, " if left["rmse_N"] is not None else ""
+    sure = "" if verdict == "unexplained" else ": no claim, a place to look"
+    return f"{above}along {left['channel']} (p {left['p_value']:.2g}){sure}"
 
 
 def _value(parameter: Mapping) -> str:

@@ -15,7 +15,7 @@ from scipy.interpolate import BSpline
 from sealfit.fit.rows import LEVELS, Rows
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
-MANY_UNITS = 10  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up
+MANY_UNITS = 20  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up
 FREE_DF = 4  # columns of a free shape: enough for a peak, an approach or a step; more only costs power
 WIDE = 20.0  # a positive channel that spans this factor is looked at on a logarithmic scale
 

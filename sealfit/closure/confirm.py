@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 from scipy import stats
 
 from sealfit.closure.channels import FINER, unit_of
-from sealfit.closure.naming import Proposal, file_shifts
-from sealfit.fit.estimate import Fitted, fit, fitted_at
+from sealfit.closure.naming import Proposal
+from sealfit.closure.waves import agreement, pass_shifts
+from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.joint import evaluate
-from sealfit.fit.mixed import whiten
 from sealfit.fit.rows import Rows
 
 SURE = 0.005  # p-value, over files (Wilcoxon), at which a ripple of free phase helps the half it was not fitted to
@@ -71,7 +72,7 @@ class Gain:
         return self.deviance > 0
 
 
-def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int) -> Gain:
+def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int, samples: pd.DataFrame) -> Gain:
     """Return what a proposal gains on held-out groups of its own unit.
 
     The RMSE of a rig whose files scatter by newtons does not see a ripple of a tenth; the whitened sum of squares of
@@ -79,7 +80,7 @@ def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int) -> G
     RMSE is taken about the means of the groups inside which the effect's channels vary.
     """
     if "shift" in proposal.term.fixed:
-        return _gain_within_files(before, proposal)
+        return _gain_within_files(before, proposal, samples)
     rows, after, scatter = before.rows, proposal.fitted, before.scatter
     squares, white, known = np.zeros(2), np.zeros(2), 0.0
     for out in folds(rows, proposal.unit, count, seed):
@@ -91,7 +92,7 @@ def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int) -> G
             residual = test.force - evaluate(kept.model, test, jacobian=False)[0]
             squares[k] += float(weight @ _about(residual, test, proposal) ** 2)
             load = before.force[out]
-            part, _ = whiten(residual[:, None], scatter.noise_sd(load), load, test.groups, scatter.components)
+            part, _ = scatter.whitened(residual[:, None], load, test.groups)
             white[k] += float((part**2).sum())
     rmse = np.sqrt(squares / max(known, 1e-300))
     return Gain(float(rmse[0] - rmse[1]), float(white[0] - white[1]))
@@ -108,34 +109,39 @@ def _about(residual: np.ndarray, rows: Rows, proposal: Proposal) -> np.ndarray:
     return residual - (np.bincount(code, residual) / np.maximum(np.bincount(code), 1))[code]
 
 
-def _gain_within_files(before: Fitted, proposal: Proposal) -> Gain:
-    """Return the gain on one half of every file with each file's phase taken from the other half.
+def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame) -> Gain:
+    """Return the gain on one half of every file with each pass's phase taken from the other half.
 
     Halves are pairs of strokes there and back, taken in turn, or halves of the stroke in a file of one or two.
     """
-    rows, after = before.rows, proposal.fitted
-    start, code = rows.groups.starts["stroke"], rows.codes("stroke")
-    count = np.diff(np.r_[start, code.size])
-    first = np.arange(code.size) - start[code] < count[code] / 2
-    stroke = rows.table["stroke"].to_numpy()
-    if stroke[start].min() < stroke[start].max() and stroke.max() >= 4:
-        first = (stroke - 1) // 2 % 2 == 0
+    rows, after, axis = before.rows, proposal.fitted, proposal.term.channels[0]
+    in_turn = rows.table["stroke"].max() >= 4
+    first, sample_first = (_first_half(table, in_turn) for table in (rows.table, samples))
     length = after.model.values[-1]["lambda_"]
-    files = rows.groups.starts["file"].size
-    squares, agreement = np.zeros(2), np.zeros(files)
-    for out in (first, ~first):
-        train, test = rows.subset(~out), rows.subset(out)
-        shift = file_shifts(fitted_at(before.model, train, before.scatter), length, proposal.term.channels[0])
+    squares = np.zeros(2)
+    for out, seen in ((first, ~sample_first), (~first, sample_first)):
+        test = rows.subset(out)
+        shift = pass_shifts(samples[seen], rows, length, axis)
         term = replace(proposal.term, fixed={**proposal.term.fixed, "shift": shift})
         model = replace(after.model, terms=(*after.model.terms[:-1], term))
         old, new = (_inside(test, evaluate(m, test, jacobian=False)[0]) for m in (before.model, model))
         weight = rows.weight[out]
         squares += weight @ old**2, weight @ new**2
-        agreement += np.bincount(rows.codes("file")[out], weight * old * (old - new), files)
-    # Files differ in how strong their ripple is, so each is asked whether it is there at all, with the phase foretold.
-    there = np.any(agreement != 0) and stats.wilcoxon(agreement, alternative="greater").pvalue < SURE
+    # Files differ in how strong their ripple is, so each is asked whether it is there at all, in both halves alike.
+    both = agreement(samples, sample_first, length, axis)
+    there = both.size > 1 and stats.wilcoxon(both, alternative="greater").pvalue < SURE
     rmse = np.sqrt(squares)
     return Gain(float(rmse[0] - rmse[1]), float(squares[0] - squares[1]) if there else -1.0)
+
+
+def _first_half(table: pd.DataFrame, in_turn: bool) -> np.ndarray:
+    """Return which rows or samples, those of a stroke one after the other, belong to the first half, shape (n,)."""
+    if in_turn:
+        return ((table["stroke"].to_numpy() - 1) // 2 % 2) == 0
+    stroke = table["stroke_id"].to_numpy()
+    start = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]])
+    count = np.diff(np.r_[start, stroke.size])
+    return np.arange(stroke.size) - np.repeat(start, count) < np.repeat(count, count) / 2
 
 
 def _inside(rows: Rows, force: np.ndarray) -> np.ndarray:

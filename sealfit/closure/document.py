@@ -7,18 +7,23 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import FINER, unit_of
+from sealfit.closure.channels import FINER, Channel, unit_of
 from sealfit.closure.grow import Added, Grown, describe
 from sealfit.closure.intervals import effect_intervals
+from sealfit.closure.naming import free_term
 from sealfit.closure.ripple import Peak
+from sealfit.closure.search import Candidate, search
 from sealfit.config import Config
 from sealfit.effects.contract import fill_unit
-from sealfit.fit.estimate import Fitted
-from sealfit.fit.joint import Term, evaluate
+from sealfit.fit.estimate import Fitted, fit
+from sealfit.fit.joint import Term, evaluate, term_slope
 from sealfit.fit.rows import Rows
 from sealfit.tables import Units
 
 LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
+WORTH_A_LOOK = 0.05  # p-value of a channel by itself, not adjusted for the search
+OFFSET = "zero_offset"
+UNSTEADY = 0.2  # share of an offset by which it may differ from run to run and still be one offset
 QUANTITY_UNIT = {"sigma_2": ("force", "speed"), "v_s": ("speed",), "b": ("days",)}
 
 
@@ -128,17 +133,65 @@ def effect_table(entries: Sequence[dict], added: Sequence[Added]) -> pd.DataFram
 
 
 def left_entry(grown: Grown, rmse_N: float, floor_N: float | None) -> dict:
-    """Return closure.json's `left`: the error above the floor, and the strongest structure that is still there."""
-    above = np.sqrt(max(rmse_N**2 - floor_N**2, 0.0)) if floor_N is not None else None
+    """Return closure.json's `left`: the error above the floor, and the strongest structure that is still there.
+
+    Where nothing is significant any more but effects were added, the channel that orders most of what is left is named
+    with its p-value, as a place to look: it is no claim.
+    """
+    above = float(np.sqrt(max(rmse_N**2 - floor_N**2, 0.0))) if floor_N is not None else None
     left = grown.left
+    if left is None and grown.added:
+        left = _unsteady_offset(grown) or _largest(
+            grown.after, [c for c in grown.last if c.log_p <= np.log(WORTH_A_LOOK)]
+        )
     if isinstance(left, Peak):
         return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
     if left is not None:
         names = [grown.channels[n].unit for n in left.channels if n in grown.channels]
         level = LEVEL_NAMES[min(names or [left.unit], key=FINER.get)]
+        if left.channels[0] == "direction" and len(left.channels) > 1:
+            level = LEVEL_NAMES[max(names, key=FINER.get)]  # it is the other channel that tells offsets apart
         return {"rmse_N": above, "level": level, "channel": " ".join(left.channels), "p_value": left.p_value}
     smallest = min((c.p_value for c in grown.last), default=None)
     return {"rmse_N": above, "level": None, "channel": None, "p_value": smallest}
+
+
+def _unsteady_offset(grown: Grown) -> Candidate | None:
+    """Return the category that orders most of an offset between directions which differs from run to run; else None.
+
+    Each condition is given an offset of its own first, as that would hide what a set-up does to it. The p-value is
+    adjusted over the categories.
+    """
+    fitted = grown.after
+    rows = fitted.rows
+    amplitude = max(
+        (abs(v["A"]) for t, v in zip(fitted.model.terms, fitted.model.values, strict=True) if t.effect.id == OFFSET),
+        default=0.0,
+    )
+    variance = sum(c.variance for c in fitted.scatter.components if c.kind == "offset" and c.level == "run")
+    categories = [c for c in grown.channels.values() if not c.numeric and not c.grouping]
+    if amplitude == 0 or np.sqrt(variance) < UNSTEADY * amplitude or not categories:
+        return None
+    if 2 <= len(rows.conditions) <= rows.groups.starts["file"].size / 3:
+        term = free_term(Channel("condition", rows.values("condition"), "run"), "force", "add")
+        model = fitted.model.with_term(term, {p.name: 0.0 for p in term.effect.parameters})
+        fitted = fit(model, rows, fitted.scatter, turns=2)
+    found = search(fitted, categories, np.random.default_rng(0))
+    return _largest(fitted, [c for c in found if c.channels[0] == "direction"])
+
+
+def _largest(fitted: Fitted, candidates: Sequence[Candidate]) -> Candidate | None:
+    """Return the candidate that explains most of the residual's sum of squares."""
+    best, most = None, 0.0
+    root = np.sqrt(fitted.rows.weight)
+    for candidate in candidates:
+        slope = term_slope(fitted.model, fitted.rows, candidate.acts_on, candidate.operation)
+        columns = candidate.columns * (slope * root)[:, None]
+        found, *_ = np.linalg.lstsq(columns, fitted.residual * root, rcond=1e-10)
+        explained = float(((columns @ found) ** 2).sum())
+        if explained > most:
+            best, most = candidate, explained
+    return best
 
 
 def next_runs(grown: Grown, config: Config) -> list[dict]:

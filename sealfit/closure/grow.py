@@ -96,7 +96,8 @@ def grow(
         first = first or last
         if periodic != _periodic_terms(fitted):  # only these change what the spectrum sees
             periodic = _periodic_terms(fitted)
-            strongest = find_ripple(_residual_samples(samples, fitted), common_phase=rig, known=_wavelengths(fitted))
+            seen = _residual_samples(samples, fitted)
+            strongest = find_ripple(seen, common_phase=rig, known=_wavelengths(fitted))
         peak = strongest
         peak = peak if peak is not None and peak.p_value <= alpha and ("peak", peak.axis) not in refused else None
         significant = [c for c in candidates if c.p_value <= alpha]
@@ -105,10 +106,10 @@ def grow(
         open_ = [c for c in significant if c.key not in refused]
         if (not open_ and peak is None) or number > config.loop.max_rounds:
             break
-        proposals = propose(fitted, _declared_first(open_, config), channels, peak, effects)
+        proposals = propose(fitted, _declared_first(open_, config), channels, peak, seen, effects)
         accepted = None
         for proposal in proposals[:TRIES]:
-            gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed)
+            gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed, seen)
             say(f"  {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
             if gain.real:
                 accepted = Added(proposal, gain.rmse_N, tuple(rivals(proposal, proposals)), number)
@@ -146,11 +147,15 @@ def describe(term: Term) -> str:
 
 
 def _drop_needless(fitted: Fitted, added: list[Added]) -> tuple[Fitted, list[Added]]:
-    """Return the fit without effects that a later one has made needless, by Schwarz's price."""
+    """Return the fit without effects that a later one has made needless, by Schwarz's price.
+
+    A ripple whose phase is each file's own was judged on the raw samples, which bins cannot overrule.
+    """
     k = 0
     while k < len(added) - 1:
         price = added[k].proposal.price
-        if _wald(fitted, k) > 2 * price:  # far from needless: no refit is wanted to see that
+        own_phases = "shift" in added[k].proposal.term.fixed
+        if own_phases or _wald(fitted, k) > 2 * price:  # far from needless: no refit is wanted to see that
             k += 1
             continue
         without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, loading=fitted.force)
@@ -189,7 +194,7 @@ def steady_samples(traces: pd.DataFrame, rows: Rows) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        stroke_id, direction, unit (number of the file), displacement_mm, time_s, force_N.
+        stroke_id, stroke, direction, unit (number of the file), displacement_mm, time_s, force_N.
     """
     first = rows.groups.starts["stroke"]
     strokes = rows.table.iloc[first]
@@ -206,6 +211,7 @@ def steady_samples(traces: pd.DataFrame, rows: Rows) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "stroke_id": strokes["stroke_id"].to_numpy()[place],
+            "stroke": strokes["stroke"].to_numpy()[place],
             "direction": strokes["direction"].to_numpy()[place],
             "unit": rows.codes("file")[first][place],
             **table,

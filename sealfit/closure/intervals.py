@@ -43,10 +43,11 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, tuple
     variance = np.maximum(np.diag(fitted.covariance)[place], np.diag(robust_covariance(fitted, level))[place])
     units = fitted.rows.groups.starts[level].size
     reach = t_quantile(max(units - count - 1, 2)) * np.sqrt(variance)
-    values = fitted.model.values[number]
+    term, values = fitted.model.terms[number], fitted.model.values[number]
+    held = term.fixed.get("held", {})
     result = {}
-    for p, r in zip(fitted.model.terms[number].effect.parameters, reach, strict=True):
-        low, high = values[p.name] - r, values[p.name] + r
+    for p, r in zip(term.effect.parameters, reach, strict=True):
+        low, high = held.get(p.name, (values[p.name] - r, values[p.name] + r))
         result[p.name] = (values[p.name], float(low), float(high))
     return result
 

@@ -91,7 +91,7 @@ def lack_of_fit(fitted: Fitted) -> float | None:
     spread = np.sqrt(fitted.scatter.level_variance("file", files["force"].to_numpy()) + 1e-300)
     noise = fitted.scatter.noise_sd(files["force"].to_numpy())
     per_file = len(rows.table) / len(files)
-    scale = np.sqrt(spread**2 + noise**2 / per_file)
+    scale = np.sqrt(spread**2 + noise**2 * fitted.scatter.alike / per_file)
     files["z"] = files["residual"] / scale
     by_run = files.groupby("run_id")["z"]
     count = by_run.transform("count").to_numpy()

@@ -16,23 +16,26 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import FREE_DF, WIDE, Channel
-from sealfit.closure.intervals import robust_covariance
+from sealfit.closure.intervals import robust_covariance, t_quantile
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import Candidate, project
+from sealfit.closure.waves import common_wavelength, pass_shifts
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.effects.free import free_effect
 from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.joint import Term, mean_derivatives, passes, term_slope
+from sealfit.fit.joint import Term, mean_derivatives, term_slope
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly
 TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
 RIVAL = 10.0  # an alternative: the data favour the chosen one by less than exp(5)
 HELD = 0.5  # relative standard error beyond which a form's own number is not determined
+OVERTURNED = 1 / 3  # share of its size by which a new effect may change an earlier one, where it has equals
 ALIKE = 0.5  # correlation below which two candidates explain different things
 SAME = 0.98  # correlation above which two candidates are one effect here
 PHASES = tuple(np.arange(4) * np.pi / 4)
+OFFSET = (("direction",), "force", "add")
 PREFERRED = ("mu", "mu_c", "mu_s", "v_s", "sigma_2", "a", "b", "mu_0", "force")
 
 
@@ -70,7 +73,8 @@ class Proposal:
         """Order among equals: mechanism, closed form, free shape; then fewer parameters; then what it acts on."""
         effect = self.term.effect
         kind = 0 if effect.physical else 2 if effect.id == "smooth" else 1
-        return (kind, len(effect.parameters), PREFERRED.index(self.term.acts_on))
+        offset = self.source == OFFSET  # an amplifier's zero is off more often than a friction differs by direction
+        return (kind, len(effect.parameters), -1 if offset else PREFERRED.index(self.term.acts_on))
 
 
 def propose(
@@ -78,6 +82,7 @@ def propose(
     significant: Sequence[Candidate],
     channels: Mapping[str, Channel],
     peak: Peak | None = None,
+    samples: pd.DataFrame | None = None,
     effects: Mapping[str, Effect] = EFFECTS,
 ) -> list[Proposal]:
     """Return jointly refitted proposals for what orders the residual most, best first.
@@ -92,27 +97,30 @@ def propose(
         Channels by name.
     peak : Peak, optional
         A periodic component found on the raw samples.
+    samples : DataFrame, optional
+        The samples it was found on, with `residual_N`; wanted with a peak.
     effects : mapping
         The catalogue, the user's own effects included.
     """
     found: list[Proposal] = []
     if significant:
-        best = significant[0]
+        # A form that starts at zero would take a constant offset in along with its own shape: the offset comes first.
+        best = next((c for c in significant if c.key == OFFSET), significant[0])
         seen = set()
         for candidate in significant:
             if candidate.chi2 < CONTENDER * best.chi2 or candidate.key in seen:
                 continue
             if best.channels == ("direction",) and "direction" not in candidate.channels:
-                continue  # a form that starts at zero would take a constant offset in along with its own shape
+                continue
             seen.add(candidate.key)
             for term, search in _terms(candidate, channels, fitted, effects):
                 found += _linearised(fitted, term, search, candidate)
     if peak is not None:
-        for term, search, candidate in _periodic(fitted, peak, effects):
+        for term, search, candidate in _periodic(fitted, peak, samples, effects):
             found += [replace(p, source=("peak", peak.axis)) for p in _linearised(fitted, term, search, candidate)]
     found.sort(key=lambda p: p.criterion)
     found = [_refit(fitted, p) for p in _spread(found)]
-    return _ordered(found)
+    return _ordered(fitted, found)
 
 
 def _spread(found: list[Proposal]) -> list[Proposal]:
@@ -130,8 +138,8 @@ def _spread(found: list[Proposal]) -> list[Proposal]:
     return kept
 
 
-def _ordered(found: list[Proposal]) -> list[Proposal]:
-    """Return proposals best first, the preferred one among equals in front."""
+def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
+    """Return proposals best first; in front of its equals the one that leaves earlier effects alone, then by rank."""
     if not found:
         return []
     found = sorted(found, key=lambda p: p.criterion)
@@ -139,10 +147,23 @@ def _ordered(found: list[Proposal]) -> list[Proposal]:
     equals = [p for p in found if p.criterion - best.criterion < TIED or _same(p, best, TIED * 2)]
     held = [p for p in equals if determined(p)]
     if held:
-        first = min(held, key=lambda p: (p.rank, p.criterion))
+        first = min(held, key=lambda p: (_overturns(fitted, p), p.rank, p.criterion))
     else:
         first = next((p for p in found if p.criterion - best.criterion < RIVAL and determined(p)), best)
     return [first, *(p for p in found if p is not first)]
+
+
+def _overturns(fitted: Fitted, proposal: Proposal) -> bool:
+    """Whether a proposal changes an amplitude of an earlier effect by more than a third.
+
+    Two effects that take from each other what both explain read worse than one beside the other.
+    """
+    return any(
+        abs(now[p.name] - then[p.name]) > OVERTURNED * abs(then[p.name])
+        for term, then, now in zip(fitted.model.terms, fitted.model.values, proposal.fitted.model.values, strict=False)
+        for p in term.effect.parameters
+        if p.linear
+    )
 
 
 def determined(proposal: Proposal) -> bool:
@@ -234,7 +255,9 @@ def free_term(channel: Channel, acts_on: str, operation: str) -> Term:
     return Term(free_effect("levels", fixed), (channel.name,), acts_on, operation, fixed)
 
 
-def _periodic(fitted: Fitted, peak: Peak, effects: Mapping[str, Effect]) -> Iterator[tuple[Term, dict, Candidate]]:
+def _periodic(
+    fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
+) -> Iterator[tuple[Term, dict, Candidate]]:
     rows = fitted.rows
     effect = effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"]
     both = np.unique(np.sign(rows.speed)).size == 2
@@ -244,9 +267,11 @@ def _periodic(fitted: Fitted, peak: Peak, effects: Mapping[str, Effect]) -> Iter
     fixed: dict = {"x_ref": 0.0}
     phases, lengths = PHASES, (peak.wavelength,)
     if not peak.common_phase:
-        lengths = (common_wavelength(fitted, peak),)
-        fixed["shift"] = file_shifts(fitted, lengths[0], peak.axis)
-        phases = (0.0,)
+        length, error = common_wavelength(samples, peak.wavelength, peak.axis)
+        reach = t_quantile(max(rows.groups.starts["file"].size - 1, 2)) * error
+        fixed["shift"] = pass_shifts(samples, rows, length, peak.axis)
+        fixed["held"] = {"lambda_": (length - reach, length + reach), "phi": (-np.pi, np.pi)}
+        lengths, phases = (length,), (0.0,)
     names = {
         p.name: (lengths if p.name == "lambda_" or p.name.startswith("lambda") else phases) for p in effect.nonlinear
     }
@@ -255,37 +280,6 @@ def _periodic(fitted: Fitted, peak: Peak, effects: Mapping[str, Effect]) -> Iter
         if way in effect.acts_on:
             candidate = Candidate((peak.axis,), *way, "file", np.empty((0, 0)), 0.0, 2, units, 0.0, peak.p_value)
             yield Term(effect, (peak.axis,), *way, fixed=fixed), names, candidate
-
-
-def file_shifts(fitted: Fitted, wavelength: float, axis: str) -> dict[str, float]:
-    """Return per file and direction how far its own origin lies from the ripple's, from the phase of its residual."""
-    return {
-        name: float(np.arctan2(b, a) * wavelength / (2 * np.pi))
-        for name, (a, b, _) in _waves(fitted, wavelength, axis).items()
-    }
-
-
-def common_wavelength(fitted: Fitted, peak: Peak) -> float:
-    """Return the wavelength near a peak that explains most when every pass has its own phase and amplitude."""
-    grid = peak.wavelength * np.linspace(0.96, 1.04, 81)
-    explained = [sum(part for *_, part in _waves(fitted, w, peak.axis).values()) for w in grid]
-    return float(grid[int(np.argmax(explained))])
-
-
-def _waves(fitted: Fitted, wavelength: float, axis: str) -> dict[str, tuple[float, float, float]]:
-    """Return per pass the sine and cosine amplitude of its residual in its strokes, and the share they explain."""
-    rows = fitted.rows
-    turn = 2 * np.pi * rows.values(axis) / wavelength
-    inside = fitted.residual - rows.groups.means(fitted.residual, "stroke")[rows.codes("stroke")]
-    sine, cosine = np.sin(turn), np.cos(turn)
-    number, names = pd.factorize(passes(rows.table))
-    ss, cc, sc, sy, cy = (
-        np.bincount(number, part) for part in (sine**2, cosine**2, sine * cosine, sine * inside, cosine * inside)
-    )
-    det = np.maximum(ss * cc - sc**2, 1e-12 * ss * cc + 1e-300)
-    a, b = (cc * sy - sc * cy) / det, (ss * cy - sc * sy) / det
-    share = (a * sy + b * cy) / np.maximum(np.bincount(number, inside**2), 1e-300)
-    return {name: (a[k], b[k], share[k]) for k, name in enumerate(names)}
 
 
 def reference(values: np.ndarray) -> float:

@@ -62,7 +62,7 @@ def predict(model: dict, points: pd.DataFrame) -> pd.DataFrame:
         )
         mean, tangent = evaluate(after, at)
         reach = t_quantile(model["df"])
-        half = reach * mean_se(tangent, np.array(model["covariance"]))
+        half = reach * np.sqrt(mean_se(tangent, np.array(model["covariance"])) ** 2 + _of_unknown_phase(after, mean))
         spread = reach * np.sqrt((half / reach) ** 2 + _one_measurement(model["scatter"], mean))
         answer.loc[good, list(ANSWERS)] = np.column_stack(
             [evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half, mean - spread, mean + spread]
@@ -205,6 +205,15 @@ def _outside(
         slack = BEYOND * max(abs(tested[0]), abs(tested[1]), 1e-12)
         outside |= (values < tested[0] - slack) | (values > tested[1] + slack)
     return outside
+
+
+def _of_unknown_phase(after: Model, force: np.ndarray) -> np.ndarray:
+    """Return the variance of ripples whose phase is each file's own and unknown for a new one, shape (n,)."""
+    total = np.zeros_like(force)
+    for term, values in zip(after.terms, after.values, strict=True):
+        if "shift" in term.fixed:
+            total += (values["A"] * (1.0 if term.operation == "add" else force)) ** 2 / 2
+    return total
 
 
 def _one_measurement(scatter: dict, force: np.ndarray) -> np.ndarray:

@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from scipy import stats
-from scipy.special import digamma
+from scipy.special import digamma, polygamma
 
-LEAST_SAMPLES = 16  # a stroke with fewer steady samples says nothing of a ripple
+from sealfit.closure.waves import freed_of_trend, strokes_of
+
 NEIGHBOURS = 25  # frequencies on each side that make the local background
 SHARED = 1e-3  # p-value below which the phase is taken to be common to all files
 LOBE = 4  # frequencies on each side that the taper smears a peak over
@@ -46,6 +47,7 @@ class Spectra:
     direction: np.ndarray  # (units,)
     unit: np.ndarray  # (units,) number of the file or run
     strokes: np.ndarray  # (units,) strokes averaged
+    taken: np.ndarray  # (f,) within a main lobe of a component already in the model
 
 
 def find_ripple(
@@ -92,36 +94,27 @@ def spectra_along(samples: pd.DataFrame, axis: str) -> Spectra | None:
     A stroke is freed of a parabola, tapered (Hann) and transformed on a grid that divides twice the longest stroke, so
     that every stroke has the same frequencies whatever its sampling; the wavelength is at most half a usual stroke.
     """
-    place = samples[axis].to_numpy(dtype=float)
-    residual = samples["residual_N"].to_numpy(dtype=float)
-    stroke = samples["stroke_id"].to_numpy()
-    starts = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]])
-    ends = np.r_[starts[1:], stroke.size]
-    good = [(a, b) for a, b in zip(starts, ends, strict=True) if b - a >= LEAST_SAMPLES and np.ptp(place[a:b]) > 0]
+    good = list(strokes_of(samples, axis))
     if len(good) < 3:
         return None
-    spans = np.array([np.ptp(place[a:b]) for a, b in good])
-    steps = np.array([s / (b - a - 1) for s, (a, b) in zip(spans, good, strict=True)])
+    spans = np.array([place[-1] - place[0] for _, place, _ in good])
+    steps = spans / (np.array([place.size for _, place, _ in good]) - 1)
     longest = 2 * spans.max()
     count = int(min(2**15, np.ceil(longest / np.quantile(steps, 0.1))))
     frequency = np.arange(count // 2 + 1) / longest
     lowest = 2 / np.median(spans)
-    direction = samples["direction"].to_numpy()[[a for a, _ in good]]
-    unit = pd.factorize(samples["unit"].to_numpy()[[a for a, _ in good]])[0]
+    direction = samples["direction"].to_numpy()[[a for a, *_ in good]]
+    unit = pd.factorize(samples["unit"].to_numpy()[[a for a, *_ in good]])[0]
     keys, number = np.unique(np.column_stack([unit, direction]), axis=0, return_inverse=True)
     number = number.ravel()
     total = np.zeros((len(keys), frequency.size), dtype=complex)
     weight = np.zeros((len(keys), frequency.size))
     strokes = np.bincount(number, minlength=len(keys))
-    for k, (a, b) in enumerate(good):
-        order = np.argsort(place[a:b], kind="stable")
-        x, y = place[a:b][order], residual[a:b][order]
+    for k, (_, place, residual) in enumerate(good):
         own = int(np.clip(np.ceil(longest / steps[k]), 8, 2**15))
         step = longest / own
-        grid = np.arange(x[0], x[-1], step)
-        scaled = 2 * (grid - grid[0]) / max(grid[-1] - grid[0], 1e-300) - 1
-        value = np.interp(grid, x, y)
-        value = value - np.polynomial.legendre.legval(scaled, np.polynomial.legendre.legfit(scaled, value, 2))
+        grid = np.arange(place[0], place[-1], step)
+        value = freed_of_trend(grid, np.interp(grid, place, residual))
         taper = np.hanning(grid.size + 2)[1:-1]
         transform = np.fft.rfft(value * taper, own) * (2 / taper.sum())
         reach = min(transform.size, frequency.size)
@@ -133,19 +126,24 @@ def spectra_along(samples: pd.DataFrame, axis: str) -> Spectra | None:
     if use.sum() < 4:
         return None
     amplitude = np.where(weight > 0, total / np.maximum(weight, 1), 0.0)
-    return Spectra(frequency[use], amplitude[:, use], weight[:, use] > 0, keys[:, 1], keys[:, 0], strokes)
+    return Spectra(
+        frequency[use],
+        amplitude[:, use],
+        weight[:, use] > 0,
+        keys[:, 1],
+        keys[:, 0],
+        strokes,
+        np.zeros(use.sum(), dtype=bool),
+    )
 
 
 def _without(spectra: Spectra, wavelengths: Sequence[float]) -> Spectra:
-    """Return the spectra with nothing within a main lobe of some wavelengths."""
+    """Return the spectra with everything within a main lobe of some wavelengths marked as taken."""
     step = spectra.frequency[1] - spectra.frequency[0]
     near = np.zeros(spectra.frequency.size, dtype=bool)
     for wavelength in wavelengths:
         near |= np.abs(spectra.frequency - 1 / wavelength) <= LOBE * step
-    if not near.any() or near.all():
-        return spectra
-    power = np.median(np.abs(spectra.amplitude[:, ~near]), axis=1, keepdims=True)
-    return replace(spectra, amplitude=np.where(near, 0.1 * power, spectra.amplitude))
+    return replace(spectra, taken=near)
 
 
 def _coherent(spectra: Spectra, axis: str) -> list[Peak]:
@@ -163,11 +161,11 @@ def _coherent(spectra: Spectra, axis: str) -> list[Peak]:
         white = by_unit / spread
         total = np.abs(white.sum(axis=0)) ** 2
         statistic = total / np.maximum((np.abs(white) ** 2).sum(axis=0), 1e-300)
-        sharp = total / _background(total) > ABOVE_BACKGROUND
+        sharp = total / _background(np.where(spectra.taken, np.nan, total)) > ABOVE_BACKGROUND
         units = int((np.abs(by_unit) > 0).any(axis=1).sum())
         if units < 4 or not sharp.any():
             continue
-        k = int(np.argmax(np.where(sharp & _tops(total), statistic, 0)))
+        k = int(np.argmax(np.where(sharp & _tops(total) & ~spectra.taken, statistic, 0)))
         p = _coherence_p(statistic[k], units) * spectra.frequency.size * (2 if both else 1)
         present = spectra.known[:, k]
         amplitude = float(np.abs((turned[present, k]).mean()))
@@ -185,17 +183,40 @@ def _coherence_p(statistic: float, units: int) -> float:
 def _incoherent(spectra: Spectra, axis: str) -> list[Peak]:
     """Return the best peak of power shared by all units whatever their phases.
 
-    The mean of U units' powers, each on its own scale, is Gamma(U) about the background.
+    The mean of U units' powers, each on its own scale, is Gamma(U) about the background; where units share a texture
+    of the track, as if there were fewer of them.
     """
     power = np.abs(spectra.amplitude) ** 2
     count = spectra.known.sum(axis=0)
     scale = power.sum(axis=1, keepdims=True) / np.maximum(spectra.known.sum(axis=1, keepdims=True), 1)
     mean = (power / np.maximum(scale, 1e-300)).sum(axis=0) / np.maximum(count, 1)
-    ratio = mean / _smooth_background(mean, spectra.frequency, count)
-    k = int(np.argmax(np.where(_tops(mean), ratio, 0)))
-    p = float(stats.gamma.sf(ratio[k] * count[k], count[k])) * spectra.frequency.size
-    amplitude = float(np.sqrt((power[:, k] * spectra.known[:, k]).sum() / max(count[k], 1)))
+    ratio = mean / _smooth_background(np.where(spectra.taken, np.nan, mean), spectra.frequency, count)
+    count = np.minimum(count, _alike(np.where(spectra.taken, np.nan, ratio)))
+    own = stats.gamma.logsf(ratio * count, count)
+    k = int(np.argmin(np.where(_tops(mean) & ~spectra.taken, own, 1.0)))
+    p = float(np.exp(own[k])) * spectra.frequency.size
+    amplitude = float(np.sqrt((power[:, k] * spectra.known[:, k]).sum() / max(spectra.known[:, k].sum(), 1)))
     return [Peak(axis, _refined(mean, spectra.frequency, k), True, False, float(ratio[k]), p, amplitude)]
+
+
+def _alike(ratio: np.ndarray) -> np.ndarray:
+    """Return of how many independent powers a spectrum behaves like the mean, by its neighbours' spread, shape (f,).
+
+    The logarithm of a mean of c powers has the variance trigamma(c); its spread is taken from the quartiles, which a
+    few peaks do not move.
+    """
+    low, high = np.nanquantile(_neighbours(np.log(np.maximum(ratio, 1e-300))), (0.25, 0.75), axis=1)
+    spread = ((high - low) / 1.349) ** 2
+    numbers = np.geomspace(1e5, 1.0, 200)
+    return np.interp(spread, polygamma(1, numbers), numbers)
+
+
+def _neighbours(value: np.ndarray) -> np.ndarray:
+    """Return each frequency's neighbours, its own main lobe and what lies beyond the ends NaN, shape (f, window)."""
+    padded = np.pad(value, NEIGHBOURS, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1).copy()
+    windows[:, np.abs(np.arange(-NEIGHBOURS, NEIGHBOURS + 1)) <= LOBE] = np.nan
+    return windows
 
 
 def _tops(power: np.ndarray) -> np.ndarray:
@@ -217,14 +238,7 @@ def _smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarr
     """
     value = np.log(np.maximum(power, 1e-300))
     place = np.log(frequency)
-    pad = NEIGHBOURS
-
-    def windows(x: np.ndarray) -> np.ndarray:
-        padded = np.pad(x, pad, constant_values=np.nan)
-        return np.lib.stride_tricks.sliding_window_view(padded, 2 * pad + 1)
-
-    y, x = windows(value).copy(), windows(place)
-    y[:, np.abs(np.arange(-pad, pad + 1)) <= LOBE] = np.nan
+    y, x = _neighbours(value), _neighbours(place)
     for _ in range(3):
         weight = np.isfinite(y).astype(float)
         total = weight.sum(axis=1)
@@ -242,10 +256,7 @@ def _smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarr
 
 def _background(power: np.ndarray) -> np.ndarray:
     """Return the median of each frequency's neighbours, the peak's own main lobe left out."""
-    padded = np.pad(power, NEIGHBOURS, mode="reflect" if power.size > NEIGHBOURS else "edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1)
-    keep = np.abs(np.arange(-NEIGHBOURS, NEIGHBOURS + 1)) > LOBE
-    return np.maximum(np.median(windows[:, keep], axis=1), 1e-300)
+    return np.maximum(np.nanmedian(_neighbours(power), axis=1), 1e-300)
 
 
 def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:

@@ -23,7 +23,6 @@ from scipy.special import betainc
 from sealfit.closure.channels import FINER, Channel, flip_level, free_columns, unit_of
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import term_slope
-from sealfit.fit.mixed import whiten
 from sealfit.fit.rows import Rows
 
 TARGETS = (
@@ -69,10 +68,7 @@ class Candidate:
 
 def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
     """Return columns of the force, whitened and freed of the current model's tangent space, shape (n, k)."""
-    rows = fitted.rows
-    white, _ = whiten(
-        columns, fitted.scatter.noise_sd(fitted.force), fitted.force, rows.groups, fitted.scatter.components
-    )
+    white, _ = fitted.scatter.whitened(columns, fitted.force, fitted.rows.groups)
     size = np.linalg.norm(white, axis=0)
     left = white - fitted.basis @ (fitted.basis.T @ white)
     left[:, np.linalg.norm(left, axis=0) ** 2 < LEAST_LEFT * size**2] = 0.0

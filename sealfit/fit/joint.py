@@ -56,7 +56,11 @@ class Declared:
 
 @dataclass(frozen=True)
 class Term:
-    """An effect bound to the channels it reads and the quantity it acts on, with fixed reference values."""
+    """An effect bound to the channels it reads and the quantity it acts on, with fixed reference values.
+
+    In `fixed`, `shift` holds each pass's own origin, and `held` the 95 % interval of each parameter that comes from the
+    raw samples and that no fit to bins moves.
+    """
 
     effect: Effect
     channels: tuple[str, ...]
@@ -76,10 +80,8 @@ class Term:
                 values = np.abs(values)  # a form of the speed is one of its size
             given[name] = values
         shift = self.fixed.get("shift")
-        if shift is not None:  # each pass has its own origin; where that is unknown the shape is given as zero
-            place = self.effect.reads[0]
-            own = passes(rows.table).map(shift).to_numpy(dtype=float)
-            given[place] = np.where(np.isfinite(own), given[place] + own, 0.0)
+        if shift is not None:  # each pass has its own origin, NaN where that is unknown
+            given[self.effect.reads[0]] = given[self.effect.reads[0]] + passes(rows.table).map(shift).to_numpy(float)
         rows.cache[key] = (self.fixed, {**given, **self.fixed})  # holding `fixed` keeps its id its own
         return rows.cache[key][1]
 
@@ -278,7 +280,12 @@ def mean_derivatives(
     parts = [
         (weight, term_derivatives(term, values, inputs, only_linear=only_linear)) for weight, inputs in term.nodes(rows)
     ]
-    return [sum(weight * part[k] for weight, part in parts) for k in range(len(parts[0][1]))]
+    return [_known(term, sum(weight * part[k] for weight, part in parts)) for k in range(len(parts[0][1]))]
+
+
+def _known(term: Term, shape: np.ndarray) -> np.ndarray:
+    """Return a shape with zero where a pass's own origin is not known, shape (n,)."""
+    return np.nan_to_num(shape) if "shift" in term.fixed else shape
 
 
 def term_derivatives(
@@ -292,6 +299,8 @@ def term_derivatives(
     for p in term.effect.parameters:
         if p.linear:
             result.append(term.effect.shape(inputs, **{**values, **zero, p.name: 1.0}))
+        elif p.name in term.fixed.get("held", ()):
+            result.append(np.zeros_like(result[0]))
         elif not only_linear:
             step = 1e-5 * max(abs(values[p.name]), 1e-3)
             up = term.effect.shape(inputs, **{**values, p.name: values[p.name] + step})
@@ -310,7 +319,7 @@ def _linear_columns(term: Term, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
 def _shape(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
     """Return the term's shape at the rows, shape (n,); columns that do not change are made once."""
     if term.effect.nonlinear:
-        return sum(weight * term.effect.shape(inputs, **values) for weight, inputs in term.nodes(rows))
+        return _known(term, sum(weight * term.effect.shape(inputs, **values) for weight, inputs in term.nodes(rows)))
     inputs = term.inputs(rows)
     key = ("columns", term.key(), id(term.fixed))
     if key not in rows.cache:

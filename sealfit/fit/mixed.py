@@ -5,8 +5,10 @@ A residual is noise of its row plus random offsets and gains of its stroke, file
 .. math:: r_i = \epsilon_i + \sum_l (o_{l,g(i)} + k_{l,g(i)} F_i), \quad
           \mathrm{Var}\, o_l = \sigma_{o,l}^2, \ \mathrm{Var}\, k_l = \sigma_{k,l}^2
 
-with F the model's force. The covariance is a diagonal plus one rank-one term per group and kind. As groups nest, a
-symmetric square root of its inverse is a chain of rank-one updates, exact and linear in the number of rows.
+with F the model's force. Neighbouring rows are alike, and files differ in shape along their strokes: the row noise
+counts `alike` times in the mean of a stroke, and `shape` times more often about it. The covariance is a diagonal plus
+one rank-one term per group and kind. As groups nest, a symmetric square root of its inverse is a chain of rank-one
+updates, exact and linear in the number of rows.
 
 Searle, Casella & McCulloch 1992, *Variance Components*, doi:10.1002/9780470316856 (REML, chapter 6).
 """
@@ -20,6 +22,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 REVIVED = 0.03  # share at which a component starts though it was nothing before: from zero it could not come back
+MOST_GAIN = 0.5  # no rig's gain scatters more: a model near zero with gains of any size would fit every force
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +42,13 @@ class Scatter:
     s0: float
     g: float
     components: tuple[Component, ...] = ()
+    alike: float = 1.0  # by which neighbours that resemble each other widen the variance of a mean
+    shape: float = 1.0  # by which files' own shapes widen the variance of a pattern along the stroke, beyond that
+
+    def whitened(self, columns: np.ndarray, force: np.ndarray, groups: Groups) -> tuple[np.ndarray, float]:
+        """Return `whiten` of some columns, shape (n, k), with this scatter at the model's force, shape (n,)."""
+        sd = self.noise_sd(force) * np.sqrt(self.alike)
+        return whiten(columns, sd, force, groups, self.components, shape=self.shape)
 
     def noise_sd(self, force: np.ndarray) -> np.ndarray:
         """Return the standard deviation of a row's own noise, shape of `force`."""
@@ -85,7 +95,13 @@ class Groups:
 
 
 def whiten(
-    columns: np.ndarray, sd: np.ndarray, force: np.ndarray, groups: Groups, components: Sequence[Component]
+    columns: np.ndarray,
+    sd: np.ndarray,
+    force: np.ndarray,
+    groups: Groups,
+    components: Sequence[Component],
+    *,
+    shape: float = 1.0,
 ) -> tuple[np.ndarray, float]:
     """Return the columns in coordinates where rows are independent with unit variance, and log det of the covariance.
 
@@ -99,13 +115,21 @@ def whiten(
         The model's force, signed: the loading of a gain.
     groups, components
         Nested groups, and the variance components, finest level first.
+    shape : float
+        Factor on the rows' variance about the mean of their stroke (the first level of `groups`).
     """
     white = columns / sd[:, None]
     logdet = 2.0 * float(np.log(sd).sum())
+    about_mean = _AboutMean(sd, groups, shape) if shape > 1.0 else None
+    if about_mean is not None:
+        white = about_mean.widened(white)
+        logdet += (sd.size - about_mean.start.size) * np.log(shape)
     active = [part for part in components if part.variance > 0]
     loadings = np.empty((sd.size, len(active)))
     for k, part in enumerate(active):
         loadings[:, k] = np.sqrt(part.variance) * (force if part.kind == "gain" else 1.0) / sd
+    if about_mean is not None:
+        loadings = about_mean.widened(loadings)
     for k, part in enumerate(active):
         start, code = groups.starts[part.level], groups.codes[part.level]
         loading = loadings[:, k].copy()
@@ -117,6 +141,22 @@ def whiten(
                 inner = np.add.reduceat(loading[:, None] * block, start, axis=0) * shrink[:, None]
                 block -= loading[:, None] * inner[code]
     return white, logdet
+
+
+class _AboutMean:
+    """Rows of a stroke (the finest groups) divided by a root of `shape`, all but their weighted mean."""
+
+    def __init__(self, sd: np.ndarray, groups: Groups, shape: float) -> None:
+        finest = next(iter(groups.starts))
+        self.start, self.code = groups.starts[finest], groups.codes[finest]
+        self.unit = 1 / sd
+        self.square = np.add.reduceat(self.unit**2, self.start)
+        self.root = np.sqrt(shape)
+
+    def widened(self, white: np.ndarray) -> np.ndarray:
+        """Return columns, shape (n, k), that had been divided by `sd`."""
+        mean = np.add.reduceat(self.unit[:, None] * white, self.start, axis=0) / self.square[:, None]
+        return white / self.root + (1 - 1 / self.root) * self.unit[:, None] * mean[self.code]
 
 
 def reml(
@@ -167,13 +207,17 @@ def reml(
         half = np.linalg.solve(chol, gram[:p, p])
         return 0.5 * (logdet + 2.0 * np.log(np.diag(chol)).sum() + gram[p, p] - half @ half)
 
-    low, high = np.log(1e-7), np.log(30.0)
+    low = np.log(1e-7)
+    high = np.log(
+        [min(30.0, MOST_GAIN**2 / u) if kind == "gain" else 30.0 for u, (_, kind) in zip(unit, kinds, strict=True)]
+    )
+    high = np.maximum(high, low + 2.0)
     first = np.full(len(kinds), np.log(0.2)) if start is None else np.log(np.maximum(np.asarray(start) / unit, REVIVED))
     best = minimize(
         objective,
         np.clip(first, low + 1.0, high - 1.0),
         method="L-BFGS-B",
-        bounds=[(low, high)] * len(kinds),
+        bounds=[(low, most) for most in high],
         options={"maxiter": 40, "ftol": 1e-7},
     )
     share = np.exp(best.x)

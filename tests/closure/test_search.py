@@ -31,7 +31,7 @@ def test_a_serial_number_is_a_grouping_and_not_a_channel():
     assert "run_order" in names
 
 
-def test_contrasts_inside_files_are_judged_between_runs_where_there_are_ten():
+def test_contrasts_inside_files_are_judged_between_runs_where_there_are_twenty():
     rows = rows_of(repeats=2, bins=4)
     assert flip_level("sample", rows) == "run"
     assert flip_level("specimen", rows) == "specimen"

@@ -4,9 +4,10 @@ import numpy.testing as npt
 import pytest
 
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
-from sealfit.fit.estimate import fit, fit_declared, start_model
+from sealfit.fit.estimate import fit, fit_declared
 from sealfit.fit.joint import Model, Term, declare, evaluate, levels_of
 from sealfit.fit.rows import make_rows, thin
+from sealfit.fit.start import start_model
 
 WAVE = Effect(
     id="wave",

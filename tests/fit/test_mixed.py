@@ -32,6 +32,23 @@ def test_whitening_is_a_root_of_the_inverse_covariance(seed, offset, gain, run):
     npt.assert_allclose(logdet, np.linalg.slogdet(covariance)[1], rtol=1e-9, atol=1e-9)
 
 
+def test_whitening_knows_that_files_have_shapes_of_their_own():
+    rng = np.random.default_rng(1)
+    codes = {"stroke": np.repeat(np.arange(6), 5), "file": np.repeat(np.arange(3), 10)}
+    groups, force, sd = Groups.of(codes), rng.normal(5, 2, 30), rng.uniform(0.3, 1.0, 30)
+    parts = [Component("file", "gain", 0.02)]
+    root, logdet = whiten(np.eye(30), sd, force, groups, parts, shape=9.0)
+    rows = np.zeros((30, 30))
+    for stroke in range(6):
+        own = codes["stroke"] == stroke
+        along = (own / sd) / np.linalg.norm(own / sd)
+        mean = np.outer(along, along)
+        rows += np.outer(sd, sd) * (mean + 9.0 * (np.diag(own.astype(float)) - mean))
+    covariance = rows + 0.02 * np.outer(force, force) * (codes["file"][:, None] == codes["file"][None, :])
+    npt.assert_allclose(root.T @ root @ covariance, np.eye(30), atol=1e-8)
+    npt.assert_allclose(logdet, np.linalg.slogdet(covariance)[1], rtol=1e-9)
+
+
 def test_reml_recovers_scatter_of_files_runs_and_specimens():
     codes = nested(3, 8, 25)
     rng = np.random.default_rng(3)

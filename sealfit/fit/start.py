@@ -1,0 +1,91 @@
+"""Where the joint fit starts: a global search of v_s and b, everything linear exact."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sealfit.fit.joint import SAME_SPEED, JointParameter, Model, declare
+from sealfit.fit.rows import Rows
+
+
+def start_model(rows: Rows) -> Model:
+    """Return the declared model with v_s and b from a global search and the rest from exact least squares."""
+    declared = declare(rows)
+    theta = np.zeros(len(declared.parameters))
+    number = {p: k for k, p in enumerate(declared.parameters)}
+    speeds = np.abs(rows.groups.means(rows.speed, "stroke"))
+    at = rows.groups.starts["stroke"]
+    condition = rows.condition[at]
+    load = rows.groups.means(rows.load, "stroke")
+    size = rows.groups.means(rows.force * np.sign(rows.speed), "stroke")
+    series = sorted({p.owner for p in declared.parameters if p.quantity in ("v_s", "sigma_2")})
+    level = np.zeros((len(declared.conditions), 2))  # mu_s, mu_c of each condition
+    chosen = np.zeros(len(declared.conditions), dtype=bool)
+    for name in series:
+        k = number.get(JointParameter("sigma_2", name), number.get(JointParameter("v_s", name)))
+        uses = (declared.index["sigma_2"] == k) | (declared.index["v_s"] == k)
+        mine = uses[condition]
+        full = JointParameter("v_s", name) in number
+        values, sigma_2, v_s = _per_condition(speeds[mine], load[mine], size[mine], condition[mine], full)
+        for c, pair in values.items():
+            level[c], chosen[c] = pair, True
+        theta[k if not full else number[JointParameter("sigma_2", name)]] = sigma_2
+        if full:
+            theta[number[JointParameter("v_s", name)]] = np.log(v_s)
+    for c in np.flatnonzero(~chosen):
+        mine = condition == c
+        level[c] = np.mean(size[mine] / load[mine])
+    days = rows.conditions["aging_days"].to_numpy()
+    for column, end in ((0, "s"), (1, "c")):
+        index_0, index_a, index_b = (
+            declared.index[f"{q}_{end}" if q != "mu_0" else f"mu_0{end}"] for q in ("mu_0", "a", "b")
+        )
+        for k in np.unique(index_0[(index_0 >= 0)]):
+            mine = index_0 == k
+            unaged = mine & (days == days[mine].min())
+            theta[k] = level[unaged, column].mean()
+        for k in np.unique(index_a[index_a >= 0]):
+            mine = index_a == k
+            mu_0 = theta[index_0[mine][0]]
+            drop = mu_0 - level[mine, column]
+            grid = np.geomspace(days[days > 0].min() / 100, days.max() * 3, 60)
+            log = np.log1p(days[mine][:, None] / grid)
+            a = (log * drop[:, None]).sum(0) / np.maximum((log**2).sum(0), 1e-300)
+            best = int(np.argmin(((drop[:, None] - a * log) ** 2).sum(0)))
+            theta[k] = a[best]
+            theta[index_b[mine][0]] = np.log(grid[best])
+    return Model(declared, theta)
+
+
+def _per_condition(speed, load, size, condition, full: bool):
+    """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of one series by a grid over v_s, the rest exact."""
+    own = np.unique(condition)
+    inside = (condition[:, None] == own[None, :]).astype(float) * load[:, None]
+    grid = np.geomspace(*stribeck_range(speed), 80) if full else np.array([1.0])
+    best, answer = np.inf, None
+    for v_s in grid:
+        decay = np.exp(-((speed / v_s) ** 2)) if full else np.zeros_like(speed)
+        parts = [inside * (1 - decay)[:, None], speed[:, None]]
+        if full:
+            parts.insert(0, inside * decay[:, None])
+        columns = np.column_stack(parts)
+        solution, *_ = np.linalg.lstsq(columns, size, rcond=1e-10)
+        cost = float(((size - columns @ solution) ** 2).sum())
+        if cost < best:
+            best, answer = cost, (solution, v_s)
+    solution, v_s = answer
+    mu_s = solution[: own.size]
+    mu_c = solution[own.size : 2 * own.size] if full else solution[: own.size]
+    return {int(c): (s, k) for c, s, k in zip(own, mu_s, mu_c, strict=True)}, float(solution[-1]), float(v_s)
+
+
+def stribeck_range(speeds: np.ndarray) -> tuple[float, float]:
+    """Return where v_s is looked for: from half the second slowest speed to the fastest.
+
+    Below that range only the slowest speed would see mu_s, which could then be any size; above it the exponential is a
+    parabola that sigma_2 and mu_c make as well (v_s needs two speeds below about 2 v_s).
+    """
+    positive = np.sort(speeds[speeds > 0])
+    above = positive[positive > SAME_SPEED * positive[0]]
+    second = above[0] if above.size else positive[0]
+    return float(second / 2), float(positive[-1])
