@@ -49,7 +49,7 @@ def test_screw_drives_lack_an_offset_between_directions_and_ripple_once_a_turn(s
     effects = {e["id"]: e for e in reversed(document["effects"])}
     offset = effects["zero_offset"]["parameters"][0]
     assert offset["unit"] == "mN m"
-    assert offset["value"] == pytest.approx(-0.354, abs=0.05)
+    assert offset["ci95"][1] < 0  # -0.35 by itself; what friction differs by direction shares it
     ripple = {p["name"]: p for p in effects["ripple"]["parameters"]}
     assert ripple["lambda"]["value"] == pytest.approx(1.0, rel=0.01)
     assert 0.11 <= ripple["A"]["value"] <= 0.32
@@ -64,16 +64,28 @@ def test_hand_edited_cells_of_the_worm_drive_are_named(screwdrive):
     assert {str(f.value).split(",")[0] for f in remarks} == {"-1200", "-800", "-400"}
 
 
-def test_pneumatic_seal_lacks_an_offset_and_a_ripple(pneuseal):
+def test_pneumatic_seal_lacks_an_offset_run_in_and_ripples(pneuseal):
     document = pneuseal[1].document
     effects = {e["id"]: e for e in reversed(document["effects"])}
     offset = effects["zero_offset"]["parameters"][0]
     assert offset["value"] == pytest.approx(3.1, abs=0.5)  # 1.2 to 4.4 N, by pressure and set-up
-    ripples = [p for e in document["effects"] if e["id"] == "ripple" for p in e["parameters"] if p["name"] == "lambda"]
-    lengths = [p["value"] for p in ripples]
-    assert any(abs(x - 3.0) < 0.12 for x in lengths), lengths
-    assert any(abs(x - 1.5) < 0.06 for x in lengths), lengths
+    assert any(e["channels"] == ["stroke"] for e in document["effects"])  # grows over ten cycles in 18 of 20 files
+    ripples = [{p["name"]: p for p in e["parameters"]} for e in document["effects"] if e["id"] == "ripple"]
+    for length in (3.0, 1.5):
+        found = [r for r in ripples if r["lambda"]["value"] == pytest.approx(length, rel=0.01)]
+        assert len(found) == 1, ripples
+        low, high = found[0]["lambda"]["ci95"]
+        assert low < length < high < low * 1.03
+        assert 0.02 < found[0]["A"]["value"] < 0.12
+        assert found[0]["A"]["ci95"][0] > 0
     assert document["after"]["rmse_N"] < 0.5 * document["before"]["rmse_N"]
+    assert document["after"]["heldout_rmse_N"] < 0.7 * document["before"]["heldout_rmse_N"]
+
+
+def test_pneumatic_seal_has_an_offset_that_depends_on_the_set_up(pneuseal):
+    left = pneuseal[1].document["left"]  # reconnected 1 has half of it
+    assert (left["level"], left["channel"]) == ("run", "direction mounting")
+    assert left["p_value"] > 0.005  # three mountings prove nothing
 
 
 def test_pneumatic_seal_has_no_stribeck_speed_and_no_effect_of_scatter_between_files(pneuseal):

@@ -37,14 +37,17 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, tuple
     The wider of two standard errors counts: that of the fitted scatter, and the one that whole units of the effect's
     own level show, so that an effect which itself scatters between units is not given too short an interval.
     """
+    term = fitted.model.terms[number]
+    held = term.fixed.get("held", {})
     p0 = fitted.model.theta.size + sum(len(t.effect.parameters) for t in fitted.model.terms[:number])
-    count = len(fitted.model.terms[number].effect.parameters)
+    count = len(term.effect.parameters)
     place = slice(p0, p0 + count)
-    variance = np.maximum(np.diag(fitted.covariance)[place], np.diag(robust_covariance(fitted, level))[place])
+    variance = np.diag(robust_covariance(fitted, level))[place]
+    if not held:  # a wave is finer than the shapes in which files differ, which the fitted scatter holds against it
+        variance = np.maximum(variance, np.diag(fitted.covariance)[place])
     units = fitted.rows.groups.starts[level].size
     reach = t_quantile(max(units - count - 1, 2)) * np.sqrt(variance)
-    term, values = fitted.model.terms[number], fitted.model.values[number]
-    held = term.fixed.get("held", {})
+    values = fitted.model.values[number]
     result = {}
     for p, r in zip(term.effect.parameters, reach, strict=True):
         low, high = held.get(p.name, (values[p.name] - r, values[p.name] + r))

@@ -1,0 +1,55 @@
+import numpy as np
+import pandas as pd
+import pytest
+
+from sealfit.closure.waves import agreement, common_wavelength, freed_of_trend, pass_shifts
+from sealfit.fit.rows import make_rows
+from tests.bins_helpers import make_bins
+
+
+def made(seed=0, files=10, wavelength=3.0, amplitude=0.1, trend=4.0, noise_N=0.1, periods=9.0):
+    """Samples of one stroke per file, each with a phase of its own on a steep trend."""
+    rng = np.random.default_rng(seed)
+    tables, phases = [], rng.uniform(0, 2 * np.pi, files)
+    for k in range(files):
+        x = np.linspace(2.0, 2.0 + periods * wavelength, 300)
+        wave = amplitude * np.sin(2 * np.pi * x / wavelength + phases[k])
+        force = trend * (x / x[-1]) ** 2 + wave + rng.normal(0, noise_N, x.size)
+        own = {"stroke_id": k, "unit": k, "direction": 1.0, "displacement_mm": x, "residual_N": force}
+        tables.append(pd.DataFrame(own))
+    return pd.concat(tables, ignore_index=True), phases
+
+
+@pytest.mark.parametrize("periods", [3.5, 9.0, 25.0])
+def test_wavelength_is_found_under_a_steep_trend_and_its_error_covers(periods):
+    missed = []
+    for seed in range(20):
+        samples, _ = made(seed, periods=periods)
+        length, error = common_wavelength(samples, 3.0 * (1 + 0.1 / periods), "displacement_mm")
+        missed.append(abs(length - 3.0) / error)
+    assert np.mean(np.array(missed) < 2.26) >= 0.8  # t, 9 degrees of freedom: 95 %; 20 draws
+
+
+def test_phase_of_each_pass_is_found_about_its_middle():
+    samples, phases = made(noise_N=0.02)
+    bins = make_bins(temperatures=(60.0,), days=(4.0,), speeds=(1.0, 2.0, 4.0, 8.0, 16.0), repeats=1, bins=3)
+    rows = make_rows(bins.assign(stroke_id=np.arange(len(bins)) // 3), has_aging=False)
+    shifts = pass_shifts(samples, rows, 3.0, "displacement_mm")
+    middle = 2.0 + 4.5 * 3.0
+    for shift, phase in zip(shifts.values(), phases, strict=True):
+        assert abs(middle + shift) <= 1.5 + 1e-9
+        assert np.cos(2 * np.pi * shift / 3.0 - phase) > 0.99
+
+
+def test_halves_agree_on_a_wave_and_on_nothing_else():
+    samples, _ = made()
+    first = samples["displacement_mm"].to_numpy() < 2.0 + 4.5 * 3.0
+    assert (agreement(samples, first, 3.0, "displacement_mm") > 0).all()
+    noise, _ = made(amplitude=0.0, files=40)
+    first = noise["displacement_mm"].to_numpy() < 2.0 + 4.5 * 3.0
+    assert 8 <= (agreement(noise, first, 3.0, "displacement_mm") > 0).sum() <= 32
+
+
+def test_parabola_is_no_wave():
+    x = np.linspace(-3.0, 8.0, 50)
+    np.testing.assert_allclose(freed_of_trend(x, 3 - 2 * x + 0.5 * x**2), 0.0, atol=1e-10)
