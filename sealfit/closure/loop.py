@@ -115,7 +115,7 @@ def _heldout(
     work = (
         _Fold(
             out,
-            *_without(coarse, samples, rows, out),
+            *_without(coarse, samples if grown.added else samples.head(0), rows, out),
             rows.subset(out),
             config,
             effects,

@@ -1,7 +1,7 @@
 r"""Ripples: periodic force along displacement or time, sought on the raw samples of the steady windows.
 
 Bins hide what is finer than they are, so every stroke's own samples are transformed: :math:`Z_u(f)` is the complex
-amplitude of unit u (a file, or a run of many) at frequency f. A ripple of the rig has one phase everywhere, so
+amplitude of unit u (a file) at frequency f. A ripple of the rig has one phase everywhere, so
 :math:`R = |\sum_u Z_u|^2 / \sum_u |Z_u|^2` is large; with phases that fall as they like, R is exponential with mean 1.
 Where each file has an origin of its own only the power is shared: it is held against the local background spectrum.
 """
@@ -38,15 +38,25 @@ class Peak:
 
 
 @dataclass(frozen=True)
-class Spectra:
-    """Complex amplitudes per unit and direction on one grid of frequencies."""
+class Common:
+    """Sums over units of amplitudes that keep their phase, for one way of acting."""
+
+    symmetric: bool  # True: the same force both ways; False: it follows the direction
+    total: np.ndarray  # (f,) complex, each unit on its own scale
+    square: np.ndarray  # (f,) of the units' powers, each on its own scale
+    units: int
+    amplitude: np.ndarray  # (f,) complex, mean over the passes that reach the frequency
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Sums over passes (units in one direction) at f frequencies; no pass is kept, so that memory stays small."""
 
     frequency: np.ndarray  # (f,)
-    amplitude: np.ndarray  # (units, f) complex, zero above a unit's own Nyquist frequency
-    known: np.ndarray  # (units, f) whether the unit reaches that frequency
-    direction: np.ndarray  # (units,)
-    unit: np.ndarray  # (units,) number of the file or run
-    strokes: np.ndarray  # (units,) strokes averaged
+    count: np.ndarray  # (f,) passes that reach each frequency
+    power: np.ndarray  # (f,) mean of the passes' powers, each on its own scale
+    amplitude: np.ndarray  # (f,) root mean square of the passes' amplitudes
+    common: tuple[Common, ...]
     taken: np.ndarray  # (f,) within a main lobe of a component already in the model
 
 
@@ -72,13 +82,12 @@ def find_ripple(
     """
     peaks = []
     for axis in axes:
-        spectra = spectra_along(samples, axis)
-        if spectra is None:
+        spectrum = spectrum_along(samples, axis, [wavelength for place, wavelength in known if place == axis])
+        if spectrum is None:
             continue
-        spectra = _without(spectra, [wavelength for place, wavelength in known if place == axis])
         if common_phase and axis == "displacement_mm":
-            peaks += _coherent(spectra, axis)
-        peaks += _incoherent(spectra, axis)
+            peaks += _coherent(spectrum, axis)
+        peaks.append(_incoherent(spectrum, axis))
     if not peaks:
         return None
     best = min(peaks, key=lambda peak: (peak.p_value, -peak.statistic))
@@ -88,8 +97,8 @@ def find_ripple(
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
 
 
-def spectra_along(samples: pd.DataFrame, axis: str) -> Spectra | None:
-    """Return the complex amplitudes of each unit and direction along one axis.
+def spectrum_along(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -> Spectrum | None:
+    """Return the spectrum along one axis, summed over units and directions; None where there is too little.
 
     A stroke is freed of a parabola, tapered (Hann) and transformed on a grid that divides twice the longest stroke, so
     that every stroke has the same frequencies whatever its sampling; the wavelength is at most half a usual stroke.
@@ -100,78 +109,90 @@ def spectra_along(samples: pd.DataFrame, axis: str) -> Spectra | None:
     spans = np.array([place[-1] - place[0] for _, place, _ in good])
     steps = spans / (np.array([place.size for _, place, _ in good]) - 1)
     longest = 2 * spans.max()
-    count = int(min(2**15, np.ceil(longest / np.quantile(steps, 0.1))))
-    frequency = np.arange(count // 2 + 1) / longest
-    lowest = 2 / np.median(spans)
-    direction = samples["direction"].to_numpy()[[a for a, *_ in good]]
-    unit = pd.factorize(samples["unit"].to_numpy()[[a for a, *_ in good]])[0]
-    keys, number = np.unique(np.column_stack([unit, direction]), axis=0, return_inverse=True)
-    number = number.ravel()
-    total = np.zeros((len(keys), frequency.size), dtype=complex)
-    weight = np.zeros((len(keys), frequency.size))
-    strokes = np.bincount(number, minlength=len(keys))
-    for k, (_, place, residual) in enumerate(good):
-        own = int(np.clip(np.ceil(longest / steps[k]), 8, 2**15))
-        step = longest / own
-        grid = np.arange(place[0], place[-1], step)
-        value = freed_of_trend(grid, np.interp(grid, place, residual))
-        taper = np.hanning(grid.size + 2)[1:-1]
-        transform = np.fft.rfft(value * taper, own) * (2 / taper.sum())
-        reach = min(transform.size, frequency.size)
-        reach = min(reach, int(np.searchsorted(frequency, 0.5 / steps[k], side="right")))
-        turned = transform[:reach] * np.exp(-2j * np.pi * frequency[:reach] * grid[0])
-        total[number[k], :reach] += turned
-        weight[number[k], :reach] += 1
-    use = (frequency >= lowest) & (weight.sum(axis=0) >= 0.25 * len(good))
+    points = np.clip(np.ceil(longest / steps), 8, 2**15).astype(int)
+    frequency = np.arange(min(2**15, int(np.ceil(longest / np.quantile(steps, 0.1)))) // 2 + 1) / longest
+    reach = np.minimum(points // 2 + 1, np.searchsorted(frequency, 0.5 / steps, side="right"))
+    strokes = np.bincount(reach, minlength=frequency.size + 1)[::-1].cumsum()[::-1][1:]  # that reach each frequency
+    use = (frequency >= 2 / np.median(spans)) & (strokes[: frequency.size] >= 0.25 * len(good))
     if use.sum() < 4:
         return None
-    amplitude = np.where(weight > 0, total / np.maximum(weight, 1), 0.0)
-    return Spectra(
-        frequency[use],
-        amplitude[:, use],
-        weight[:, use] > 0,
-        keys[:, 1],
-        keys[:, 0],
-        strokes,
-        np.zeros(use.sum(), dtype=bool),
-    )
+    first = [a for a, *_ in good]
+    direction = samples["direction"].to_numpy()[first]
+    unit = samples["unit"].to_numpy()[first]
+    sums = _Sums(int(use.sum()), (True, False) if np.unique(direction).size == 2 else (True,))
+    order = np.argsort(unit, kind="stable")
+    for strokes_of_unit in np.split(order, np.flatnonzero(np.diff(unit[order])) + 1):
+        passes = {}
+        for side in np.unique(direction[strokes_of_unit]):
+            total, weight = np.zeros(frequency.size, dtype=complex), np.zeros(frequency.size)
+            for k in strokes_of_unit[direction[strokes_of_unit] == side]:
+                wave = _transform(good[k][1], good[k][2], longest, points[k])[: reach[k]]
+                total[: wave.size] += wave
+                weight[: wave.size] += 1
+            passes[side] = (total[use] / np.maximum(weight[use], 1), weight[use] > 0)
+        sums.add(passes)
+    near = np.zeros(int(use.sum()), dtype=bool)
+    for wavelength in known:
+        near |= np.abs(frequency[use] - 1 / wavelength) <= LOBE / longest
+    return sums.spectrum(frequency[use], near)
 
 
-def _without(spectra: Spectra, wavelengths: Sequence[float]) -> Spectra:
-    """Return the spectra with everything within a main lobe of some wavelengths marked as taken."""
-    step = spectra.frequency[1] - spectra.frequency[0]
-    near = np.zeros(spectra.frequency.size, dtype=bool)
-    for wavelength in wavelengths:
-        near |= np.abs(spectra.frequency - 1 / wavelength) <= LOBE * step
-    return replace(spectra, taken=near)
+def _transform(place: np.ndarray, residual: np.ndarray, longest: float, points: int) -> np.ndarray:
+    """Return a stroke's complex amplitudes at the multiples of 1 / `longest`, phases counted from place 0."""
+    grid = np.arange(place[0], place[-1], longest / points)
+    value = freed_of_trend(grid, np.interp(grid, place, residual))
+    taper = np.hanning(grid.size + 2)[1:-1]
+    wave = np.fft.rfft(value * taper, points) * (2 / taper.sum())
+    return wave * np.exp(-2j * np.pi * np.arange(wave.size) / longest * grid[0])
 
 
-def _coherent(spectra: Spectra, axis: str) -> list[Peak]:
-    """Return the best peak of each way of acting: the same force both ways, or following the direction."""
-    both = np.unique(spectra.direction).size == 2
-    peaks = []
-    for symmetric in (True, False) if both else (True,):
-        factor = np.ones_like(spectra.direction, dtype=float) if symmetric else spectra.direction.astype(float)
-        turned = spectra.amplitude * factor[:, None]
-        size = np.maximum(spectra.unit.max() + 1, 1)
-        by_unit = np.zeros((size, spectra.frequency.size), dtype=complex)
-        np.add.at(by_unit, spectra.unit, turned)
-        # Each unit weighs by its own spread, so that one noisy file does not decide.
-        spread = np.sqrt(np.median(np.abs(by_unit) ** 2, axis=1, keepdims=True)) + 1e-300
-        white = by_unit / spread
-        total = np.abs(white.sum(axis=0)) ** 2
-        statistic = total / np.maximum((np.abs(white) ** 2).sum(axis=0), 1e-300)
-        sharp = total / _background(np.where(spectra.taken, np.nan, total)) > ABOVE_BACKGROUND
-        units = int((np.abs(by_unit) > 0).any(axis=1).sum())
-        if units < 4 or not sharp.any():
-            continue
-        k = int(np.argmax(np.where(sharp & _tops(total) & ~spectra.taken, statistic, 0)))
-        p = _coherence_p(statistic[k], units) * spectra.frequency.size * (2 if both else 1)
-        present = spectra.known[:, k]
-        amplitude = float(np.abs((turned[present, k]).mean()))
-        peaks.append(
-            Peak(axis, _refined(total, spectra.frequency, k), symmetric, True, float(statistic[k]), p, amplitude)
+class _Sums:
+    """A spectrum in the making: what is kept of each unit."""
+
+    def __init__(self, size: int, ways: tuple[bool, ...]) -> None:
+        self.count, self.power, self.square = np.zeros(size), np.zeros(size), np.zeros(size)
+        self.common = {way: [np.zeros(size, complex), np.zeros(size), 0, np.zeros(size, complex)] for way in ways}
+
+    def add(self, passes: dict[float, tuple[np.ndarray, np.ndarray]]) -> None:
+        """Add one unit: per direction its amplitudes and which frequencies it reaches, each of shape (f,)."""
+        for wave, known in passes.values():
+            power = np.abs(wave) ** 2
+            self.count += known
+            self.square += power
+            self.power += power / max(power.sum() / max(known.sum(), 1), 1e-300)
+        reached = np.any([known for _, known in passes.values()], axis=0)
+        for way, sums in self.common.items():
+            own = sum(wave * (1.0 if way else side) for side, (wave, _) in passes.items())
+            # Each unit weighs by its own spread, so that one noisy file does not decide.
+            spread = np.sqrt(np.median(np.abs(own[reached]) ** 2)) if reached.any() else 0.0
+            white = own / spread if spread > 0 else np.zeros_like(own)
+            sums[0] += white
+            sums[1] += np.abs(white) ** 2
+            sums[2] += bool(np.abs(own).any())
+            sums[3] += own
+
+    def spectrum(self, frequency: np.ndarray, taken: np.ndarray) -> Spectrum:
+        """Return the spectrum of all units added."""
+        count = np.maximum(self.count, 1)
+        common = tuple(
+            Common(way, total, square, units, own / count) for way, (total, square, units, own) in self.common.items()
         )
+        return Spectrum(frequency, self.count, self.power / count, np.sqrt(self.square / count), common, taken)
+
+
+def _coherent(spectrum: Spectrum, axis: str) -> list[Peak]:
+    """Return the best peak of each way of acting: the same force both ways, or following the direction."""
+    peaks = []
+    for common in spectrum.common:
+        total = np.abs(common.total) ** 2
+        statistic = total / np.maximum(common.square, 1e-300)
+        sharp = total / _background(np.where(spectrum.taken, np.nan, total)) > ABOVE_BACKGROUND
+        if common.units < 4 or not sharp.any():
+            continue
+        k = int(np.argmax(np.where(sharp & _tops(total) & ~spectrum.taken, statistic, 0)))
+        p = _coherence_p(statistic[k], common.units) * spectrum.frequency.size * len(spectrum.common)
+        wavelength, amplitude = _refined(total, spectrum.frequency, k), float(np.abs(common.amplitude[k]))
+        peaks.append(Peak(axis, wavelength, common.symmetric, True, float(statistic[k]), p, amplitude))
     return peaks
 
 
@@ -180,23 +201,20 @@ def _coherence_p(statistic: float, units: int) -> float:
     return float(stats.beta.sf(min(statistic / units, 1.0), 1, max(units - 1, 1)))
 
 
-def _incoherent(spectra: Spectra, axis: str) -> list[Peak]:
+def _incoherent(spectrum: Spectrum, axis: str) -> Peak:
     """Return the best peak of power shared by all units whatever their phases.
 
     The mean of U units' powers, each on its own scale, is Gamma(U) about the background; where units share a texture
     of the track, as if there were fewer of them.
     """
-    power = np.abs(spectra.amplitude) ** 2
-    count = spectra.known.sum(axis=0)
-    scale = power.sum(axis=1, keepdims=True) / np.maximum(spectra.known.sum(axis=1, keepdims=True), 1)
-    mean = (power / np.maximum(scale, 1e-300)).sum(axis=0) / np.maximum(count, 1)
-    ratio = mean / _smooth_background(np.where(spectra.taken, np.nan, mean), spectra.frequency, count)
-    count = np.minimum(count, _alike(np.where(spectra.taken, np.nan, ratio)))
+    open_power = np.where(spectrum.taken, np.nan, spectrum.power)
+    ratio = spectrum.power / _smooth_background(open_power, spectrum.frequency, spectrum.count)
+    count = np.minimum(spectrum.count, _alike(np.where(spectrum.taken, np.nan, ratio)))
     own = stats.gamma.logsf(ratio * count, count)
-    k = int(np.argmin(np.where(_tops(mean) & ~spectra.taken, own, 1.0)))
-    p = float(np.exp(own[k])) * spectra.frequency.size
-    amplitude = float(np.sqrt((power[:, k] * spectra.known[:, k]).sum() / max(spectra.known[:, k].sum(), 1)))
-    return [Peak(axis, _refined(mean, spectra.frequency, k), True, False, float(ratio[k]), p, amplitude)]
+    k = int(np.argmin(np.where(_tops(spectrum.power) & ~spectrum.taken, own, 1.0)))
+    p = float(np.exp(own[k])) * spectrum.frequency.size
+    wavelength = _refined(spectrum.power, spectrum.frequency, k)
+    return Peak(axis, wavelength, True, False, float(ratio[k]), p, float(spectrum.amplitude[k]))
 
 
 def _alike(ratio: np.ndarray) -> np.ndarray:

@@ -189,9 +189,7 @@ def left_over(closure: Mapping, config: Config) -> Markup:
     if closure["verdict"] == "unexplained":
         said.append(f"It is not only noise: {_where(left, config)}.")
     elif left.get("channels"):
-        said.append(
-            f"No channel orders it more surely than chance would; where to look first: {_where(left, config)}."
-        )
+        said.append(f"No channel orders it more surely than chance would; where to look first: {_where(left, config)}.")
     else:
         said.append("No channel orders it: it is scatter.")
     return Markup(" ").join([part if isinstance(part, Markup) else Markup("{}").format(part) for part in said])
