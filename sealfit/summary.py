@@ -195,7 +195,8 @@ def closure_lines(part: Mapping) -> list[str]:
     found = [_line("verdict", f"{part['verdict']}: {part['sentence']}")]
     for effect in part["effects"]:
         status = "candidate, not applied: " if effect["candidate"] else "+ "
-        values = ", ".join(_value(p) for p in effect["parameters"]) if effect["named"] else "no form does as well"
+        known = [p for p in effect["parameters"] if p["value"] is not None]
+        values = ", ".join(_value(p) for p in known) if effect["named"] else "no form does as well"
         found.append(_line("", f"{status}{effect['label']}: {values}"))
     rows = (("rmse", "rmse_N"), ("held out", "heldout_rmse_N"), ("run means", "rmse_runs_N"), ("largest", "max_abs_N"))
     texts = [f"{name} {_number(before[key])} -> {_number(after[key])}" for name, key in rows]
@@ -211,7 +212,7 @@ def closure_lines(part: Mapping) -> list[str]:
 
 def _left(left: Mapping, verdict: str, unit: str) -> str:
     """Return what is left: how much above the floor, along which channels, and whether chance could have made it."""
-    above = f"rmse {_number(left['rmse_N'])} {unit} above the floor, " if left["rmse_N"] is not None else ""
+    above = f"rmse {_number(left['rmse_N'])} {unit} above the floor, " if left["rmse_N"] else ""
     sure = "" if verdict == "unexplained" else ": no claim, a place to look"
     return f"{above}along {left['channel']} (p {left['p_value']:.2g}){sure}"
 

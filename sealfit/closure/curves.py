@@ -8,7 +8,7 @@ import pandas as pd
 from sealfit.closure.channels import Channel, unit_of
 from sealfit.closure.document import parameter_unit
 from sealfit.closure.grow import Grown
-from sealfit.closure.intervals import degrees_of_freedom, mean_se, t_quantile
+from sealfit.closure.intervals import degrees_of_freedom, mean_se, robust_covariance, t_quantile
 from sealfit.closure.naming import free_term
 from sealfit.config import Config
 from sealfit.fit.estimate import Fitted, fit
@@ -58,9 +58,9 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
     reach = t_quantile(degrees_of_freedom(after))
     offset = after.model.theta.size
     for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True)):
-        count = len(term.effect.parameters)
-        covariance = after.covariance[offset : offset + count, offset : offset + count]
-        offset += count
+        place = slice(offset, offset + len(term.effect.parameters))
+        covariance = (robust_covariance(after, "file") if "held" in term.fixed else after.covariance)[place, place]
+        offset = place.stop
         inputs, x, labels = _along(term, after)
         value = np.asarray(term.effect.shape(inputs, **values), dtype=float)
         tangent = np.column_stack([np.broadcast_to(d, value.shape) for d in term_derivatives(term, values, inputs)])

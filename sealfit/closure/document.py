@@ -33,11 +33,14 @@ def effect_entries(after: Fitted, added: Sequence[Added], config: Config) -> lis
     for number, (item, term) in enumerate(zip(added, after.model.terms, strict=True)):
         proposal = item.proposal
         intervals = effect_intervals(after, number, proposal.unit)
+        free = (
+            {"phi"} if "shift" in term.fixed else set()
+        )  # each pass has a phase of its own: there is not one to print
         parameters = [
             {
                 "name": p.symbol,
-                "value": intervals[p.name][0],
-                "ci95": [intervals[p.name][1], intervals[p.name][2]],
+                "value": None if p.name in free else intervals[p.name][0],
+                "ci95": [None, None] if p.name in free else list(intervals[p.name][1:]),
                 "unit": parameter_unit(p.unit, term, config.units),
             }
             for p in term.effect.parameters
@@ -45,7 +48,7 @@ def effect_entries(after: Fitted, added: Sequence[Added], config: Config) -> lis
         entries.append(
             {
                 "id": term.effect.id,
-                "label": describe(term),
+                "label": describe(term) + (", its phase each pass's own" if "shift" in term.fixed else ""),
                 "level": effect_level(term, after.rows),
                 "channels": channels_of(term, after.rows),
                 "acts_on": term.acts_on,

@@ -181,7 +181,7 @@ def left_over(closure: Mapping, config: Config) -> Markup:
         size, ground = together([rmse, floor])
         beside = f" beside a noise floor of {of_unit(ground, unit)}" if known(floor) else ""
         said.append(f"The rms error that is left over all bins is {of_unit(size, unit)}{beside}")
-        if known(floor) and known(left.get("rmse_N")) and left["rmse_N"] < rmse:
+        if known(floor) and known(left.get("rmse_N")) and 0 < left["rmse_N"] < rmse:
             said[0] += (
                 f"; {of_unit(number(left['rmse_N'], 2), unit)} of it lies above the floor (roots of sums of squares)"
             )
