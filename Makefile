@@ -6,7 +6,7 @@ NO_NETWORK = echo "make: the packages that sealfit needs could not be installed;
 CODE := $(wildcard sealfit tests benchmarks)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint check clean
+.PHONY: help demo test lint check bench bench-null bench-effects bench-coverage clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -22,6 +22,17 @@ lint: .venv/.installed-test ## check style and formatting
 	$(BIN)/ruff format --check $(CODE)
 
 check: test ## what the continuous integration runs: the same as test
+
+bench: bench-null bench-effects bench-coverage ## long counts of false alarms, effects found and coverage (about half an hour)
+
+bench-null: .venv/.installed-test
+	$(BIN)/python benchmarks/false_alarms.py --seeds 3
+
+bench-effects: .venv/.installed-test
+	$(BIN)/python benchmarks/false_alarms.py --seeds 1 --strength strong --effects
+
+bench-coverage: .venv/.installed-test
+	$(BIN)/python benchmarks/coverage_steady.py 400
 
 clean: ## remove everything that make made, .venv too
 	rm -rf .venv demo-out build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
