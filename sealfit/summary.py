@@ -195,7 +195,7 @@ def closure_lines(part: Mapping) -> list[str]:
     found = [_line("verdict", f"{part['verdict']}: {part['sentence']}")]
     for effect in part["effects"]:
         status = "candidate, not applied: " if effect["candidate"] else "+ "
-        known = [p for p in effect["parameters"] if p["value"] is not None]
+        known = [p for p in effect["parameters"] if p["value"] is not None or p["name"] != "phi"]
         values = ", ".join(_value(p) for p in known) if effect["named"] else "no form does as well"
         found.append(_line("", f"{status}{effect['label']}: {values}"))
     rows = (("rmse", "rmse_N"), ("held out", "heldout_rmse_N"), ("run means", "rmse_runs_N"), ("largest", "max_abs_N"))

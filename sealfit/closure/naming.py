@@ -23,7 +23,7 @@ from sealfit.closure.waves import common_wavelength, pass_shifts
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.effects.free import free_effect
-from sealfit.fit.estimate import Fitted, fit
+from sealfit.fit.estimate import Fitted, fit, settled
 from sealfit.fit.joint import Term, mean_derivatives, term_slope
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
@@ -210,7 +210,8 @@ def _identical(one: Proposal, other: Proposal) -> bool:
 
 def _refit(fitted: Fitted, proposal: Proposal) -> Proposal:
     model = fitted.model.with_term(proposal.term, proposal.values)
-    return replace(proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0, loading=fitted.force))
+    refitted = fit(model, fitted.rows, fitted.scatter, turns=0, loading=fitted.force)
+    return replace(proposal, fitted=settled(refitted, fitted.force))
 
 
 def _terms(
@@ -278,7 +279,7 @@ def _periodic(
     units = rows.groups.starts["file"].size
     for way in ways:
         if way in effect.acts_on:
-            candidate = Candidate((peak.axis,), *way, "file", np.empty((0, 0)), 0.0, 2, units, 0.0, peak.p_value)
+            candidate = Candidate((peak.axis,), *way, "file", np.empty((0, 0)), 0.0, 2, units, 0.0, 0.0, peak.p_value)
             yield Term(effect, (peak.axis,), *way, fixed=fixed), names, candidate
 
 

@@ -223,10 +223,27 @@ def _alike(ratio: np.ndarray) -> np.ndarray:
     The logarithm of a mean of c powers has the variance trigamma(c); its spread is taken from the quartiles, which a
     few peaks do not move.
     """
-    low, high = np.nanquantile(_neighbours(np.log(np.maximum(ratio, 1e-300))), (0.25, 0.75), axis=1)
+    low, high = _quantiles(_neighbours(np.log(np.maximum(ratio, 1e-300))), (0.25, 0.75))
     spread = ((high - low) / 1.349) ** 2
     numbers = np.geomspace(1e5, 1.0, 200)
     return np.interp(spread, polygamma(1, numbers), numbers)
+
+
+def _quantiles(windows: np.ndarray, levels: Sequence[float]) -> list[np.ndarray]:
+    """Return quantiles of each row, NaN left out, by linear interpolation, each of shape (f,).
+
+    numpy's nanquantile takes the rows one by one, a hundred times slower.
+    """
+    ordered = np.sort(windows, axis=1)  # NaN last
+    last = np.maximum(np.isfinite(windows).sum(axis=1) - 1, 0)
+    every = np.arange(last.size)
+    found = []
+    for level in levels:
+        place = level * last
+        low = np.floor(place).astype(int)
+        high = np.minimum(low + 1, last)
+        found.append(ordered[every, low] + (place - low) * (ordered[every, high] - ordered[every, low]))
+    return found
 
 
 def _neighbours(value: np.ndarray) -> np.ndarray:
@@ -274,7 +291,7 @@ def _smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarr
 
 def _background(power: np.ndarray) -> np.ndarray:
     """Return the median of each frequency's neighbours, the peak's own main lobe left out."""
-    return np.maximum(np.nanmedian(_neighbours(power), axis=1), 1e-300)
+    return np.maximum(_quantiles(_neighbours(power), (0.5,))[0], 1e-300)
 
 
 def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from sealfit.fit.joint import LOGARITHMIC, Model, evaluate
 from sealfit.fit.mixed import Scatter
 from sealfit.fit.rows import Rows
-from sealfit.fit.scatter import estimate_scatter
+from sealfit.fit.scatter import estimate_components, estimate_scatter
 from sealfit.fit.start import start_model, stribeck_range
 
 PRIOR_SD = 3.0
@@ -150,6 +150,25 @@ def fitted_at(model: Model, rows: Rows, scatter: Scatter, loading: np.ndarray | 
     white, logdet = scatter.whitened(np.column_stack([rows.force - force, jacobian]), load, rows.groups)
     residual = white[:, 0]
     return Fitted(model, scatter, rows, force, jacobian, residual, white[:, 1:], float(residual @ residual) + logdet)
+
+
+def settled(fitted: Fitted, loading: np.ndarray) -> Fitted:
+    """Return a fit with the variance components that its own residual shows, the row noise held.
+
+    What a model leaves unexplained between units stands in their variance. Two models are told apart by their deviances
+    only if each has its own; under the larger variance of what is missing they all look alike.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        A fit made under other components.
+    loading : ndarray, shape (n,)
+        Force that gains and noise load on: fits to be compared must share it.
+    """
+    rows = fitted.rows
+    scatter = estimate_components(rows, fitted.residual, loading, fitted.jacobian, fitted.scatter)
+    model = _descend(fitted.model, rows, scatter, fitted.model.vector(), loading)
+    return fitted_at(model, rows, scatter, loading)
 
 
 def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:

@@ -28,23 +28,42 @@ def estimate_scatter(rows: Rows, force: np.ndarray, jacobian: np.ndarray, start:
     residual = rows.force - force
     s0, g, inflation = row_noise(rows, residual, force)
     shape = shape_scatter(rows, residual, np.sqrt((s0**2 + (g * force) ** 2) * inflation))
+    start = Scatter(s0, g, () if start is None else start.components, inflation, shape)
+    return estimate_components(rows, residual, force, jacobian, start)
+
+
+def estimate_components(
+    rows: Rows, residual: np.ndarray, force: np.ndarray, jacobian: np.ndarray, scatter: Scatter
+) -> Scatter:
+    """Return a scatter with its components estimated anew and its row noise as it is.
+
+    Parameters
+    ----------
+    rows : Rows
+        The rows.
+    residual, force : ndarray, shape (n,)
+        Measured minus model, and the force that gains load on.
+    jacobian : ndarray, shape (n, p)
+        The model's tangent, whose degrees of freedom are taken out.
+    scatter : Scatter
+        Row noise, and where the components start.
+    """
     groups, level = rows.groups, "stroke"
     means = groups.means(np.column_stack([residual, force, jacobian]), level)
-    noise = groups.means(s0**2 + (g * force) ** 2, level)
+    noise = groups.means(scatter.noise_sd(force) ** 2, level)
     count = np.diff(np.r_[groups.starts[level], residual.size])
-    small = groups.at(level)
     kinds = usable_components(rows)
-    known = {} if start is None else {(c.level, c.kind): c.variance for c in start.components}
+    known = {(c.level, c.kind): c.variance for c in scatter.components}
     components = reml(
         means[:, 0],
         means[:, 2:],
-        noise * inflation / count,
+        noise * scatter.alike / count,
         means[:, 1],
-        small,
+        groups.at(level),
         kinds,
         [known.get(kind, 0.0) for kind in kinds] if known else None,
     )
-    return Scatter(s0, g, tuple(replace(c, df=_df(rows, c)) for c in components), inflation, shape)
+    return replace(scatter, components=tuple(replace(c, df=_df(rows, c)) for c in components))
 
 
 def usable_components(rows: Rows) -> list[tuple[str, str]]:
