@@ -15,7 +15,7 @@ demo: .venv/.installed ## analyse the simulated campaign in sample_data, and say
 	@$(BIN)/sealfit run sample_data/simulated --out demo-out
 
 test: lint ## lint and run every test
-	$(BIN)/python -m pytest -rs
+	$(BIN)/python -m pytest -rs -n auto --dist loadfile
 
 lint: .venv/.installed-test ## check style and formatting
 	$(BIN)/ruff check $(CODE)
