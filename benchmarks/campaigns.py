@@ -5,7 +5,8 @@
 
 `campaign(name, ...)` gives the SPEC; `sealfit.simulate.simulate` writes it. Small campaigns have about 200 files,
 large ones about 600. Strengths are chosen against the scatter of `RIG`: weak has an RMS of 0.25 to 1 times one file's,
-medium is three times, strong ten times that. Draws depend on the seed and on what they are for only: two nulls of one
+medium is three times, strong ten times that; faint is beyond what the files can show. The kinds of effect stand in
+`effect_kinds.py`. Draws depend on the seed and on what they are for only: two nulls of one
 seed share their run order and specimens, so count on different seeds.
 """
 
@@ -13,16 +14,17 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
+
+from effect_kinds import DESIGNS, EFFECT_CAMPAIGNS, NEEDS_BOTH_WAYS, Size
 
 from sealfit.errors import SealfitError
 from sealfit.simulate import Spec, simulate
 
-Size = Literal["small", "large"]
-Strength = Literal["weak", "medium", "strong"]
+Strength = Literal["faint", "weak", "medium", "strong"]
 STRENGTHS: dict[Strength, float] = {"weak": 1.0, "medium": 3.0, "strong": 10.0}
+FAINT = 0.03  # below what some 200 files can show
 
 SPEEDS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 50.0)
 ONE_WAY: dict[Size, dict] = {
@@ -63,70 +65,6 @@ NULLS: dict[str, tuple[tuple[dict, ...], tuple[dict, ...]]] = {
     "null_proportional": (({"kind": "proportional", "sd_rel": 0.01}, WHITE), ()),
 }
 
-# ---------------------------------------------------------------- effects: strength -> (effects, channels)
-COLUMN = {"kind": "numeric", "name": "oil_ppm", "level": "run", "mean": 50.0, "sd": 10.0}
-OTHER = {"kind": "numeric", "name": "dust_mg", "level": "run", "mean": 5.0, "sd": 1.0}
-GRADES = {"kind": "category", "name": "cleaner", "level": "run", "labels": ("K", "L", "M"), "assignment": "balanced"}
-Ingredients = tuple[tuple[dict, ...], tuple[dict, ...]]
-
-
-def _one(id: str, parameters: dict, acts_on: str, operation: str, **more) -> dict:
-    return {"id": id, "parameters": parameters, "acts_on": acts_on, "operation": operation, **more}
-
-
-def _ripple(k: float) -> dict:
-    return _one("ripple", {"A": 0.1 * k, "lambda_": 5.0, "phi": 0.7}, "force", "add")
-
-
-def _warming_distance(k: float) -> dict:
-    return _one("warming_distance", {"A": 0.01 * k, "s_0": 10.0}, "mu", "multiply")
-
-
-def _conditioning(k: float) -> dict:
-    return _one("conditioning", {"A": -0.01 * k, "n_0": 1.0}, "mu", "multiply")
-
-
-def _column(k: float) -> dict:
-    reference = {"x_ref": COLUMN["mean"]}
-    return _one("linear", {"A": 0.0007 * k}, "mu", "multiply", channels=("oil_ppm",), reference=reference)
-
-
-def _column_log(k: float) -> dict:
-    reference = {"x_ref": COLUMN["mean"]}
-    return _one("log", {"A": 0.7 * k}, "force", "add", channels=("oil_ppm",), reference=reference)
-
-
-def _grades(k: float, acts_on: str, operation: str, size: float) -> dict:
-    values = {"K": -size * k, "L": 0.0, "M": size * k}
-    return _one("levels", values, acts_on, operation, channels=("cleaner",))
-
-
-def _expression(formula: str, size: float, acts_on: str, operation: str) -> dict:
-    return _one("expression", {"A": size}, acts_on, operation, formula=formula)
-
-
-BUMP = "A * exp(-((displacement_mm - 22) / 2) ** 2)"
-PRODUCT = "A * (oil_ppm - 50) / 10 * (dust_mg - 5)"
-
-EFFECT_CAMPAIGNS: dict[str, Callable[[float], Ingredients]] = {
-    "ripple": lambda k: ((_ripple(k),), ()),
-    "warming_time": lambda k: ((_one("warming_time", {"A": 0.01 * k, "tau": 4.0}, "mu", "multiply"),), ()),
-    "warming_distance": lambda k: ((_warming_distance(k),), ()),
-    "drift": lambda k: ((_one("drift", {"A": 0.004 * k}, "force", "add"),), ()),
-    "conditioning": lambda k: ((_conditioning(k),), ()),
-    "zero_offset": lambda k: ((_one("zero_offset", {"A": 0.15 * k}, "force", "add"),), ()),
-    "asymmetry": lambda k: ((_one("asymmetry", {"A": 0.014 * k}, "mu", "multiply"),), ()),
-    "column_linear_mu": lambda k: ((_column(k),), (COLUMN,)),
-    "column_log_force": lambda k: ((_column_log(k),), (COLUMN,)),
-    "column_category_mu": lambda k: ((_grades(k, "mu", "multiply", 0.008),), (GRADES,)),
-    "column_category_force": lambda k: ((_grades(k, "force", "add", 0.2),), (GRADES,)),
-    "bump": lambda k: ((_expression(BUMP, 0.25 * k, "force", "add"),), ()),
-    "product": lambda k: ((_expression(PRODUCT, 0.007 * k, "mu", "multiply"),), (COLUMN, OTHER)),
-    "two_at_once": lambda k: ((_ripple(k), _conditioning(k)), ()),
-    "three_at_once": lambda k: ((_warming_distance(k), _column(k), _ripple(k)), (COLUMN,)),
-}
-NEEDS_BOTH_WAYS = ("zero_offset", "asymmetry")
-
 
 def names() -> list[str]:
     """Names of all campaigns, nulls first."""
@@ -143,7 +81,7 @@ def campaign(name: str, *, seed: int = 1, size: Size = "small", strength: Streng
     if name in NULLS:
         noise, channels = NULLS[name]
     else:
-        effects, channels = EFFECT_CAMPAIGNS[name](STRENGTHS[strength])
+        effects, channels = EFFECT_CAMPAIGNS[name](FAINT if strength == "faint" else STRENGTHS[strength])
         noise = RIG
     both = name in NEEDS_BOTH_WAYS
     design = {
@@ -152,6 +90,7 @@ def campaign(name: str, *, seed: int = 1, size: Size = "small", strength: Streng
         "start_scatter_mm": 4.0,  # or distance could not be told from position
         "max_rows": rows,
         **(BOTH_WAYS if both else ONE_WAY)[size],
+        **DESIGNS.get(name, {}).get(size, {}),
     }
     return Spec(
         name=name, seed=seed, physics={"growth": {}}, design=design, effects=effects, channels=channels, noise=noise
@@ -192,7 +131,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, metavar="DIR")
     parser.add_argument("--size", choices=["small", "large"], default="small")
-    parser.add_argument("--strength", choices=list(STRENGTHS), default="medium")
+    parser.add_argument("--strength", choices=["faint", *STRENGTHS], default="medium")
     parser.add_argument("--rows", type=int, default=400, help="most rows of a file (paper: 1,000)")
     given = parser.parse_args(arguments)
     if given.list:

