@@ -6,9 +6,11 @@ Mechanisms come first, then closed forms of any channel. Free shapes, whose size
 
 from sealfit.effects.aging_floor import AGING_FLOOR
 from sealfit.effects.aging_induction import AGING_INDUCTION
+from sealfit.effects.arrhenius_aging import ARRHENIUS_AGING
 from sealfit.effects.asymmetry import ASYMMETRY
 from sealfit.effects.bump import BUMP
 from sealfit.effects.campaign_drift import CAMPAIGN_DRIFT
+from sealfit.effects.compression_factor import COMPRESSION_FACTOR
 from sealfit.effects.conditioning import CONDITIONING
 from sealfit.effects.drift import DRIFT
 from sealfit.effects.exponential_approach import EXPONENTIAL_APPROACH
@@ -29,6 +31,7 @@ from sealfit.effects.run_in import RUN_IN
 from sealfit.effects.saturation import SATURATION
 from sealfit.effects.sinusoid import SINUSOID
 from sealfit.effects.step import STEP
+from sealfit.effects.stribeck_exponent import STRIBECK_EXPONENT
 from sealfit.effects.stribeck_speed_aging import STRIBECK_SPEED_AGING
 from sealfit.effects.viscosity_aging import VISCOSITY_AGING
 from sealfit.effects.warming_conduction import WARMING_CONDUCTION
@@ -55,9 +58,12 @@ EFFECTS = {
         REST_STRENGTHENING,
         CAMPAIGN_DRIFT,
         LOAD_EXPONENT,
+        STRIBECK_EXPONENT,
         LOG_RATE,
         POWER_VISCOUS,
         GROSCH_PEAK,
+        ARRHENIUS_AGING,
+        COMPRESSION_FACTOR,
         AGING_FLOOR,
         AGING_INDUCTION,
         STRIBECK_SPEED_AGING,

@@ -38,6 +38,8 @@ CAMPAIGN = {
     "rest_s": np.geomspace(0.1, 1e5, 12),
     "elapsed_h": np.linspace(0.0, 900.0, 12),
     "aging_days": np.array([0.0, 0.0, 1.0, 1.0, 2.0, 2.0, 4.0, 4.0, 8.0, 8.0, 16.0, 16.0]),
+    "temperature_C": np.repeat([23.0, 60.0, 80.0], 4),
+    "compression_ratio_pct": np.repeat([100.0, 90.0, 80.0], 4),
     "lab_temperature_C": np.linspace(18.0, 27.0, 12),
     "humidity_pct": np.linspace(20.0, 80.0, 12),
     "x": np.linspace(0.5, 11.8, 12),

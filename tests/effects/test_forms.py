@@ -44,7 +44,9 @@ def test_an_added_viscous_force_is_odd_in_the_speed(speed, n, A):
     npt.assert_array_equal(shape({"speed_mm_s": np.array([-speed])}, A=A, n=n), -forward)
 
 
-@pytest.mark.parametrize("name", ["log_rate", "grosch_peak", "warming_power", "warming_conduction"])
+@pytest.mark.parametrize(
+    "name", ["log_rate", "stribeck_exponent", "grosch_peak", "warming_power", "warming_conduction"]
+)
 def test_a_factor_is_even_in_the_speed(name):
     effect = EFFECTS[name]
     sliding = {"distance_mm": np.arange(12.0), "time_s": np.arange(12.0), "load_N": np.arange(1.0, 13.0)}
@@ -121,3 +123,50 @@ def test_asymmetry_is_the_difference_of_both_ways_and_leaves_their_mean():
 def test_a_viscoelastic_peak_has_no_force_at_rest():
     shape = EFFECTS["grosch_peak"].shape({"speed_mm_s": np.array([0.0])}, A=0.3, v_p=1.0, w=1.0)
     npt.assert_array_equal(shape, [0.0])
+
+
+def test_the_declared_curve_with_its_exponent_changed_is_the_curve_of_that_exponent():
+    speed = np.geomspace(0.1, 60.0, 20)
+    declared = 0.4 + 0.3 * np.exp(-((speed / 5.0) ** 2))
+    change = EFFECTS["stribeck_exponent"].shape({"speed_mm_s": speed}, A=0.3, v_s=5.0, n=0.7)
+    npt.assert_allclose(declared + change, 0.4 + 0.3 * np.exp(-((speed / 5.0) ** 0.7)), rtol=1e-14)
+
+
+@given(n=st.floats(0.2, 10.0))
+def test_a_stribeck_exponent_changes_nothing_at_rest_at_the_stribeck_speed_and_far_above(n):
+    shape = EFFECTS["stribeck_exponent"].shape
+    npt.assert_allclose(shape({"speed_mm_s": np.array([0.0, 5.0, 5e19])}, A=0.3, v_s=5.0, n=n), 0.0, atol=1e-15)
+
+
+def test_a_stribeck_exponent_of_2_is_the_declared_curve_and_near_2_only_a_product_shows():
+    speed = np.geomspace(0.1, 60.0, 20)
+    shape = EFFECTS["stribeck_exponent"].shape
+    npt.assert_array_equal(shape({"speed_mm_s": speed}, A=0.3, v_s=5.0, n=2.0), 0.0)
+    ratio = speed / 5.0
+    first = 0.3 * -1e-4 * ratio**2 * np.log(ratio) * np.exp(-(ratio**2))
+    npt.assert_allclose(shape({"speed_mm_s": speed}, A=0.3, v_s=5.0, n=2.0001), first, atol=1e-8)
+
+
+def test_arrhenius_is_a_factor_of_two_to_three_per_ten_degrees_at_a_rubbers_activation_energy():
+    # van 't Hoff's rule. By hand, 60 to 70 degC at 80 kJ/mol: 9621.8 K * (1/333.15 - 1/343.15) / K = 0.84165.
+    inputs = {"temperature_C": np.array([60.0, 70.0]), "temperature_C_ref": 60.0}
+    shape = EFFECTS["arrhenius_aging"].shape(inputs, A=1.0, E=8e4)
+    npt.assert_allclose(1 + shape, [1.0, 2.3202], atol=2e-4)
+
+
+@given(celsius=st.floats(20.0, 100.0), energy=st.floats(1e3, 1.2e5))
+def test_arrhenius_on_a_time_undoes_that_on_a_rate(celsius, energy):
+    shape = EFFECTS["arrhenius_aging"].shape
+    inputs = {"temperature_C": np.array([celsius]), "temperature_C_ref": 60.0}
+    rate, time = 1 + shape(inputs, A=1.0, E=energy), 1 + shape(inputs, A=1.0, E=-energy)
+    npt.assert_allclose(rate * time, 1.0, rtol=1e-9)
+
+
+def test_arrhenius_says_nothing_below_absolute_zero():
+    shape = EFFECTS["arrhenius_aging"].shape({"temperature_C": np.array([-273.15, -300.0])}, A=1.0, E=8e4)
+    npt.assert_array_equal(shape, [np.nan, np.nan])
+
+
+def test_rubber_that_was_not_compressed_is_the_reference_whatever_the_campaigns_mean():
+    inputs = {"compression_ratio_pct": np.array([100.0, 90.0, 80.0]), "compression_ratio_pct_ref": 90.0}
+    npt.assert_allclose(EFFECTS["compression_factor"].shape(inputs, A=0.5), [0.0, 0.05, 0.10], atol=1e-16)
