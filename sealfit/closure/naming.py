@@ -226,7 +226,7 @@ def _terms(
         if target not in effect.acts_on or not set(effect.reads) <= known | {CHANNEL}:
             continue
         if effect.reads == (CHANNEL,):
-            if not channel.numeric or name == "direction" or effect.id == "sinusoid":
+            if not channel.numeric or name == "direction" or effect.id in ("sinusoid", "sinusoid_harmonics"):
                 continue
             if not _in_domain(effect, channel.values):
                 continue

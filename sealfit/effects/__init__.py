@@ -16,6 +16,7 @@ from sealfit.effects.drift import DRIFT
 from sealfit.effects.exponential_approach import EXPONENTIAL_APPROACH
 from sealfit.effects.grosch_peak import GROSCH_PEAK
 from sealfit.effects.humidity import HUMIDITY
+from sealfit.effects.hyperbolic import HYPERBOLIC
 from sealfit.effects.lab_temperature import LAB_TEMPERATURE
 from sealfit.effects.linear import LINEAR
 from sealfit.effects.load_exponent import LOAD_EXPONENT
@@ -30,6 +31,7 @@ from sealfit.effects.ripple import RIPPLE
 from sealfit.effects.run_in import RUN_IN
 from sealfit.effects.saturation import SATURATION
 from sealfit.effects.sinusoid import SINUSOID
+from sealfit.effects.sinusoid_harmonics import SINUSOID_HARMONICS
 from sealfit.effects.step import STEP
 from sealfit.effects.stribeck_exponent import STRIBECK_EXPONENT
 from sealfit.effects.stribeck_speed_aging import STRIBECK_SPEED_AGING
@@ -77,8 +79,10 @@ EFFECTS = {
         POWER,
         EXPONENTIAL_APPROACH,
         SATURATION,
+        HYPERBOLIC,
         STEP,
         BUMP,
         SINUSOID,
+        SINUSOID_HARMONICS,
     )
 }

@@ -147,6 +147,21 @@ def test_a_stribeck_exponent_of_2_is_the_declared_curve_and_near_2_only_a_produc
     npt.assert_allclose(shape({"speed_mm_s": speed}, A=0.3, v_s=5.0, n=2.0001), first, atol=1e-8)
 
 
+def test_a_hyperbolic_decay_is_a_constant_less_a_saturation():
+    inputs = {"x": np.array([0.0, 1.0, 50.0, -1.0])}
+    decay = EFFECTS["hyperbolic"].shape(inputs, A=0.4, x_half=3.0)
+    npt.assert_allclose(decay, 0.4 - EFFECTS["saturation"].shape(inputs, A=0.4, x_half=3.0), rtol=1e-14)
+    npt.assert_array_equal(decay[[0, 3]], [0.4, np.nan])
+
+
+def test_a_sine_with_harmonics_is_two_sines_the_second_of_half_the_period():
+    inputs = {"x": np.linspace(-3.0, 4.0, 15)}
+    both = EFFECTS["sinusoid_harmonics"].shape(inputs, A=0.4, B=0.2, lambda_=1.7, phi=0.3, phi_2=-1.1)
+    sine = EFFECTS["sinusoid"].shape
+    first, second = sine(inputs, A=0.4, lambda_=1.7, phi=0.3), sine(inputs, A=0.2, lambda_=0.85, phi=-1.1)
+    npt.assert_allclose(both, first + second, atol=1e-14)
+
+
 def test_arrhenius_is_a_factor_of_two_to_three_per_ten_degrees_at_a_rubbers_activation_energy():
     # van 't Hoff's rule. By hand, 60 to 70 degC at 80 kJ/mol: 9621.8 K * (1/333.15 - 1/343.15) / K = 0.84165.
     inputs = {"temperature_C": np.array([60.0, 70.0]), "temperature_C_ref": 60.0}
