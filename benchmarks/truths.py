@@ -1,0 +1,194 @@
+"""What the truth file of a campaign says, in the terms of the joint model: true effects as terms, tested and fitted.
+
+The true-form test of an effect: the declared model with every true effect in its true form, what is nonlinear in them
+held at its true value, fitted by the loop's own estimator to the rows the loop works on; z is the effect's amplitude
+over its standard error, the wider of the fitted scatter's and the one that whole groups of the effect's own unit show
+(as in the loop's intervals), with the sign of the true amplitude. For k amplitudes at once it is
+sqrt(max(W - (k - 1), 0)), W the Wald statistic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sealfit.closure.channels import flip_level, unit_of
+from sealfit.closure.document import channels_of, effect_level
+from sealfit.closure.intervals import robust_covariance
+from sealfit.effects import EFFECTS
+from sealfit.effects.contract import AMPLITUDE, Effect, Parameter
+from sealfit.effects.free import LEVELS, levels_effect
+from sealfit.fit.estimate import Fitted, fit
+from sealfit.fit.joint import Model, Term
+from sealfit.fit.rows import Rows
+from sealfit.simulate import Spec
+from sealfit.simulation.formula import evaluate_formula, parse_formula
+from sealfit.simulation.law import SteadyLaw, steady_law
+
+UNITS = ("stroke", "file", "run", "specimen")
+NO_INTERVAL = {("step", "x_0")}  # any place between two neighbouring values of the channel is the same step
+
+
+@dataclass(frozen=True)
+class TrueEffect:
+    """One true effect: its term, its true numbers in the term's parameters, and what it adds to each row's force."""
+
+    id: str
+    term: Term
+    values: Mapping[str, float]
+    channels: tuple[str, ...]  # as closure.json names them
+    level: str
+    unit: str  # whose whole groups are its evidence
+    column: np.ndarray  # (n,) with it less without it, noise-free
+
+    @property
+    def catalogued(self) -> bool:
+        """Whether the catalogue, or levels of a category, can name it."""
+        return self.id in EFFECTS or self.id == LEVELS
+
+
+def true_effects(spec: Spec, rows: Rows) -> list[TrueEffect]:
+    """Return the true effects of a campaign, on the rows of its bins."""
+    law = steady_law(spec)
+    given = row_channels(law, rows)
+    whole = np.broadcast_to(law.force_N(given), rows.force.shape)
+    found = []
+    for number, entry in enumerate(spec.effects):
+        term, values = true_term(entry, law.effects[number].channels)
+        found.append(
+            TrueEffect(
+                entry.id,
+                term,
+                values,
+                tuple(channels_of(term, rows)),
+                effect_level(term, rows),
+                evidence_unit(term, rows),
+                whole - law.without(number).force_N(given),
+            )
+        )
+    return found
+
+
+def row_channels(law: SteadyLaw, rows: Rows) -> dict[str, np.ndarray]:
+    """Return what a law reads, from rows."""
+    names = {"speed_mm_s", "direction", "temperature_C", "compression_ratio_pct", "aging_days", "load_N"}
+    names |= {name for effect in law.effects for name in effect.channels}
+    return {name: rows.values(name) for name in names if name in rows.table}
+
+
+def evidence_unit(term: Term, rows: Rows) -> str:
+    """Return the level of the whole groups that bear witness to an effect: that of its finest channel."""
+    order = ("sample", *UNITS)
+    finest = min((unit_of(rows.values(name), rows) for name in channels_of(term, rows)), key=order.index)
+    return flip_level(finest, rows)
+
+
+def true_term(entry, channels: tuple[str, ...]) -> tuple[Term, dict[str, float]]:
+    """Return an effect of a SPEC as a term of the joint model, and its true numbers in the term's parameters."""
+    target = (entry.acts_on, entry.operation)
+    if entry.id == LEVELS:
+        categories = sorted(entry.parameters)
+        base = entry.parameters[categories[0]]
+        scale = 1.0 + base if entry.operation == "multiply" else 1.0
+        values = {f"d_{k}": (entry.parameters[c] - base) / scale for k, c in enumerate(categories[1:], start=1)}
+        return Term(levels_effect(categories), channels, *target, fixed={"categories": tuple(categories)}), values
+    if entry.formula is not None:
+        return Term(formula_effect(entry.formula, entry.parameters, target), channels, *target), dict(entry.parameters)
+    return Term(EFFECTS[entry.id], channels, *target, fixed=dict(entry.reference)), dict(entry.parameters)
+
+
+def formula_effect(text: str, values: Mapping[str, float], target: tuple[str, str]) -> Effect:
+    """Return a formula that is proportional to each of its parameters as an effect."""
+    formula = parse_formula(text)
+    reads = tuple(name for name in formula.channels if name not in values)
+
+    def shape(inputs, **given) -> np.ndarray:
+        numbers = {name: np.float64(value) for name, value in given.items()}
+        return evaluate_formula(formula, {**{name: inputs[name] for name in reads}, **numbers})
+
+    parameters = tuple(Parameter(n, "{y}", 0.0, AMPLITUDE, "size", linear=True) for n in values)
+    return Effect("expression", text, text, text, reads, (target,), parameters, shape, "SPEC", ({}, {}, 0.0))
+
+
+@dataclass(frozen=True)
+class Tested:
+    """The true-form test of one effect: z as measured, and z at the true amplitude."""
+
+    z: float
+    z_expected: float
+
+
+def test_true_forms(declared: Model, rows: Rows, scatter, true: list[TrueEffect]) -> tuple[list[Tested], Fitted]:
+    """Return each true effect's test, and the true form fitted as a whole (nothing held)."""
+    held = declared
+    for effect in true:
+        fixed = {p.name: (effect.values[p.name],) * 2 for p in effect.term.effect.nonlinear}
+        own = dict(effect.term.fixed) | ({"held": fixed} if fixed else {})
+        held = held.with_term(replace(effect.term, fixed=own), effect.values)
+    known = fit(held, rows, scatter, turns=2)
+    tests, at = [], held.theta.size
+    for number, effect in enumerate(true):
+        names = [p.name for p in effect.term.effect.parameters]
+        places = [at + k for k, p in enumerate(effect.term.effect.parameters) if p.linear]
+        at += len(names)
+        covariance = _wider(known, effect.unit)[np.ix_(places, places)]
+        fitted = known.model.values[number]
+        linear = list(effect.term.effect.linear)
+        found, wanted = (np.array([v[n] for n in linear]) for v in (fitted, effect.values))
+        sign = 1.0 if len(linear) > 1 else float(np.sign(wanted[0]))
+        tests.append(Tested(sign * _z(found, covariance), abs(_z(wanted, covariance))))
+    free = known.model
+    for _ in true:
+        free = free.without_term(0)
+    for number, effect in enumerate(true):
+        free = free.with_term(effect.term, known.model.values[number])
+    return tests, fit(free, rows, known.scatter, turns=2)
+
+
+test_true_forms.__test__ = False  # a test of effects, not of this program
+
+
+def _wider(fitted: Fitted, unit: str) -> np.ndarray:
+    """Return the covariance of the fitted scatter, widened to what whole groups of a unit show where that is more."""
+    usual, robust = fitted.covariance, robust_covariance(fitted, unit)
+    grow = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(usual), 1e-300), 1.0))
+    return usual * np.outer(grow, grow)
+
+
+def _z(amplitude: np.ndarray, covariance: np.ndarray) -> float:
+    if amplitude.size == 1:
+        return float(amplitude[0] / np.sqrt(max(covariance[0, 0], 1e-300)))
+    wald = float(amplitude @ np.linalg.pinv(covariance) @ amplitude)
+    return float(np.sqrt(max(wald - (amplitude.size - 1), 0.0)))
+
+
+def truth_in_claim(effect: TrueEffect, claimed: Term, found: Mapping[str, float], rows: Rows) -> dict[str, float]:
+    """Return the true numbers as the claimed term would write them: its references, its phase's turn, its sign.
+
+    Two forms with other references are one effect where 1 + h' = c (1 + h) for a factor, or h' = h + c for a change:
+    the constant goes into the declared model. Amplitudes follow from least squares over the rows; nonlinear numbers
+    mean the same in both. Only for a claim with the true id and target.
+    """
+    values = dict(effect.values)
+    if "phi" in values:
+        turn = 2 * np.pi
+        if np.sign(found["A"]) != np.sign(values["A"]):
+            values = {**values, "A": -values["A"], "phi": values["phi"] + np.pi}
+        values["phi"] += turn * np.round((found["phi"] - values["phi"]) / turn)
+        return values
+    references = [name for name in {**claimed.fixed, **effect.term.fixed} if name.endswith("_ref")]
+    if effect.id == LEVELS or not any(claimed.fixed.get(n) != effect.term.fixed.get(n) for n in references):
+        return values
+    own = effect.term.effect.shape(effect.term.inputs(rows), **values)
+    zero = dict.fromkeys(effect.term.effect.linear, 0.0)
+    columns = [
+        claimed.effect.shape(claimed.inputs(rows), **{**values, **zero, name: 1.0}) for name in claimed.effect.linear
+    ]
+    if effect.term.operation == "multiply":  # c (1 + own) - sum A g = 1
+        matrix, wanted = np.column_stack([*(-c for c in columns), 1 + own]), np.ones_like(own)
+    else:
+        matrix, wanted = np.column_stack([*columns, -np.ones_like(own)]), own
+    solved, *_ = np.linalg.lstsq(matrix, wanted, rcond=None)
+    return values | dict(zip(claimed.effect.linear, (float(x) for x in solved[: len(columns)]), strict=True))
