@@ -6,7 +6,7 @@ NO_NETWORK = echo "make: the packages that sealfit needs could not be installed;
 CODE := $(wildcard sealfit tests benchmarks)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint check bench bench-null bench-effects bench-coverage clean
+.PHONY: help demo test lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -34,6 +34,13 @@ bench-effects: .venv/.installed-test
 bench-coverage: .venv/.installed-test
 	$(BIN)/python benchmarks/coverage_steady.py 400
 
+# In an environment of its own, as pygam holds scipy back. What is in out/loop.jsonl already is not run again.
+bench-loop: .venv/.installed-bench ## close the loop on some 550 campaigns beside what people would use instead (90 minutes)
+	.venv/bench/bin/python benchmarks/loop.py --out out/loop.jsonl
+
+bench-loop-cost: .venv/.installed-test
+	$(BIN)/python benchmarks/loop_cost.py
+
 clean: ## remove everything that make made, .venv too
 	rm -rf .venv demo-out build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find sealfit tests -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -50,4 +57,9 @@ clean: ## remove everything that make made, .venv too
 
 .venv/.installed-test: .venv/.installed
 	@$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[test]' || { $(NO_NETWORK); exit 1; }
+	@touch $@
+
+.venv/.installed-bench: .venv/.installed
+	@test -x .venv/bench/bin/python || $(BIN)/python -m venv .venv/bench
+	@.venv/bench/bin/python -m pip install -q --disable-pip-version-check -e '.[bench]' || { $(NO_NETWORK); exit 1; }
 	@touch $@
