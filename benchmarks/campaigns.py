@@ -6,8 +6,8 @@
 `campaign(name, ...)` gives the SPEC; `sealfit.simulate.simulate` writes it. Small campaigns have about 200 files,
 large ones about 600. Strengths are chosen against the scatter of `RIG`: weak has an RMS of 0.25 to 1 times one file's,
 medium is three times, strong ten times that; faint is beyond what the files can show. The kinds of effect stand in
-`effect_kinds.py`. Draws depend on the seed and on what they are for only: two nulls of one
-seed share their run order and specimens, so count on different seeds.
+`effect_kinds.py`. Draws depend on the seed and on what they are for only: two nulls of one seed share their run order
+and specimens, so count on different seeds.
 """
 
 from __future__ import annotations

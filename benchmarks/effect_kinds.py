@@ -21,6 +21,7 @@ REST = {"kind": "formula", "name": "rest_s", "formula": "5 * exp(2.5 + 2.5 * sin
 
 TWO_HUMPS = "A * (exp(-((oil_ppm - 40) / 4) ** 2) + exp(-((oil_ppm - 60) / 4) ** 2))"
 PRODUCT = "A * (oil_ppm - 50) / 10 * (dust_mg - 5)"
+FORMULA_OF = {PRODUCT: "product"}  # formulas that the catalogue holds: to be named so
 SPEED_TIMES_DAYS = "A * log(abs(speed_mm_s) / 5) * (log(1 + aging_days) - 1.4)"
 
 

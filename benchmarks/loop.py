@@ -33,7 +33,7 @@ FAINT_SEEDS = (1, 2)
 def plan(
     kinds: list[str], strengths: list[str], seeds: list[int], null_seeds: list[int], *, rivals: bool
 ) -> list[Task]:
-    """Return every campaign to run, the large ones first so that none is left to the end; nulls have no strength."""
+    """Return every campaign to run, by seed, so that a run that is stopped has all kinds; nulls have no strength."""
     from campaigns import NULLS
 
     tasks = []
@@ -45,7 +45,7 @@ def plan(
                 large = seed == LARGE_SEED["nulls" if null else "effects"] and strength != "faint"
                 with_rivals = rivals and (not null or seed <= RIVALS_ON_NULLS) and strength != "faint"
                 tasks.append(Task(kind, strength, seed, "large" if large else "small", with_rivals))
-    return sorted(tasks, key=lambda t: (t.size != "large", t.seed))
+    return sorted(tasks, key=lambda t: t.seed)
 
 
 def run(tasks: list[Task], out: Path, workers: int, *, limit: float) -> None:

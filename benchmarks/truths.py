@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from effect_kinds import FORMULA_OF
 
 from sealfit.closure.channels import flip_level, unit_of
 from sealfit.closure.document import channels_of, effect_level
@@ -57,9 +58,10 @@ def true_effects(spec: Spec, rows: Rows) -> list[TrueEffect]:
     found = []
     for number, entry in enumerate(spec.effects):
         term, values = true_term(entry, law.effects[number].channels)
+        name = FORMULA_OF.get(entry.formula, entry.id)
         found.append(
             TrueEffect(
-                entry.id,
+                name if name in EFFECTS else entry.id,
                 term,
                 values,
                 tuple(channels_of(term, rows)),
