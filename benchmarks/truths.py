@@ -180,10 +180,9 @@ def truth_in_claim(effect: TrueEffect, claimed: Term, found: Mapping[str, float]
             values = {**values, "A": -values["A"], "phi": values["phi"] + np.pi}
         values["phi"] += turn * np.round((found["phi"] - values["phi"]) / turn)
         return values
-    references = [name for name in {**claimed.fixed, **effect.term.fixed} if name.endswith("_ref")]
-    if effect.id == LEVELS or not any(claimed.fixed.get(n) != effect.term.fixed.get(n) for n in references):
-        return values
     own = effect.term.effect.shape(effect.term.inputs(rows), **values)
+    if np.allclose(claimed.effect.shape(claimed.inputs(rows), **values), own):
+        return values
     zero = dict.fromkeys(effect.term.effect.linear, 0.0)
     columns = [
         claimed.effect.shape(claimed.inputs(rows), **{**values, **zero, name: 1.0}) for name in claimed.effect.linear

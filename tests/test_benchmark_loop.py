@@ -206,6 +206,18 @@ def test_a_true_number_is_told_in_the_claims_reference_and_turn(made):
     assert turned == pytest.approx({"A": -0.3, "lambda_": 5.0, "phi": 0.7 - np.pi})
 
 
+def test_a_number_without_reference_is_told_as_it_is(made):
+    _, _, bins = made
+    bins = bins.assign(
+        direction=np.where(bins.index % 2, 1, -1), speed_mm_s=bins["speed_mm_s"] * np.where(bins.index % 2, 1, -1)
+    )
+    rows = make_rows(bins, has_aging=True)
+    (offset,) = true_effects(campaign("zero_offset", strength="strong"), rows)
+    claimed = Term(EFFECTS["zero_offset"], ("direction",), "force", "add", fixed={"direction_ref": 1.0})
+    assert offset.channels == ("direction",)
+    assert truth_in_claim(offset, claimed, {"A": 1.4}, rows) == {"A": 1.5}
+
+
 def test_levels_are_told_as_differences_from_the_first():
     entry = campaign("column_category_mu", strength="strong").effects[0]
     _, values = true_term(entry, ("cleaner",))
