@@ -39,7 +39,9 @@ def draw_points(bins: pd.DataFrame, spec: Spec, count: int, rng: np.random.Gener
                 values = rng.normal(channel.mean, channel.sd, count)
                 table[channel.name] = values.clip(bins[channel.name].min(), bins[channel.name].max())
             case CategoryChannel() if channel.labels:
-                table[channel.name] = rng.choice(channel.labels, count)
+                table[channel.name] = rng.choice(
+                    np.unique(bins[channel.name].astype(str)), count
+                )  # those that were drawn
             case _:  # a formula of other columns: as some file had it
                 table[channel.name] = bins[channel.name].to_numpy()[rng.integers(len(bins), size=count)]
     return table.drop(columns=["force_N", "force_sd_N", "n", "bin", "started_at"], errors="ignore")

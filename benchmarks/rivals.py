@@ -103,6 +103,7 @@ def sparse(inputs: Inputs, residual: np.ndarray, seed: int) -> np.ndarray:
 
     The library holds polynomials to second order and two Fourier terms of every channel, each scaled to -1 to 1 (the
     speed on a logarithmic scale). Its columns are standardised; a term stays while it gives 5 % of the residual's SD.
+    The ridge is kept in the last fit, which otherwise runs away at new points where channels say the same.
     """
     import pysindy
 
@@ -121,7 +122,7 @@ def sparse(inputs: Inputs, residual: np.ndarray, seed: int) -> np.ndarray:
     mean, spread = columns.mean(axis=0), columns.std(axis=0)
     used = spread > 1e-9
     size = float(residual.std()) or 1.0
-    optimiser = pysindy.STLSQ(threshold=THRESHOLD, alpha=RIDGE * len(x))
+    optimiser = pysindy.STLSQ(threshold=THRESHOLD, alpha=RIDGE * len(x), unbias=False)
     white = (columns[:, used] - mean[used]) / spread[used]
     optimiser.fit(white, ((residual - residual.mean()) / size)[:, None])
     new = (np.asarray(library.transform(scaled(inputs.at)))[:, used] - mean[used]) / spread[used]
