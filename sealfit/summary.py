@@ -113,7 +113,7 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
         listed.append(
             {
                 "id": effect.id,
-                "label": effect.label.replace("{x}", "a channel x"),
+                "label": effect.label.replace("{x}", "a channel x").replace("{z}", "a channel z"),
                 "form": effect.form,
                 "equation": effect.equation,
                 "reads": list(effect.reads),

@@ -7,10 +7,11 @@ import pandas as pd
 
 from sealfit.closure.channels import Channel, unit_of
 from sealfit.closure.document import parameter_unit
+from sealfit.closure.forms import free_term
 from sealfit.closure.grow import Grown
 from sealfit.closure.intervals import degrees_of_freedom, mean_se, robust_covariance, t_quantile
-from sealfit.closure.naming import free_term
 from sealfit.config import Config
+from sealfit.effects.contract import SECOND
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.joint import Term, evaluate, term_derivatives
 from sealfit.fit.rows import point_rows
@@ -101,10 +102,17 @@ def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
     x = distinct if distinct.size <= 12 else np.linspace(low, high, 4 * POINTS if high < values.max() else POINTS)
     inputs = {}
     for name, channel in zip(term.effect.reads, term.channels, strict=True):
-        own = rows.values(channel)
-        inputs[name] = x if channel == first else np.full(x.size, float(np.mean(np.abs(own))))
+        inputs[name] = x if channel == first else np.full(x.size, _usual(rows.values(channel), pair=name == SECOND))
     fixed = {key: value for key, value in term.fixed.items() if key != "shift"}
     return {**inputs, **fixed}, x, None
+
+
+def _usual(values: np.ndarray, *, pair: bool) -> float | str:
+    """Return where a second channel is held in a plot: its mean, nine tenths up for a pair, or the first category."""
+    if values.dtype.kind != "f":
+        return str(np.unique(values)[0])
+    size = np.abs(values)
+    return float(np.quantile(values, 0.9)) if pair else float(size.mean())
 
 
 def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:

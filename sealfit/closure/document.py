@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import FINER, Channel, unit_of
+from sealfit.closure.forms import free_term
 from sealfit.closure.grow import Added, Grown, describe
 from sealfit.closure.intervals import effect_intervals
-from sealfit.closure.naming import free_term
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import Candidate, search
 from sealfit.config import Config
@@ -91,14 +91,16 @@ def effect_level(term: Term, rows: Rows) -> str:
 
 def form_of(term: Term) -> str:
     """Return the effect's equation in plain text with its fixed reference value."""
-    text = term.effect.form
-    reference = term.fixed.get("x_ref")
-    return text.replace("x_ref", f"{reference:g}") if reference is not None else text
+    text = term.effect.form.replace("{x}", term.channels[0]).replace("{z}", term.channels[-1])
+    for name in ("x_ref", "z_ref"):
+        if name in term.fixed:
+            text = text.replace(name, f"{term.fixed[name]:g}")
+    return text
 
 
 def parameter_unit(unit: str, term: Term, units: Units) -> str:
-    """Return a parameter's true unit: {x} is the channel's, {y} that of what the effect gives."""
-    channel = units.of(term.channels[0])
+    """Return a parameter's true unit: {x} and {z} are the channels', {y} that of what the effect gives."""
+    channel, second = units.of(term.channels[0]), units.of(term.channels[-1])
     if term.operation == "multiply":
         given = ""
     elif term.acts_on == "force":
@@ -109,7 +111,7 @@ def parameter_unit(unit: str, term: Term, units: Units) -> str:
         given = units.unit("speed")
     else:
         given = ""
-    return fill_unit(unit, channel, given)
+    return fill_unit(unit, channel, given, second)
 
 
 def effect_table(entries: Sequence[dict], added: Sequence[Added]) -> pd.DataFrame:

@@ -10,7 +10,9 @@ import pandas as pd
 
 from sealfit.closure.channels import Channel, find_channels
 from sealfit.closure.confirm import heldout_gain
+from sealfit.closure.forms import PERIODIC
 from sealfit.closure.naming import Proposal, propose, rivals
+from sealfit.closure.pairs import search_pairs
 from sealfit.closure.ripple import Peak, find_ripple
 from sealfit.closure.search import Candidate, search
 from sealfit.config import Config
@@ -19,7 +21,6 @@ from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import Term, evaluate, passes
 from sealfit.fit.rows import Rows
 
-PERIODIC = ("ripple", "sinusoid")
 CALENDAR = {"run_order", "elapsed_h"}
 TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
 
@@ -102,6 +103,10 @@ def grow(
         peak = peak if peak is not None and peak.p_value <= alpha and ("peak", peak.axis) not in refused else None
         significant = [c for c in candidates if c.p_value <= alpha]
         say(f"round {number}: {len(candidates)} candidates on {len(channels)} channels, {len(significant)} significant")
+        if not significant and peak is None:
+            pairs = search_pairs(fitted, list(channels.values()), candidates, rng)
+            significant = [c for c in pairs if c.p_value <= alpha]
+            say(f"round {number}: {len(pairs)} pairs, {len(significant)} significant")
         left = significant[0] if significant else peak
         open_ = [c for c in significant if c.key not in refused]
         if (not open_ and peak is None) or number > config.loop.max_rounds:
@@ -142,7 +147,7 @@ def _declared_first(significant: list[Candidate], config: Config) -> list[Candid
 
 def describe(term: Term) -> str:
     """Return an effect in words, e.g. "ripple along displacement_mm, on force"."""
-    label = term.effect.label.replace("{x}", term.channels[0])
+    label = term.effect.label.replace("{x}", term.channels[0]).replace("{z}", term.channels[-1])
     return f"{label}, {'added to' if term.operation == 'add' else 'factor on'} {term.acts_on}"
 
 

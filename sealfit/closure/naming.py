@@ -9,20 +9,20 @@ Where rivals do equally well, a named mechanism comes before a closed form, and 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import FREE_DF, WIDE, Channel
-from sealfit.closure.intervals import robust_covariance, t_quantile
+from sealfit.closure.channels import Channel
+from sealfit.closure.forms import periodic_terms, terms_of
+from sealfit.closure.intervals import robust_covariance
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import Candidate, project
-from sealfit.closure.waves import common_wavelength, pass_shifts
 from sealfit.effects import EFFECTS
-from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.effects.free import free_effect
+from sealfit.effects.contract import Effect
+from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.estimate import Fitted, fit, settled
 from sealfit.fit.joint import Term, mean_derivatives, term_slope
 
@@ -34,7 +34,7 @@ HELD = 0.5  # relative standard error beyond which a form's own number is not de
 OVERTURNED = 1 / 3  # share of its size by which a new effect may change an earlier one, where it has equals
 ALIKE = 0.5  # correlation below which two candidates explain different things
 SAME = 0.98  # correlation above which two candidates are one effect here
-PHASES = tuple(np.arange(4) * np.pi / 4)
+UNNAMED = (SMOOTH, SURFACE)
 OFFSET = (("direction",), "force", "add")
 PREFERRED = ("mu", "mu_c", "mu_s", "v_s", "sigma_2", "a", "b", "mu_0", "force")
 
@@ -66,13 +66,13 @@ class Proposal:
     @property
     def named(self) -> bool:
         """Whether the form has a name."""
-        return self.term.effect.id not in ("smooth",)
+        return self.term.effect.id not in UNNAMED
 
     @property
     def rank(self) -> tuple:
         """Order among equals: mechanism, closed form, free shape; then fewer parameters; then what it acts on."""
         effect = self.term.effect
-        kind = 0 if effect.physical else 2 if effect.id == "smooth" else 1
+        kind = 0 if effect.physical else 2 if effect.id in UNNAMED else 1
         offset = self.source == OFFSET  # an amplifier's zero is off more often than a friction differs by direction
         return (kind, len(effect.parameters), -1 if offset else PREFERRED.index(self.term.acts_on))
 
@@ -113,10 +113,10 @@ def propose(
             if best.channels == ("direction",) and "direction" not in candidate.channels:
                 continue
             seen.add(candidate.key)
-            for term, search in _terms(candidate, channels, fitted, effects):
+            for term, search in terms_of(candidate, channels, fitted, effects):
                 found += _linearised(fitted, term, search, candidate)
     if peak is not None:
-        for term, search, candidate in _periodic(fitted, peak, samples, effects):
+        for term, search, candidate in periodic_terms(fitted, peak, samples, effects):
             found += [replace(p, source=("peak", peak.axis)) for p in _linearised(fitted, term, search, candidate)]
     found.sort(key=lambda p: p.criterion)
     found = [_refit(fitted, p) for p in _spread(found)]
@@ -212,107 +212,6 @@ def _refit(fitted: Fitted, proposal: Proposal) -> Proposal:
     model = fitted.model.with_term(proposal.term, proposal.values)
     refitted = fit(model, fitted.rows, fitted.scatter, turns=0, loading=fitted.force)
     return replace(proposal, fitted=settled(refitted, fitted.force))
-
-
-def _terms(
-    candidate: Candidate, channels: Mapping[str, Channel], fitted: Fitted, effects: Mapping[str, Effect]
-) -> Iterator[tuple[Term, dict]]:
-    """Yield every form that may act where the candidate does, with the values to try for each searched parameter."""
-    target = (candidate.acts_on, candidate.operation)
-    name = candidate.channels[-1]
-    channel = channels[name]
-    known = set(fitted.rows.table.columns)
-    for effect in effects.values():
-        if target not in effect.acts_on or not set(effect.reads) <= known | {CHANNEL}:
-            continue
-        if effect.reads == (CHANNEL,):
-            if not channel.numeric or name == "direction" or effect.id in ("sinusoid", "sinusoid_harmonics"):
-                continue
-            if not _in_domain(effect, channel.values):
-                continue
-            fixed = {"x_ref": reference(channel.values)}
-            yield Term(effect, (name,), *target, fixed=fixed), _grids(effect, channel.values)
-        elif name in effect.reads and effect.id != "ripple":
-            fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
-            yield Term(effect, effect.reads, *target, fixed=fixed), _grids(effect, np.abs(channel.values))
-    if name != "direction":
-        yield free_term(channel, *target), {}
-
-
-def free_term(channel: Channel, acts_on: str, operation: str) -> Term:
-    """Return the free shape of a channel: a spline with knots at quantiles, or one level per category."""
-    if channel.numeric:
-        distinct = np.unique(channel.values)
-        count = min(FREE_DF + 1, distinct.size)
-        if distinct.size <= FREE_DF + 1:
-            knots = distinct
-        elif distinct[0] > 0 and distinct[-1] / distinct[0] >= WIDE:
-            knots = np.geomspace(distinct[0], distinct[-1], count)
-        else:
-            knots = np.quantile(distinct, np.linspace(0, 1, count))
-        fixed = {"knots": tuple(float(k) for k in knots), "x_ref": float(knots[0])}
-        return Term(free_effect("smooth", fixed), (channel.name,), acts_on, operation, fixed)
-    fixed = {"categories": tuple(str(c) for c in np.unique(channel.values))}
-    return Term(free_effect("levels", fixed), (channel.name,), acts_on, operation, fixed)
-
-
-def _periodic(
-    fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
-) -> Iterator[tuple[Term, dict, Candidate]]:
-    rows = fitted.rows
-    effect = effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"]
-    both = np.unique(np.sign(rows.speed)).size == 2
-    ways = [("force", "add")] if peak.sign_symmetric else []
-    if not both or not peak.sign_symmetric:
-        ways += [("mu", "multiply"), ("force", "multiply")]
-    fixed: dict = {"x_ref": 0.0}
-    phases, lengths = PHASES, (peak.wavelength,)
-    if not peak.common_phase:
-        length, error = common_wavelength(samples, peak.wavelength, peak.axis)
-        reach = t_quantile(max(rows.groups.starts["file"].size - 1, 2)) * error
-        fixed["shift"] = pass_shifts(samples, rows, length, peak.axis)
-        fixed["held"] = {"lambda_": (length - reach, length + reach), "phi": (-np.pi, np.pi)}
-        lengths, phases = (length,), (0.0,)
-    names = {
-        p.name: (lengths if p.name == "lambda_" or p.name.startswith("lambda") else phases) for p in effect.nonlinear
-    }
-    units = rows.groups.starts["file"].size
-    for way in ways:
-        if way in effect.acts_on:
-            candidate = Candidate((peak.axis,), *way, "file", np.empty((0, 0)), 0.0, 2, units, 0.0, 0.0, peak.p_value)
-            yield Term(effect, (peak.axis,), *way, fixed=fixed), names, candidate
-
-
-def reference(values: np.ndarray) -> float:
-    """Return a channel's reference value: its mean, to three digits, so that it reads well."""
-    mean = float(np.mean(values))
-    return float(f"{mean:.3g}")
-
-
-def _in_domain(effect: Effect, values: np.ndarray) -> bool:
-    """Whether a form gives numbers at every value of the channel."""
-    sample = np.unique(values)[:: max(1, np.unique(values).size // 50)]
-    with np.errstate(all="ignore"):
-        result = effect.shape({CHANNEL: sample, "x_ref": reference(values)}, **effect.start())
-    return bool(np.isfinite(result).all())
-
-
-def _grids(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
-    """Return the values to try for each parameter that is searched."""
-    span = float(np.ptp(values)) or 1.0
-    grids = {}
-    for p in effect.nonlinear:
-        if p.search == "inside":
-            grid = np.quantile(np.unique(values), np.linspace(0.05, 0.95, 13))
-        elif p.search == "span":
-            grid = np.geomspace(span / 100, span * 2, 13)
-        elif p.search == "ratio":
-            positive = np.abs(values[values != 0])
-            grid = np.geomspace(positive.min(), positive.max(), 13) if positive.size else np.array([p.start])
-        else:
-            grid = np.array(p.search or (p.start,))
-        grids[p.name] = tuple(float(x) for x in np.unique(np.clip(grid, *p.bounds)))
-    return grids
 
 
 def _linearised(fitted: Fitted, term: Term, search: Mapping[str, tuple], candidate: Candidate) -> list[Proposal]:

@@ -8,7 +8,7 @@ import pandas as pd
 from sealfit.closure.intervals import degrees_of_freedom
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.effects.free import LEVELS, SMOOTH, free_effect
+from sealfit.effects.free import FREE, free_effect
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import QUANTITIES, Declared, JointParameter, Model, Term
 from sealfit.fit.rows import Rows
@@ -103,9 +103,7 @@ def from_record(record: dict) -> tuple[Model, Model, pd.DataFrame]:
         model = Model(declared, np.array(record[stage]["theta"], dtype=float))
         for raw_term in record[stage]["terms"]:
             fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in raw_term["fixed"].items()}
-            effect = (
-                free_effect(raw_term["id"], fixed) if raw_term["id"] in (SMOOTH, LEVELS) else effects[raw_term["id"]]
-            )
+            effect = free_effect(raw_term["id"], fixed) if raw_term["id"] in FREE else effects[raw_term["id"]]
             term = Term(effect, tuple(raw_term["channels"]), raw_term["acts_on"], raw_term["operation"], fixed)
             model = model.with_term(term, raw_term["values"])
         models.append(model)

@@ -60,9 +60,10 @@ class Candidate:
     df: int
     units: int
     log_p: float  # of T by its F distribution, not adjusted
-    log_p_jackknife: float  # of the estimate against its jackknife over units; 0 where that was not tried
+    log_p_jackknife: float = 0.0  # of the estimate against its jackknife over units; 0 where that was not tried
     p_value: float = 1.0  # adjusted over the search
     scores: np.ndarray | None = None  # (units, k)
+    pair: bool = False  # whether it acts by two channels together
 
     @property
     def key(self) -> tuple:
@@ -99,11 +100,16 @@ def search(fitted: Fitted, channels: Sequence[Channel], rng: np.random.Generator
     candidates = [c for channel in channels for c in _of_channel(fitted, channel)]
     if not candidates:
         return []
+    return judged(candidates, rng)
+
+
+def judged(candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
+    """Return candidates with p-values adjusted over all of them, strongest evidence first."""
     flipped = adjust(candidates, rng)
     jackknife = len(candidates) * np.exp([c.log_p_jackknife for c in candidates])
     p_values = np.minimum(1.0, 2 * np.minimum(flipped, jackknife))
-    judged = [replace(c, p_value=float(p)) for c, p in zip(candidates, p_values, strict=True)]
-    return sorted(judged, key=lambda c: -c.evidence)
+    found = [replace(c, p_value=float(p)) for c, p in zip(candidates, p_values, strict=True)]
+    return sorted(found, key=lambda c: -c.evidence)
 
 
 def _of_channel(fitted: Fitted, channel: Channel) -> Iterator[Candidate]:

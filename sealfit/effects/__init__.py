@@ -25,6 +25,8 @@ from sealfit.effects.log_growth import LOG_GROWTH
 from sealfit.effects.log_rate import LOG_RATE
 from sealfit.effects.power import POWER
 from sealfit.effects.power_viscous import POWER_VISCOUS
+from sealfit.effects.product import PRODUCT
+from sealfit.effects.product_log import PRODUCT_LOG
 from sealfit.effects.quadratic import QUADRATIC
 from sealfit.effects.rest_strengthening import REST_STRENGTHENING
 from sealfit.effects.ripple import RIPPLE
@@ -74,6 +76,8 @@ EFFECTS = {
         HUMIDITY,
         LINEAR,
         QUADRATIC,
+        PRODUCT,
+        PRODUCT_LOG,
         LOG,
         LOG_GROWTH,
         POWER,

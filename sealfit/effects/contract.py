@@ -17,6 +17,9 @@ from sealfit.errors import ParameterError
 CHANNEL = "x"
 """In `Effect.reads`: any one numeric channel; `shape` finds it in `inputs["x"]`."""
 
+SECOND = "z"
+"""In `Effect.reads` after CHANNEL: any second channel, for the effects of a pair."""
+
 AMPLITUDE = (-1e9, 1e9)
 """Bounds of an amplitude that carries units: a free sign, and no size that a rig's numbers could reach."""
 
@@ -46,7 +49,7 @@ ANYWHERE: tuple[tuple[Target, Operation], ...] = (
 class Parameter:
     """One parameter of an effect.
 
-    In `unit`, `{x}` stands for the unit of the first channel read and `{y}` for that of what the effect gives: the
+    In `unit`, `{x}` and `{z}` stand for the units of the channels read and `{y}` for that of what the effect gives: the
     force's unit for a force that is added, none for a factor, the parameter's own unit for the change of a parameter;
     `fill_unit` puts them in. A name that is a word of Python carries an underscore; `symbol` is what people read.
 
@@ -161,28 +164,34 @@ def not_negative(values) -> np.ndarray:
     return np.where(values >= 0, values, np.nan)
 
 
-def fill_unit(unit: str, x: str, y: str) -> str:
-    """Return a parameter's unit with those of the channel and of what the effect gives put in.
+def fill_unit(unit: str, x: str, y: str, z: str = "") -> str:
+    """Return a parameter's unit with those of the channels and of what the effect gives put in.
 
     Parameters
     ----------
     unit : str
         `Parameter.unit`.
-    x, y : str
-        Unit of the channel, and of what the effect gives; empty for none.
+    x, y, z : str
+        Unit of the channel, of what the effect gives, and of the second channel; empty for none.
 
     Examples
     --------
     >>> fill_unit("{y}/{x}", "mm/s", "N"), fill_unit("{y}/{x}^2", "mm", ""), fill_unit("{y}/{x}", "", "N")
     ('N/(mm/s)', '1/mm^2', 'N')
+    >>> fill_unit("{y}/({x} {z})", "mm/s", "", "d"), fill_unit("{y}/({x} {z})", "", "N", "d")
+    ('1/((mm/s) d)', 'N/d')
     """
-    known = {"{x}": x, "{y}": y}
+    known = {"{x}": x, "{y}": y, "{z}": z}
     top, slash, bottom = unit.partition("/")
     if not slash:
         return known.get(unit, unit)
     top = known.get(top, top)
     base, hat, power = bottom.partition("^")
-    base = known.get(base, base)
+    if base.startswith("("):
+        factors = [factor for factor in (known.get(name, name) for name in base[1:-1].split()) if factor]
+        base = " ".join(f"({f})" if len(factors) > 1 and any(c in f for c in "/ *·") else f for f in factors)
+    else:
+        base = known.get(base, base)
     if not base:
         return top
     if any(sign in base for sign in "/ *·"):

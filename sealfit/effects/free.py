@@ -10,15 +10,16 @@ shape is zero there. Beyond the outer knots a natural spline goes on as a straig
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, Effect, Parameter
+from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, reference
 from sealfit.errors import ParameterError
 
-SMOOTH, LEVELS = "smooth", "levels"
+SMOOTH, LEVELS, SURFACE, SLOPES = "smooth", "levels", "surface", "slopes"
+BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))  # powers of the two scaled channels in a free surface
 
 
 def smooth_effect(knots: Sequence[float], reference: float | None = None) -> Effect:
@@ -149,15 +150,129 @@ def _levels(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
     return result
 
 
+def surface_effect(x_range: Sequence[float], z_range: Sequence[float]) -> Effect:
+    """Return a free surface of two channels: the mixed terms of a polynomial, zero where either is in its middle.
+
+    Parameters
+    ----------
+    x_range, z_range : sequence of two float
+        Lowest and highest value of each channel, which are mapped to -1 and 1.
+
+    Returns
+    -------
+    Effect
+        Amplitudes `c_jk` of x^j z^k, j and k 1 or 2.
+
+    Raises
+    ------
+    ParameterError
+        If a range is empty.
+    """
+    ranges = tuple(tuple(float(end) for end in pair) for pair in (x_range, z_range))
+    if any(len(pair) != 2 or not pair[0] < pair[1] for pair in ranges):
+        raise ParameterError(f"surface: {ranges} must be two ranges, each from low to high.", mend="Give low, high.")
+    return Effect(
+        id=SURFACE,
+        label="smooth in {x} and {z}",
+        equation=r"h = \sum_{jk} c_{jk} u^j w^k",
+        form="c_jk u^j w^k summed over j, k = 1, 2; u, w = {x}, {z} mapped to -1..1 over "
+        + _listed([f"{low:.6g} to {high:.6g}" for low, high in ranges]),
+        reads=(CHANNEL, SECOND),
+        acts_on=ANYWHERE,
+        parameters=tuple(
+            Parameter(f"c_{j}{k}", "{y}", 0.0, AMPLITUDE, f"of u^{j} w^{k}", linear=True) for j, k in BENDS
+        ),
+        shape=partial(_surface, ranges),
+        source="Form: ours. The mixed terms of a polynomial in two channels.",
+        # By hand: at the upper corner u = w = 1, and all terms add up.
+        worked=(
+            {CHANNEL: ranges[0][1], SECOND: ranges[1][1]},
+            {f"c_{j}{k}": 10.0 * j + k for j, k in BENDS},
+            66.0,
+        ),
+        physical=False,
+    )
+
+
+def _surface(ranges: tuple[tuple[float, float], ...], inputs: Mapping, **values) -> np.ndarray:
+    u, w = (
+        2 * (np.asarray(inputs[name], dtype=float) - low) / (high - low) - 1
+        for name, (low, high) in zip((CHANNEL, SECOND), ranges, strict=True)
+    )
+    return sum(values[f"c_{j}{k}"] * u**j * w**k for j, k in BENDS)
+
+
+def slopes_effect(categories: Sequence[str]) -> Effect:
+    """Return a straight line in a channel for each category of a second one, all zero at the reference.
+
+    Parameters
+    ----------
+    categories : sequence of str
+        At least two different categories.
+
+    Returns
+    -------
+    Effect
+        Amplitudes `e_1`, `e_2`, ..., the slope of each category. A category that is not listed gives NaN.
+
+    Raises
+    ------
+    ParameterError
+        If there are fewer than two categories, or one stands twice.
+    """
+    names = tuple(str(c) for c in categories)
+    if len(names) < 2 or len(set(names)) != len(names):
+        raise ParameterError(f"slopes: {list(names)} must be two or more different categories.", mend="List each once.")
+    return Effect(
+        id=SLOPES,
+        label="linear in {x}, by {z}",
+        equation=r"h = \sum_k e_k [z = k] (x - x_{ref})",
+        form=f"e_k (x - x_ref) for category k of {_listed(names)}",
+        reads=(CHANNEL, SECOND),
+        acts_on=ANYWHERE,
+        parameters=tuple(
+            Parameter(f"e_{k}", "{y}/{x}", 0.0, AMPLITUDE, f"slope for {name}", linear=True)
+            for k, name in enumerate(names, start=1)
+        ),
+        shape=partial(_slopes, names),
+        source="Form: ours. One slope per category, as in any analysis of covariance.",
+        # By hand: 3 above the reference, in the last category.
+        worked=(
+            {CHANNEL: 5.0, "x_ref": 2.0, SECOND: names[-1]},
+            {f"e_{k}": k / 10 for k in range(1, len(names) + 1)},
+            0.3 * len(names),
+        ),
+        physical=False,
+    )
+
+
+def _slopes(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
+    x = np.asarray(inputs[CHANNEL], dtype=float) - reference(inputs, CHANNEL, 0.0)
+    given = np.asarray(inputs[SECOND]).astype(str)
+    slope = np.full(given.shape, np.nan)
+    for k, name in enumerate(names, start=1):
+        slope[given == name] = values[f"e_{k}"]
+    return slope * x
+
+
+FREE: Mapping[str, tuple[Callable[..., Effect], tuple[str, ...]]] = {
+    SMOOTH: (lambda fixed: smooth_effect(fixed["knots"], fixed.get("x_ref")), ("knots",)),
+    LEVELS: (lambda fixed: levels_effect(fixed["categories"]), ("categories",)),
+    SURFACE: (lambda fixed: surface_effect(fixed["x_range"], fixed["z_range"]), ("x_range", "z_range")),
+    SLOPES: (lambda fixed: slopes_effect(fixed["categories"]), ("categories",)),
+}
+
+
 def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
     """Return the free shape that `fixed` describes, as it stands in a model file.
 
     Parameters
     ----------
     id : str
-        `smooth` or `levels`.
+        `smooth`, `levels`, `surface` or `slopes`.
     fixed : mapping
-        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels. Other entries are not looked at.
+        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `x_range` and `z_range` for
+        a surface. Other entries are not looked at.
 
     Raises
     ------
@@ -170,14 +285,13 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
     >>> effect.linear, [float(h) for h in effect.shape({"x": [0.0, 2.0, 3.0]}, c_2=1.0, c_3=2.0)]
     (('c_2', 'c_3'), [0.0, 2.0, 3.0])
     """
-    need = {SMOOTH: "knots", LEVELS: "categories"}.get(id)
-    if need is None:
-        raise ParameterError(f"'{id}' is no free shape.", mend="Use 'smooth' or 'levels'.")
-    if need not in fixed:
-        raise ParameterError(f"{id}: '{need}' is missing.", mend=f"Give '{need}' in its fixed values.")
-    if id == SMOOTH:
-        return smooth_effect(fixed["knots"], fixed.get("x_ref"))
-    return levels_effect(fixed["categories"])
+    if id not in FREE:
+        raise ParameterError(f"'{id}' is no free shape.", mend=f"Use one of {', '.join(FREE)}.")
+    make, needs = FREE[id]
+    for need in needs:
+        if need not in fixed:
+            raise ParameterError(f"{id}: '{need}' is missing.", mend=f"Give '{need}' in its fixed values.")
+    return make(fixed)
 
 
 def _listed(values: Sequence[object]) -> str:

@@ -17,8 +17,8 @@ from types import ModuleType
 import numpy as np
 
 from sealfit.effects import EFFECTS
-from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.effects.free import LEVELS, SMOOTH
+from sealfit.effects.contract import CHANNEL, SECOND, Effect
+from sealfit.effects.free import FREE
 from sealfit.errors import ConfigError, ParameterError
 
 EXAMPLE = "See sealfit/effects/drift.py for a whole one."
@@ -117,7 +117,7 @@ def _line_in(path: Path, error: BaseException) -> int | None:
 def _refuse_taken(name: str, found: Mapping[str, Effect], path: Path) -> None:
     if not (isinstance(name, str) and name.isidentifier()):
         raise ConfigError(f"id {name!r} is not a plain name.", file=path, mend="Use letters, digits and underscores.")
-    if name in EFFECTS or name in (SMOOTH, LEVELS):
+    if name in EFFECTS or name in FREE:
         raise ConfigError(f"the catalogue has an effect '{name}' already.", file=path, mend="Give it another id.")
     if name in found:
         raise ConfigError(f"another file of the folder has an effect '{name}' already.", file=path, mend="Rename one.")
@@ -140,8 +140,8 @@ def _description_fault(effect: Effect) -> str:
         return "acts_on is empty: say on what it may act"
     if not effect.reads:
         return "reads is empty: name the channels it depends on"
-    if CHANNEL in effect.reads and len(effect.reads) > 1:
-        return "reads mixes 'x' (any channel) with named channels"
+    if {CHANNEL, SECOND} & set(effect.reads) and effect.reads not in ((CHANNEL,), (CHANNEL, SECOND)):
+        return "reads mixes 'x' or 'z' (any channel) with named channels"
     names = [p.name for p in effect.parameters]
     if len(set(names)) != len(names):
         return "two parameters share a name"

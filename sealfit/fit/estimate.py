@@ -100,8 +100,12 @@ def prior_precision(model: Model) -> np.ndarray:
 
 
 def fit_declared(rows: Rows) -> Fitted:
-    """Return the declared model fitted to `rows`: "before"."""
-    return fit(start_model(rows), rows)
+    """Return the declared model fitted to `rows`: "before"; the better of two starts where series could go astray."""
+    fitted = fit(start_model(rows), rows)
+    if sum(p.quantity == "v_s" for p in fitted.model.declared.parameters) > 1:
+        other = fit(start_model(rows, together=True), rows)
+        return min(fitted, other, key=lambda f: f.deviance)
+    return fitted
 
 
 def fit(
@@ -174,17 +178,18 @@ def settled(fitted: Fitted, loading: np.ndarray) -> Fitted:
 def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
     """Return the model with each v_s at the best point of a grid, everything linear solved anew at each.
 
-    What an effect explains may have stood in v_s before, and the way out of there can lead over a hill.
+    What an effect explains may have stood in v_s before, and the way out of there can lead over a hill. Series share
+    mu_0, so that one v_s alone may not get out: all are tried together first, then each by itself.
     """
     slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
     held = prior_precision(model) > 0
-    for k, parameter in enumerate(model.declared.parameters):
-        if parameter.quantity != "v_s":
-            continue
+    places = [k for k, parameter in enumerate(model.declared.parameters) if parameter.quantity == "v_s"]
+    for group in [places, *([k] for k in places)] if len(places) > 1 else [places] if places else []:
         best, chosen = np.inf, model.vector()
-        for value in (model.theta[k], *np.linspace(np.log(slowest), np.log(fastest), STRIBECK_GRID)):
+        for value in (None, *np.linspace(np.log(slowest), np.log(fastest), STRIBECK_GRID)):
             vector = model.vector()
-            vector[k] = value
+            if value is not None:
+                vector[group] = value
             force, jacobian = evaluate(model.at(vector), rows)
             columns = np.column_stack([rows.force - force, jacobian[:, ~held]])
             white, _ = scatter.whitened(columns, rows.force, rows.groups)

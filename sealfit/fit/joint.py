@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.effects.contract import CHANNEL, Effect
+from sealfit.effects.contract import CHANNEL, SECOND, Effect
 from sealfit.fit.rows import Rows
 
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
@@ -76,7 +76,7 @@ class Term:
         given = {}
         for name, channel in zip(self.effect.reads, self.channels, strict=True):
             values = rows.values(channel)
-            if name == CHANNEL and channel == "speed_mm_s":
+            if name in (CHANNEL, SECOND) and channel == "speed_mm_s":
                 values = np.abs(values)  # a form of the speed is one of its size
             given[name] = values
         shift = self.fixed.get("shift")

@@ -8,8 +8,11 @@ from sealfit.fit.joint import SAME_SPEED, JointParameter, Model, declare
 from sealfit.fit.rows import Rows
 
 
-def start_model(rows: Rows) -> Model:
-    """Return the declared model with v_s and b from a global search and the rest from exact least squares."""
+def start_model(rows: Rows, *, together: bool = False) -> Model:
+    """Return the declared model with v_s and b from a global search and the rest from exact least squares.
+
+    With `together`, all series start from one v_s and one sigma_2, which a few noisy runs cannot lead astray.
+    """
     declared = declare(rows)
     theta = np.zeros(len(declared.parameters))
     number = {p: k for k, p in enumerate(declared.parameters)}
@@ -21,11 +24,12 @@ def start_model(rows: Rows) -> Model:
     series = sorted({p.owner for p in declared.parameters if p.quantity in ("v_s", "sigma_2")})
     level = np.zeros((len(declared.conditions), 2))  # mu_s, mu_c of each condition
     chosen = np.zeros(len(declared.conditions), dtype=bool)
+    curved = declared.index["v_s"] >= 0
     for name in series:
         k = number.get(JointParameter("sigma_2", name), number.get(JointParameter("v_s", name)))
-        uses = (declared.index["sigma_2"] == k) | (declared.index["v_s"] == k)
-        mine = uses[condition]
         full = JointParameter("v_s", name) in number
+        uses = curved if together and full else (declared.index["sigma_2"] == k) | (declared.index["v_s"] == k)
+        mine = uses[condition]
         values, sigma_2, v_s = _per_condition(speeds[mine], load[mine], size[mine], condition[mine], full)
         for c, pair in values.items():
             level[c], chosen[c] = pair, True

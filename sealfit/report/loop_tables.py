@@ -23,7 +23,12 @@ from sealfit.report.symbols import (
 from sealfit.report.words import PARTS, acts, meaning, target_html
 
 MOST_TESTS = 40
-FREE = {"smooth": "a free smooth shape", "levels": "a level of its own for each category"}
+FREE = {
+    "smooth": "a free smooth shape",
+    "levels": "a level of its own for each category",
+    "surface": "a free smooth surface",
+    "slopes": "a slope of its own for each category",
+}
 
 
 def error_rows(closure: Mapping, config: Config) -> list[dict]:
@@ -101,7 +106,9 @@ def _rival(rival: Mapping, config: Config) -> Markup:
     channels = joined([channel_words(name, config.units) for name in rival.get("channels") or []])
     label = FREE.get(rival["id"], str(rival["id"]).replace("_", " "))
     if known_effect is not None:
-        label = known_effect.label.replace("{x}", channels)
+        names = [channel_words(name, config.units) for name in rival.get("channels") or [""]]
+        pair = "{z}" in known_effect.label
+        label = known_effect.label.replace("{x}", names[0] if pair else channels).replace("{z}", names[-1])
     target = target_html(rival["acts_on"], config)
     text = Markup("{}, acting on {}").format(label, target)
     if channels and channels not in label:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sealfit.effects.free import free_effect, levels_effect, smooth_effect
+from sealfit.effects.free import free_effect, levels_effect, slopes_effect, smooth_effect, surface_effect
 from sealfit.errors import ParameterError
 
 
@@ -69,10 +69,26 @@ def test_free_shapes_are_rebuilt_from_plain_data(id_, fixed):
         (lambda: smooth_effect([1.0, np.nan]), "two or more rising numbers"),
         (lambda: levels_effect(["A"]), "two or more different categories"),
         (lambda: levels_effect(["A", "A"]), "two or more different categories"),
-        (lambda: free_effect("wavelet", {}), "'wavelet' is no free shape.*'smooth' or 'levels'"),
+        (lambda: free_effect("wavelet", {}), "'wavelet' is no free shape.*smooth, levels, surface, slopes"),
         (lambda: free_effect("smooth", {}), "'knots' is missing"),
+        (lambda: free_effect("surface", {"x_range": (0, 1)}), "'z_range' is missing"),
+        (lambda: surface_effect((0, 1), (2, 2)), "two ranges, each from low to high"),
+        (lambda: slopes_effect(["A", "A"]), "two or more different categories"),
     ],
 )
 def test_refuses_what_makes_no_effect(call, words):
     with pytest.raises(ParameterError, match=words):
         call()
+
+
+@pytest.mark.parametrize("effect", [surface_effect((2.0, 6.0), (0.0, 10.0)), slopes_effect(["A", "B"])])
+def test_effects_of_a_pair_give_what_is_worked_by_hand(effect):
+    inputs, values, expected = effect.worked
+    assert float(effect.shape(inputs, **values)) == pytest.approx(expected)
+
+
+def test_surface_is_zero_where_either_channel_is_in_its_middle():
+    effect = surface_effect((2.0, 6.0), (0.0, 10.0))
+    values = dict.fromkeys(effect.linear, 1.0)
+    given = effect.shape({"x": np.array([4.0, 3.0, 6.0]), "z": np.array([9.0, 5.0, 10.0])}, **values)
+    assert list(given) == [0.0, 0.0, 4.0]

@@ -145,6 +145,7 @@ def test_catalogue_effects_are_resolved_with_their_shapes(campaign, monkeypatch)
             simulate(Spec(effects=[{**entry, **change}]), Path("never-written"))
 
 
+FREELY = {"x": "distance_mm", "z": "time_s"}  # what the effects of any channel are made of here
 SETTING = {"rest_s": 30.0, "humidity_pct": 55.0, "lab_temperature_C": 24.0}
 
 
@@ -153,7 +154,7 @@ def test_every_effect_of_the_catalogue_can_be_simulated(campaign, known):
     """Amplitudes of 0.01 in its first role, other numbers as they start: the truth moves by what its shape gives."""
     values = {p.name: 0.01 if p.linear else p.start for p in known.parameters}
     values |= {"x_0": 20.0, "w": 5.0} if known.id == "bump" else {}  # it starts at 0, before steady sliding
-    entry = {"id": known.id, "parameters": values, "channels": ["distance_mm" if n == "x" else n for n in known.reads]}
+    entry = {"id": known.id, "parameters": values, "channels": [FREELY.get(n, n) for n in known.reads]}
     channels = [{"kind": "constant", "name": n, "value": SETTING[n]} for n in known.reads if n in SETTING]
     design = {**ONE_CONDITION, "days": (16.0,), "speeds_mm_s": (2.0,), "directions": (1, -1)}
     truth, runs, traces = campaign(design=design, channels=channels, effects=[entry], noise=())
@@ -170,9 +171,7 @@ def test_every_effect_of_the_catalogue_can_be_simulated(campaign, known):
         found = true_force(truth, points)
         npt.assert_allclose(points["force_N"], found, atol=2e-5)
         bare = true_force({"spec": {**truth["spec"], "effects": []}}, points)
-        inputs = {
-            ("x" if n == "distance_mm" and "x" in known.reads else n): points[n].to_numpy() for n in entry["channels"]
-        }
+        inputs = {read: points[n].to_numpy() for read, n in zip(known.reads, entry["channels"], strict=True)}
         shape = known.shape(inputs, **values)
         role = known.acts_on[0]
         if role == ("force", "add"):

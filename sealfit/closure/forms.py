@@ -1,0 +1,178 @@
+"""Which forms may act where a candidate does, and the values to try for what is not linear in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.channels import FREE_DF, WIDE, Channel
+from sealfit.closure.intervals import t_quantile
+from sealfit.closure.ripple import Peak
+from sealfit.closure.search import Candidate
+from sealfit.closure.waves import common_wavelength, pass_shifts
+from sealfit.effects.contract import CHANNEL, SECOND, Effect
+from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, free_effect
+from sealfit.fit.estimate import Fitted
+from sealfit.fit.joint import Term
+
+PHASES = tuple(np.arange(4) * np.pi / 4)
+PERIODIC = ("ripple", "sinusoid", "sinusoid_harmonics")  # sought in the spectrum, not along a grid of wavelengths
+
+
+def terms_of(
+    candidate: Candidate, channels: Mapping[str, Channel], fitted: Fitted, effects: Mapping[str, Effect]
+) -> Iterator[tuple[Term, dict]]:
+    """Yield every form that may act where a candidate does, with the values to try for each searched parameter.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        What acts on what, as the search found it.
+    channels : mapping
+        Channels by name.
+    fitted : Fitted
+        The current model.
+    effects : mapping
+        The catalogue, the user's own effects included.
+    """
+    target = (candidate.acts_on, candidate.operation)
+    if candidate.pair:
+        yield from _terms_of_pair(*(channels[name] for name in candidate.channels), target, effects)
+        return
+    name = candidate.channels[-1]
+    channel = channels[name]
+    known = set(fitted.rows.table.columns)
+    for effect in effects.values():
+        if target not in effect.acts_on or not set(effect.reads) <= known | {CHANNEL}:
+            continue
+        if effect.reads == (CHANNEL,):
+            if not channel.numeric or name == "direction" or effect.id in ("sinusoid", "sinusoid_harmonics"):
+                continue
+            if not _in_domain(effect, channel.values):
+                continue
+            fixed = {"x_ref": reference(channel.values)}
+            yield Term(effect, (name,), *target, fixed=fixed), _grids(effect, channel.values)
+        elif name in effect.reads and effect.id != "ripple":
+            fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
+            grids = _grids(effect, np.abs(channel.values))
+            yield Term(effect, effect.reads, *target, fixed=fixed), grids
+            if target == ("mu", "multiply") and ("mu", "add") in effect.acts_on:  # the search tries the factor for both
+                yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids
+    if name != "direction":
+        yield free_term(channel, *target), {}
+
+
+def _terms_of_pair(
+    one: Channel, other: Channel, target: tuple[str, str], effects: Mapping[str, Effect]
+) -> Iterator[tuple[Term, dict]]:
+    """Yield the forms of a pair of channels: products, or a slope for each category."""
+    if not (one.numeric and other.numeric):
+        number, category = (one, other) if one.numeric else (other, one)
+        fixed = {"categories": tuple(np.unique(category.values)), "x_ref": reference(number.values)}
+        yield Term(free_effect(SLOPES, fixed), (number.name, category.name), *target, fixed=fixed), {}
+        return
+    for x, z in ((one, other), (other, one)):
+        for effect in effects.values():
+            if effect.reads != (CHANNEL, SECOND) or target not in effect.acts_on:
+                continue
+            fixed = {"x_ref": reference(x.values), "z_ref": reference(z.values)}
+            inputs = {CHANNEL: x.values, SECOND: z.values, **fixed}
+            with np.errstate(all="ignore"):
+                good = np.isfinite(effect.shape(inputs, **effect.start())).all()
+            if good and (effect.id != "product" or x is one):
+                yield Term(effect, (x.name, z.name), *target, fixed=fixed), {}
+    fixed = {f"{name}_range": (float(c.values.min()), float(c.values.max())) for name, c in (("x", one), ("z", other))}
+    yield Term(free_effect(SURFACE, fixed), (one.name, other.name), *target, fixed=fixed), {}
+
+
+def free_term(channel: Channel, acts_on: str, operation: str) -> Term:
+    """Return the free shape of a channel: a spline with knots at quantiles, or one level per category."""
+    if channel.numeric:
+        distinct = np.unique(channel.values)
+        count = min(FREE_DF + 1, distinct.size)
+        if distinct.size <= FREE_DF + 1:
+            knots = distinct
+        elif distinct[0] > 0 and distinct[-1] / distinct[0] >= WIDE:
+            knots = np.geomspace(distinct[0], distinct[-1], count)
+        else:
+            knots = np.quantile(distinct, np.linspace(0, 1, count))
+        fixed = {"knots": tuple(float(k) for k in knots), "x_ref": float(knots[0])}
+        return Term(free_effect(SMOOTH, fixed), (channel.name,), acts_on, operation, fixed)
+    fixed = {"categories": tuple(str(c) for c in np.unique(channel.values))}
+    return Term(free_effect(LEVELS, fixed), (channel.name,), acts_on, operation, fixed)
+
+
+def periodic_terms(
+    fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
+) -> Iterator[tuple[Term, dict, Candidate]]:
+    """Yield the ways in which a periodic component may act, with the values to try, and a candidate for each.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The current model.
+    peak : Peak
+        The component.
+    samples : DataFrame
+        The samples it was found on.
+    effects : mapping
+        The catalogue.
+    """
+    rows = fitted.rows
+    effect = effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"]
+    both = np.unique(np.sign(rows.speed)).size == 2
+    ways = [("force", "add")] if peak.sign_symmetric else []
+    if not both or not peak.sign_symmetric:
+        ways += [("mu", "multiply"), ("force", "multiply")]
+    fixed: dict = {"x_ref": 0.0}
+    phases, lengths = PHASES, (peak.wavelength,)
+    if not peak.common_phase:
+        length, error = common_wavelength(samples, peak.wavelength, peak.axis)
+        reach = t_quantile(max(rows.groups.starts["file"].size - 1, 2)) * error
+        fixed["shift"] = pass_shifts(samples, rows, length, peak.axis)
+        fixed["held"] = {"lambda_": (length - reach, length + reach), "phi": (-np.pi, np.pi)}
+        lengths, phases = (length,), (0.0,)
+    names = {
+        p.name: (lengths if p.name == "lambda_" or p.name.startswith("lambda") else phases) for p in effect.nonlinear
+    }
+    units = rows.groups.starts["file"].size
+    for way in ways:
+        if way in effect.acts_on:
+            candidate = Candidate(
+                (peak.axis,), *way, "file", np.empty((0, 0)), 0.0, 2, units, 0.0, p_value=peak.p_value
+            )
+            yield Term(effect, (peak.axis,), *way, fixed=fixed), names, candidate
+
+
+def reference(values: np.ndarray) -> float:
+    """Return a channel's reference value: its mean, to three digits, so that it reads well."""
+    mean = float(np.mean(values))
+    return float(f"{mean:.3g}")
+
+
+def _in_domain(effect: Effect, values: np.ndarray) -> bool:
+    """Whether a form gives numbers at every value of the channel."""
+    sample = np.unique(values)[:: max(1, np.unique(values).size // 50)]
+    with np.errstate(all="ignore"):
+        result = effect.shape({CHANNEL: sample, "x_ref": reference(values)}, **effect.start())
+    return bool(np.isfinite(result).all())
+
+
+def _grids(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
+    """Return the values to try for each parameter that is searched."""
+    span = float(np.ptp(values)) or 1.0
+    grids = {}
+    for p in effect.nonlinear:
+        if p.search == "inside":
+            grid = np.quantile(np.unique(values), np.linspace(0.05, 0.95, 13))
+        elif p.search == "span":
+            grid = np.geomspace(span / 100, span * 2, 13)
+        elif p.search == "ratio":
+            positive = np.abs(values[values != 0])
+            grid = np.geomspace(positive.min(), positive.max(), 13) if positive.size else np.array([p.start])
+        else:
+            grid = np.array(p.search or (p.start,))
+        grids[p.name] = tuple(float(x) for x in np.unique(np.clip(grid, *p.bounds)))
+    return grids

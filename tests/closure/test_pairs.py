@@ -1,0 +1,59 @@
+import numpy as np
+import pytest
+from bins_helpers import make_bins, make_traces
+
+from sealfit.closure.channels import Channel
+from sealfit.closure.loop import close_loop
+from sealfit.closure.pairs import mixed_columns
+from sealfit.closure.predict import predict
+from sealfit.config import Config
+from sealfit.engine import cores
+
+COLUMNS = {
+    "oil_ppm": lambda rng: rng.normal(50, 10),
+    "dust_mg": lambda rng: rng.normal(5, 1),
+    "batch": lambda rng: str(rng.choice(list("AB"))),
+}
+
+
+def close(effect):
+    bins = make_bins(5, setup=0.003, effect=effect, run_channels=COLUMNS, bins=8)
+    return bins, close_loop(bins, make_traces(bins), Config(), workers=cores())
+
+
+def test_product_of_two_columns_is_found_and_predicted():
+    def product(table, force):
+        return force * (1 + 0.004 * (table["oil_ppm"] - 50) * (table["dust_mg"] - 5)).to_numpy()
+
+    bins, closure = close(product)
+    (effect,) = closure.document["effects"]
+    assert (effect["id"], set(effect["channels"])) == ("product", {"oil_ppm", "dust_mg"})
+    assert (effect["acts_on"], effect["operation"], effect["level"]) == ("mu", "multiply", "run")
+    assert effect["parameters"][0]["value"] == pytest.approx(0.004, rel=0.15)
+    assert closure.document["after"]["heldout_rmse_N"] < 0.5 * closure.document["before"]["heldout_rmse_N"]
+    point = bins.head(1).assign(speed_mm_s=4.0)
+    usual, both = (point.assign(oil_ppm=50.0 + d, dust_mg=5.0 + d / 10) for d in (0.0, 10.0))
+    forces = [predict(closure.model, table)["force_after_N"].iloc[0] for table in (usual, both)]
+    assert forces[1] / forces[0] - 1 == pytest.approx(0.04, rel=0.2)
+
+
+def test_slope_in_one_batch_only_is_found():
+    def in_b(table, force):
+        return force * (1 + 0.006 * (table["oil_ppm"] - 50) * np.where(table["batch"] == "B", 1, -1)).to_numpy()
+
+    effects = close(in_b)[1].document["effects"]
+    assert [(e["id"], set(e["channels"])) for e in effects] == [("slopes", {"oil_ppm", "batch"})]
+    low, high = sorted(p["value"] for p in effects[0]["parameters"])
+    assert (low, high) == (pytest.approx(-0.006, rel=0.2), pytest.approx(0.006, rel=0.2))
+
+
+def test_mixed_columns_hold_nothing_of_either_channel_alone():
+    rng = np.random.default_rng(0)
+    one, other = (Channel(name, rng.uniform(size=4000), "run") for name in "ab")
+    columns = mixed_columns(one, other)
+    assert columns.shape == (4000, 4)
+    for channel in (one, other):
+        assert abs(np.corrcoef(columns[:, 0], channel.values)[0, 1]) < 0.05
+    category = Channel("c", rng.choice(["x", "y"], 4000), "run")
+    assert mixed_columns(one, category).shape == (4000, 1)
+    assert mixed_columns(category, category).shape == (4000, 0)
