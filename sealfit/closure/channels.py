@@ -17,6 +17,8 @@ from sealfit.fit.rows import LEVELS, Rows
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 MANY_UNITS = 20  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up
 FREE_DF = 4  # columns of a free shape: enough for a peak, an approach or a step; more only costs power
+FINE_DF = 9  # of a second, finer shape, for two humps or a narrow one
+FINE_UNITS = 50  # units from which it is tried
 WIDE = 20.0  # a positive channel that spans this factor is looked at on a logarithmic scale
 
 
@@ -103,7 +105,7 @@ def _is_grouping(channel: Channel, rows: Rows) -> bool:
     return np.unique(first).size == first.size
 
 
-def free_columns(channel: Channel) -> np.ndarray:
+def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
     """Return the columns of a free shape, first a straight line: shape (n, k), each centred and scaled.
 
     A cubic B-spline with knots at quantiles (in the logarithm where a positive channel spans a factor of 20); one
@@ -114,10 +116,10 @@ def free_columns(channel: Channel) -> np.ndarray:
         return (channel.values[:, None] == levels[None, 1:]).astype(float)
     x = scaled(channel.values)
     distinct = np.unique(x)
-    df = min(FREE_DF, distinct.size - 1)
+    df = min(most, distinct.size - 1)
     columns = [x]
     if df >= 2:
-        if distinct.size <= FREE_DF + 1:
+        if distinct.size <= most + 1:
             columns += [x**k for k in range(2, df + 1)]
         else:
             inner = np.quantile(distinct, np.linspace(0, 1, df)[1:-1]) if df > 2 else []
@@ -128,6 +130,13 @@ def free_columns(channel: Channel) -> np.ndarray:
     stacked = stacked - stacked.mean(axis=0)
     size = np.sqrt((stacked**2).mean(axis=0))
     return stacked[:, size > 1e-12] / size[size > 1e-12]
+
+
+def even_knots(values: np.ndarray) -> tuple[float, ...]:
+    """Return up to five values of a channel that part its different values evenly, for `effects.free.evenly`."""
+    distinct = np.unique(values)
+    knots = distinct if distinct.size <= 5 else np.quantile(distinct, np.linspace(0, 1, 5))
+    return tuple(float(k) for k in np.unique(knots))
 
 
 def scaled(values: np.ndarray) -> np.ndarray:

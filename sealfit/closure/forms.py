@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import FREE_DF, WIDE, Channel
+from sealfit.closure.channels import FINE_DF, FREE_DF, WIDE, Channel, even_knots
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import Candidate
@@ -62,6 +62,8 @@ def terms_of(
                 yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids
     if name != "direction":
         yield free_term(channel, *target), {}
+        if candidate.df > FREE_DF + 1 and channel.numeric:
+            yield free_term(channel, *target, df=FINE_DF), {}
 
 
 def _terms_of_pair(
@@ -81,18 +83,18 @@ def _terms_of_pair(
             inputs = {CHANNEL: x.values, SECOND: z.values, **fixed}
             with np.errstate(all="ignore"):
                 good = np.isfinite(effect.shape(inputs, **effect.start())).all()
-            if good and (effect.id != "product" or x is one):
+            if good and (effect.id not in ("product", "bilinear") or x is one):  # the same either way round
                 yield Term(effect, (x.name, z.name), *target, fixed=fixed), {}
-    fixed = {f"{name}_range": (float(c.values.min()), float(c.values.max())) for name, c in (("x", one), ("z", other))}
+    fixed = {f"{name}_knots": even_knots(c.values) for name, c in (("x", one), ("z", other))}
     yield Term(free_effect(SURFACE, fixed), (one.name, other.name), *target, fixed=fixed), {}
 
 
-def free_term(channel: Channel, acts_on: str, operation: str) -> Term:
+def free_term(channel: Channel, acts_on: str, operation: str, *, df: int = FREE_DF) -> Term:
     """Return the free shape of a channel: a spline with knots at quantiles, or one level per category."""
     if channel.numeric:
         distinct = np.unique(channel.values)
-        count = min(FREE_DF + 1, distinct.size)
-        if distinct.size <= FREE_DF + 1:
+        count = min(df + 1, distinct.size)
+        if distinct.size <= df + 1:
             knots = distinct
         elif distinct[0] > 0 and distinct[-1] / distinct[0] >= WIDE:
             knots = np.geomspace(distinct[0], distinct[-1], count)

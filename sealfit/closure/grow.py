@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -22,6 +22,7 @@ from sealfit.fit.joint import Term, evaluate, passes
 from sealfit.fit.rows import Rows
 
 CALENDAR = {"run_order", "elapsed_h"}
+BEHIND = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
 TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
 
 
@@ -108,6 +109,7 @@ def grow(
             significant = [c for c in pairs if c.p_value <= alpha]
             say(f"round {number}: {len(pairs)} pairs, {len(significant)} significant")
         left = significant[0] if significant else peak
+        significant += _pairs_in_disguise(fitted, significant, channels, candidates, rng)
         open_ = [c for c in significant if c.key not in refused]
         if (not open_ and peak is None) or number > config.loop.max_rounds:
             break
@@ -131,6 +133,27 @@ def grow(
         }  # what came and went does not come again
         added = kept
     return Grown(before, fitted if added else before, tuple(added), first, last, left, channels)
+
+
+def _pairs_in_disguise(
+    fitted: Fitted, significant: list[Candidate], channels: Mapping[str, Channel], singles: tuple, rng
+) -> list[Candidate]:
+    """Return the pairs that a channel's change of a or of v_s may stand for.
+
+    a is how mu changes with days, v_s how it changes with speed. The pair explains the same significant structure, so
+    it is tried beside the single channel whatever its own p-value; the fits decide.
+    """
+    best: dict[frozenset, Candidate] = {}
+    for single in significant:
+        other = BEHIND.get(single.acts_on)
+        pair = frozenset((*single.channels, other))
+        if single.pair or other not in channels or len(pair) != 2 or pair in best:
+            continue
+        found = search_pairs(fitted, [channels[name] for name in sorted(pair)], singles, rng)
+        if found:
+            strongest = max(found, key=lambda c: c.chi2)
+            best[pair] = replace(strongest, chi2=max(strongest.chi2, single.chi2), p_value=single.p_value)
+    return list(best.values())
 
 
 def _declared_first(significant: list[Candidate], config: Config) -> list[Candidate]:

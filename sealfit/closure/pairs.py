@@ -11,13 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sealfit.closure.channels import FINER, Channel, flip_level, scaled
-from sealfit.closure.search import Candidate, judge, judged, project
-from sealfit.effects.free import BENDS
+from sealfit.closure.channels import FINER, Channel, even_knots, flip_level
+from sealfit.closure.search import MAIN_TARGETS, Candidate, inside_specimens, judge, judged, project
+from sealfit.effects.free import BENDS, evenly
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import term_slope
 
-TARGETS = (("mu", "multiply"), ("force", "add"))
 MOST_CATEGORIES = 12  # a slope for each of more would find what single units do
 
 
@@ -51,11 +50,12 @@ def _of_pair(fitted: Fitted, one: Channel, other: Channel) -> list[Candidate]:
     if shapes.shape[1] == 0:
         return []
     rows, unit = fitted.rows, flip_level(min(one.unit, other.unit, key=FINER.get), fitted.rows)
-    slopes = [term_slope(fitted.model, rows, *target) for target in TARGETS]
+    slopes = [term_slope(fitted.model, rows, *target) for target in MAIN_TARGETS]
     left = project(fitted, np.column_stack([shapes * slope[:, None] for slope in slopes]))
+    left = inside_specimens(fitted, left, min(one.unit, other.unit, key=FINER.get))
     width = shapes.shape[1]
     found = []
-    for k, target in enumerate(TARGETS):
+    for k, target in enumerate(MAIN_TARGETS):
         if "load_N" in (one.name, other.name) and target[0] == "force":
             continue
         block = left[:, k * width : (k + 1) * width]
@@ -86,12 +86,17 @@ def mixed_columns(one: Channel, other: Channel) -> np.ndarray:
     if not (one.numeric or other.numeric):
         return np.empty((one.values.size, 0))
     if one.numeric and other.numeric:
-        u, w = (scaled(c.values) - scaled(c.values).mean() for c in (one, other))
+        u, w = (_centred(c) for c in (one, other))
         columns = np.column_stack([u**j * w**k for j, k in BENDS])
     else:
         number, category = (one, other) if one.numeric else (other, one)
-        u = scaled(number.values) - scaled(number.values).mean()
+        u = _centred(number)
         levels = np.unique(category.values)
         columns = (category.values[:, None] == levels[None, 1:]) * u[:, None]
     size = np.sqrt((columns**2).mean(axis=0))
     return columns[:, size > 1e-9] / size[size > 1e-9]
+
+
+def _centred(channel: Channel) -> np.ndarray:
+    mapped = evenly(channel.values, even_knots(channel.values))
+    return mapped - mapped.mean()

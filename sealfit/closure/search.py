@@ -26,9 +26,10 @@ import numpy as np
 from scipy import stats
 from scipy.special import betainc
 
-from sealfit.closure.channels import FINER, Channel, flip_level, free_columns, unit_of
+from sealfit.closure.channels import FINE_DF, FINE_UNITS, FINER, Channel, flip_level, free_columns, unit_of
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import term_slope
+from sealfit.fit.mixed import orthonormal
 from sealfit.fit.rows import Rows
 
 TARGETS = (
@@ -41,6 +42,7 @@ TARGETS = (
     ("sigma_2", "add"),
     ("a", "multiply"),
 )
+MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
 MANY = 10  # units from which the jackknife is tried
 PROMISING = 0.01  # p-value by sign flips, not adjusted, below which it is
@@ -114,10 +116,25 @@ def judged(candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Ca
 
 def _of_channel(fitted: Fitted, channel: Channel) -> Iterator[Candidate]:
     rows = fitted.rows
+    if channel.name == "direction":
+        yield from _of_shapes(fitted, channel, np.ones((rows.force.size, 1)), TARGETS)
+        return
+    shapes = free_columns(channel)
+    widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
+    yield from _of_shapes(fitted, channel, shapes, TARGETS, widths)
+    units = rows.groups.starts[flip_level(channel.unit, rows)].size
+    if channel.numeric and units >= FINE_UNITS and np.unique(channel.values).size > 2 * FINE_DF:
+        yield from _of_shapes(fitted, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
+
+
+def _of_shapes(
+    fitted: Fitted, channel: Channel, shapes: np.ndarray, targets: Sequence[tuple[str, str]], widths: Sequence[int] = ()
+) -> Iterator[Candidate]:
+    """Yield the candidates of a channel's columns, by the first so many of them, on every target that may take them."""
+    rows = fitted.rows
     both_ways = rows.speed.min() < 0 < rows.speed.max()
-    shapes = np.ones((rows.force.size, 1)) if channel.name == "direction" else free_columns(channel)
     slopes, places = [], []
-    for acts_on, operation in TARGETS:
+    for acts_on, operation in targets:
         if not (_allowed(channel, acts_on, operation, both_ways) and _declared(fitted, acts_on)):
             continue
         slope = term_slope(fitted.model, rows, acts_on, operation)
@@ -130,37 +147,47 @@ def _of_channel(fitted: Fitted, channel: Channel) -> Iterator[Candidate]:
         places.append((acts_on, operation, own))
     if not slopes:
         return
-    left = project(fitted, np.column_stack(slopes))
-    at = 0
-    for acts_on, operation, own in places:
-        block = left[:, at : at + own.shape[1]]
-        at += own.shape[1]
+    left = inside_specimens(fitted, project(fitted, np.column_stack(slopes)), channel.unit)
+    for number, (acts_on, operation, own) in enumerate(places):
+        block = left[:, number * own.shape[1] : (number + 1) * own.shape[1]]
         unit = channel.unit
         names = (channel.name,)
         unsigned = both_ways and (acts_on, operation) == ("force", "add") and channel.name != "direction"
         if unsigned and FINER[channel.unit] > FINER["stroke"]:  # it shows only between directions
             names = ("direction", channel.name)
             unit = min(unit, _direction_unit(rows), key=FINER.get)
-        for width in dict.fromkeys((1, own.shape[1])):
-            if not channel.numeric and width != own.shape[1]:
-                continue
+        for width in dict.fromkeys(widths or (own.shape[1],)):
             found = judge(fitted, block[:, :width], flip_level(unit, rows))
             if found is not None:
                 chi2, df, units, log_p, jackknife, scores = found
+                level = flip_level(unit, rows)
+                shape = own[:, :width]
                 yield Candidate(
-                    names,
-                    acts_on,
-                    operation,
-                    flip_level(unit, rows),
-                    own[:, :width],
-                    chi2,
-                    df,
-                    units,
-                    log_p,
-                    jackknife,
-                    1.0,
-                    scores,
+                    names, acts_on, operation, level, shape, chi2, df, units, log_p, jackknife, scores=scores
                 )
+
+
+def inside_specimens(fitted: Fitted, left: np.ndarray, unit: str) -> np.ndarray:
+    """Return projected columns, shape (n, k), freed of what tells specimens apart where their scatter is not known.
+
+    With about as many specimens as conditions their scatter cannot be told from the conditions' own values. A channel
+    that varies from run to run, such as the time since the start, would then be given what specimens do.
+    """
+    rows = fitted.rows
+    scatter = {c.level for c in fitted.scatter.components}
+    starts = rows.groups.starts["specimen"]
+    if (
+        "specimen" in scatter
+        or FINER[unit] >= FINER["specimen"]
+        or not 1 < starts.size < rows.groups.starts["run"].size
+    ):
+        return left
+    own = rows.codes("specimen")[:, None] == np.arange(starts.size)[None, :]
+    basis = orthonormal(project(fitted, own * fitted.force[:, None]))
+    size = np.linalg.norm(left, axis=0)
+    freed = left - basis @ (basis.T @ left)
+    freed[:, np.linalg.norm(freed, axis=0) ** 2 < LEAST_LEFT * size**2] = 0.0
+    return freed
 
 
 def _direction_unit(rows: Rows) -> str:

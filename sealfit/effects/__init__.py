@@ -8,6 +8,9 @@ from sealfit.effects.aging_floor import AGING_FLOOR
 from sealfit.effects.aging_induction import AGING_INDUCTION
 from sealfit.effects.arrhenius_aging import ARRHENIUS_AGING
 from sealfit.effects.asymmetry import ASYMMETRY
+from sealfit.effects.bilinear import BILINEAR
+from sealfit.effects.bilinear_log import BILINEAR_LOG
+from sealfit.effects.bilinear_logs import BILINEAR_LOGS
 from sealfit.effects.bump import BUMP
 from sealfit.effects.campaign_drift import CAMPAIGN_DRIFT
 from sealfit.effects.compression_factor import COMPRESSION_FACTOR
@@ -27,6 +30,7 @@ from sealfit.effects.power import POWER
 from sealfit.effects.power_viscous import POWER_VISCOUS
 from sealfit.effects.product import PRODUCT
 from sealfit.effects.product_log import PRODUCT_LOG
+from sealfit.effects.product_logs import PRODUCT_LOGS
 from sealfit.effects.quadratic import QUADRATIC
 from sealfit.effects.rest_strengthening import REST_STRENGTHENING
 from sealfit.effects.ripple import RIPPLE
@@ -78,6 +82,10 @@ EFFECTS = {
         QUADRATIC,
         PRODUCT,
         PRODUCT_LOG,
+        PRODUCT_LOGS,
+        BILINEAR,
+        BILINEAR_LOG,
+        BILINEAR_LOGS,
         LOG,
         LOG_GROWTH,
         POWER,

@@ -150,43 +150,44 @@ def _levels(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
     return result
 
 
-def surface_effect(x_range: Sequence[float], z_range: Sequence[float]) -> Effect:
+def surface_effect(x_knots: Sequence[float], z_knots: Sequence[float]) -> Effect:
     """Return a free surface of two channels: the mixed terms of a polynomial, zero where either is in its middle.
 
     Parameters
     ----------
-    x_range, z_range : sequence of two float
-        Lowest and highest value of each channel, which are mapped to -1 and 1.
+    x_knots, z_knots : sequence of float
+        Rising values of each channel that are mapped evenly to -1 to 1, straight in between and flat beyond: usual
+        values lie evenly then, whether the channel was set in steps or in decades.
 
     Returns
     -------
     Effect
-        Amplitudes `c_jk` of x^j z^k, j and k 1 or 2.
+        Amplitudes `c_jk` of u^j w^k, j and k 1 or 2, u and w the mapped channels.
 
     Raises
     ------
     ParameterError
-        If a range is empty.
+        If there are fewer than two knots, or they do not rise.
     """
-    ranges = tuple(tuple(float(end) for end in pair) for pair in (x_range, z_range))
-    if any(len(pair) != 2 or not pair[0] < pair[1] for pair in ranges):
-        raise ParameterError(f"surface: {ranges} must be two ranges, each from low to high.", mend="Give low, high.")
+    knots = tuple(tuple(float(k) for k in given) for given in (x_knots, z_knots))
+    if any(len(given) < 2 or not (np.diff(given) > 0).all() for given in knots):
+        raise ParameterError(f"surface: knots {knots} must be two or more rising numbers.", mend="Sort them.")
     return Effect(
         id=SURFACE,
         label="smooth in {x} and {z}",
         equation=r"h = \sum_{jk} c_{jk} u^j w^k",
-        form="c_jk u^j w^k summed over j, k = 1, 2; u, w = {x}, {z} mapped to -1..1 over "
-        + _listed([f"{low:.6g} to {high:.6g}" for low, high in ranges]),
+        form="c_jk u^j w^k summed over j, k = 1, 2; u, w = {x}, {z} mapped to -1..1 at "
+        + " and ".join(_listed(given) for given in knots),
         reads=(CHANNEL, SECOND),
         acts_on=ANYWHERE,
         parameters=tuple(
             Parameter(f"c_{j}{k}", "{y}", 0.0, AMPLITUDE, f"of u^{j} w^{k}", linear=True) for j, k in BENDS
         ),
-        shape=partial(_surface, ranges),
+        shape=partial(_surface, knots),
         source="Form: ours. The mixed terms of a polynomial in two channels.",
         # By hand: at the upper corner u = w = 1, and all terms add up.
         worked=(
-            {CHANNEL: ranges[0][1], SECOND: ranges[1][1]},
+            {CHANNEL: knots[0][-1], SECOND: knots[1][-1]},
             {f"c_{j}{k}": 10.0 * j + k for j, k in BENDS},
             66.0,
         ),
@@ -194,12 +195,20 @@ def surface_effect(x_range: Sequence[float], z_range: Sequence[float]) -> Effect
     )
 
 
-def _surface(ranges: tuple[tuple[float, float], ...], inputs: Mapping, **values) -> np.ndarray:
-    u, w = (
-        2 * (np.asarray(inputs[name], dtype=float) - low) / (high - low) - 1
-        for name, (low, high) in zip((CHANNEL, SECOND), ranges, strict=True)
-    )
+def _surface(knots: tuple[tuple[float, ...], ...], inputs: Mapping, **values) -> np.ndarray:
+    u, w = (evenly(inputs[name], given) for name, given in zip((CHANNEL, SECOND), knots, strict=True))
     return sum(values[f"c_{j}{k}"] * u**j * w**k for j, k in BENDS)
+
+
+def evenly(values, knots: Sequence[float]) -> np.ndarray:
+    """Return values mapped so that the knots lie evenly from -1 to 1, shape of `values`.
+
+    Examples
+    --------
+    >>> [float(u) for u in evenly([1.0, 10.0, 55.0, 500.0], [1.0, 10.0, 100.0])]
+    [-1.0, 0.0, 0.5, 1.0]
+    """
+    return np.interp(np.asarray(values, dtype=float), knots, np.linspace(-1, 1, len(knots)))
 
 
 def slopes_effect(categories: Sequence[str]) -> Effect:
@@ -258,7 +267,7 @@ def _slopes(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
 FREE: Mapping[str, tuple[Callable[..., Effect], tuple[str, ...]]] = {
     SMOOTH: (lambda fixed: smooth_effect(fixed["knots"], fixed.get("x_ref")), ("knots",)),
     LEVELS: (lambda fixed: levels_effect(fixed["categories"]), ("categories",)),
-    SURFACE: (lambda fixed: surface_effect(fixed["x_range"], fixed["z_range"]), ("x_range", "z_range")),
+    SURFACE: (lambda fixed: surface_effect(fixed["x_knots"], fixed["z_knots"]), ("x_knots", "z_knots")),
     SLOPES: (lambda fixed: slopes_effect(fixed["categories"]), ("categories",)),
 }
 
@@ -271,7 +280,7 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
     id : str
         `smooth`, `levels`, `surface` or `slopes`.
     fixed : mapping
-        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `x_range` and `z_range` for
+        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `x_knots` and `z_knots` for
         a surface. Other entries are not looked at.
 
     Raises

@@ -71,8 +71,8 @@ def test_free_shapes_are_rebuilt_from_plain_data(id_, fixed):
         (lambda: levels_effect(["A", "A"]), "two or more different categories"),
         (lambda: free_effect("wavelet", {}), "'wavelet' is no free shape.*smooth, levels, surface, slopes"),
         (lambda: free_effect("smooth", {}), "'knots' is missing"),
-        (lambda: free_effect("surface", {"x_range": (0, 1)}), "'z_range' is missing"),
-        (lambda: surface_effect((0, 1), (2, 2)), "two ranges, each from low to high"),
+        (lambda: free_effect("surface", {"x_knots": (0, 1)}), "'z_knots' is missing"),
+        (lambda: surface_effect((0, 1), (2, 2)), "two or more rising numbers"),
         (lambda: slopes_effect(["A", "A"]), "two or more different categories"),
     ],
 )

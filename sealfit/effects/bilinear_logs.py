@@ -1,0 +1,50 @@
+r"""The logarithms of two channels with their product, the second counted from one unit below zero.
+
+.. math:: h = A u w + B u + C w, \quad u = \ln(x / x_{ref}), \; w = \ln((1 + z) / (1 + z_{ref}))
+
+As `bilinear`, for a channel x that spans decades and one that starts at zero and acts ever more slowly, as days of
+aging do. NaN where x is not positive or z negative.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sealfit.effects.contract import (
+    AMPLITUDE,
+    ANYWHERE,
+    CHANNEL,
+    SECOND,
+    Effect,
+    Parameter,
+    not_negative,
+    positive,
+    reference,
+)
+
+
+def shape(inputs, *, A, B, C):
+    """Product and both terms alone, shape (n,), in the unit of what the effect gives."""
+    u = np.log(positive(inputs[CHANNEL]) / reference(inputs, CHANNEL, 1.0))
+    w = np.log1p(not_negative(inputs[SECOND])) - np.log1p(max(reference(inputs, SECOND, 0.0), 0.0))
+    return A * u * w + B * u + C * w
+
+
+BILINEAR_LOGS = Effect(
+    id="bilinear_logs",
+    label="product of log {x} and log of 1 + {z}, and each alone",
+    equation=r"h = A u w + B u + C w, \quad u = \ln(x / x_{ref}), \; w = \ln((1 + z) / (1 + z_{ref}))",
+    form="A u w + B u + C w, u = ln(x / x_ref), w = ln((1 + z) / (1 + z_ref))",
+    reads=(CHANNEL, SECOND),
+    acts_on=ANYWHERE,
+    parameters=(
+        Parameter("A", "{y}", 0.01, AMPLITUDE, "slope of a slope", linear=True),
+        Parameter("B", "{y}", 0.0, AMPLITUDE, "slope in the first channel", linear=True),
+        Parameter("C", "{y}", 0.0, AMPLITUDE, "slope in the second channel", linear=True),
+    ),
+    shape=shape,
+    source="Form: ours, the first terms of a Taylor series in ln x and ln(1 + z).",
+    # By hand: 1 and 2: 1 + 1 + 4.
+    worked=({"x": np.e, "x_ref": 1.0, "z": np.e**2 - 1.0, "z_ref": 0.0}, {"A": 0.5, "B": 1.0, "C": 2.0}, 6.0),
+    physical=False,
+)

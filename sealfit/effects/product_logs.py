@@ -1,0 +1,45 @@
+r"""Product of the logarithms of two channels, the second counted from one unit below zero, as days of aging are.
+
+.. math:: h = A \ln(x / x_{ref}) \ln \frac{1 + z}{1 + z_{ref}}
+
+As `product_log`, where z starts at zero and acts ever more slowly. NaN where x is not positive or z negative.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sealfit.effects.contract import (
+    AMPLITUDE,
+    ANYWHERE,
+    CHANNEL,
+    SECOND,
+    Effect,
+    Parameter,
+    not_negative,
+    positive,
+    reference,
+)
+
+
+def shape(inputs, *, A):
+    """Product of two logarithms, shape (n,), in the unit of A."""
+    x, z = positive(inputs[CHANNEL]), not_negative(inputs[SECOND])
+    late = np.log1p(z) - np.log1p(max(reference(inputs, SECOND, 0.0), 0.0))
+    return A * np.log(x / reference(inputs, CHANNEL, 1.0)) * late
+
+
+PRODUCT_LOGS = Effect(
+    id="product_logs",
+    label="product of log {x} and log of 1 + {z}",
+    equation=r"h = A \ln(x / x_{ref}) \ln((1 + z) / (1 + z_{ref}))",
+    form="A ln(x / x_ref) ln((1 + z) / (1 + z_ref))",
+    reads=(CHANNEL, SECOND),
+    acts_on=ANYWHERE,
+    parameters=(Parameter("A", "{y}", 0.01, AMPLITUDE, "slope of a slope, in logarithms", linear=True),),
+    shape=shape,
+    source="Form: ours, the first mixed term of a Taylor series in ln x and ln(1 + z).",
+    # By hand: one factor e above the first reference, two above the second.
+    worked=({"x": np.e, "x_ref": 1.0, "z": np.e**2 - 1.0, "z_ref": 0.0}, {"A": 0.5}, 1.0),
+    physical=False,
+)
