@@ -16,6 +16,7 @@ from sealfit.fit.rows import LEVELS, Rows
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 MANY_UNITS = 20  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up
+CALENDAR = ("run_order", "elapsed_h")  # conditions are tested one after the other, so the calendar follows them
 FREE_DF = 4  # columns of a free shape: enough for a peak, an approach or a step; more only costs power
 FINE_DF = 9  # of a second, finer shape, for two humps or a narrow one
 FINE_UNITS = 50  # units from which it is tried

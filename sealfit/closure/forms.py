@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import FINE_DF, FREE_DF, WIDE, Channel, even_knots
+from sealfit.closure.channels import CALENDAR, FINE_DF, FREE_DF, WIDE, Channel, even_knots
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import Candidate
@@ -17,6 +18,8 @@ from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, free_effect
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import Term
 
+WAVY = ("bump", "quadratic")  # through a calendar they follow whatever was tested when
+REACH = 4.0  # spans of a channel that a width or a time constant may have
 PHASES = tuple(np.arange(4) * np.pi / 4)
 PERIODIC = ("ripple", "sinusoid", "sinusoid_harmonics")  # sought in the spectrum, not along a grid of wavelengths
 
@@ -50,10 +53,11 @@ def terms_of(
         if effect.reads == (CHANNEL,):
             if not channel.numeric or name == "direction" or effect.id in ("sinusoid", "sinusoid_harmonics"):
                 continue
-            if not _in_domain(effect, channel.values):
+            if not _in_domain(effect, channel.values) or (name in CALENDAR and effect.id in WAVY):
                 continue
             fixed = {"x_ref": reference(channel.values)}
-            yield Term(effect, (name,), *target, fixed=fixed), _grids(effect, channel.values)
+            held = _within_reach(effect, channel.values)
+            yield Term(held, (name,), *target, fixed=fixed), _grids(held, channel.values)
         elif name in effect.reads and effect.id != "ripple":
             fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
             grids = _grids(effect, np.abs(channel.values))
@@ -160,6 +164,22 @@ def _in_domain(effect: Effect, values: np.ndarray) -> bool:
     with np.errstate(all="ignore"):
         result = effect.shape({CHANNEL: sample, "x_ref": reference(values)}, **effect.start())
     return bool(np.isfinite(result).all())
+
+
+def _within_reach(effect: Effect, values: np.ndarray) -> Effect:
+    """Return a form whose places lie inside the channel's range and whose widths do not exceed a few of its spans.
+
+    A bump far outside is a bent line and a constant under another name.
+    """
+    low, high, span = float(values.min()), float(values.max()), float(np.ptp(values)) or 1.0
+    limits = {"inside": (low, high), "span": (span / 1000, REACH * span)}
+    parameters = []
+    for p in effect.parameters:
+        if p.search in ("inside", "span"):
+            near = tuple(float(x) for x in np.clip(limits[p.search], *p.bounds))
+            p = replace(p, bounds=near, start=float(np.clip(p.start, *near)))
+        parameters.append(p)
+    return replace(effect, parameters=tuple(parameters))
 
 
 def _grids(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import Channel, find_channels
+from sealfit.closure.channels import CALENDAR, Channel, find_channels
 from sealfit.closure.confirm import heldout_gain
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.naming import Proposal, propose, rivals
@@ -21,7 +21,6 @@ from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import Term, evaluate, passes
 from sealfit.fit.rows import Rows
 
-CALENDAR = {"run_order", "elapsed_h"}
 BEHIND = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
 TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
 
@@ -113,7 +112,7 @@ def grow(
         open_ = [c for c in significant if c.key not in refused]
         if (not open_ and peak is None) or number > config.loop.max_rounds:
             break
-        proposals = propose(fitted, _declared_first(open_, config), channels, peak, seen, effects)
+        proposals = propose(fitted, _calendar_last(open_), channels, peak, seen, effects)
         accepted = None
         for proposal in proposals[:TRIES]:
             gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed, seen)
@@ -156,15 +155,15 @@ def _pairs_in_disguise(
     return list(best.values())
 
 
-def _declared_first(significant: list[Candidate], config: Config) -> list[Candidate]:
-    """Return the candidates without the calendar's where a condition's own column explains at least half as much.
+def _calendar_last(significant: list[Candidate]) -> list[Candidate]:
+    """Return the candidates without the calendar's where another explains at least half as much.
 
-    Conditions are tested one after the other, so the calendar follows them; what the model knows comes first.
+    Conditions are tested one after the other, so the calendar follows them; what was set or measured comes first.
     """
-    calendar = [c for c in significant if set(c.channels) & CALENDAR]
-    own = [c for c in significant if set(c.channels) & set(config.condition)]
-    if calendar and own and max(c.chi2 for c in own) >= 0.5 * max(c.chi2 for c in calendar):
-        return [c for c in significant if not set(c.channels) & CALENDAR]
+    calendar = [c for c in significant if set(c.channels) & set(CALENDAR)]
+    others = [c for c in significant if not set(c.channels) & set(CALENDAR)]
+    if calendar and others and max(c.chi2 for c in others) >= 0.5 * max(c.chi2 for c in calendar):
+        return others
     return significant
 
 

@@ -110,7 +110,7 @@ def propose(
         for candidate in significant:
             if candidate.chi2 < CONTENDER * best.chi2 or candidate.key in seen:
                 continue
-            if best.channels == ("direction",) and "direction" not in candidate.channels:
+            if best.channels == ("direction",) and (candidate.pair or "direction" not in candidate.channels):
                 continue
             seen.add(candidate.key)
             for term, search in terms_of(candidate, channels, fitted, effects):

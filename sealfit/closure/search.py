@@ -12,7 +12,7 @@ gives the p-value adjusted for the whole search (Westfall & Young 1993; sign fli
 Goeman & Finos 2020, doi:10.1111/rssb.12369).
 
 Sign flips hold whatever the units' scatter is, but a strong effect stands in V itself: T never exceeds the number of
-units over the kurtosis of c, and a few runs in extreme places hide what all others show. So from ten units on the
+units over the kurtosis of c, and a few runs in extreme places hide what all others show. So from thirty units on the
 estimate is also held against its jackknife over whole units (CV3; MacKinnon, Nielsen & Webb 2023,
 doi:10.1016/j.jeconom.2022.04.001), adjusted by the number of candidates (Bonferroni). Each way has half of the error.
 """
@@ -26,7 +26,7 @@ import numpy as np
 from scipy import stats
 from scipy.special import betainc
 
-from sealfit.closure.channels import FINE_DF, FINE_UNITS, FINER, Channel, flip_level, free_columns, unit_of
+from sealfit.closure.channels import CALENDAR, FINE_DF, FINE_UNITS, FINER, Channel, flip_level, free_columns, unit_of
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import term_slope
 from sealfit.fit.mixed import orthonormal
@@ -44,8 +44,9 @@ TARGETS = (
 )
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
-MANY = 10  # units from which the jackknife is tried
+MANY = 30  # units from which the jackknife is tried
 PROMISING = 0.01  # p-value by sign flips, not adjusted, below which it is
+SEARCHES = 2  # single channels and pairs of them: each search has half of the error
 LEAST_LEFT = 0.01  # share of a column's variance that must survive projection to be identifiable here
 
 
@@ -109,7 +110,9 @@ def judged(candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Ca
     """Return candidates with p-values adjusted over all of them, strongest evidence first."""
     flipped = adjust(candidates, rng)
     jackknife = len(candidates) * np.exp([c.log_p_jackknife for c in candidates])
-    p_values = np.minimum(1.0, 2 * np.minimum(flipped, jackknife))
+    both = np.array([c.units >= MANY for c in candidates])  # two ways, each with half of the error
+    p_values = SEARCHES * np.where(both, 2 * np.minimum(flipped, jackknife), flipped)
+    p_values = np.minimum(1.0, p_values)
     found = [replace(c, p_value=float(p)) for c, p in zip(candidates, p_values, strict=True)]
     return sorted(found, key=lambda c: -c.evidence)
 
@@ -123,7 +126,12 @@ def _of_channel(fitted: Fitted, channel: Channel) -> Iterator[Candidate]:
     widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
     yield from _of_shapes(fitted, channel, shapes, TARGETS, widths)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
-    if channel.numeric and units >= FINE_UNITS and np.unique(channel.values).size > 2 * FINE_DF:
+    if (
+        channel.numeric
+        and channel.name not in CALENDAR
+        and units >= FINE_UNITS
+        and np.unique(channel.values).size > 2 * FINE_DF
+    ):
         yield from _of_shapes(fitted, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
 
 
@@ -147,9 +155,10 @@ def _of_shapes(
         places.append((acts_on, operation, own))
     if not slopes:
         return
-    left = inside_specimens(fitted, project(fitted, np.column_stack(slopes)), channel.unit)
+    left = project(fitted, np.column_stack(slopes))
+    inside = inside_specimens(fitted, left, channel.unit)
     for number, (acts_on, operation, own) in enumerate(places):
-        block = left[:, number * own.shape[1] : (number + 1) * own.shape[1]]
+        place = slice(number * own.shape[1], (number + 1) * own.shape[1])
         unit = channel.unit
         names = (channel.name,)
         unsigned = both_ways and (acts_on, operation) == ("force", "add") and channel.name != "direction"
@@ -157,10 +166,10 @@ def _of_shapes(
             names = ("direction", channel.name)
             unit = min(unit, _direction_unit(rows), key=FINER.get)
         for width in dict.fromkeys(widths or (own.shape[1],)):
-            found = judge(fitted, block[:, :width], flip_level(unit, rows))
+            level = flip_level(unit, rows)
+            found = weaker(fitted, left[:, place][:, :width], inside[:, place][:, :width], level)
             if found is not None:
                 chi2, df, units, log_p, jackknife, scores = found
-                level = flip_level(unit, rows)
                 shape = own[:, :width]
                 yield Candidate(
                     names, acts_on, operation, level, shape, chi2, df, units, log_p, jackknife, scores=scores
@@ -188,6 +197,15 @@ def inside_specimens(fitted: Fitted, left: np.ndarray, unit: str) -> np.ndarray:
     freed = left - basis @ (basis.T @ left)
     freed[:, np.linalg.norm(freed, axis=0) ** 2 < LEAST_LEFT * size**2] = 0.0
     return freed
+
+
+def weaker(fitted: Fitted, left: np.ndarray, inside: np.ndarray, level: str) -> tuple | None:
+    """Return the judgement of columns as they are or inside specimens, whichever says less; both must hold."""
+    found = judge(fitted, left, level)
+    if inside is left or np.shares_memory(inside, left) or found is None:
+        return found
+    other = judge(fitted, inside, level)
+    return None if other is None else max(found, other, key=lambda f: max(f[3], f[4]))
 
 
 def _direction_unit(rows: Rows) -> str:
