@@ -22,6 +22,7 @@ from sealfit.tables import Units
 
 LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
 WORTH_A_LOOK = 0.05  # p-value of a channel by itself, not adjusted for the search
+EVEN = 0.5  # adjusted p-value from which chance is the likelier explanation
 OFFSET = "zero_offset"
 UNSTEADY = 0.2  # share of an offset by which it may differ from run to run and still be one offset
 QUANTITY_UNIT = {"sigma_2": ("force", "speed"), "v_s": ("speed",), "b": ("days",)}
@@ -147,7 +148,7 @@ def left_entry(grown: Grown, rmse_N: float, floor_N: float | None) -> dict:
     left = grown.left
     if left is None and grown.added:
         left = _unsteady_offset(grown) or _largest(
-            grown.after, [c for c in grown.last if c.log_p <= np.log(WORTH_A_LOOK)]
+            grown.after, [c for c in grown.last if c.log_p <= np.log(WORTH_A_LOOK) and c.p_value < EVEN]
         )
     if isinstance(left, Peak):
         return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
