@@ -18,15 +18,15 @@ from scoring import Target, correlations, match, misplaced, named_right
 from truths import NO_INTERVAL, TrueEffect, test_true_forms, true_effects, truth_in_claim
 
 from sealfit.closure.grow import numbered
+from sealfit.closure.judge import project
 from sealfit.closure.loop import MOST_ROWS, MOST_ROWS_OF_RIPPLE, Closure, close_loop
 from sealfit.closure.predict import predict
 from sealfit.closure.record import from_record
-from sealfit.closure.search import project
 from sealfit.config import load_config
 from sealfit.fit.estimate import fitted_at
 from sealfit.fit.joint import Model, evaluate
-from sealfit.fit.mixed import Component, Scatter
 from sealfit.fit.rows import Rows, make_rows, thin
+from sealfit.fit.whitening import Component, Scatter
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.simulate import Spec, load_truth, simulate, true_force, truth_path
 

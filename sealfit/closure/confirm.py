@@ -15,6 +15,7 @@ from sealfit.closure.waves import agreement, pass_shifts
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import Rows
+from sealfit.fit.whitening import Whitening
 
 SURE = 0.005  # p-value, over files (Wilcoxon), at which a ripple of free phase helps the half it was not fitted to
 LEAST_RUNS = 6  # below six runs whole files are held out, below six files strokes (design: held-out unit)
@@ -112,9 +113,8 @@ def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int, samp
             kept = fit(model, train, scatter, turns=0, loading=before.force[~out])
             residual = test.force - evaluate(kept.model, test, jacobian=False)[0]
             squares[k] += float(weight @ _about(residual, test, proposal) ** 2)
-            load = before.force[out]
-            part, _ = scatter.whitened(residual[:, None], load, test.groups)
-            white[k] += float((part**2).sum())
+            whitening = Whitening(scatter, before.force[out], test.groups)
+            white[k] += float((whitening(residual[:, None]) ** 2).sum())
     rmse = np.sqrt(squares / max(known, 1e-300))
     return Gain(float(rmse[0] - rmse[1]), float(white[0] - white[1]))
 

@@ -11,12 +11,13 @@ from sealfit.closure.channels import FINER, Channel, unit_of
 from sealfit.closure.forms import free_term
 from sealfit.closure.grow import Added, Grown, describe
 from sealfit.closure.intervals import effect_intervals
+from sealfit.closure.judge import Candidate
 from sealfit.closure.ripple import Peak
-from sealfit.closure.search import Candidate, search
+from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.effects.contract import fill_unit
 from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.joint import Term, evaluate, term_slope
+from sealfit.fit.joint import Term, evaluate
 from sealfit.fit.rows import Rows
 from sealfit.tables import Units
 
@@ -148,7 +149,7 @@ def left_entry(grown: Grown, rmse_N: float, floor_N: float | None) -> dict:
     left = grown.left
     if left is None and grown.added:
         left = _unsteady_offset(grown) or _largest(
-            grown.after, [c for c in grown.last if c.log_p <= np.log(WORTH_A_LOOK) and c.p_value < EVEN]
+            grown.after, [c for c in grown.last if c.judgement.log_p <= np.log(WORTH_A_LOOK) and c.p_value < EVEN]
         )
     if isinstance(left, Peak):
         return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
@@ -191,7 +192,7 @@ def _largest(fitted: Fitted, candidates: Sequence[Candidate]) -> Candidate | Non
     best, most = None, 0.0
     root = np.sqrt(fitted.rows.weight)
     for candidate in candidates:
-        slope = term_slope(fitted.model, fitted.rows, candidate.acts_on, candidate.operation)
+        slope = fitted.slope(candidate.acts_on, candidate.operation)
         columns = candidate.columns * (slope * root)[:, None]
         found, *_ = np.linalg.lstsq(columns, fitted.residual * root, rcond=1e-10)
         explained = float(((columns @ found) ** 2).sum())

@@ -10,8 +10,8 @@ import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, FINE_DF, FREE_DF, WIDE, Channel, even_knots
 from sealfit.closure.intervals import t_quantile
+from sealfit.closure.judge import Candidate, Judgement
 from sealfit.closure.ripple import Peak
-from sealfit.closure.search import Candidate
 from sealfit.closure.waves import common_wavelength, pass_shifts
 from sealfit.effects.contract import CHANNEL, SECOND, Effect
 from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, free_effect
@@ -66,7 +66,7 @@ def terms_of(
                 yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids
     if name != "direction":
         yield free_term(channel, *target), {}
-        if candidate.df > FREE_DF + 1 and channel.numeric:
+        if candidate.judgement.df > FREE_DF + 1 and channel.numeric:
             yield free_term(channel, *target, df=FINE_DF), {}
 
 
@@ -146,9 +146,8 @@ def periodic_terms(
     units = rows.groups.starts["file"].size
     for way in ways:
         if way in effect.acts_on:
-            candidate = Candidate(
-                (peak.axis,), *way, "file", np.empty((0, 0)), 0.0, 2, units, 0.0, p_value=peak.p_value
-            )
+            judgement = Judgement(0.0, 2, units, 0.0)
+            candidate = Candidate((peak.axis,), *way, "file", np.empty((0, 0)), judgement, p_value=peak.p_value)
             yield Term(effect, (peak.axis,), *way, fixed=fixed), names, candidate
 
 

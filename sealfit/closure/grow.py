@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
@@ -11,17 +11,17 @@ import pandas as pd
 from sealfit.closure.channels import CALENDAR, Channel, find_channels
 from sealfit.closure.confirm import heldout_gain
 from sealfit.closure.forms import PERIODIC
+from sealfit.closure.judge import Candidate
 from sealfit.closure.naming import Proposal, propose, rivals
-from sealfit.closure.pairs import search_pairs
+from sealfit.closure.pairs import pairs_in_disguise, search_pairs
 from sealfit.closure.ripple import Peak, find_ripple
-from sealfit.closure.search import Candidate, search
+from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import Term, evaluate, passes
 from sealfit.fit.rows import Rows
 
-BEHIND = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
 TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
 
 
@@ -108,7 +108,7 @@ def grow(
             significant = [c for c in pairs if c.p_value <= alpha]
             say(f"round {number}: {len(pairs)} pairs, {len(significant)} significant")
         left = significant[0] if significant else peak
-        significant += _pairs_in_disguise(fitted, significant, channels, candidates, rng)
+        significant += pairs_in_disguise(fitted, significant, channels)
         open_ = [c for c in significant if c.key not in refused]
         if (not open_ and peak is None) or number > config.loop.max_rounds:
             break
@@ -132,27 +132,6 @@ def grow(
         }  # what came and went does not come again
         added = kept
     return Grown(before, fitted if added else before, tuple(added), first, last, left, channels)
-
-
-def _pairs_in_disguise(
-    fitted: Fitted, significant: list[Candidate], channels: Mapping[str, Channel], singles: tuple, rng
-) -> list[Candidate]:
-    """Return the pairs that a channel's change of a or of v_s may stand for.
-
-    a is how mu changes with days, v_s how it changes with speed. The pair explains the same significant structure, so
-    it is tried beside the single channel whatever its own p-value; the fits decide.
-    """
-    best: dict[frozenset, Candidate] = {}
-    for single in significant:
-        other = BEHIND.get(single.acts_on)
-        pair = frozenset((*single.channels, other))
-        if single.pair or other not in channels or len(pair) != 2 or pair in best:
-            continue
-        found = search_pairs(fitted, [channels[name] for name in sorted(pair)], singles, rng)
-        if found:
-            strongest = max(found, key=lambda c: c.chi2)
-            best[pair] = replace(strongest, chi2=max(strongest.chi2, single.chi2), p_value=single.p_value)
-    return list(best.values())
 
 
 def _calendar_last(significant: list[Candidate]) -> list[Candidate]:

@@ -25,9 +25,7 @@ def t_quantile(df: float) -> float:
 
 def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
     """Return the sandwich covariance from whole groups of a level (CR2), shape (p, p)."""
-    scores = np.add.reduceat(
-        fitted.white_jacobian * fitted.unit_residual(level)[:, None], fitted.rows.groups.starts[level], axis=0
-    )
+    scores = fitted.rows.groups.sums(fitted.white_jacobian * fitted.unit_residual(level)[:, None], level)
     return fitted.covariance @ (scores.T @ scores) @ fitted.covariance
 
 

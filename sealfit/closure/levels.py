@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from sealfit.closure.search import Candidate
+from sealfit.closure.judge import Candidate
 from sealfit.fit.estimate import Fitted
-from sealfit.fit.mixed import orthonormal
+from sealfit.fit.reml import orthonormal
 from sealfit.fit.rows import LEVELS, Rows
 
 
@@ -151,7 +151,7 @@ def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.D
     best: dict[tuple, Candidate] = {}
     for candidate in candidates:
         name = " ".join(candidate.channels)
-        if name not in best or candidate.log_p < best[name].log_p:
+        if name not in best or candidate.judgement.log_p < best[name].judgement.log_p:
             best[name] = candidate
     sd = float(np.sqrt(rows.weight @ fitted.residual**2))
     white = float(fitted.white_residual @ fitted.white_residual)
@@ -164,7 +164,7 @@ def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.D
                 "channel": name,
                 "sd_N": sd * np.sqrt(share),
                 "share": share,
-                "df": float(candidate.df),
+                "df": float(candidate.judgement.df),
                 "p_value": candidate.p_value,
             }
         )

@@ -9,7 +9,7 @@ Where rivals do equally well, a named mechanism comes before a closed form, and 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,16 +18,17 @@ import pandas as pd
 from sealfit.closure.channels import Channel
 from sealfit.closure.forms import periodic_terms, terms_of
 from sealfit.closure.intervals import robust_covariance
+from sealfit.closure.judge import LEAST_LEFT, Candidate, project
 from sealfit.closure.ripple import Peak
-from sealfit.closure.search import Candidate, project
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
 from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.estimate import Fitted, fit, settled
-from sealfit.fit.joint import Term, mean_derivatives, term_slope
+from sealfit.fit.joint import Term, mean_derivatives
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly
+PART = 32  # points of a grid whitened at once
 TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
 RIVAL = 10.0  # an alternative: the data favour the chosen one by less than exp(5)
 HELD = 0.5  # relative standard error beyond which a form's own number is not determined
@@ -102,25 +103,34 @@ def propose(
     effects : mapping
         The catalogue, the user's own effects included.
     """
-    found: list[Proposal] = []
-    if significant:
-        # A form that starts at zero would take a constant offset in along with its own shape: the offset comes first.
-        best = next((c for c in significant if c.key == OFFSET), significant[0])
-        seen = set()
-        for candidate in significant:
-            if candidate.chi2 < CONTENDER * best.chi2 or candidate.key in seen:
-                continue
-            if best.channels == ("direction",) and (candidate.pair or "direction" not in candidate.channels):
-                continue
-            seen.add(candidate.key)
-            for term, search in terms_of(candidate, channels, fitted, effects):
-                found += _linearised(fitted, term, search, candidate)
+    linearised = Linearised(fitted)
+    forms = [(t, search, c) for c in _contenders(significant) for t, search in terms_of(c, channels, fitted, effects)]
+    forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # a shape made once serves every quantity
+    found = [p for form in forms for p in linearised(*form)]
     if peak is not None:
-        for term, search, candidate in periodic_terms(fitted, peak, samples, effects):
-            found += [replace(p, source=("peak", peak.axis)) for p in _linearised(fitted, term, search, candidate)]
+        for form in periodic_terms(fitted, peak, samples, effects):
+            found += [replace(p, source=("peak", peak.axis)) for p in linearised(*form)]
     found.sort(key=lambda p: p.criterion)
     found = [_refit(fitted, p) for p in _spread(found)]
     return _ordered(fitted, found)
+
+
+def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
+    """Yield the candidates worth a form: those that explain nearly as much as the strongest, each once.
+
+    A form that starts at zero would take a constant offset in along with its own shape, so the offset comes first.
+    """
+    if not significant:
+        return
+    best = next((c for c in significant if c.key == OFFSET), significant[0])
+    seen = set()
+    for candidate in significant:
+        if candidate.chi2 < CONTENDER * best.chi2 or candidate.key in seen:
+            continue
+        if best.channels == ("direction",) and (candidate.pair or "direction" not in candidate.channels):
+            continue
+        seen.add(candidate.key)
+        yield candidate
 
 
 def _spread(found: list[Proposal]) -> list[Proposal]:
@@ -214,34 +224,71 @@ def _refit(fitted: Fitted, proposal: Proposal) -> Proposal:
     return replace(proposal, fitted=settled(refitted, fitted.force))
 
 
-def _linearised(fitted: Fitted, term: Term, search: Mapping[str, tuple], candidate: Candidate) -> list[Proposal]:
-    """Return the term at the best point of its grid, its amplitudes exact; nothing where none is left of it here."""
-    effect = term.effect
-    slope = term_slope(fitted.model, fitted.rows, term.acts_on, term.operation)
-    names = list(search)
-    points = [dict(zip(names, point, strict=True)) for point in itertools.product(*search.values())] or [{}]
-    linear = [k for k, p in enumerate(effect.parameters) if p.linear]
-    best: Proposal | None = None
-    for part in range(0, len(points), 32):
-        some = points[part : part + 32]
-        columns = []
-        for point in some:
-            values = {**effect.start(), **point}
-            derivatives = mean_derivatives(term, values, fitted.rows, only_linear=True)
-            columns += [slope * derivatives[k] for k in range(len(linear))]
-        with np.errstate(all="ignore"):
-            left = project(fitted, np.column_stack(columns))
-        for k, point in enumerate(some):
-            own = left[:, k * len(linear) : (k + 1) * len(linear)]
-            if not np.isfinite(own).all() or not np.abs(own).max() > 0:
-                continue
-            amplitude, *_ = np.linalg.lstsq(own, fitted.white_residual, rcond=1e-10)
-            column = own @ amplitude
-            chi2 = float(2 * column @ fitted.white_residual - column @ column)
-            if best is None or chi2 > best.chi2:
-                named = {effect.parameters[i].name: float(a) for i, a in zip(linear, amplitude, strict=True)}
-                values = {p.name: {**effect.start(), **point, **named}[p.name] for p in effect.parameters}
-                best = Proposal(
-                    term, values, candidate.unit, candidate.units, chi2, candidate.p_value, column, candidate.key
-                )
-    return [best] if best is not None else []
+class Linearised:
+    """Terms fitted to the residual in the tangent space of a model: amplitudes exact, a grid over the rest.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The current model.
+    """
+
+    def __init__(self, fitted: Fitted) -> None:
+        self.fitted = fitted
+        self._kept: tuple[tuple, np.ndarray] | None = None  # shapes are the same on every quantity a form may act on
+
+    def __call__(self, term: Term, search: Mapping[str, tuple], candidate: Candidate) -> list[Proposal]:
+        """Return the term at the best point of its grid; nothing where none of it is left here."""
+        fitted, effect = self.fitted, term.effect
+        points = [dict(zip(search, point, strict=True)) for point in itertools.product(*search.values())]
+        shapes = self._shapes(term, points)
+        slope = fitted.slope(term.acts_on, term.operation)
+        count = len(effect.linear)
+        chi2 = np.concatenate(
+            [
+                _explained(fitted, slope[:, None] * shapes[:, k : k + PART * count], count)
+                for k in range(0, shapes.shape[1], PART * count)
+            ]
+        )
+        best = int(np.argmax(chi2))
+        if not chi2[best] > 0:
+            return []
+        left = project(fitted, slope[:, None] * shapes[:, best * count : (best + 1) * count])
+        amplitude, *_ = np.linalg.lstsq(left, fitted.white_residual, rcond=1e-10)
+        column = left @ amplitude
+        chosen = {**effect.start(), **points[best], **dict(zip(effect.linear, amplitude.tolist(), strict=True))}
+        values = {p.name: chosen[p.name] for p in effect.parameters}
+        found = float(2 * column @ fitted.white_residual - column @ column)
+        units = candidate.judgement.units
+        return [Proposal(term, values, candidate.unit, units, found, candidate.p_value, column, candidate.key)]
+
+    def _shapes(self, term: Term, points: list[dict[str, float]]) -> np.ndarray:
+        """Return the shape per unit of each amplitude at every point, shape (n, points * amplitudes)."""
+        key = (term.effect.id, term.channels, points, term.fixed)
+        if self._kept is None or self._kept[0] != key:
+            start = term.effect.start()
+            with np.errstate(all="ignore"):
+                columns = [
+                    c
+                    for point in points
+                    for c in mean_derivatives(term, {**start, **point}, self.fitted.rows, only_linear=True)
+                ]
+            self._kept = (key, np.column_stack(columns))
+        return self._kept[1]
+
+
+def _explained(fitted: Fitted, columns: np.ndarray, count: int) -> np.ndarray:
+    """Return the sum of squares that each `count` neighbouring columns of the force explain, shape (points,)."""
+    good = np.isfinite(columns).all(axis=0)
+    white = fitted.whitening(np.where(good, columns, 0.0))
+    taken = fitted.basis.T @ white
+    white, taken = (a.reshape(a.shape[0], -1, count) for a in (white, taken))
+    whole = np.einsum("npi,npj->pij", white, white)
+    gram = whole - np.einsum("npi,npj->pij", taken, taken)
+    score = np.einsum("npi,n->pi", white, fitted.white_residual)
+    size, least = (np.einsum("pii->pi", a) for a in (gram, whole))
+    kept = (size > LEAST_LEFT * least) & good.reshape(-1, count)
+    score = np.where(kept, score / np.sqrt(np.where(kept, size, 1.0)), 0.0)
+    unit = np.where(kept, 1 / np.sqrt(np.where(kept, size, 1.0)), 0.0)
+    inverse = np.linalg.pinv(gram * unit[:, :, None] * unit[:, None, :], rcond=1e-10, hermitian=True)
+    return np.einsum("pi,pij,pj->p", score, inverse, score)

@@ -7,17 +7,18 @@ does by itself was tested before and is none of the pair's.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from sealfit.closure.channels import FINER, Channel, even_knots, flip_level
-from sealfit.closure.search import MAIN_TARGETS, Candidate, inside_specimens, judged, project, weaker
+from sealfit.closure.judge import Candidate, Judge, judged
+from sealfit.closure.search import MAIN_TARGETS
 from sealfit.effects.free import BENDS, evenly
 from sealfit.fit.estimate import Fitted
-from sealfit.fit.joint import term_slope
 
+BEHIND = {"a": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along what a parameter acts
 ALONE = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; the calendar drifts by itself
 RARE = 2.0  # pairs are many and seldom at work: they get half of their share of the error
 MOST_CATEGORIES = 12  # a slope for each of more would find what single units do
@@ -39,53 +40,73 @@ def search_pairs(
     rng : Generator
         For the sign flips.
     """
-    usable = [
-        c
-        for c in channels
-        if not (c.grouping or c.name in ALONE) and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
-    ]
-    found = []
-    for one, other in itertools.combinations(usable, 2):
-        found += _of_pair(fitted, one, other)
+    judge = Judge(fitted)
+    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _of_pair(judge, *pair)]
     if not found:
         return []
     pairs = [c for c in judged([*found, *singles], rng) if c.pair]
     return [replace(c, p_value=min(1.0, RARE * c.p_value)) for c in pairs]
 
 
-def _of_pair(fitted: Fitted, one: Channel, other: Channel) -> list[Candidate]:
+def pairs_in_disguise(
+    fitted: Fitted, significant: Sequence[Candidate], channels: Mapping[str, Channel]
+) -> list[Candidate]:
+    """Return the pairs that a channel's change of a or of v_s may stand for.
+
+    a is how mu changes with days, v_s how it changes with speed. The pair explains the same significant structure, so
+    it is tried beside the single channel whatever its own p-value; the fits decide.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The current model at its optimum.
+    significant : sequence of Candidate
+        What the search has accepted on it.
+    channels : mapping
+        Channels by name.
+    """
+    judge = Judge(fitted)
+    best: dict[frozenset, Candidate] = {}
+    for single in significant:
+        pair = frozenset((*single.channels, BEHIND.get(single.acts_on)))
+        if single.pair or len(pair) != 2 or not pair <= channels.keys() or pair in best:
+            continue
+        members = _usable([channels[name] for name in sorted(pair)])
+        found = _of_pair(judge, *members) if len(members) == 2 else []
+        if found:
+            strongest = max(found, key=lambda c: c.chi2)
+            judgement = strongest.judgement._replace(chi2=max(strongest.chi2, single.chi2))
+            best[pair] = replace(strongest, judgement=judgement, p_value=single.p_value)
+    return list(best.values())
+
+
+def _usable(channels: Sequence[Channel]) -> list[Channel]:
+    return [
+        c
+        for c in channels
+        if not (c.grouping or c.name in ALONE) and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
+    ]
+
+
+def _of_pair(judge: Judge, one: Channel, other: Channel) -> list[Candidate]:
     shapes = mixed_columns(one, other)
-    if shapes.shape[1] == 0:
-        return []
-    rows, unit = fitted.rows, flip_level(min(one.unit, other.unit, key=FINER.get), fitted.rows)
-    slopes = [term_slope(fitted.model, rows, *target) for target in MAIN_TARGETS]
-    left = project(fitted, np.column_stack([shapes * slope[:, None] for slope in slopes]))
-    inside = inside_specimens(fitted, left, min(one.unit, other.unit, key=FINER.get))
     width = shapes.shape[1]
+    if width == 0:
+        return []
+    fitted, finer = judge.fitted, min(one.unit, other.unit, key=FINER.get)
+    level = flip_level(finer, fitted.rows)
+    variants = judge.variants(
+        np.column_stack([shapes * fitted.slope(*target)[:, None] for target in MAIN_TARGETS]), finer
+    )
     found = []
     for k, target in enumerate(MAIN_TARGETS):
         if "load_N" in (one.name, other.name) and target[0] == "force":
             continue
-        place = slice(k * width, (k + 1) * width)
-        for columns in dict.fromkeys((1, width)) if one.numeric and other.numeric else (width,):
-            judgement = weaker(fitted, left[:, place][:, :columns], inside[:, place][:, :columns], unit)
+        for count in dict.fromkeys((1, width)) if one.numeric and other.numeric else (width,):
+            judgement = judge([v[:, k * width : k * width + count] for v in variants], level)
             if judgement is not None:
-                chi2, df, units, log_p, jackknife, scores = judgement
-                found.append(
-                    Candidate(
-                        (one.name, other.name),
-                        *target,
-                        unit,
-                        shapes[:, :columns],
-                        chi2,
-                        df,
-                        units,
-                        log_p,
-                        jackknife,
-                        scores=scores,
-                        pair=True,
-                    )
-                )
+                names = (one.name, other.name)
+                found.append(Candidate(names, *target, level, shapes[:, :count], judgement, pair=True))
     return found
 
 

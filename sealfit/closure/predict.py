@@ -18,8 +18,8 @@ from sealfit.conditions import add_keys
 from sealfit.config import Config
 from sealfit.errors import RequestError
 from sealfit.fit.joint import Declared, Model, evaluate
-from sealfit.fit.mixed import Component, Scatter
 from sealfit.fit.rows import LEVELS, point_rows
+from sealfit.fit.whitening import Component, Scatter
 
 BEYOND = 1e-6  # relative slack before a value counts as outside the tested range
 ANSWERS = (

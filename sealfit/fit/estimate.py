@@ -13,11 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.fit.joint import LOGARITHMIC, Model, evaluate
-from sealfit.fit.mixed import Scatter
+from sealfit.fit.joint import LOGARITHMIC, Model, evaluate, term_slope
 from sealfit.fit.rows import Rows
 from sealfit.fit.scatter import estimate_components, estimate_scatter
 from sealfit.fit.start import start_model, stribeck_range
+from sealfit.fit.whitening import Scatter, Whitening
 
 PRIOR_SD = 3.0
 MAX_STEPS = 60
@@ -53,8 +53,23 @@ class Fitted:
         return q[:, np.abs(np.diag(r)) > 1e-8]
 
     @cached_property
+    def whitening(self) -> Whitening:
+        """What whitens columns on the rows, at this fit's force."""
+        return Whitening(self.scatter, self.force, self.rows.groups)
+
+    @cached_property
     def _widened(self) -> dict[str, np.ndarray]:
         return {}
+
+    @cached_property
+    def _slopes(self) -> dict[tuple[str, str], np.ndarray]:
+        return {}
+
+    def slope(self, acts_on: str, operation: str) -> np.ndarray:
+        """Return the force's derivative with respect to the shape of a term that is not there yet, shape (n,)."""
+        if (acts_on, operation) not in self._slopes:
+            self._slopes[acts_on, operation] = term_slope(self.model, self.rows, acts_on, operation)
+        return self._slopes[acts_on, operation]
 
     def unit_residual(self, level: str) -> np.ndarray:
         """Return the whitened residual widened by (I - H_gg)^(-1/2) in each group of a level, shape (n,).
@@ -65,15 +80,11 @@ class Fitted:
         if level not in self._widened:
             starts = self.rows.groups.starts[level]
             code = self.rows.codes(level)
-            gram = (
-                np.add.reduceat(self.basis[:, :, None] * self.basis[:, None, :], starts, axis=0)
-                if (self.basis.size * self.basis.shape[1] < 3e7)
-                else np.stack([part.T @ part for part in np.split(self.basis, starts[1:])])
-            )
+            gram = np.stack([part.T @ part for part in np.split(self.basis, starts[1:])])
             size, axes = np.linalg.eigh(gram)
             size = np.clip(size, 0.0, 0.98)  # a group that the fit owns whole has nothing left to widen
             grow = np.where(size > 1e-12, (1 / np.sqrt(1 - size) - 1) / np.maximum(size, 1e-12), 0.0)
-            inner = np.add.reduceat(self.basis * self.white_residual[:, None], starts, axis=0)
+            inner = self.rows.groups.sums(self.basis * self.white_residual[:, None], level)
             rotated = np.einsum("gji,gj->gi", axes, inner) * grow
             back = np.einsum("gij,gj->gi", axes, rotated)
             self._widened[level] = self.white_residual + (self.basis * back[code]).sum(axis=1)
@@ -151,9 +162,10 @@ def fitted_at(model: Model, rows: Rows, scatter: Scatter, loading: np.ndarray | 
     """Return the `Fitted` of a model as it stands, nothing refitted."""
     force, jacobian = evaluate(model, rows)
     load = force if loading is None else loading
-    white, logdet = scatter.whitened(np.column_stack([rows.force - force, jacobian]), load, rows.groups)
-    residual = white[:, 0]
-    return Fitted(model, scatter, rows, force, jacobian, residual, white[:, 1:], float(residual @ residual) + logdet)
+    whitening = Whitening(scatter, load, rows.groups)
+    residual, white = whitening((rows.force - force)[:, None])[:, 0], whitening(jacobian)
+    deviance = float(residual @ residual) + whitening.logdet
+    return Fitted(model, scatter, rows, force, jacobian, residual, white, deviance)
 
 
 def settled(fitted: Fitted, loading: np.ndarray) -> Fitted:
@@ -183,6 +195,7 @@ def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
     """
     slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
     held = prior_precision(model) > 0
+    whitening = Whitening(scatter, rows.force, rows.groups)
     places = [k for k, parameter in enumerate(model.declared.parameters) if parameter.quantity == "v_s"]
     for group in [places, *([k] for k in places)] if len(places) > 1 else [places] if places else []:
         best, chosen = np.inf, model.vector()
@@ -192,7 +205,7 @@ def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
                 vector[group] = value
             force, jacobian = evaluate(model.at(vector), rows)
             columns = np.column_stack([rows.force - force, jacobian[:, ~held]])
-            white, _ = scatter.whitened(columns, rows.force, rows.groups)
+            white = whitening(columns)
             step, *_ = np.linalg.lstsq(white[:, 1:].T @ white[:, 1:], white[:, 1:].T @ white[:, 0], rcond=1e-10)
             cost = float(white[:, 0] @ white[:, 0] - step @ (white[:, 1:].T @ white[:, 0]))
             if cost < best - 1e-9:
@@ -213,17 +226,16 @@ def _descend(
     force, jacobian = evaluate(model, rows)
     loading = force if loading is None else loading  # held, so that the criterion does not move under the search
 
-    def white_of(columns: np.ndarray) -> np.ndarray:
-        return scatter.whitened(columns, loading, rows.groups)[0]
+    whitening = Whitening(scatter, loading, rows.groups)
 
     def cost_of(residual: np.ndarray, at: np.ndarray) -> float:
         return float(residual @ residual + precision @ (at - centre) ** 2)
 
-    residual = white_of((rows.force - force)[:, None])[:, 0]
+    residual = whitening((rows.force - force)[:, None])[:, 0]
     cost = cost_of(residual, vector)
     damping, crept = 1e-4, 0
     for _ in range(MAX_STEPS):
-        white = white_of(jacobian)
+        white = whitening(jacobian)
         gradient = white.T @ residual - precision * (vector - centre)
         normal = white.T @ white + np.diag(precision)
         blocked = ((vector <= low) & (gradient < 0)) | ((vector >= high) & (gradient > 0))
@@ -238,7 +250,7 @@ def _descend(
             trial = np.clip(vector + move, low, high)
             trial_model = model.at(trial)
             trial_force, _none = evaluate(trial_model, rows, jacobian=False)
-            trial_residual = white_of((rows.force - trial_force)[:, None])[:, 0]
+            trial_residual = whitening((rows.force - trial_force)[:, None])[:, 0]
             trial_cost = cost_of(trial_residual, trial)
             if np.isfinite(trial_cost) and trial_cost <= cost:
                 break

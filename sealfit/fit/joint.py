@@ -13,7 +13,7 @@ are fitted as logarithms. Wu et al. 2020, Polymers 12(1) 102, doi:10.3390/polym1
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -259,9 +259,7 @@ def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.nda
             tangent[every[has], number[has]] += (slopes[quantity] * state["through"].get(quantity, 1.0) * base)[has]
     column = model.theta.size
     for term, values, slope in zip(model.terms, model.values, state["term_slopes"], strict=True):
-        key = ("columns", term.key(), id(term.fixed))
-        known = rows.cache[key][1].T if key in rows.cache else mean_derivatives(term, values, rows)
-        for derivative in known:
+        for derivative in _derivatives(term, values, rows):
             tangent[:, column] = slope * derivative
             column += 1
     return state["force"], tangent
@@ -317,14 +315,39 @@ def _linear_columns(term: Term, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _shape(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
-    """Return the term's shape at the rows, shape (n,); columns that do not change are made once."""
-    if term.effect.nonlinear:
-        return _known(term, sum(weight * term.effect.shape(inputs, **values) for weight, inputs in term.nodes(rows)))
-    inputs = term.inputs(rows)
+    """Return the term's shape at the rows, shape (n,); what does not change is made once."""
+    if not term.effect.nonlinear:
+        return _columns_of(term, rows) @ np.array([values[p.name] for p in term.effect.parameters])
+    return _kept(
+        "shape",
+        term,
+        values,
+        rows,
+        lambda: _known(term, sum(weight * term.effect.shape(inputs, **values) for weight, inputs in term.nodes(rows))),
+    )
+
+
+def _derivatives(term: Term, values: Mapping[str, float], rows: Rows) -> list[np.ndarray] | np.ndarray:
+    """Return the derivatives of a term's shape in each of its parameters; what does not change is made once."""
+    if not term.effect.nonlinear:
+        return _columns_of(term, rows).T
+    return _kept("derivatives", term, values, rows, lambda: mean_derivatives(term, values, rows))
+
+
+def _kept(what: str, term: Term, values: Mapping[str, float], rows: Rows, make: Callable):
+    """Return what was made last for a term at the same values, or make it: a fit moves some terms and not others."""
+    key = (what, term.key(), id(term.fixed))
+    at = tuple(values.values())
+    if key not in rows.cache or rows.cache[key][1] != at:
+        rows.cache[key] = (term.fixed, at, make())  # holding `fixed` keeps its id its own
+    return rows.cache[key][2]
+
+
+def _columns_of(term: Term, rows: Rows) -> np.ndarray:
     key = ("columns", term.key(), id(term.fixed))
     if key not in rows.cache:
-        rows.cache[key] = (term.fixed, _linear_columns(term, inputs))
-    return rows.cache[key][1] @ np.array([values[p.name] for p in term.effect.parameters])
+        rows.cache[key] = (term.fixed, _linear_columns(term, term.inputs(rows)))
+    return rows.cache[key][1]
 
 
 def _state(model: Model, rows: Rows, *, slopes: bool = True) -> dict:

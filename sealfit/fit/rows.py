@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.fit.mixed import Groups
+from sealfit.fit.groups import Groups
 from sealfit.tables import BINS
 
 LEVELS = ("stroke", "file", "run", "specimen")

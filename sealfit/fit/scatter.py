@@ -8,8 +8,9 @@ import numpy as np
 from scipy.optimize import nnls
 
 from sealfit.fit.joint import declare
-from sealfit.fit.mixed import Component, Scatter, reml
+from sealfit.fit.reml import reml
 from sealfit.fit.rows import LEVELS, Rows
+from sealfit.fit.whitening import Component, Scatter
 
 LEAST_NOISE = 1e-6  # of the force: below what any sensor resolves; keeps noise-free data from weights without end
 LEAST_FILES = 6  # from which files can be compared in shape

@@ -3,7 +3,8 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.channels import find_channels, flip_level, free_columns, unit_of
-from sealfit.closure.search import log_p_of, search
+from sealfit.closure.judge import log_p_of
+from sealfit.closure.search import search
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
 

@@ -1,0 +1,223 @@
+r"""Score tests of columns of the force, judged by sign flips of whole units and by their jackknife.
+
+A candidate is a free shape of one channel acting on one quantity: columns c of the force. After whitening and after
+projection on the tangent space of the current model, the score of unit u is :math:`s_u = c_u^T r_u`, and
+
+.. math:: T = S^T V^{-1} S, \quad S = \sum_u s_u, \quad V = \sum_u s_u s_u^T .
+
+The r_u in V are widened for what the fit has taken out of each unit (CR2, Bell & McCaffrey 2002), as residuals are
+smaller than errors and few units would otherwise look too quiet. V is unchanged when a unit's sign is flipped, so
+flipping all units at random many times costs one matrix product, and the largest standardised T over all candidates
+gives the p-value adjusted for the whole search (Westfall & Young 1993; sign flips of score contributions: Hemerik,
+Goeman & Finos 2020, doi:10.1111/rssb.12369).
+
+Sign flips hold whatever the units' scatter is, but a strong effect stands in V itself: T never exceeds the number of
+units over the kurtosis of c, and a few runs in extreme places hide what all others show. So from thirty units on the
+estimate is also held against its jackknife over whole units (CV3; MacKinnon, Nielsen & Webb 2023,
+doi:10.1016/j.jeconom.2022.04.001), adjusted by the number of candidates (Bonferroni). Each way has half of the error.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+from scipy.special import betainc
+
+from sealfit.closure.channels import FINER
+from sealfit.fit.estimate import Fitted
+from sealfit.fit.reml import orthonormal
+
+FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
+JACKKNIFE_UNITS = 30  # from which the jackknife is tried
+PROMISING = 0.01  # p-value by sign flips, not adjusted, below which it is
+SEARCHES = 2  # single channels and pairs of them: each search has half of the error
+LEAST_LEFT = 0.01  # share of a column's variance that must survive projection to be identifiable here
+
+
+class Judgement(NamedTuple):
+    """What the residual says of some columns."""
+
+    chi2: float  # whitened sum of squares they explain
+    df: int
+    units: int
+    log_p: float  # of T by its F distribution, not adjusted
+    log_p_jackknife: float = 0.0  # of the estimate against its jackknife over units; 0 where that was not tried
+    scores: np.ndarray | None = None  # (units, k)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A free shape of one channel, or of a pair, acting on one quantity, with its test."""
+
+    channels: tuple[str, ...]
+    acts_on: str
+    operation: str
+    unit: str  # level of the groups moved by sign flips
+    columns: np.ndarray  # (n, k) shape values, before the slope of the quantity
+    judgement: Judgement
+    p_value: float = 1.0  # adjusted over the search
+    pair: bool = False  # whether it acts by two channels together
+
+    @property
+    def key(self) -> tuple:
+        """What it acts with and on."""
+        return (self.channels, self.acts_on, self.operation)
+
+    @property
+    def chi2(self) -> float:
+        """Whitened sum of squares it explains."""
+        return self.judgement.chi2
+
+    @property
+    def evidence(self) -> float:
+        """Explained sum of squares less what as many idle columns would be given (Schwarz)."""
+        return self.chi2 - self.judgement.df * np.log(max(self.judgement.units, 2))
+
+
+def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
+    """Return columns of the force, whitened and freed of the current model's tangent space, shape (n, k)."""
+    white = fitted.whitening(columns)
+    size = np.linalg.norm(white, axis=0)
+    left = white - fitted.basis @ (fitted.basis.T @ white)
+    left[:, np.linalg.norm(left, axis=0) ** 2 < LEAST_LEFT * size**2] = 0.0
+    return left
+
+
+class Judge:
+    """Holds columns of the force against the residual of a fit.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The current model at its optimum.
+    """
+
+    def __init__(self, fitted: Fitted) -> None:
+        self.fitted = fitted
+
+    def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
+        """Return columns of a channel of some unit, shape (n, k), in every way in which they must hold.
+
+        They are projected; and, where the scatter of specimens is not known, freed of what tells specimens apart. With
+        about as many specimens as conditions that scatter cannot be told from the conditions' own values, and a channel
+        that varies from run to run, such as the time since the start, would be given what specimens do.
+        """
+        left = project(self.fitted, columns)
+        if self._specimens is None or FINER[unit] >= FINER["specimen"]:
+            return (left,)
+        size = np.linalg.norm(left, axis=0)
+        freed = left - self._specimens @ (self._specimens.T @ left)
+        freed[:, np.linalg.norm(freed, axis=0) ** 2 < LEAST_LEFT * size**2] = 0.0
+        return left, freed
+
+    @cached_property
+    def _specimens(self) -> np.ndarray | None:
+        """Basis of what tells specimens apart, shape (n, k); None where their scatter is known or nothing can be."""
+        rows = self.fitted.rows
+        starts = rows.groups.starts
+        known = any(c.level == "specimen" for c in self.fitted.scatter.components)
+        if known or not 1 < starts["specimen"].size < starts["run"].size:
+            return None
+        own = rows.codes("specimen")[:, None] == np.arange(starts["specimen"].size)[None, :]
+        return orthonormal(project(self.fitted, own * self.fitted.force[:, None]))
+
+    def __call__(self, variants: Sequence[np.ndarray], level: str) -> Judgement | None:
+        """Return the judgement that says least of all variants of some columns; None where one cannot be judged."""
+        found = []
+        for left in variants:
+            judgement = self._judge(left, level)
+            if judgement is None:
+                return None
+            found.append(judgement)
+        return max(found, key=lambda j: max(j.log_p, j.log_p_jackknife))
+
+    def _judge(self, left: np.ndarray, level: str) -> Judgement | None:
+        fitted = self.fitted
+        units = fitted.rows.groups.starts[level].size
+        size = np.linalg.norm(left, axis=0)
+        left = left[:, size > 0] / size[size > 0]
+        if left.shape[1] == 0 or units < 4:
+            return None
+        u, s, _ = np.linalg.svd(left.T @ left)
+        keep = s > 1e-6 * s[0]
+        left = (left @ u[:, keep] / np.sqrt(s[keep]))[:, : max(1, units // 5)]
+        scores = fitted.rows.groups.sums(left * fitted.unit_residual(level)[:, None], level)
+        total = left.T @ fitted.white_residual
+        log_p = float(log_p_of(_wald(total[None, :], scores)[0], left.shape[1], units))
+        jackknife = 0.0
+        if units >= JACKKNIFE_UNITS and log_p < np.log(PROMISING):
+            jackknife = _jackknife(fitted, left, level)
+        return Judgement(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
+
+
+def _jackknife(fitted: Fitted, left: np.ndarray, level: str) -> float:
+    """Return the log p-value of orthonormal columns' coefficients against their jackknife over whole units.
+
+    Everything is estimated anew without each unit, the current model's numbers too, in the tangent space.
+    """
+    start = fitted.rows.groups.starts[level]
+    units, k = start.size, left.shape[1]
+    every = np.column_stack([fitted.basis, left])
+    own = np.stack([part.T @ part for part in np.split(every, start[1:])])
+    product = fitted.rows.groups.sums(every * fitted.white_residual[:, None], level)
+    total = left.T @ fitted.white_residual
+    size, axes = np.linalg.eigh(np.eye(every.shape[1]) - own)
+    inverse = np.where(
+        size > 1e-6, 1 / np.maximum(size, 1e-6), 0.0
+    )  # what one unit alone determines is left where it is
+    right = np.r_[np.zeros(every.shape[1] - k), total] - product
+    without = np.einsum("uij,uj,ukj,uk->ui", axes, inverse, axes, right)[:, -k:]
+    spread = (without - total).T @ (without - total) * (units - 1) / units
+    t = float(total @ np.linalg.pinv(spread, hermitian=True) @ total)
+    return float(stats.f.logsf(t * (units - k) / (k * (units - 1)), k, units - k))
+
+
+def _wald(totals: np.ndarray, scores: np.ndarray) -> np.ndarray:
+    """Return T for each row of `totals`, shape (m, k) -> (m,)."""
+    inverse = np.linalg.pinv(scores.T @ scores, rcond=1e-10, hermitian=True)
+    return np.einsum("ij,jk,ik->i", totals, inverse, totals)
+
+
+def judged(candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
+    """Return candidates with p-values adjusted over all of them, strongest evidence first."""
+    flipped = adjust([c.judgement for c in candidates], [c.unit for c in candidates], rng)
+    jackknife = len(candidates) * np.exp([c.judgement.log_p_jackknife for c in candidates])
+    both = np.array([c.judgement.units >= JACKKNIFE_UNITS for c in candidates])  # two ways, each with half of the error
+    p_values = SEARCHES * np.where(both, 2 * np.minimum(flipped, jackknife), flipped)
+    found = [replace(c, p_value=min(1.0, float(p))) for c, p in zip(candidates, p_values, strict=True)]
+    return sorted(found, key=lambda c: -c.evidence)
+
+
+def log_p_of(t: np.ndarray, df: int, units: int) -> np.ndarray:
+    """Return the log p-value of T, from Hotelling's F with as many units; T never exceeds their number."""
+    share = np.clip(np.asarray(t) / units, 0.0, 1 - 1e-15)
+    return np.log(np.maximum(betainc((units - df) / 2, df / 2, 1 - share), 1e-300))
+
+
+def adjust(
+    judgements: Sequence[Judgement], levels: Sequence[str], rng: np.random.Generator, flips: int = FLIPS
+) -> np.ndarray:
+    """Return each p-value adjusted over all judgements, by the maximum over sign flips, shape (m,).
+
+    Those of one level are flipped with the same signs, so that what they share counts once.
+    """
+    alike = defaultdict(list)
+    for judgement, level in zip(judgements, levels, strict=True):
+        alike[level, judgement.units, judgement.df].append(judgement.scores)
+    signs = {
+        place: rng.choice([-1.0, 1.0], size=(flips, place[1])) for place in dict.fromkeys(key[:2] for key in alike)
+    }
+    least = np.zeros(flips)
+    for (level, units, df), scores in alike.items():
+        most = np.zeros(flips)  # the largest T has the smallest p-value where units and df are the same
+        for own in scores:
+            most = np.maximum(most, _wald(signs[level, units] @ own, own))
+        least = np.minimum(least, log_p_of(most, df, units))
+    own = np.array([j.log_p for j in judgements])
+    return (1 + np.searchsorted(np.sort(least), own, side="right")) / (flips + 1)

@@ -1,0 +1,11 @@
+import numpy as np
+import numpy.testing as npt
+
+from sealfit.fit.groups import Groups
+
+
+def test_sums_and_means_of_groups():
+    groups = Groups.of({"file": np.array([0, 0, 1, 1, 1])})
+    values = np.array([1.0, 3.0, 2.0, 4.0, 6.0])
+    npt.assert_allclose(groups.means(values, "file"), [2.0, 4.0])
+    npt.assert_allclose(groups.sums(np.column_stack([values, -values]), "file"), [[4.0, -4.0], [12.0, -12.0]])

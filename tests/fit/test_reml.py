@@ -1,0 +1,74 @@
+import numpy as np
+import numpy.testing as npt
+import pytest
+
+from sealfit.fit.groups import Groups
+from sealfit.fit.reml import RestrictedLikelihood, orthonormal, reml
+
+
+def nested(files_per_run, runs_per_specimen, specimens):
+    files = files_per_run * runs_per_specimen * specimens
+    return {
+        "file": np.arange(files),
+        "run": np.arange(files) // files_per_run,
+        "specimen": np.arange(files) // (files_per_run * runs_per_specimen),
+    }
+
+
+def test_the_likelihood_is_that_of_the_dense_covariance_and_its_gradient_is_exact():
+    rng = np.random.default_rng(7)
+    codes = {"stroke": np.arange(72), **{name: code.repeat(2) for name, code in nested(3, 4, 3).items()}}
+    force, tangent = rng.normal(40, 10, 72) * rng.choice([-1, 1], 72), orthonormal(rng.normal(size=(72, 8)))
+    residual, variance = rng.normal(size=72), rng.uniform(0.1, 0.3, 72)
+    kinds = [(level, kind) for level in codes for kind in ("offset", "gain")]
+    sizes = rng.uniform(0.5, 2.0, 8) * np.tile([0.1, 1e-4], 4)
+    likelihood = RestrictedLikelihood(residual, tangent, variance, force, Groups.of(codes), kinds)
+
+    def dense(at):
+        covariance = np.diag(variance)
+        for (level, kind), size in zip(kinds, at, strict=True):
+            load = force if kind == "gain" else np.ones(72)
+            covariance = covariance + size * np.outer(load, load) * (codes[level][:, None] == codes[level])
+        inverse = np.linalg.inv(covariance)
+        gram = tangent.T @ inverse @ tangent
+        left = residual - tangent @ np.linalg.solve(gram, tangent.T @ inverse @ residual)
+        return 0.5 * (np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(gram)[1] + left @ inverse @ left)
+
+    value, gradient = likelihood(sizes)
+    steps = np.diag(1e-4 * sizes)
+    npt.assert_allclose(value, dense(sizes), rtol=1e-9)
+    slopes = [(dense(sizes + step) - dense(sizes - step)) / (2 * step.sum()) for step in steps]
+    npt.assert_allclose(gradient, slopes, rtol=1e-5)
+
+
+def test_reml_recovers_scatter_of_files_runs_and_specimens():
+    codes = nested(3, 8, 25)
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(12):
+        force = rng.uniform(20, 50, 200)[codes["run"]]
+        residual = (
+            rng.normal(0, 0.05, force.size)
+            + force * rng.normal(0, 0.01, force.size)
+            + rng.normal(0, 0.2, 200)[codes["run"]]
+            + force * rng.normal(0, 0.02, 25)[codes["specimen"]]
+        )
+        tangent = np.column_stack([np.ones(force.size), force])
+        kinds = [("file", "gain"), ("run", "offset"), ("specimen", "gain")]
+        parts = reml(residual, tangent, np.full(force.size, 0.05**2), force, Groups.of(codes), kinds)
+        found.append([np.sqrt(p.variance) for p in parts])
+    npt.assert_allclose(np.mean(found, axis=0), [0.01, 0.2, 0.02], rtol=0.15)
+
+
+def test_reml_counts_the_degrees_of_freedom_that_the_model_took():
+    # 40 groups of one, 20 of whose means the model owns: the plain mean square would be half the variance.
+    rng = np.random.default_rng(5)
+    codes = {"file": np.arange(40)}
+    found = []
+    for _ in range(200):
+        tangent = rng.normal(0, 1, (40, 20))
+        error = rng.normal(0, 1.0, 40)
+        residual = error - tangent @ np.linalg.lstsq(tangent, error, rcond=None)[0]
+        (part,) = reml(residual, tangent, np.full(40, 1e-6), np.ones(40), Groups.of(codes), [("file", "offset")])
+        found.append(part.variance)
+    assert np.mean(found) == pytest.approx(1.0, abs=0.08)  # SE of the mean: sqrt(2/20/200) = 0.022
