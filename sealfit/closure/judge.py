@@ -37,6 +37,7 @@ FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
 JACKKNIFE_UNITS = 30  # from which the jackknife is tried
 PROMISING = 0.01  # p-value by sign flips, not adjusted, below which it is
 SEARCHES = 2  # single channels and pairs of them: each search has half of the error
+OWN = 1e-6  # eigenvalue of what is left without a unit, below which the unit alone determines it
 LEAST_LEFT = 0.01  # share of a column's variance that must survive projection to be identifiable here
 
 
@@ -83,10 +84,18 @@ class Candidate:
 def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
     """Return columns of the force, whitened and freed of the current model's tangent space, shape (n, k)."""
     white = fitted.whitening(columns)
-    size = np.linalg.norm(white, axis=0)
-    left = white - fitted.basis @ (fitted.basis.T @ white)
-    left[:, np.linalg.norm(left, axis=0) ** 2 < LEAST_LEFT * size**2] = 0.0
+    return _freed(white, fitted.basis)
+
+
+def _freed(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return columns less what an orthonormal basis holds of them; zeros where next to nothing is left."""
+    left = columns - basis @ (basis.T @ columns)
+    left[:, _squares(left) < LEAST_LEFT * _squares(columns)] = 0.0
     return left
+
+
+def _squares(columns: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->j", columns, columns)
 
 
 class Judge:
@@ -100,6 +109,7 @@ class Judge:
 
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
+        self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
         """Return columns of a channel of some unit, shape (n, k), in every way in which they must hold.
@@ -111,10 +121,7 @@ class Judge:
         left = project(self.fitted, columns)
         if self._specimens is None or FINER[unit] >= FINER["specimen"]:
             return (left,)
-        size = np.linalg.norm(left, axis=0)
-        freed = left - self._specimens @ (self._specimens.T @ left)
-        freed[:, np.linalg.norm(freed, axis=0) ** 2 < LEAST_LEFT * size**2] = 0.0
-        return left, freed
+        return left, _freed(left, self._specimens)
 
     @cached_property
     def _specimens(self) -> np.ndarray | None:
@@ -140,7 +147,7 @@ class Judge:
     def _judge(self, left: np.ndarray, level: str) -> Judgement | None:
         fitted = self.fitted
         units = fitted.rows.groups.starts[level].size
-        size = np.linalg.norm(left, axis=0)
+        size = np.sqrt(_squares(left))
         left = left[:, size > 0] / size[size > 0]
         if left.shape[1] == 0 or units < 4:
             return None
@@ -152,30 +159,46 @@ class Judge:
         log_p = float(log_p_of(_wald(total[None, :], scores)[0], left.shape[1], units))
         jackknife = 0.0
         if units >= JACKKNIFE_UNITS and log_p < np.log(PROMISING):
-            jackknife = _jackknife(fitted, left, level)
+            jackknife = self._jackknife(left, level)
         return Judgement(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
 
+    def _jackknife(self, left: np.ndarray, level: str) -> float:
+        """Return the log p-value of orthonormal columns' coefficients against their jackknife over whole units.
 
-def _jackknife(fitted: Fitted, left: np.ndarray, level: str) -> float:
-    """Return the log p-value of orthonormal columns' coefficients against their jackknife over whole units.
+        Everything is estimated anew without each unit u, the current model's numbers too, in the tangent space: the
+        normal equations less those of u, [[1 - B'B, -B'L], [-L'B, 1 - L'L]] with B, L its rows of basis and columns.
+        """
+        fitted, start = self.fitted, self.fitted.rows.groups.starts[level]
+        units, k = start.size, left.shape[1]
+        parts = np.split(left, start[1:])
+        inverse, product = self._without(level)
+        own = np.add.reduceat(left * fitted.white_residual[:, None], start)
+        mixed = np.stack([b.T @ c for b, c in zip(np.split(fitted.basis, start[1:]), parts, strict=True)])
+        through = mixed.transpose(0, 2, 1) @ inverse
+        square = np.eye(k) - np.stack([c.T @ c for c in parts]) - through @ mixed
+        total = left.T @ fitted.white_residual
+        right = total - own - np.einsum("uij,uj->ui", through, product)
+        without = np.einsum("uij,uj->ui", _inverses(square), right)
+        spread = (without - total).T @ (without - total) * (units - 1) / units
+        t = float(total @ np.linalg.pinv(spread, hermitian=True) @ total)
+        return float(stats.f.logsf(t * (units - k) / (k * (units - 1)), k, units - k))
 
-    Everything is estimated anew without each unit, the current model's numbers too, in the tangent space.
-    """
-    start = fitted.rows.groups.starts[level]
-    units, k = start.size, left.shape[1]
-    every = np.column_stack([fitted.basis, left])
-    own = np.stack([part.T @ part for part in np.split(every, start[1:])])
-    product = fitted.rows.groups.sums(every * fitted.white_residual[:, None], level)
-    total = left.T @ fitted.white_residual
-    size, axes = np.linalg.eigh(np.eye(every.shape[1]) - own)
-    inverse = np.where(
-        size > 1e-6, 1 / np.maximum(size, 1e-6), 0.0
-    )  # what one unit alone determines is left where it is
-    right = np.r_[np.zeros(every.shape[1] - k), total] - product
-    without = np.einsum("uij,uj,ukj,uk->ui", axes, inverse, axes, right)[:, -k:]
-    spread = (without - total).T @ (without - total) * (units - 1) / units
-    t = float(total @ np.linalg.pinv(spread, hermitian=True) @ total)
-    return float(stats.f.logsf(t * (units - k) / (k * (units - 1)), k, units - k))
+    def _without(self, level: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return per unit the inverse of 1 - B'B, shape (units, p, p), and B'r, shape (units, p)."""
+        if level not in self._kept:
+            fitted = self.fitted
+            square = np.stack([b.T @ b for b in np.split(fitted.basis, fitted.rows.groups.starts[level][1:])])
+            inverse = _inverses(np.eye(fitted.basis.shape[1]) - square)
+            product = fitted.rows.groups.sums(fitted.basis * fitted.white_residual[:, None], level)
+            self._kept[level] = (inverse, product)
+        return self._kept[level]
+
+
+def _inverses(square: np.ndarray) -> np.ndarray:
+    """Return the inverses of symmetric matrices, shape (u, k, k); what one unit alone determines is left as it is."""
+    size, axes = np.linalg.eigh(square)
+    shrink = np.where(size > OWN, 1 / np.maximum(size, OWN), 0.0)
+    return (axes * shrink[:, None, :]) @ axes.transpose(0, 2, 1)
 
 
 def _wald(totals: np.ndarray, scores: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ from sealfit.fit.joint import Term, mean_derivatives
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly
+BEHIND = 0.3  # share of the best one's gain by which a proposal may be behind before each has its own scatter
 PART = 32  # points of a grid whitened at once
 TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
 RIVAL = 10.0  # an alternative: the data favour the chosen one by less than exp(5)
@@ -111,8 +112,7 @@ def propose(
         for form in periodic_terms(fitted, peak, samples, effects):
             found += [replace(p, source=("peak", peak.axis)) for p in linearised(*form)]
     found.sort(key=lambda p: p.criterion)
-    found = [_refit(fitted, p) for p in _spread(found)]
-    return _ordered(fitted, found)
+    return _ordered(fitted, _refitted(fitted, _spread(found)))
 
 
 def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
@@ -218,10 +218,19 @@ def _identical(one: Proposal, other: Proposal) -> bool:
     return one.term.key()[1:] == other.term.key()[1:] and abs(one.criterion - other.criterion) < 1e-3
 
 
-def _refit(fitted: Fitted, proposal: Proposal) -> Proposal:
+def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
+    """Return proposals fitted jointly with the physics; those in reach of the best with a scatter of their own."""
+    refitted = [replace(p, fitted=_joint(fitted, p)) for p in found]
+    if not refitted:
+        return []
+    best = min(p.criterion for p in refitted)
+    reach = max(3 * RIVAL, BEHIND * (fitted.deviance - best))
+    return [replace(p, fitted=settled(p.fitted, fitted.force)) if p.criterion < best + reach else p for p in refitted]
+
+
+def _joint(fitted: Fitted, proposal: Proposal) -> Fitted:
     model = fitted.model.with_term(proposal.term, proposal.values)
-    refitted = fit(model, fitted.rows, fitted.scatter, turns=0, loading=fitted.force)
-    return replace(proposal, fitted=settled(refitted, fitted.force))
+    return fit(model, fitted.rows, fitted.scatter, turns=0, loading=fitted.force)
 
 
 class Linearised:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from scipy import stats
+from scipy.fft import next_fast_len
 from scipy.special import digamma, polygamma
 
 from sealfit.closure.waves import freed_of_trend, strokes_of
@@ -109,7 +110,7 @@ def spectrum_along(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()
     spans = np.array([place[-1] - place[0] for _, place, _ in good])
     steps = spans / (np.array([place.size for _, place, _ in good]) - 1)
     longest = 2 * spans.max()
-    points = np.clip(np.ceil(longest / steps), 8, 2**15).astype(int)
+    points = np.array([next_fast_len(int(n), real=True) for n in np.clip(np.ceil(longest / steps), 8, 2**15)])
     frequency = np.arange(min(2**15, int(np.ceil(longest / np.quantile(steps, 0.1)))) // 2 + 1) / longest
     reach = np.minimum(points // 2 + 1, np.searchsorted(frequency, 0.5 / steps, side="right"))
     strokes = np.bincount(reach, minlength=frequency.size + 1)[::-1].cumsum()[::-1][1:]  # that reach each frequency

@@ -21,7 +21,7 @@ from sealfit.fit.whitening import Scatter, Whitening
 
 PRIOR_SD = 3.0
 MAX_STEPS = 60
-STRIBECK_GRID = 24  # points of log v_s tried when an effect has come in
+STRIBECK_GRID = 12  # points of log v_s tried when an effect has come in
 CREEPING = 1e-2  # several such steps in a row go along a valley in which the data hold nothing
 SETTLED = 1e-4  # of the whitened sum of squares: the estimates then lie within a hundredth of a standard error
 TURNS = 3  # of model and scatter; the third moves no estimate by a tenth of its standard error

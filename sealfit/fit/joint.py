@@ -250,13 +250,12 @@ def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.nda
     slopes = state["slopes"]
     n = rows.force.size
     tangent = np.zeros((n, model.size))
-    every = np.arange(n)
     for quantity in QUANTITIES:
         number = model.declared.index[quantity][rows.condition]
-        has = number >= 0
-        if has.any():
+        has = np.flatnonzero(number >= 0)
+        if has.size:
             base = state["base"][quantity] if quantity in LOGARITHMIC else 1.0
-            tangent[every[has], number[has]] += (slopes[quantity] * state["through"].get(quantity, 1.0) * base)[has]
+            tangent[has, number[has]] = (slopes[quantity] * state["through"].get(quantity, 1.0) * base)[has]
     column = model.theta.size
     for term, values, slope in zip(model.terms, model.values, state["term_slopes"], strict=True):
         for derivative in _derivatives(term, values, rows):
