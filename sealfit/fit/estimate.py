@@ -22,8 +22,11 @@ from sealfit.fit.whitening import Scatter, Whitening
 PRIOR_SD = 3.0
 MAX_STEPS = 60
 STRIBECK_GRID = 12  # points of log v_s tried when an effect has come in
+ROWS_FOR_START = 4  # of each stroke: v_s acts on a stroke as a whole
 CREEPING = 1e-2  # several such steps in a row go along a valley in which the data hold nothing
 SETTLED = 1e-4  # of the whitened sum of squares: the estimates then lie within a hundredth of a standard error
+COMPARED = 1e-2  # as above where fits are only compared: rivals are told apart by several units
+ROUGH = 1.0  # as above before anything is known of the scatter
 TURNS = 3  # of model and scatter; the third moves no estimate by a tenth of its standard error
 
 
@@ -145,7 +148,7 @@ def fit(
     centre = model.vector()
     if scatter is None:
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
-        model = _descend(model, rows, scatter, centre)
+        model = _descend(model, rows, scatter, centre, near=ROUGH)
     if turns and model.terms:
         model = _search_stribeck(model, rows, scatter)
     for turn in range(turns):
@@ -153,7 +156,7 @@ def fit(
         scatter = estimate_scatter(rows, force, jacobian, scatter if turn else None)
         model = _descend(model, rows, scatter, centre)
     if not turns:
-        model = _descend(model, rows, scatter, centre, loading)
+        model = _descend(model, rows, scatter, centre, loading, near=COMPARED)
         return fitted_at(model, rows, scatter, loading)
     return fitted_at(model, rows, scatter)
 
@@ -183,7 +186,7 @@ def settled(fitted: Fitted, loading: np.ndarray) -> Fitted:
     """
     rows = fitted.rows
     scatter = estimate_components(rows, fitted.residual, loading, fitted.jacobian, fitted.scatter)
-    model = _descend(fitted.model, rows, scatter, fitted.model.vector(), loading)
+    model = _descend(fitted.model, rows, scatter, fitted.model.vector(), loading, near=COMPARED)
     return fitted_at(model, rows, scatter, loading)
 
 
@@ -194,6 +197,7 @@ def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
     mu_0, so that one v_s alone may not get out: all are tried together first, then each by itself.
     """
     slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
+    rows = rows.sparse(ROWS_FOR_START)
     held = prior_precision(model) > 0
     whitening = Whitening(scatter, rows.force, rows.groups)
     places = [k for k, parameter in enumerate(model.declared.parameters) if parameter.quantity == "v_s"]
@@ -204,10 +208,10 @@ def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
             if value is not None:
                 vector[group] = value
             force, jacobian = evaluate(model.at(vector), rows)
-            columns = np.column_stack([rows.force - force, jacobian[:, ~held]])
-            white = whitening(columns)
-            step, *_ = np.linalg.lstsq(white[:, 1:].T @ white[:, 1:], white[:, 1:].T @ white[:, 0], rcond=1e-10)
-            cost = float(white[:, 0] @ white[:, 0] - step @ (white[:, 1:].T @ white[:, 0]))
+            residual = whitening((rows.force - force)[:, None])[:, 0]
+            normal, gradient = whitening.normal(jacobian[:, ~held], residual)
+            step, *_ = np.linalg.lstsq(normal, gradient, rcond=1e-10)
+            cost = float(residual @ residual - step @ gradient)
             if cost < best - 1e-9:
                 vector[~held] += step
                 best, chosen = cost, vector
@@ -216,9 +220,18 @@ def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
 
 
 def _descend(
-    model: Model, rows: Rows, scatter: Scatter, centre: np.ndarray, loading: np.ndarray | None = None
+    model: Model,
+    rows: Rows,
+    scatter: Scatter,
+    centre: np.ndarray,
+    loading: np.ndarray | None = None,
+    *,
+    near: float = SETTLED,
 ) -> Model:
-    """Return the model at the least whitened sum of squares, by Levenberg-Marquardt with the scatter held fixed."""
+    """Return the model at the least whitened sum of squares, by Levenberg-Marquardt with the scatter held fixed.
+
+    It ends where a step gains less than `near`.
+    """
     precision = prior_precision(model)
     low, high = _bounds(model, rows)
     vector = np.clip(model.vector(), low, high)
@@ -235,9 +248,9 @@ def _descend(
     cost = cost_of(residual, vector)
     damping, crept = 1e-4, 0
     for _ in range(MAX_STEPS):
-        white = whitening(jacobian)
-        gradient = white.T @ residual - precision * (vector - centre)
-        normal = white.T @ white + np.diag(precision)
+        normal, gradient = whitening.normal(jacobian, residual)
+        gradient = gradient - precision * (vector - centre)
+        normal = normal + np.diag(precision)
         blocked = ((vector <= low) & (gradient < 0)) | ((vector >= high) & (gradient > 0))
         free = ~blocked & (np.diag(normal) > 0)
         scale = np.sqrt(np.diag(normal)[free])
@@ -261,7 +274,7 @@ def _descend(
         vector, model, residual, cost = trial, trial_model, trial_residual, trial_cost
         damping /= 10
         crept = crept + 1 if gain < CREEPING else 0
-        if crept > 3 or (gain < SETTLED and damping < 1e-3):  # a step under heavy damping gains little anywhere
+        if crept > 3 or (gain < near and damping < 1e-3):  # a step under heavy damping gains little anywhere
             return model
         _, jacobian = evaluate(model, rows)
     return model

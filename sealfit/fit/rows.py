@@ -82,6 +82,16 @@ class Rows:
         """Return each row's group number at a level."""
         return self.groups.codes[level]
 
+    def sparse(self, most: int) -> Rows:
+        """Return at most about `most` rows of each stroke, evenly spread: enough for what acts on whole strokes."""
+        key = ("sparse", most)
+        if key not in self.cache:
+            start, code = self.groups.starts["stroke"], self.codes("stroke")
+            place = np.arange(code.size) - start[code]
+            step = -(-np.bincount(code) // most)[code]  # rounded up
+            self.cache[key] = self.subset(place % step == step // 2)
+        return self.cache[key]
+
     def subset(self, mask: np.ndarray) -> Rows:
         """Return the rows where `mask` is true; conditions keep their numbers, so that a model fits both."""
         weight = self.weight[mask]

@@ -144,6 +144,20 @@ class Whitening:
         self.back = csr_array((along, code, every), shape=(sd.size, start.size))
         self.kept = size / root
 
+    def normal(self, columns: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return C' V^-1 C, shape (k, k), and C' V^-1 r of columns on the rows, shape (n, k): no column is whitened.
+
+        `residual`, shape (n,), is white already.
+        """
+        mean = self.mean @ columns
+        scaled = columns * self.about[:, None]
+        between, kept = self.between(mean), mean * self.kept[:, None]
+        part = residual @ self.back
+        return (
+            scaled.T @ scaled + between.T @ between - kept.T @ kept,
+            residual @ scaled + part @ (between - kept),
+        )
+
     def __call__(self, columns: np.ndarray) -> np.ndarray:
         """Return columns on the rows, shape (n, k), in coordinates where rows are independent, of unit variance."""
         mean = self.mean @ columns
