@@ -42,3 +42,10 @@ class Groups:
         first = self.starts[level]
         levels = list(self.codes)
         return Groups.of({name: self.codes[name][first] for name in levels[levels.index(level) :]})
+
+    def repeated(self, count: int) -> Groups:
+        """Return the groups of a table with each row `count` times, one copy after the other."""
+        return Groups(
+            {level: count * start for level, start in self.starts.items()},
+            {level: np.repeat(code, count) for level, code in self.codes.items()},
+        )

@@ -2,24 +2,28 @@ r"""Scatter at several nested levels, and the whitening that makes rows independ
 
 A residual is noise of its row plus random offsets and gains of its stroke, file, run and specimen,
 
-.. math:: r_i = \epsilon_i + \sum_l (o_{l,g(i)} + k_{l,g(i)} F_{s(i)}), \quad
+.. math:: r_i = \epsilon_i + \sum_l (o_{l,g(i)} + k_{l,g(i)} F_i), \quad
           \mathrm{Var}\, o_l = \sigma_{o,l}^2, \ \mathrm{Var}\, k_l = \sigma_{k,l}^2
 
-with F_s the model's mean force in the stroke: a gain shifts a stroke as a whole. Neighbouring rows are alike, and files
-differ in shape along their strokes: the row noise counts `alike` times in the mean of a stroke, and `shape` times more
-often about it. So only the strokes' means, one number each, feel the components; there a root of the inverse covariance
-is a chain of rank-one updates, as groups nest: exact and linear in the number of rows.
+with F the model's force. Neighbouring rows are alike, and files differ in shape along their strokes: the row noise
+counts `alike` times in the mean of a stroke, and `shape` times more often about it.
+
+Within a stroke the components move only two numbers: its mean, and how much of F's own variation about its mean it
+holds (zero where F is constant). There a root of the inverse covariance is a chain of rank-one updates, as groups nest;
+all other patterns are only divided by their noise. That is exact, and linear in the number of rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from sealfit.fit.groups import Groups
+
+FLAT = 1e-9  # of the mean: a force that varies less within a stroke does not vary
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,14 +60,16 @@ class Scatter:
 
 
 class Between:
-    """Whitening of one number per finest group, whose own noise is independent, under the components above it.
+    """Whitening of a few numbers per group, whose own noise is independent, under the components above it.
 
     Parameters
     ----------
-    force, sd : ndarray, shape (m,)
-        The model's force in each group, signed, which a gain loads on; standard deviation of the number's noise.
+    variance : ndarray, shape (m,)
+        Variance of each number's own noise.
+    loads : mapping
+        `offset` and `gain` -> how much a unit of it moves each number, shape (m,).
     groups : Groups
-        Nested groups of the m numbers, one number in each of the finest.
+        Nested groups of the m numbers.
     components : sequence of Component
         Variance components, finest level first.
 
@@ -73,30 +79,28 @@ class Between:
         log det of the covariance.
     """
 
-    def __init__(self, force: np.ndarray, sd: np.ndarray, groups: Groups, components: Sequence[Component]) -> None:
-        finest = next(iter(groups.starts))
-        own = sd**2
-        above = []
-        for part in components:
-            if part.variance > 0 and part.level == finest:
-                own = own + part.variance * (force**2 if part.kind == "gain" else 1.0)
-            elif part.variance > 0:
-                load = np.sqrt(part.variance) * (force if part.kind == "gain" else np.ones_like(force))
-                above.append((groups.starts[part.level], groups.codes[part.level], load))
-        self.scale = 1 / np.sqrt(own)
-        self.logdet = float(np.log(own).sum())
+    def __init__(
+        self, variance: np.ndarray, loads: Mapping[str, np.ndarray], groups: Groups, components: Sequence[Component]
+    ) -> None:
+        above = [
+            (groups.starts[part.level], groups.codes[part.level], np.sqrt(part.variance) * loads[part.kind])
+            for part in components
+            if part.variance > 0
+        ]
+        self.scale = 1 / np.sqrt(variance)
+        self.logdet = float(np.log(variance).sum())
         self.steps: list[tuple] = []
-        loads = np.column_stack([load for *_, load in above]) * self.scale[:, None] if above else None
+        left = np.column_stack([load for *_, load in above]) * self.scale[:, None] if above else None
         for k, (start, code, _) in enumerate(above):
-            load = loads[:, k]
+            load = left[:, k].copy()
             square = np.add.reduceat(load**2, start)
             self.logdet += float(np.log1p(square).sum())
             shrink = (1.0 - 1.0 / np.sqrt(1.0 + square)) / np.maximum(square, 1e-300)
-            self.steps.append((start, code, load.copy(), shrink))
-            loads = self._step(loads, *self.steps[-1])
+            self.steps.append((start, code, load, shrink))
+            left = self._step(left, *self.steps[-1])
 
     def __call__(self, numbers: np.ndarray) -> np.ndarray:
-        """Return columns over the groups, shape (m, k), in coordinates where they are independent, of unit variance."""
+        """Return columns over the numbers, shape (m, k), in coordinates where they are independent, of variance 1."""
         white = numbers * self.scale[:, None]
         for step in self.steps:
             white = self._step(white, *step)
@@ -131,36 +135,45 @@ class Whitening:
     def __init__(self, scatter: Scatter, force: np.ndarray, groups: Groups) -> None:
         finest = next(iter(groups.starts))
         start, code = groups.starts[finest], groups.codes[finest]
+        n, m = force.size, start.size
         sd = scatter.noise_sd(force) * np.sqrt(scatter.alike)
-        size = np.sqrt(np.bincount(code, sd**-2.0))  # of a stroke's ones, in units of the rows' noise
-        self.between = Between(groups.means(force, finest), 1 / size, groups.at(finest), scatter.components)
-        self.logdet = self.between.logdet + float(
-            2 * (np.log(sd).sum() + np.log(size).sum()) + (sd.size - start.size) * np.log(scatter.shape)
+        size = np.sqrt(np.bincount(code, sd**-2.0))
+        mean = 1 / (sd * size[code])  # unit vector along a stroke's mean, in units of the rows' noise
+        level = np.bincount(code, mean * force / sd)
+        about = force / sd - level[code] * mean
+        spread = np.sqrt(np.bincount(code, about**2))
+        flat = spread < FLAT * np.abs(level)
+        about = np.where(flat[code], 0.0, about / np.where(flat, 1.0, spread)[code])  # and along F about its mean
+        self.root = np.sqrt(scatter.shape)
+        self.unit = 1 / (sd * self.root)
+        self.back = csr_array(
+            (np.column_stack([mean, about]).ravel(), (2 * code[:, None] + [0, 1]).ravel(), 2 * np.arange(n + 1)),
+            shape=(n, 2 * m),
         )
-        every, root = np.arange(sd.size + 1), np.sqrt(scatter.shape)
-        along = 1 / (sd * size[code])  # the unit vector of each stroke
-        self.about = 1 / (sd * root)
-        self.mean = csr_array((along / (sd * size[code]), every[:-1], np.r_[start, sd.size]))
-        self.back = csr_array((along, code, every), shape=(sd.size, start.size))
-        self.kept = size / root
+        self.take = csr_array(self.back.T.multiply(1 / sd[None, :]))
+        self.between = Between(
+            np.tile([1.0, scatter.shape], m),
+            {
+                "offset": np.column_stack([size, np.zeros(m)]).ravel(),
+                "gain": np.column_stack([level, np.where(flat, 0.0, spread)]).ravel(),
+            },
+            groups.at(finest).repeated(2),
+            scatter.components,
+        )
+        self.logdet = self.between.logdet + float(2 * np.log(sd).sum() + (n - 2 * m) * np.log(scatter.shape))
 
     def normal(self, columns: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return C' V^-1 C, shape (k, k), and C' V^-1 r of columns on the rows, shape (n, k): no column is whitened.
 
         `residual`, shape (n,), is white already.
         """
-        mean = self.mean @ columns
-        scaled = columns * self.about[:, None]
-        between, kept = self.between(mean), mean * self.kept[:, None]
-        part = residual @ self.back
-        return (
-            scaled.T @ scaled + between.T @ between - kept.T @ kept,
-            residual @ scaled + part @ (between - kept),
-        )
+        scaled, numbers = columns * self.unit[:, None], self.take @ columns
+        between, kept = self.between(numbers), numbers / self.root
+        square = scaled.T @ scaled + between.T @ between - kept.T @ kept
+        return square, residual @ scaled + (residual @ self.back) @ (between - kept)
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
         """Return columns on the rows, shape (n, k), in coordinates where rows are independent, of unit variance."""
-        mean = self.mean @ columns
-        white = columns * self.about[:, None]
-        white += self.back @ (self.between(mean) - mean * self.kept[:, None])
+        white, numbers = columns * self.unit[:, None], self.take @ columns
+        white += self.back @ (self.between(numbers) - numbers / self.root)
         return white
