@@ -110,10 +110,10 @@ def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int, samp
         weight = rows.weight[out]
         known += float(weight.sum())
         for k, model in enumerate((before.model, after.model)):
-            kept = fit(model, train, scatter, turns=0, loading=before.force[~out])
+            kept = fit(model, train, scatter, turns=0, friction=before.friction[~out])
             residual = test.force - evaluate(kept.model, test, jacobian=False)[0]
             squares[k] += float(weight @ _about(residual, test, proposal) ** 2)
-            whitening = Whitening(scatter, before.force[out], test.groups)
+            whitening = Whitening(scatter, before.friction[out], test.groups)
             white[k] += float((whitening(residual[:, None]) ** 2).sum())
     rmse = np.sqrt(squares / max(known, 1e-300))
     return Gain(float(rmse[0] - rmse[1]), float(white[0] - white[1]))

@@ -164,7 +164,7 @@ def _drop_needless(fitted: Fitted, added: list[Added]) -> tuple[Fitted, list[Add
         if own_phases or _wald(fitted, k) > 2 * price:  # far from needless: no refit is wanted to see that
             k += 1
             continue
-        without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, loading=fitted.force)
+        without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
         if without.deviance - fitted.deviance < price:
             fitted = fit(without.model, fitted.rows, fitted.scatter, turns=1)
             added = [a for j, a in enumerate(added) if j != k]

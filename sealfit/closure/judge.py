@@ -132,7 +132,7 @@ class Judge:
         if known or not 1 < starts["specimen"].size < starts["run"].size:
             return None
         own = rows.codes("specimen")[:, None] == np.arange(starts["specimen"].size)[None, :]
-        return orthonormal(project(self.fitted, own * self.fitted.force[:, None]))
+        return orthonormal(project(self.fitted, own * self.fitted.friction[:, None]))
 
     def __call__(self, variants: Sequence[np.ndarray], level: str) -> Judgement | None:
         """Return the judgement that says least of all variants of some columns; None where one cannot be judged."""

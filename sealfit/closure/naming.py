@@ -225,12 +225,12 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
         return []
     best = min(p.criterion for p in refitted)
     reach = max(3 * RIVAL, BEHIND * (fitted.deviance - best))
-    return [replace(p, fitted=settled(p.fitted, fitted.force)) if p.criterion < best + reach else p for p in refitted]
+    return [replace(p, fitted=settled(p.fitted)) if p.criterion < best + reach else p for p in refitted]
 
 
 def _joint(fitted: Fitted, proposal: Proposal) -> Fitted:
     model = fitted.model.with_term(proposal.term, proposal.values)
-    return fit(model, fitted.rows, fitted.scatter, turns=0, loading=fitted.force)
+    return fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
 
 
 class Linearised:

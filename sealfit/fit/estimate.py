@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.fit.joint import LOGARITHMIC, Model, evaluate, term_slope
+from sealfit.fit.joint import LOGARITHMIC, Model, evaluate, friction_of, term_slope
 from sealfit.fit.rows import Rows
 from sealfit.fit.scatter import estimate_components, estimate_scatter
 from sealfit.fit.start import start_model, stribeck_range
@@ -38,6 +38,7 @@ class Fitted:
     scatter: Scatter
     rows: Rows
     force: np.ndarray  # (n,)
+    friction: np.ndarray  # (n,) that noise and gains load on: the force less what is added to it
     jacobian: np.ndarray  # (n, p)
     white_residual: np.ndarray  # (n,)
     white_jacobian: np.ndarray  # (n, p)
@@ -58,7 +59,7 @@ class Fitted:
     @cached_property
     def whitening(self) -> Whitening:
         """What whitens columns on the rows, at this fit's force."""
-        return Whitening(self.scatter, self.force, self.rows.groups)
+        return Whitening(self.scatter, self.friction, self.rows.groups)
 
     @cached_property
     def _widened(self) -> dict[str, np.ndarray]:
@@ -128,7 +129,7 @@ def fit(
     scatter: Scatter | None = None,
     *,
     turns: int = TURNS,
-    loading: np.ndarray | None = None,
+    friction: np.ndarray | None = None,
 ) -> Fitted:
     """Return the model fitted to `rows`, physics and effects together.
 
@@ -142,8 +143,8 @@ def fit(
         Scatter to start from; with `turns=0` it is kept.
     turns : int
         How often scatter is estimated anew and the model refitted.
-    loading : ndarray, shape (n,), optional
-        Force that gains and noise load on, where `turns` is 0: fits to be compared must share it.
+    friction : ndarray, shape (n,), optional
+        Friction that gains and noise load on, where `turns` is 0: fits to be compared must share it.
     """
     centre = model.vector()
     if scatter is None:
@@ -153,25 +154,27 @@ def fit(
         model = _search_stribeck(model, rows, scatter)
     for turn in range(turns):
         force, jacobian = evaluate(model, rows)
-        scatter = estimate_scatter(rows, force, jacobian, scatter if turn else None)
+        scatter = estimate_scatter(
+            rows, rows.force - force, friction_of(model, rows), jacobian, scatter if turn else None
+        )
         model = _descend(model, rows, scatter, centre)
     if not turns:
-        model = _descend(model, rows, scatter, centre, loading, near=COMPARED)
-        return fitted_at(model, rows, scatter, loading)
+        model = _descend(model, rows, scatter, centre, friction, near=COMPARED)
+        return fitted_at(model, rows, scatter, friction)
     return fitted_at(model, rows, scatter)
 
 
-def fitted_at(model: Model, rows: Rows, scatter: Scatter, loading: np.ndarray | None = None) -> Fitted:
+def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Fitted:
     """Return the `Fitted` of a model as it stands, nothing refitted."""
     force, jacobian = evaluate(model, rows)
-    load = force if loading is None else loading
-    whitening = Whitening(scatter, load, rows.groups)
+    friction = friction_of(model, rows) if friction is None else friction
+    whitening = Whitening(scatter, friction, rows.groups)
     residual, white = whitening((rows.force - force)[:, None])[:, 0], whitening(jacobian)
     deviance = float(residual @ residual) + whitening.logdet
-    return Fitted(model, scatter, rows, force, jacobian, residual, white, deviance)
+    return Fitted(model, scatter, rows, force, friction, jacobian, residual, white, deviance)
 
 
-def settled(fitted: Fitted, loading: np.ndarray) -> Fitted:
+def settled(fitted: Fitted) -> Fitted:
     """Return a fit with the variance components that its own residual shows, the row noise held.
 
     What a model leaves unexplained between units stands in their variance. Two models are told apart by their deviances
@@ -180,14 +183,12 @@ def settled(fitted: Fitted, loading: np.ndarray) -> Fitted:
     Parameters
     ----------
     fitted : Fitted
-        A fit made under other components.
-    loading : ndarray, shape (n,)
-        Force that gains and noise load on: fits to be compared must share it.
+        A fit made under other components; what noise and gains load on is kept, as fits to be compared share it.
     """
     rows = fitted.rows
-    scatter = estimate_components(rows, fitted.residual, loading, fitted.jacobian, fitted.scatter)
-    model = _descend(fitted.model, rows, scatter, fitted.model.vector(), loading, near=COMPARED)
-    return fitted_at(model, rows, scatter, loading)
+    scatter = estimate_components(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
+    model = _descend(fitted.model, rows, scatter, fitted.model.vector(), fitted.friction, near=COMPARED)
+    return fitted_at(model, rows, scatter, fitted.friction)
 
 
 def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
@@ -224,7 +225,7 @@ def _descend(
     rows: Rows,
     scatter: Scatter,
     centre: np.ndarray,
-    loading: np.ndarray | None = None,
+    friction: np.ndarray | None = None,
     *,
     near: float = SETTLED,
 ) -> Model:
@@ -237,9 +238,10 @@ def _descend(
     vector = np.clip(model.vector(), low, high)
     model = model.at(vector)
     force, jacobian = evaluate(model, rows)
-    loading = force if loading is None else loading  # held, so that the criterion does not move under the search
+    if friction is None:
+        friction = friction_of(model, rows)  # held, so that the criterion does not move under the search
 
-    whitening = Whitening(scatter, loading, rows.groups)
+    whitening = Whitening(scatter, friction, rows.groups)
 
     def cost_of(residual: np.ndarray, at: np.ndarray) -> float:
         return float(residual @ residual + precision @ (at - centre) ** 2)

@@ -264,6 +264,11 @@ def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.nda
     return state["force"], tangent
 
 
+def friction_of(model: Model, rows: Rows) -> np.ndarray:
+    """Return the model's force less what is added to it, shape (n,): what rubber, load and gains scale."""
+    return _state(model, rows, slopes=False)["friction"]
+
+
 def term_slope(model: Model, rows: Rows, acts_on: str, operation: str) -> np.ndarray:
     """Return the force's derivative with respect to the shape of a term that is not there yet, shape (n,)."""
     state = _state(model, rows)
@@ -406,7 +411,7 @@ def _state(model: Model, rows: Rows, *, slopes: bool = True) -> dict:
     sliding = friction + now["sigma_2"] * speed
     force = sliding * on_force + added
     if not slopes:
-        return {"force": force}
+        return {"force": force, "friction": sliding * on_force}
     drive = rows.load * sign * on_mu * on_force  # derivative with respect to mu before its factor
     log_s, log_c = np.log1p(days / now["b_s"]), np.log1p(days / now["b_c"])
     slope_of = {

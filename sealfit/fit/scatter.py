@@ -16,25 +16,30 @@ LEAST_NOISE = 1e-6  # of the force: below what any sensor resolves; keeps noise-
 LEAST_FILES = 6  # from which files can be compared in shape
 
 
-def estimate_scatter(rows: Rows, force: np.ndarray, jacobian: np.ndarray, start: Scatter | None = None) -> Scatter:
+def estimate_scatter(
+    rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: np.ndarray, start: Scatter | None = None
+) -> Scatter:
     """Return row noise and variance components of the residual at a model, its degrees of freedom taken out.
 
     Parameters
     ----------
-    rows, force, jacobian
-        The rows, the model's force there, shape (n,), and its tangent, shape (n, p).
+    rows : Rows
+        The rows.
+    residual, friction : ndarray, shape (n,)
+        Measured minus model, and the model's friction, which noise and gains load on.
+    jacobian : ndarray, shape (n, p)
+        The model's tangent.
     start : Scatter, optional
         An earlier estimate, to start from.
     """
-    residual = rows.force - force
-    s0, g, inflation = row_noise(rows, residual, force)
-    shape = shape_scatter(rows, residual, np.sqrt((s0**2 + (g * force) ** 2) * inflation))
+    s0, g, inflation = row_noise(rows, residual, friction)
+    shape = shape_scatter(rows, residual, np.sqrt((s0**2 + (g * friction) ** 2) * inflation))
     start = Scatter(s0, g, () if start is None else start.components, inflation, shape)
-    return estimate_components(rows, residual, force, jacobian, start)
+    return estimate_components(rows, residual, friction, jacobian, start)
 
 
 def estimate_components(
-    rows: Rows, residual: np.ndarray, force: np.ndarray, jacobian: np.ndarray, scatter: Scatter
+    rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: np.ndarray, scatter: Scatter
 ) -> Scatter:
     """Return a scatter with its components estimated anew and its row noise as it is.
 
@@ -42,16 +47,16 @@ def estimate_components(
     ----------
     rows : Rows
         The rows.
-    residual, force : ndarray, shape (n,)
-        Measured minus model, and the force that gains load on.
+    residual, friction : ndarray, shape (n,)
+        Measured minus model, and the model's friction.
     jacobian : ndarray, shape (n, p)
         The model's tangent, whose degrees of freedom are taken out.
     scatter : Scatter
         Row noise, and where the components start.
     """
     groups, level = rows.groups, "stroke"
-    means = groups.means(np.column_stack([residual, force, jacobian]), level)
-    noise = groups.means(scatter.noise_sd(force) ** 2, level)
+    means = groups.means(np.column_stack([residual, friction, jacobian]), level)
+    noise = groups.means(scatter.noise_sd(friction) ** 2, level)
     count = np.diff(np.r_[groups.starts[level], residual.size])
     kinds = usable_components(rows)
     known = {(c.level, c.kind): c.variance for c in scatter.components}

@@ -5,7 +5,8 @@ A residual is noise of its row plus random offsets and gains of its stroke, file
 .. math:: r_i = \epsilon_i + \sum_l (o_{l,g(i)} + k_{l,g(i)} F_i), \quad
           \mathrm{Var}\, o_l = \sigma_{o,l}^2, \ \mathrm{Var}\, k_l = \sigma_{k,l}^2
 
-with F the model's force. Neighbouring rows are alike, and files differ in shape along their strokes: the row noise
+with F the model's friction: its force less what effects add to it, as rubber and load scale no ripple of the drive.
+Neighbouring rows are alike, and files differ in shape along their strokes: the row noise
 counts `alike` times in the mean of a stroke, and `shape` times more often about it.
 
 Within a stroke the components move only two numbers: its mean, and how much of F's own variation about its mean it
@@ -46,9 +47,9 @@ class Scatter:
     alike: float = 1.0  # by which neighbours that resemble each other widen the variance of a mean
     shape: float = 1.0  # by which files' own shapes widen the variance of a pattern along the stroke, beyond that
 
-    def noise_sd(self, force: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of a row's own noise, shape of `force`."""
-        return np.sqrt(self.s0**2 + (self.g * force) ** 2)
+    def noise_sd(self, friction: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of a row's own noise, shape of `friction`."""
+        return np.sqrt(self.s0**2 + (self.g * friction) ** 2)
 
     def level_variance(self, level: str, force: np.ndarray) -> np.ndarray:
         """Return the variance that one level adds to a row at `force`, shape of `force`."""
@@ -121,8 +122,8 @@ class Whitening:
     ----------
     scatter : Scatter
         Row noise and components.
-    force : ndarray, shape (n,)
-        The model's force, signed: what noise and gains load on.
+    friction : ndarray, shape (n,)
+        The model's friction, signed: what noise and gains load on.
     groups : Groups
         Nested groups of the rows, strokes first.
 
@@ -132,15 +133,15 @@ class Whitening:
         log det of the covariance.
     """
 
-    def __init__(self, scatter: Scatter, force: np.ndarray, groups: Groups) -> None:
+    def __init__(self, scatter: Scatter, friction: np.ndarray, groups: Groups) -> None:
         finest = next(iter(groups.starts))
         start, code = groups.starts[finest], groups.codes[finest]
-        n, m = force.size, start.size
-        sd = scatter.noise_sd(force) * np.sqrt(scatter.alike)
+        n, m = friction.size, start.size
+        sd = scatter.noise_sd(friction) * np.sqrt(scatter.alike)
         size = np.sqrt(np.bincount(code, sd**-2.0))
         mean = 1 / (sd * size[code])  # unit vector along a stroke's mean, in units of the rows' noise
-        level = np.bincount(code, mean * force / sd)
-        about = force / sd - level[code] * mean
+        level = np.bincount(code, mean * friction / sd)
+        about = friction / sd - level[code] * mean
         spread = np.sqrt(np.bincount(code, about**2))
         flat = spread < FLAT * np.abs(level)
         about = np.where(flat[code], 0.0, about / np.where(flat, 1.0, spread)[code])  # and along F about its mean
