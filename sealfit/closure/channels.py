@@ -17,6 +17,7 @@ from sealfit.fit.rows import LEVELS, Rows
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 MANY_UNITS = 20  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up
 CALENDAR = ("run_order", "elapsed_h")  # conditions are tested one after the other, so the calendar follows them
+FEW_DF = 2  # of a free shape along a dozen specimens: a line and a bend
 FREE_DF = 4  # columns of a free shape: enough for a peak, an approach or a step; more only costs power
 FINE_DF = 9  # of a second, finer shape, for two humps or a narrow one
 FINE_UNITS = 50  # units from which it is tried
@@ -109,8 +110,8 @@ def _is_grouping(channel: Channel, rows: Rows) -> bool:
 def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
     """Return the columns of a free shape, first a straight line: shape (n, k), each centred and scaled.
 
-    A cubic B-spline with knots at quantiles (in the logarithm where a positive channel spans a factor of 20); one
-    column per category but the first for categories.
+    A cubic B-spline with knots at quantiles (in the logarithm where a positive channel spans a factor of 20), a line
+    and a bend for few units; one column per category but the first for categories.
     """
     if not channel.numeric:
         levels = np.unique(channel.values)
@@ -120,7 +121,7 @@ def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
     df = min(most, distinct.size - 1)
     columns = [x]
     if df >= 2:
-        if distinct.size <= most + 1:
+        if distinct.size <= most + 1 or most == FEW_DF:
             columns += [x**k for k in range(2, df + 1)]
         else:
             inner = np.quantile(distinct, np.linspace(0, 1, df)[1:-1]) if df > 2 else []
@@ -133,6 +134,12 @@ def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
     return stacked[:, size > 1e-12] / size[size > 1e-12]
 
 
+def kinks(channel: Channel) -> np.ndarray:
+    """Return the columns of a channel that stops at one of its inner values, shape (n, k): floors and late starts."""
+    x = scaled(channel.values)
+    return np.minimum(x[:, None], np.unique(x)[1:-1])
+
+
 def even_knots(values: np.ndarray) -> tuple[float, ...]:
     """Return up to five values of a channel that part its different values evenly, for `effects.free.evenly`."""
     distinct = np.unique(values)
@@ -141,8 +148,15 @@ def even_knots(values: np.ndarray) -> tuple[float, ...]:
 
 
 def scaled(values: np.ndarray) -> np.ndarray:
-    """Return a channel on the scale it is looked at, mapped to [-1, 1]: logarithmic where it spans a factor of 20."""
+    """Return a channel on the scale it is looked at, mapped to [-1, 1]: logarithmic where it spans a factor of 20.
+
+    A channel that starts at 0, such as days of aging, is moved by its smallest positive value where it spans 10 of it.
+    """
     low, high = float(values.min()), float(values.max())
+    if low == 0 < high:
+        least = float(values[values > 0].min())
+        if high / least >= WIDE / 2:
+            values, low, high = values + least, least, high + least
     if low > 0 and high / low >= WIDE:
         values, low, high = np.log(values), np.log(low), np.log(high)
     return np.clip(2 * (values - low) / (high - low) - 1, -1.0, 1.0)

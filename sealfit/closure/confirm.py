@@ -88,8 +88,8 @@ class Gain:
 
     @property
     def real(self) -> bool:
-        """Whether the held-out data speak for the proposal."""
-        return self.deviance > 0
+        """Whether the held-out data speak for the proposal, in either way."""
+        return self.deviance > 0 and self.rmse_N > 0
 
 
 def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int, samples: pd.DataFrame) -> Gain:

@@ -11,7 +11,7 @@ from sealfit.closure.channels import FINER, Channel, unit_of
 from sealfit.closure.forms import free_term
 from sealfit.closure.grow import Added, Grown, describe
 from sealfit.closure.intervals import effect_intervals
-from sealfit.closure.judge import Candidate
+from sealfit.closure.judge import Candidate, Judge
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import search
 from sealfit.config import Config
@@ -183,7 +183,7 @@ def _unsteady_offset(grown: Grown) -> Candidate | None:
         term = free_term(Channel("condition", rows.values("condition"), "run"), "force", "add")
         model = fitted.model.with_term(term, {p.name: 0.0 for p in term.effect.parameters})
         fitted = fit(model, rows, fitted.scatter, turns=2)
-    found = search(fitted, categories, np.random.default_rng(0))
+    found = search(Judge(fitted), categories, np.random.default_rng(0))
     return _largest(fitted, [c for c in found if c.channels[0] == "direction"])
 
 

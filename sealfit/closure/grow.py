@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -11,8 +11,8 @@ import pandas as pd
 from sealfit.closure.channels import CALENDAR, Channel, find_channels
 from sealfit.closure.confirm import heldout_gain
 from sealfit.closure.forms import PERIODIC
-from sealfit.closure.judge import Candidate
-from sealfit.closure.naming import Proposal, propose, rivals
+from sealfit.closure.judge import Candidate, Judge
+from sealfit.closure.naming import HALF, Proposal, propose, rivals
 from sealfit.closure.pairs import pairs_in_disguise, search_pairs
 from sealfit.closure.ripple import Peak, find_ripple
 from sealfit.closure.search import search
@@ -92,7 +92,8 @@ def grow(
     strongest: Peak | None = None
     periodic: tuple | None = None
     for number in range(1, config.loop.max_rounds + 2):
-        candidates = search(fitted, list(channels.values()), rng)
+        judge = Judge(fitted)
+        candidates = search(judge, list(channels.values()), rng)
         last = tuple(candidates)
         first = first or last
         if periodic != _periodic_terms(fitted):  # only these change what the spectrum sees
@@ -104,15 +105,16 @@ def grow(
         significant = [c for c in candidates if c.p_value <= alpha]
         say(f"round {number}: {len(candidates)} candidates on {len(channels)} channels, {len(significant)} significant")
         if not significant and peak is None:
-            pairs = search_pairs(fitted, list(channels.values()), candidates, rng)
+            pairs = search_pairs(judge, list(channels.values()), candidates, rng)
             significant = [c for c in pairs if c.p_value <= alpha]
             say(f"round {number}: {len(pairs)} pairs, {len(significant)} significant")
         left = significant[0] if significant else peak
-        significant += pairs_in_disguise(fitted, significant, channels)
+        significant += pairs_in_disguise(judge, significant, channels)
         open_ = [c for c in significant if c.key not in refused]
         if (not open_ and peak is None) or number > config.loop.max_rounds:
             break
-        proposals = propose(fitted, _calendar_last(open_), channels, peak, seen, effects)
+        open_ += [c for c in _standing_for(open_, candidates) if c.key not in refused]
+        proposals = propose(fitted, open_, channels, peak, seen, effects)
         accepted = None
         for proposal in proposals[:TRIES]:
             gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed, seen)
@@ -134,16 +136,20 @@ def grow(
     return Grown(before, fitted if added else before, tuple(added), first, last, left, channels)
 
 
-def _calendar_last(significant: list[Candidate]) -> list[Candidate]:
-    """Return the candidates without the calendar's where another explains at least half as much.
+def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
+    """Return candidates of a condition that explain at least half of what the calendar does on the same quantity.
 
-    Conditions are tested one after the other, so the calendar follows them; what was set or measured comes first.
+    Conditions are tested one after the other, so the calendar follows them, and a dozen specimens alone may not say so.
     """
-    calendar = [c for c in significant if set(c.channels) & set(CALENDAR)]
-    others = [c for c in significant if not set(c.channels) & set(CALENDAR)]
-    if calendar and others and max(c.chi2 for c in others) >= 0.5 * max(c.chi2 for c in calendar):
-        return others
-    return significant
+    found = []
+    keys = {c.key for c in significant}
+    for calendar in (c for c in significant if c.channels[0] in CALENDAR):
+        for c in candidates:
+            alike = c.unit == "specimen" and (c.acts_on, c.operation) == (calendar.acts_on, calendar.operation)
+            if alike and c.key not in keys and c.chi2 >= HALF * calendar.chi2:
+                found.append(replace(c, p_value=calendar.p_value))
+                keys.add(c.key)
+    return found
 
 
 def describe(term: Term) -> str:

@@ -14,7 +14,8 @@ Goeman & Finos 2020, doi:10.1111/rssb.12369).
 Sign flips hold whatever the units' scatter is, but a strong effect stands in V itself: T never exceeds the number of
 units over the kurtosis of c, and a few runs in extreme places hide what all others show. So from thirty units on the
 estimate is also held against its jackknife over whole units (CV3; MacKinnon, Nielsen & Webb 2023,
-doi:10.1016/j.jeconom.2022.04.001), adjusted by the number of candidates (Bonferroni). Each way has half of the error.
+doi:10.1016/j.jeconom.2022.04.001), adjusted by the number of candidates (Bonferroni); each way has half of the error.
+With fewer specimens than that, what is constant in them is held against their own scatter (`few`).
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ import numpy as np
 from scipy import stats
 from scipy.special import betainc
 
+from sealfit.closure import few
 from sealfit.closure.channels import FINER
+from sealfit.closure.few import FewTest, FewUnits
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.reml import orthonormal
 
@@ -50,6 +53,7 @@ class Judgement(NamedTuple):
     log_p: float  # of T by its F distribution, not adjusted
     log_p_jackknife: float = 0.0  # of the estimate against its jackknife over units; 0 where that was not tried
     scores: np.ndarray | None = None  # (units, k)
+    few: FewTest | None = None  # against the scatter of few specimens; None where that was not tried
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,7 @@ class Judge:
 
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
+        self.few = FewUnits(fitted)
         self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
@@ -134,15 +139,30 @@ class Judge:
         own = rows.codes("specimen")[:, None] == np.arange(starts["specimen"].size)[None, :]
         return orthonormal(project(self.fitted, own * self.fitted.friction[:, None]))
 
-    def __call__(self, variants: Sequence[np.ndarray], level: str) -> Judgement | None:
-        """Return the judgement that says least of all variants of some columns; None where one cannot be judged."""
+    def __call__(self, variants: Sequence[np.ndarray], level: str, target: tuple[str, str]) -> Judgement | None:
+        """Return the judgement that says least of all variants of some columns; None where one cannot be judged.
+
+        Parameters
+        ----------
+        variants : sequence of ndarray, shape (n, k)
+            Columns as `variants` gives them.
+        level : str
+            Level whose whole groups are the evidence.
+        target : tuple of str
+            (acts_on, operation) of the columns.
+        """
         found = []
         for left in variants:
             judgement = self._judge(left, level)
             if judgement is None:
                 return None
             found.append(judgement)
-        return max(found, key=lambda j: max(j.log_p, j.log_p_jackknife))
+        weakest = max(found, key=lambda j: max(j.log_p, j.log_p_jackknife))
+        if level == "specimen" and weakest.units < JACKKNIFE_UNITS:
+            test = self.few.test(variants[0], target)
+            if test is not None:
+                return weakest._replace(chi2=test.chi2, df=test.basis.shape[1], few=test)
+        return weakest
 
     def _judge(self, left: np.ndarray, level: str) -> Judgement | None:
         fitted = self.fitted
@@ -207,13 +227,17 @@ def _wald(totals: np.ndarray, scores: np.ndarray) -> np.ndarray:
     return np.einsum("ij,jk,ik->i", totals, inverse, totals)
 
 
-def judged(candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
+def judged(judge: Judge, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
     """Return candidates with p-values adjusted over all of them, strongest evidence first."""
-    flipped = adjust([c.judgement for c in candidates], [c.unit for c in candidates], rng)
-    jackknife = len(candidates) * np.exp([c.judgement.log_p_jackknife for c in candidates])
-    both = np.array([c.judgement.units >= JACKKNIFE_UNITS for c in candidates])  # two ways, each with half of the error
-    p_values = SEARCHES * np.where(both, 2 * np.minimum(flipped, jackknife), flipped)
-    found = [replace(c, p_value=min(1.0, float(p))) for c, p in zip(candidates, p_values, strict=True)]
+    judgements = [c.judgement for c in candidates]
+    p_values = adjust(judgements, [c.unit for c in candidates], rng)
+    by_specimen = adjust_few(judge.few, judgements, rng)
+    for k, judgement in enumerate(judgements):
+        if judgement.units >= JACKKNIFE_UNITS:  # of two ways, each has half of the error
+            p_values[k] = 2 * min(p_values[k], len(candidates) * np.exp(judgement.log_p_jackknife))
+        elif judgement.few is not None:
+            p_values[k] = by_specimen[k]
+    found = [replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)]
     return sorted(found, key=lambda c: -c.evidence)
 
 
@@ -232,7 +256,7 @@ def adjust(
     """
     alike = defaultdict(list)
     for judgement, level in zip(judgements, levels, strict=True):
-        alike[level, judgement.units, judgement.df].append(judgement.scores)
+        alike[level, judgement.units, judgement.scores.shape[1]].append(judgement.scores)
     signs = {
         place: rng.choice([-1.0, 1.0], size=(flips, place[1])) for place in dict.fromkeys(key[:2] for key in alike)
     }
@@ -244,3 +268,19 @@ def adjust(
         least = np.minimum(least, log_p_of(most, df, units))
     own = np.array([j.log_p for j in judgements])
     return (1 + np.searchsorted(np.sort(least), own, side="right")) / (flips + 1)
+
+
+def adjust_few(
+    units: FewUnits, judgements: Sequence[Judgement], rng: np.random.Generator, draws: int = FLIPS
+) -> np.ndarray:
+    """Return the p-values of the tests on few specimens, adjusted over all of them, shape (m,); 1 for no test."""
+    p_values = np.ones(len(judgements))
+    tried = [k for k, j in enumerate(judgements) if j.few is not None]
+    if tried:
+        drawn = units.draws(draws, rng)
+        least = np.zeros(draws)
+        for k in tried:
+            least = np.minimum(least, few.log_p_of(drawn[judgements[k].few.target], judgements[k].few.basis))
+        own = [judgements[k].few.log_p for k in tried]
+        p_values[tried] = (1 + np.searchsorted(np.sort(least), own, side="right")) / (draws + 1)
+    return p_values

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import Channel
+from sealfit.closure.channels import CALENDAR, Channel
 from sealfit.closure.forms import periodic_terms, terms_of
 from sealfit.closure.intervals import robust_covariance
 from sealfit.closure.judge import LEAST_LEFT, Candidate, project
@@ -28,6 +28,8 @@ from sealfit.fit.joint import Term, mean_derivatives
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly
+HALF = 0.5  # share of what the calendar explains from which anything else comes before it
+CALENDAR_RIVALS = 2  # refitted as rivals where something else comes first
 BEHIND = 0.3  # share of the best one's gain by which a proposal may be behind before each has its own scatter
 PART = 32  # points of a grid whitened at once
 TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
@@ -111,8 +113,13 @@ def propose(
     if peak is not None:
         for form in periodic_terms(fitted, peak, samples, effects):
             found += [replace(p, source=("peak", peak.axis)) for p in linearised(*form)]
-    found.sort(key=lambda p: p.criterion)
-    return _ordered(fitted, _refitted(fitted, _spread(found)))
+    calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
+    others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
+    if not (calendar and others and max(p.chi2 for p in others) >= HALF * max(p.chi2 for p in calendar)):
+        return _ordered(fitted, _refitted(fitted, _spread(found)))
+    # Conditions are tested one after the other and the calendar follows them: what was set or measured comes first.
+    others, calendar = (_refitted(fitted, part) for part in (_spread(others), _spread(calendar)[:CALENDAR_RIVALS]))
+    return _ordered(fitted, others) + sorted(calendar, key=lambda p: p.criterion)
 
 
 def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
@@ -156,6 +163,8 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
     best = found[0]
     equals = [p for p in found if p.criterion - best.criterion < TIED or _same(p, best, TIED * 2)]
     held = [p for p in equals if determined(p)]
+    fewest = min((len(p.term.effect.parameters) for p in held), default=0)
+    held += [p for p in equals if p.term.effect.physical and p not in held and len(p.term.effect.parameters) <= fewest]
     if held:
         first = min(held, key=lambda p: (_overturns(fitted, p), p.rank, p.criterion))
     else:

@@ -16,7 +16,6 @@ from sealfit.closure.channels import FINER, Channel, even_knots, flip_level
 from sealfit.closure.judge import Candidate, Judge, judged
 from sealfit.closure.search import MAIN_TARGETS
 from sealfit.effects.free import BENDS, evenly
-from sealfit.fit.estimate import Fitted
 
 BEHIND = {"a": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along what a parameter acts
 ALONE = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; the calendar drifts by itself
@@ -25,14 +24,14 @@ MOST_CATEGORIES = 12  # a slope for each of more would find what single units do
 
 
 def search_pairs(
-    fitted: Fitted, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
+    judge: Judge, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
 ) -> list[Candidate]:
     """Return candidates of two channels, adjusted over these and the single ones, strongest evidence first.
 
     Parameters
     ----------
-    fitted : Fitted
-        The current model at its optimum.
+    judge : Judge
+        Of the current model.
     channels : sequence of Channel
         Where to look.
     singles : sequence of Candidate
@@ -40,16 +39,15 @@ def search_pairs(
     rng : Generator
         For the sign flips.
     """
-    judge = Judge(fitted)
     found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _of_pair(judge, *pair)]
     if not found:
         return []
-    pairs = [c for c in judged([*found, *singles], rng) if c.pair]
+    pairs = [c for c in judged(judge, [*found, *singles], rng) if c.pair]
     return [replace(c, p_value=min(1.0, RARE * c.p_value)) for c in pairs]
 
 
 def pairs_in_disguise(
-    fitted: Fitted, significant: Sequence[Candidate], channels: Mapping[str, Channel]
+    judge: Judge, significant: Sequence[Candidate], channels: Mapping[str, Channel]
 ) -> list[Candidate]:
     """Return the pairs that a channel's change of a or of v_s may stand for.
 
@@ -58,14 +56,13 @@ def pairs_in_disguise(
 
     Parameters
     ----------
-    fitted : Fitted
-        The current model at its optimum.
+    judge : Judge
+        Of the current model.
     significant : sequence of Candidate
         What the search has accepted on it.
     channels : mapping
         Channels by name.
     """
-    judge = Judge(fitted)
     best: dict[frozenset, Candidate] = {}
     for single in significant:
         pair = frozenset((*single.channels, BEHIND.get(single.acts_on)))
@@ -103,7 +100,7 @@ def _of_pair(judge: Judge, one: Channel, other: Channel) -> list[Candidate]:
         if "load_N" in (one.name, other.name) and target[0] == "force":
             continue
         for count in dict.fromkeys((1, width)) if one.numeric and other.numeric else (width,):
-            judgement = judge([v[:, k * width : k * width + count] for v in variants], level)
+            judgement = judge([v[:, k * width : k * width + count] for v in variants], level, target)
             if judgement is not None:
                 names = (one.name, other.name)
                 found.append(Candidate(names, *target, level, shapes[:, :count], judgement, pair=True))

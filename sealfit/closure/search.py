@@ -6,8 +6,20 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sealfit.closure.channels import CALENDAR, FINE_DF, FINE_UNITS, FINER, Channel, flip_level, free_columns, unit_of
-from sealfit.closure.judge import Candidate, Judge, judged
+from sealfit.closure.channels import (
+    CALENDAR,
+    FEW_DF,
+    FINE_DF,
+    FINE_UNITS,
+    FINER,
+    FREE_DF,
+    Channel,
+    flip_level,
+    free_columns,
+    kinks,
+    unit_of,
+)
+from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge, judged
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import Rows
 
@@ -24,21 +36,20 @@ TARGETS = (
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 
 
-def search(fitted: Fitted, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
+def search(judge: Judge, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
     """Return every candidate with its adjusted p-value, strongest evidence first.
 
     Parameters
     ----------
-    fitted : Fitted
-        The current model at its optimum.
+    judge : Judge
+        Of the current model.
     channels : sequence of Channel
         Where to look.
     rng : Generator
         For the sign flips.
     """
-    judge = Judge(fitted)
     candidates = [c for channel in channels for c in _of_channel(judge, channel)]
-    return judged(candidates, rng) if candidates else []
+    return judged(judge, candidates, rng) if candidates else []
 
 
 def _of_channel(judge: Judge, channel: Channel) -> Iterator[Candidate]:
@@ -46,9 +57,13 @@ def _of_channel(judge: Judge, channel: Channel) -> Iterator[Candidate]:
     if channel.name == "direction":
         yield from _of_shapes(judge, channel, np.ones((rows.force.size, 1)), TARGETS)
         return
-    shapes = free_columns(channel)
+    few = channel.numeric and channel.unit == "specimen" and rows.groups.starts["specimen"].size < JACKKNIFE_UNITS
+    shapes = free_columns(channel, FEW_DF if few else FREE_DF)
     widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
     yield from _of_shapes(judge, channel, shapes, TARGETS, widths)
+    if few:
+        for kink in kinks(channel).T:
+            yield from _of_shapes(judge, channel, kink[:, None], MAIN_TARGETS)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
     fine = channel.numeric and channel.name not in CALENDAR and units >= FINE_UNITS
     if fine and np.unique(channel.values).size > 2 * FINE_DF:
@@ -86,7 +101,7 @@ def _of_shapes(
             unit = min(unit, _direction_unit(rows), key=FINER.get)
         level = flip_level(unit, rows)
         for width in dict.fromkeys(widths or (own.shape[1],)):
-            judgement = judge([v[:, first : first + width] for v in variants], level)
+            judgement = judge([v[:, first : first + width] for v in variants], level, (acts_on, operation))
             if judgement is not None:
                 yield Candidate(names, acts_on, operation, level, own[:, :width], judgement)
 

@@ -1,0 +1,116 @@
+r"""Few units: does one number per specimen follow a channel, held against the specimens' own scatter?
+
+What acts on a quantity and is constant within a specimen shifts each specimen along one direction, the slope of that
+quantity. With g_u that direction in specimen u (whitened, of length 1), :math:`\rho_u = g_u^T r_u` is one number a
+specimen; what the current model has taken out of them is known, and without it they are independent and of one variance
+if specimens scatter alike. A channel's columns then stand against what is left of them by an F test.
+
+A dozen specimens have too few sign flips for a search of hundreds of candidates, and a strong effect stands in its own
+denominator there. The F test needs normal scatter instead; its p-values are adjusted by the largest over all candidates
+in draws of normal numbers with the same covariance (a rotation test: Langsrud 2005, doi:10.1007/s11222-005-4789-5).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from sealfit.fit.estimate import Fitted
+from sealfit.fit.reml import orthonormal
+
+LEAST_LEFT = 0.01  # of a number's variance: what the model has taken out beyond that is no number any more
+LEAST_ERROR = 4  # degrees of freedom of the specimens' scatter below which it is not known
+
+
+class FewTest(NamedTuple):
+    """Columns seen as one number per specimen: the quantity, their span there, and how surely it is followed."""
+
+    target: tuple[str, str]
+    basis: np.ndarray  # (d, k) orthonormal
+    chi2: float  # whitened sum of squares they explain
+    log_p: float  # not adjusted
+
+
+class Numbers(NamedTuple):
+    """One number per specimen along the direction of one quantity."""
+
+    direction: np.ndarray  # (n,) whitened slope, of length 1 in each specimen
+    taken: np.ndarray  # (units, p) of the model's basis along it
+    root: np.ndarray  # (d, units) makes the numbers independent, with variance 1
+    values: np.ndarray  # (d,)
+
+
+class FewUnits:
+    """The specimens of a fit as single numbers.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The current model at its optimum.
+    level : str
+        Level of the units: nothing is shared between its groups but the model.
+    """
+
+    def __init__(self, fitted: Fitted, level: str = "specimen") -> None:
+        self.fitted, self.level = fitted, level
+        self._numbers: dict[tuple[str, str], Numbers] = {}
+
+    @cached_property
+    def _residual(self) -> np.ndarray:
+        """Whitened residual less what priors and bounds have kept the fit from taking out of it, shape (n,)."""
+        basis, residual = self.fitted.basis, self.fitted.white_residual
+        return residual - basis @ (basis.T @ residual)
+
+    def numbers(self, target: tuple[str, str]) -> Numbers:
+        """Return the units' numbers along the direction of a quantity: (acts_on, operation)."""
+        if target not in self._numbers:
+            fitted, groups = self.fitted, self.fitted.rows.groups
+            white = fitted.whitening(fitted.slope(*target)[:, None])[:, 0]
+            size = np.sqrt(groups.sums(white**2, self.level))
+            direction = white * np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)[groups.codes[self.level]]
+            taken = groups.sums(direction[:, None] * fitted.basis, self.level)
+            share, axes = np.linalg.eigh(np.diag((size > 0).astype(float)) - taken @ taken.T)
+            kept = share > LEAST_LEFT
+            root = axes[:, kept].T / np.sqrt(share[kept])[:, None]
+            values = root @ groups.sums(direction * self._residual, self.level)
+            self._numbers[target] = Numbers(direction, taken, root, values)
+        return self._numbers[target]
+
+    def test(self, left: np.ndarray, target: tuple[str, str]) -> FewTest | None:
+        """Return the F test of projected columns, shape (n, k), on a quantity; None with too few units for one."""
+        numbers = self.numbers(target)
+        columns = self.fitted.rows.groups.sums(numbers.direction[:, None] * left, self.level)
+        basis = orthonormal(numbers.root @ columns, 1e-3)
+        d, k = basis.shape
+        if k == 0 or d - k < LEAST_ERROR:
+            return None
+        chi2 = float(((numbers.values @ basis) ** 2).sum())
+        return FewTest(target, basis, chi2, float(log_p_of(numbers.values[None, :], basis)[0]))
+
+    def draws(self, count: int, rng: np.random.Generator) -> dict[tuple[str, str], np.ndarray]:
+        """Return numbers as chance alone would give them, for each quantity of shape (count, d), correlated as here."""
+        groups, known = self.fitted.rows.groups, list(self._numbers.values())
+        blocks = [
+            [
+                one.root
+                @ (np.diag(groups.sums(one.direction * other.direction, self.level)) - one.taken @ other.taken.T)
+                @ other.root.T
+                for other in known
+            ]
+            for one in known
+        ]
+        size, axes = np.linalg.eigh(np.block(blocks))
+        drawn = rng.standard_normal((count, size.size)) @ (axes * np.sqrt(np.maximum(size, 0.0))).T
+        ends = np.cumsum([len(n.values) for n in known])[:-1]
+        return dict(zip(self._numbers, np.split(drawn, ends, axis=1), strict=True))
+
+
+def log_p_of(values: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return the log p-value of F for rows of independent numbers, shape (m, d), against columns (d, k) -> (m,)."""
+    d, k = basis.shape
+    explained = ((values @ basis) ** 2).sum(axis=1)
+    left = np.maximum((values**2).sum(axis=1) - explained, 1e-300)
+    return stats.f.logsf(explained / k / (left / (d - k)), k, d - k)

@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+from bins_helpers import make_bins
+from scipy import stats
+
+from sealfit.closure.channels import find_channels
+from sealfit.closure.few import FewUnits, log_p_of
+from sealfit.closure.judge import Judge
+from sealfit.closure.search import search
+from sealfit.fit.estimate import fit_declared
+from sealfit.fit.rows import make_rows
+
+DAYS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+
+
+def rows_of(seed=0, **options):
+    return make_rows(make_bins(seed, days=DAYS, repeats=1, bins=4, **options), has_aging=True)
+
+
+def test_one_column_is_students_t_of_a_slope():
+    rng = np.random.default_rng(3)
+    x, y = rng.normal(size=9), rng.normal(size=9)
+    x, y = x - x.mean(), y - y.mean()
+    centred = np.linalg.qr(np.column_stack([np.ones(9), np.eye(9)[:, :8]]))[0][:, 1:]  # 8 numbers free of the mean
+    basis = (centred.T @ x)[:, None] / np.linalg.norm(x)
+    expected = stats.linregress(x, y).pvalue  # nine points less the mean less the slope: 7 degrees of freedom
+    assert np.exp(log_p_of((centred.T @ y)[None, :], basis)[0]) == pytest.approx(expected, rel=1e-9)
+
+
+def test_draws_have_the_covariance_of_the_numbers():
+    units = FewUnits(fit_declared(rows_of(specimen=0.01)))
+    mu, force = ("mu", "multiply"), ("force", "multiply")
+    d = units.numbers(mu).values.size
+    units.numbers(force)
+    drawn = units.draws(20_000, np.random.default_rng(0))
+    assert np.cov(drawn[mu].T) == pytest.approx(np.eye(d), abs=0.05)
+    between = np.corrcoef(drawn[mu].T, drawn[force].T)[:d, d:]
+    assert np.abs(between).max() > 0.8  # both scale the friction of a specimen
+
+
+def test_p_values_along_a_dozen_specimens_are_not_too_small():
+    smallest = []
+    for seed in range(24):
+        rows = rows_of(seed + 500, specimen=0.02)
+        days = [c for c in find_channels(rows) if c.name == "aging_days"]
+        found = search(Judge(fit_declared(rows)), days, np.random.default_rng(seed))
+        smallest.append(min(c.p_value for c in found))
+    # The smallest adjusted p is doubled for the two searches: a tenth below 0.2; more than 7 of 24 with p 0.003.
+    assert sum(p < 0.2 for p in smallest) <= 7
+    assert min(smallest) > 0.001
+
+
+def test_an_aging_that_stops_is_found_on_nineteen_specimens():
+    def floor(table, force):
+        return force * (1 + 0.12 * np.maximum(np.log(np.maximum(table["aging_days"].to_numpy(), 1e-9) / 4.0), 0.0))
+
+    rows = rows_of(1, specimen=0.003, temperatures=(40.0, 60.0, 80.0), effect=floor)
+    days = [c for c in find_channels(rows) if c.name == "aging_days"]
+    best = min(search(Judge(fit_declared(rows)), days, np.random.default_rng(0)), key=lambda c: c.p_value)
+    assert best.unit == "specimen"
+    assert best.p_value < 0.005
