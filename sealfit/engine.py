@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
@@ -72,10 +72,30 @@ def run_map(
     if waiting and done and (time.monotonic() - began) / done * len(waiting) < PROCESSES_START_S:
         yield from map(function, waiting)
     elif waiting:
-        yield from _in_processes(function, list(waiting), min(workers, len(waiting)))
+        yield from begin_map(function, list(waiting), workers=workers)
+
+
+def begin_map(
+    function: Callable[[Given], Made], items: Sequence[Given], *, workers: int = 1
+) -> Generator[Made, None, None]:
+    """Return `run_map`, its processes already at work while the caller does something else.
+
+    Close it (`contextlib.closing`) where its results may not be wanted after all.
+
+    Parameters
+    ----------
+    function, items, workers
+        As for `run_map`; with one worker nothing is done before the first result is asked for.
+    """
+    if workers <= 1 or len(items) <= 1 or multiprocessing.parent_process() is not None:
+        return (function(item) for item in items)
+    made = _in_processes(function, items, min(workers, len(items)))
+    next(made)
+    return made
 
 
 def _in_processes(function: Callable[[Given], Made], items: Sequence[Given], workers: int) -> Iterator[Made]:
+    """Yield once when the first items are sent, then the results."""
     size = max(1, min(MAX_CHUNK, len(items) // (workers * CHUNKS_PER_WORKER)))
     chunks = (items[start : start + size] for start in range(0, len(items), size))
     # Spawn, not fork: a fork copies the locks of pyarrow's and BLAS's threads without the threads that free them.
@@ -89,6 +109,7 @@ def _in_processes(function: Callable[[Given], Made], items: Sequence[Given], wor
     finished = False
     try:
         send(workers * WAITING_PER_WORKER)
+        yield None
         while sent:
             made = sent.popleft().result()
             send(1)

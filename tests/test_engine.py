@@ -1,3 +1,4 @@
+import multiprocessing
 import os
 import pickle
 import signal
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sealfit.engine import cores, run_map
+from sealfit.engine import begin_map, cores, run_map
 from sealfit.errors import CampaignError, Fault, RequestError, WorkerError
 
 HERE = Path(__file__).resolve().parent
@@ -175,3 +176,11 @@ def test_no_worker_outlives_its_parent(tmp_path, how):
     while any(map(alive, children)) and time.monotonic() < until:
         time.sleep(0.05)
     assert not any(map(alive, children))
+
+
+def test_begun_work_gives_the_same_and_can_be_given_up():
+    items = list(range(6))
+    assert list(begin_map(square, items, workers=2)) == list(begin_map(square, items)) == [k * k for k in items]
+    given_up = begin_map(square, items, workers=2)
+    given_up.close()
+    assert not multiprocessing.active_children()

@@ -46,10 +46,9 @@ def terms_of(
         return
     name = candidate.channels[-1]
     channel = channels[name]
-    known = set(fitted.rows.table.columns)
     for effect in effects.values():
-        if target not in effect.acts_on or not set(effect.reads) <= known | {CHANNEL}:
-            continue
+        if target not in effect.acts_on or not set(effect.reads) <= channels.keys() | {CHANNEL}:
+            continue  # a channel that does not vary makes of an effect another one under a longer name
         if effect.reads == (CHANNEL,):
             if not channel.numeric or name == "direction" or effect.id in ("sinusoid", "sinusoid_harmonics"):
                 continue

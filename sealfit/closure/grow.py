@@ -55,6 +55,7 @@ def grow(
     effects: Mapping[str, Effect],
     *,
     start: Fitted | None = None,
+    on_found: Callable[[Fitted], None] | None = None,
     on_progress: Callable[[str], None] | None = None,
 ) -> Grown:
     """Return the model grown until no channel orders its residual.
@@ -71,6 +72,8 @@ def grow(
         The catalogue.
     start : Fitted, optional
         The declared model fitted to more rows: where the fit begins, so that it need not search again.
+    on_found : callable, optional
+        Given the declared fit as soon as the first search has found something.
     on_progress : callable, optional
         Told in words what is being done.
     """
@@ -113,6 +116,8 @@ def grow(
         open_ = [c for c in significant if c.key not in refused]
         if (not open_ and peak is None) or number > config.loop.max_rounds:
             break
+        if number == 1 and on_found is not None:
+            on_found(before)
         open_ += [c for c in _standing_for(open_, candidates) if c.key not in refused]
         proposals = propose(fitted, open_, channels, peak, seen, effects)
         accepted = None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from sealfit.closure.ripple import find_ripple
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
-from sealfit.engine import run_map
+from sealfit.engine import begin_map, run_map
 from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.rows import Rows, make_rows, thin
 
@@ -73,16 +74,17 @@ def close_loop(
     ripple = peak is not None and peak.p_value <= config.loop.family_error
     most = MOST_ROWS_OF_RIPPLE if ripple else MOST_ROWS
     coarse = rows if len(bins) <= most else make_rows(thin(counted, most), has_aging=config.aging)
-    grown = grow(coarse, samples, config, effects, on_progress=say)
-    say("before and after on all rows")
-    before = grown.before if coarse is rows else fit_declared(rows)
-    after = before
-    if grown.added:
-        after = grown.after if coarse is rows else fit(grown.after.model, rows, grown.after.scatter, turns=2)
-    level = heldout_level(rows)
-    say(f"held out by {level}: the search repeated without each fold")
-    held_before, held_after = _heldout(rows, coarse, samples, config, effects, level, grown, workers, say)
-    document = _document(config, grown, before, after, held_before, held_after, level)
+    heldout = _HeldOut(rows, coarse, samples, config, effects, workers)
+    with closing(heldout):
+        grown = grow(coarse, samples, config, effects, on_found=heldout.begin, on_progress=say)
+        say("before and after on all rows")
+        before = grown.before if coarse is rows else fit_declared(rows)
+        after = before
+        if grown.added:
+            after = grown.after if coarse is rows else fit(grown.after.model, rows, grown.after.scatter, turns=2)
+        say(f"held out by {heldout.level}: the search repeated without each fold")
+        held_before, held_after = heldout.forces(grown, say)
+    document = _document(config, grown, before, after, held_before, held_after, heldout.level)
     tables = {
         "effects": effect_table(document["effects"], grown.added),
         "residuals_before": _residual_table(bins, before, held_before),
@@ -98,43 +100,54 @@ def close_loop(
     return Closure(document, to_record(before, after, config), tables)
 
 
-def _heldout(
-    rows: Rows,
-    coarse: Rows,
-    samples: pd.DataFrame,
-    config: Config,
-    effects,
-    level: str,
-    grown: Grown,
-    workers: int,
-    say,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return each row's force, before and after, by fits and a search that did not see its group; NaN if never out."""
-    before, after = np.full(rows.force.size, np.nan), np.full(rows.force.size, np.nan)
-    masks = list(folds(rows, level, config.loop.folds, config.loop.seed))
-    work = (
-        _Fold(
-            out,
-            *_without(coarse, samples if grown.added else samples.head(0), rows, out),
-            rows.subset(out),
-            config,
-            effects,
-            grown.before,
-            bool(grown.added),
-        )
-        for out in masks
-    )
-    for k, (out, parts) in enumerate(zip(masks, run_map(_held_out, work, workers=workers), strict=True)):
-        say(f"  fold {k + 1} of {len(masks)}")
-        before[out], after[out] = parts
-    return before, after
+class _HeldOut:
+    """The folds: everything fitted and searched again without some groups, and asked for them.
+
+    With several workers the folds begin as soon as something is found in the whole campaign.
+    """
+
+    def __init__(
+        self, rows: Rows, coarse: Rows, samples: pd.DataFrame, config: Config, effects: dict[str, Effect], workers: int
+    ) -> None:
+        self.rows, self.coarse, self.samples = rows, coarse, samples
+        self.config, self.effects, self.workers = config, effects, workers
+        self.level = heldout_level(rows)
+        self.masks = list(folds(rows, self.level, config.loop.folds, config.loop.seed))
+        self._begun: Generator | None = None
+
+    def begin(self, before: Fitted) -> None:
+        """Set processes to work, on the assumption that something will be added."""
+        if self.workers > 1:
+            self._begun = begin_map(_held_out, list(self._folds(before, search=True)), workers=self.workers)
+
+    def close(self) -> None:
+        """End what is still being computed."""
+        if self._begun is not None:
+            self._begun.close()
+
+    def forces(self, grown: Grown, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
+        """Return each row's force, before and after, by fits that did not see its group; NaN if never held out."""
+        before, after = np.full(self.rows.force.size, np.nan), np.full(self.rows.force.size, np.nan)
+        made = self._begun
+        if made is None or not grown.added:
+            self.close()
+            made = run_map(_held_out, self._folds(grown.before, search=bool(grown.added)), workers=self.workers)
+        for k, (out, parts) in enumerate(zip(self.masks, made, strict=True)):
+            say(f"  fold {k + 1} of {len(self.masks)}")
+            before[out], after[out] = parts
+        return before, after
+
+    def _folds(self, before: Fitted, *, search: bool) -> Iterator[_Fold]:
+        samples = self.samples if search else self.samples.head(0)
+        for out in self.masks:
+            train, seen = _without(self.coarse, samples, self.rows, out)
+            yield _Fold(train, seen, self.rows.subset(out), self.config, self.effects, before, search)
 
 
 @dataclass(frozen=True)
 class _Fold:
     """One fold: the rows and samples the fit may see, and those it is asked for."""
 
-    out: np.ndarray
     train: Rows
     seen: pd.DataFrame
     test: Rows
