@@ -183,4 +183,8 @@ def test_begun_work_gives_the_same_and_can_be_given_up():
     assert list(begin_map(square, items, workers=2)) == list(begin_map(square, items)) == [k * k for k in items]
     given_up = begin_map(square, items, workers=2)
     given_up.close()
+    for _ in range(100):
+        if not multiprocessing.active_children():
+            break
+        time.sleep(0.1)
     assert not multiprocessing.active_children()
