@@ -3,15 +3,18 @@ r"""Few units: does one number per specimen follow a channel, held against the s
 What acts on a quantity and is constant within a specimen shifts each specimen along one direction, the slope of that
 quantity. With g_u that direction in specimen u (whitened, of length 1), :math:`\rho_u = g_u^T r_u` is one number a
 specimen; what the current model has taken out of them is known, and without it they are independent and of one variance
-if specimens scatter alike. A channel's columns then stand against what is left of them by an F test.
+if specimens scatter alike. A channel's columns then stand against what is left of them by an F test. A few numbers may
+look quieter than they are: where runs and files explain their variance of 1, that counts as if eight more had been seen
+(moderated F: Smyth 2004, doi:10.2202/1544-6115.1027); where it is the specimens' own, it is known from nothing else.
 
 A dozen specimens have too few sign flips for a search of hundreds of candidates, and a strong effect stands in its own
 denominator there. The F test needs normal scatter instead; its p-values are adjusted by the largest over all candidates
-in draws of normal numbers with the same covariance (a rotation test: Langsrud 2005, doi:10.1007/s11222-005-4789-5).
+in draws of such numbers with the same covariance (a rotation test: Langsrud 2005, doi:10.1007/s11222-005-4789-5).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -20,8 +23,11 @@ from scipy import stats
 
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.reml import orthonormal
+from sealfit.fit.whitening import Whitening
 
 LEAST_LEFT = 0.01  # of a number's variance: what the model has taken out beyond that is no number any more
+KNOWN = 8.0  # degrees of freedom that a variance counts for which runs and files explain
+LEAST_KNOWN = 0.5  # of these degrees of freedom; with fewer the scale is free and no draw depends on it
 LEAST_ERROR = 4  # degrees of freedom of the specimens' scatter below which it is not known
 
 
@@ -30,6 +36,7 @@ class FewTest(NamedTuple):
 
     target: tuple[str, str]
     basis: np.ndarray  # (d, k) orthonormal
+    known: float  # degrees of freedom that the variance components count for
     chi2: float  # whitened sum of squares they explain
     log_p: float  # not adjusted
 
@@ -41,6 +48,7 @@ class Numbers(NamedTuple):
     taken: np.ndarray  # (units, p) of the model's basis along it
     root: np.ndarray  # (d, units) makes the numbers independent, with variance 1
     values: np.ndarray  # (d,)
+    known: float  # degrees of freedom that the variance components count for
 
 
 class FewUnits:
@@ -64,6 +72,13 @@ class FewUnits:
         basis, residual = self.fitted.basis, self.fitted.white_residual
         return residual - basis @ (basis.T @ residual)
 
+    @cached_property
+    def _finer(self) -> Whitening:
+        """What whitens columns where the units themselves do not scatter."""
+        fitted = self.fitted
+        finer = tuple(c for c in fitted.scatter.components if c.level != self.level)
+        return Whitening(replace(fitted.scatter, components=finer), fitted.friction, fitted.rows.groups)
+
     def numbers(self, target: tuple[str, str]) -> Numbers:
         """Return the units' numbers along the direction of a quantity: (acts_on, operation)."""
         if target not in self._numbers:
@@ -76,7 +91,9 @@ class FewUnits:
             kept = share > LEAST_LEFT
             root = axes[:, kept].T / np.sqrt(share[kept])[:, None]
             values = root @ groups.sums(direction * self._residual, self.level)
-            self._numbers[target] = Numbers(direction, taken, root, values)
+            finer = groups.sums(self._finer(fitted.slope(*target)[:, None])[:, 0] ** 2, self.level)
+            explained = float(np.mean((size**2)[finer > 0] / finer[finer > 0]))
+            self._numbers[target] = Numbers(direction, taken, root, values, KNOWN * min(explained, 1.0))
         return self._numbers[target]
 
     def test(self, left: np.ndarray, target: tuple[str, str]) -> FewTest | None:
@@ -88,7 +105,8 @@ class FewUnits:
         if k == 0 or d - k < LEAST_ERROR:
             return None
         chi2 = float(((numbers.values @ basis) ** 2).sum())
-        return FewTest(target, basis, chi2, float(log_p_of(numbers.values[None, :], basis)[0]))
+        log_p = float(log_p_of(numbers.values[None, :], basis, numbers.known)[0])
+        return FewTest(target, basis, numbers.known, chi2, log_p)
 
     def draws(self, count: int, rng: np.random.Generator) -> dict[tuple[str, str], np.ndarray]:
         """Return numbers as chance alone would give them, for each quantity of shape (count, d), correlated as here."""
@@ -105,12 +123,18 @@ class FewUnits:
         size, axes = np.linalg.eigh(np.block(blocks))
         drawn = rng.standard_normal((count, size.size)) @ (axes * np.sqrt(np.maximum(size, 0.0))).T
         ends = np.cumsum([len(n.values) for n in known])[:-1]
-        return dict(zip(self._numbers, np.split(drawn, ends, axis=1), strict=True))
+        found = {}
+        for (target, numbers), own in zip(self._numbers.items(), np.split(drawn, ends, axis=1), strict=True):
+            df = numbers.known  # a variance that counts for so many is as uncertain as that
+            scale = np.sqrt(df / rng.chisquare(df, count)) if df > LEAST_KNOWN else np.ones(count)
+            found[target] = own * scale[:, None]
+        return found
 
 
-def log_p_of(values: np.ndarray, basis: np.ndarray) -> np.ndarray:
+def log_p_of(values: np.ndarray, basis: np.ndarray, known: float) -> np.ndarray:
     """Return the log p-value of F for rows of independent numbers, shape (m, d), against columns (d, k) -> (m,)."""
     d, k = basis.shape
     explained = ((values @ basis) ** 2).sum(axis=1)
     left = np.maximum((values**2).sum(axis=1) - explained, 1e-300)
-    return stats.f.logsf(explained / k / (left / (d - k)), k, d - k)
+    df = known + d - k
+    return stats.f.logsf(explained / k / ((known + left) / df), k, df)

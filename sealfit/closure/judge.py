@@ -280,7 +280,8 @@ def adjust_few(
         drawn = units.draws(draws, rng)
         least = np.zeros(draws)
         for k in tried:
-            least = np.minimum(least, few.log_p_of(drawn[judgements[k].few.target], judgements[k].few.basis))
+            test = judgements[k].few
+            least = np.minimum(least, few.log_p_of(drawn[test.target], test.basis, test.known))
         own = [judgements[k].few.log_p for k in tried]
         p_values[tried] = (1 + np.searchsorted(np.sort(least), own, side="right")) / (draws + 1)
     return p_values

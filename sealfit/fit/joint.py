@@ -20,14 +20,13 @@ import numpy as np
 import pandas as pd
 
 from sealfit.effects.contract import CHANNEL, SECOND, Effect
-from sealfit.fit.rows import Rows
+from sealfit.fit.rows import ALONG, Rows
 
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
 LOGARITHMIC = ("b_s", "b_c", "v_s")
 SPEEDS_FOR_STRIBECK = 4  # mu_s, mu_c, v_s and sigma_2 are four numbers
 SPEEDS_FOR_VISCOUS = 2
 DAYS_FOR_LAW = 3  # mu_0, a and b are three numbers
-ALONG = ("displacement_mm", "distance_mm", "time_s")
 FINE = ("ripple", "sinusoid", "bump")  # effects that may be as fine as a bin
 GAUSS = tuple(zip(*(part.tolist() for part in np.polynomial.legendre.leggauss(4)), strict=True))
 GAUSS = tuple((place, weight / 2) for place, weight in GAUSS)

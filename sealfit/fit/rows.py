@@ -13,6 +13,9 @@ from sealfit.tables import BINS
 LEVELS = ("stroke", "file", "run", "specimen")
 """Grouping levels, finest first; a row of `bins` stands for samples below the stroke."""
 
+ALONG = ("displacement_mm", "distance_mm", "time_s")
+"""Channels that run along a stroke, so that a bin covers a piece of them."""
+
 NOT_CHANNELS = {
     "file",
     "run_id",
@@ -87,6 +90,8 @@ class Rows:
         key = ("sparse", most)
         if key not in self.cache:
             start, code = self.groups.starts["stroke"], self.codes("stroke")
+            for channel in (name for name in ALONG if name in self.table):
+                self.bin_width(channel)  # of the bins as they are, not from one kept row to the next
             place = np.arange(code.size) - start[code]
             step = -(-np.bincount(code) // most)[code]  # rounded up
             self.cache[key] = self.subset(place % step == step // 2)
