@@ -135,9 +135,10 @@ def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
 
 
 def kinks(channel: Channel) -> np.ndarray:
-    """Return the columns of a channel that stops at one of its inner values, shape (n, k): floors and late starts."""
+    """Return centred columns of a channel that stops at one of its inner values, shape (n, k): floors, late starts."""
     x = scaled(channel.values)
-    return np.minimum(x[:, None], np.unique(x)[1:-1])
+    columns = np.minimum(x[:, None], np.unique(x)[1:-1])
+    return columns - columns.mean(axis=0)
 
 
 def even_knots(values: np.ndarray) -> tuple[float, ...]:

@@ -19,6 +19,7 @@ from sealfit.effects.free import BENDS, evenly
 
 BEHIND = {"a": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along what a parameter acts
 ALONE = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; the calendar drifts by itself
+LOGARITHMIC = 5.0  # span of a positive channel from which its logarithm is tried as well
 RARE = 2.0  # pairs are many and seldom at work: they get half of their share of the error
 MOST_CATEGORIES = 12  # a slope for each of more would find what single units do
 
@@ -86,43 +87,57 @@ def _usable(channels: Sequence[Channel]) -> list[Channel]:
 
 
 def _of_pair(judge: Judge, one: Channel, other: Channel) -> list[Candidate]:
-    shapes = mixed_columns(one, other)
-    width = shapes.shape[1]
-    if width == 0:
+    blocks = mixed_columns(one, other)
+    if not blocks:
         return []
     fitted, finer = judge.fitted, min(one.unit, other.unit, key=FINER.get)
     level = flip_level(finer, fitted.rows)
-    variants = judge.variants(
-        np.column_stack([shapes * fitted.slope(*target)[:, None] for target in MAIN_TARGETS]), finer
-    )
+    shapes = np.column_stack(blocks)
+    ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
     found = []
-    for k, target in enumerate(MAIN_TARGETS):
+    for target in MAIN_TARGETS:
         if "load_N" in (one.name, other.name) and target[0] == "force":
             continue
-        for count in dict.fromkeys((1, width)) if one.numeric and other.numeric else (width,):
-            judgement = judge([v[:, k * width : k * width + count] for v in variants], level, target)
+        variants = judge.variants(shapes * fitted.slope(*target)[:, None], finer)
+        for block, first, last in zip(blocks, ends[:-1], ends[1:], strict=True):
+            judgement = judge([v[:, first:last] for v in variants], level, target)
             if judgement is not None:
                 names = (one.name, other.name)
-                found.append(Candidate(names, *target, level, shapes[:, :count], judgement, pair=True))
+                found.append(Candidate(names, *target, level, block, judgement, pair=True))
     return found
 
 
-def mixed_columns(one: Channel, other: Channel) -> np.ndarray:
-    """Return the mixed terms of two channels, first the plain product, shape (n, k); none for two categories."""
+def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
+    """Return the mixed terms of two channels, blocks of shape (n, k) to be judged each; none for two categories.
+
+    The plain product, also of logarithms where a channel spans enough for them to matter: what either does alone may
+    hold nearly all of a product, and the rest depends on its exact shape. Then bent terms, for what is no product.
+    """
     if not (one.numeric or other.numeric):
-        return np.empty((one.values.size, 0))
+        return []
     if one.numeric and other.numeric:
-        u, w = (_centred(c) for c in (one, other))
-        columns = np.column_stack([u**j * w**k for j, k in BENDS])
+        products = [(u * w)[:, None] for u in _scales(one) for w in _scales(other)]
+        u, w = (_centred(evenly(c.values, even_knots(c.values))) for c in (one, other))
+        blocks = [*products, np.column_stack([u**j * w**k for j, k in BENDS])]
     else:
         number, category = (one, other) if one.numeric else (other, one)
-        u = _centred(number)
+        u = _centred(evenly(number.values, even_knots(number.values)))
         levels = np.unique(category.values)
-        columns = (category.values[:, None] == levels[None, 1:]) * u[:, None]
-    size = np.sqrt((columns**2).mean(axis=0))
-    return columns[:, size > 1e-9] / size[size > 1e-9]
+        blocks = [(category.values[:, None] == levels[None, 1:]) * u[:, None]]
+    sizes = [np.sqrt((columns**2).mean(axis=0)) for columns in blocks]
+    blocks = [columns[:, size > 1e-9] / size[size > 1e-9] for columns, size in zip(blocks, sizes, strict=True)]
+    return [columns for columns in blocks if columns.shape[1]]
 
 
-def _centred(channel: Channel) -> np.ndarray:
-    mapped = evenly(channel.values, even_knots(channel.values))
-    return mapped - mapped.mean()
+def _scales(channel: Channel) -> list[np.ndarray]:
+    """Return a channel, centred, and its logarithm where that is another shape (from 0 on, moved by its least)."""
+    x = channel.values
+    scales = [x]
+    least = float(x[x > 0].min(initial=np.inf))
+    if x.min() >= 0 and x.max() > LOGARITHMIC * least:
+        scales.append(np.log(x if x.min() > 0 else x + least))
+    return [_centred(x) / max(float(np.ptp(x)), 1e-300) for x in scales]
+
+
+def _centred(values: np.ndarray) -> np.ndarray:
+    return values - values.mean()

@@ -49,11 +49,19 @@ def test_slope_in_one_batch_only_is_found():
 
 def test_mixed_columns_hold_nothing_of_either_channel_alone():
     rng = np.random.default_rng(0)
-    one, other = (Channel(name, rng.uniform(size=4000), "run") for name in "ab")
-    columns = mixed_columns(one, other)
-    assert columns.shape == (4000, 4)
+    one, other = (Channel(name, rng.uniform(1, 2, size=4000), "run") for name in "ab")
+    blocks = mixed_columns(one, other)
+    assert [b.shape for b in blocks] == [(4000, 1), (4000, 4)]
     for channel in (one, other):
-        assert abs(np.corrcoef(columns[:, 0], channel.values)[0, 1]) < 0.05
+        assert abs(np.corrcoef(blocks[0][:, 0], channel.values)[0, 1]) < 0.05
     category = Channel("c", rng.choice(["x", "y"], 4000), "run")
-    assert mixed_columns(one, category).shape == (4000, 1)
-    assert mixed_columns(category, category).shape == (4000, 0)
+    assert [b.shape for b in mixed_columns(one, category)] == [(4000, 1)]
+    assert mixed_columns(category, category) == []
+
+
+def test_products_of_logarithms_are_tried_where_a_channel_spans_enough():
+    speed = Channel("speed_mm_s", np.tile([0.5, 5.0, 50.0], 4), "run")
+    days = Channel("aging_days", np.repeat([0.0, 1.0, 4.0, 16.0], 3), "specimen")
+    product = np.log(speed.values / 5) * (np.log(days.values + 1) - np.log(days.values + 1).mean())
+    best = max(abs(np.corrcoef(product, block[:, 0])[0, 1]) for block in mixed_columns(speed, days)[:-1])
+    assert best == pytest.approx(1.0)
