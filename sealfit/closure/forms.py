@@ -14,11 +14,12 @@ from sealfit.closure.judge import Candidate, Judgement
 from sealfit.closure.ripple import Peak
 from sealfit.closure.waves import common_wavelength, pass_shifts
 from sealfit.effects.contract import CHANNEL, SECOND, Effect
-from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, free_effect
+from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, free_effect, natural
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import Term
 
 WAVY = ("bump", "quadratic")  # through a calendar they follow whatever was tested when
+MOST_PLACES = 60  # between neighbouring values that are tried
 REACH = 4.0  # spans of a channel that a width or a time constant may have
 PHASES = tuple(np.arange(4) * np.pi / 4)
 PERIODIC = ("ripple", "sinusoid", "sinusoid_harmonics")  # sought in the spectrum, not along a grid of wavelengths
@@ -103,9 +104,12 @@ def free_term(channel: Channel, acts_on: str, operation: str, *, df: int = FREE_
             knots = np.geomspace(distinct[0], distinct[-1], count)
         else:
             knots = np.quantile(distinct, np.linspace(0, 1, count))
-        fixed = {"knots": tuple(float(k) for k in knots), "x_ref": float(knots[0])}
+        places = tuple(float(k) for k in knots)
+        means = natural(places, channel.values).mean(axis=0)
+        fixed = {"knots": places, "x_ref": places[0], "means": tuple(means.tolist())}
         return Term(free_effect(SMOOTH, fixed), (channel.name,), acts_on, operation, fixed)
-    fixed = {"categories": tuple(str(c) for c in np.unique(channel.values))}
+    categories, count = np.unique(channel.values, return_counts=True)
+    fixed = {"categories": tuple(categories.tolist()), "means": tuple((count / count.sum()).tolist())}
     return Term(free_effect(LEVELS, fixed), (channel.name,), acts_on, operation, fixed)
 
 
@@ -170,10 +174,10 @@ def _within_reach(effect: Effect, values: np.ndarray) -> Effect:
     A bump far outside is a bent line and a constant under another name.
     """
     low, high, span = float(values.min()), float(values.max()), float(np.ptp(values)) or 1.0
-    limits = {"inside": (low, high), "span": (span / 1000, REACH * span)}
+    limits = {"inside": (low, high), "between": (low, high), "span": (span / 1000, REACH * span)}
     parameters = []
     for p in effect.parameters:
-        if p.search in ("inside", "span"):
+        if p.search in limits:
             near = tuple(float(x) for x in np.clip(limits[p.search], *p.bounds))
             p = replace(p, bounds=near, start=float(np.clip(p.start, *near)))
         parameters.append(p)
@@ -187,6 +191,10 @@ def _grids(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
     for p in effect.nonlinear:
         if p.search == "inside":
             grid = np.quantile(np.unique(values), np.linspace(0.05, 0.95, 13))
+        elif p.search == "between":
+            distinct = np.unique(values)
+            middle = (distinct[1:] + distinct[:-1]) / 2
+            grid = middle[np.unique(np.linspace(0, middle.size - 1, MOST_PLACES).astype(int))]
         elif p.search == "span":
             grid = np.geomspace(span / 100, span * 2, 13)
         elif p.search == "ratio":

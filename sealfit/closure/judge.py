@@ -15,6 +15,7 @@ Sign flips hold whatever the units' scatter is, but a strong effect stands in V 
 units over the kurtosis of c, and a few runs in extreme places hide what all others show. So from thirty units on the
 estimate is also held against its jackknife over whole units (CV3; MacKinnon, Nielsen & Webb 2023,
 doi:10.1016/j.jeconom.2022.04.001), adjusted by the number of candidates (Bonferroni); each way has half of the error.
+A few runs may hold nearly all that columns say and agree by chance, so what the columns explain must count as well.
 With fewer specimens than that, what is constant in them is held against their own scatter (`few`).
 """
 
@@ -179,7 +180,7 @@ class Judge:
         log_p = float(log_p_of(_wald(total[None, :], scores)[0], left.shape[1], units))
         jackknife = 0.0
         if units >= JACKKNIFE_UNITS and log_p < np.log(PROMISING):
-            jackknife = self._jackknife(left, level)
+            jackknife = max(self._jackknife(left, level), float(stats.chi2.logsf(total @ total, left.shape[1])))
         return Judgement(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
 
     def _jackknife(self, left: np.ndarray, level: str) -> float:

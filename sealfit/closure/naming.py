@@ -147,12 +147,18 @@ def _spread(found: list[Proposal]) -> list[Proposal]:
     """
     kept: list[Proposal] = []
     for proposal in sorted(found, key=lambda p: p.criterion - TIED * p.term.effect.physical):
-        same = [p for p in kept if p.term.effect.id == proposal.term.effect.id]
+        kind = _kind(proposal)
+        same = [p for p in kept if _kind(p) == kind]
         if len(same) >= 2 or any(p.term.key() == proposal.term.key() for p in same):
             continue
         if len(kept) < REFITTED or (not proposal.named and not same):
             kept.append(proposal)
     return kept
+
+
+def _kind(proposal: Proposal) -> tuple[str, int]:
+    """What counts as one form: a free shape with more knots is another one."""
+    return proposal.term.effect.id, len(proposal.term.effect.parameters)
 
 
 def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:

@@ -54,8 +54,9 @@ class Parameter:
     `fill_unit` puts them in. A name that is a word of Python carries an underscore; `symbol` is what people read.
 
     `linear` marks an amplitude: the shape is proportional to it, or to the vector of all linear ones. `search` says
-    where to look for one that is not linear: numbers, or "inside" (quantiles of the channel), "span" (logarithmic,
-    from a fraction of the channel's span to a few spans), "ratio" (logarithmic, over the channel's own magnitudes).
+    where to look for one that is not linear: numbers, or "inside" (quantiles of the channel), "between" (halfway from
+    one of its values to the next, for a jump), "span" (logarithmic, from a fraction of the channel's span to a few
+    spans), "ratio" (logarithmic, over the channel's own magnitudes).
     """
 
     name: str
@@ -64,7 +65,7 @@ class Parameter:
     bounds: tuple[float, float]
     meaning: str
     linear: bool = False
-    search: tuple[float, ...] | Literal["inside", "span", "ratio"] = ()
+    search: tuple[float, ...] | Literal["inside", "between", "span", "ratio"] = ()
 
     def __post_init__(self) -> None:
         low, high = self.bounds

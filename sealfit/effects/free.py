@@ -4,8 +4,9 @@ They name no mechanism. Both are rebuilt from plain data by `free_effect`, so a 
 
 .. math:: h = \sum_j c_j B_j(x), \qquad h = \sum_k d_k [x = k]
 
-B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the knot of reference has none, so the
-shape is zero there. Beyond the outer knots a natural spline goes on as a straight line.
+B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the knot of reference has none. Beyond the
+outer knots a natural spline goes on as a straight line. Both are counted from their mean over the campaign where that
+is given: a constant that came in with them would stand for friction, and what scales friction would miss it.
 """
 
 from __future__ import annotations
@@ -19,10 +20,13 @@ from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effec
 from sealfit.errors import ParameterError
 
 SMOOTH, LEVELS, SURFACE, SLOPES = "smooth", "levels", "surface", "slopes"
+LESS_MEAN = "; less its mean over the campaign"
 BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))  # powers of the two scaled channels in a free surface
 
 
-def smooth_effect(knots: Sequence[float], reference: float | None = None) -> Effect:
+def smooth_effect(
+    knots: Sequence[float], reference: float | None = None, means: Sequence[float] | None = None
+) -> Effect:
     """Return a natural cubic spline of the channel, with its values at the knots as amplitudes.
 
     Parameters
@@ -32,6 +36,8 @@ def smooth_effect(knots: Sequence[float], reference: float | None = None) -> Eff
     reference : float, optional
         The shape is zero at the knot nearest to it; default: the first knot. That knot has no amplitude: a common level
         belongs to the declared model.
+    means : sequence of float, optional
+        Mean of each B_j over the campaign, for a shape whose mean is zero.
 
     Returns
     -------
@@ -57,7 +63,8 @@ def smooth_effect(knots: Sequence[float], reference: float | None = None) -> Eff
         id=SMOOTH,
         label="smooth in {x}",
         equation=r"h = \sum_j c_j B_j(x)",
-        form=f"natural cubic spline through (x_j, c_j), knots {_listed(places)}, zero at {places[zero]:.6g}",
+        form=f"natural cubic spline through (x_j, c_j), knots {_listed(places)}, zero at {places[zero]:.6g}"
+        + LESS_MEAN * (means is not None),
         reads=(CHANNEL,),
         acts_on=ANYWHERE,
         parameters=tuple(
@@ -71,16 +78,24 @@ def smooth_effect(knots: Sequence[float], reference: float | None = None) -> Eff
             )
             for j in free
         ),
-        shape=partial(_spline, places, zero),
+        shape=partial(_spline, places, zero, _numbers(means, len(places))),
         source="Form: ours. de Boor 2001, A Practical Guide to Splines, Springer; natural end conditions.",
         # By hand: at a knot the spline is that knot's amplitude, whatever the others are.
-        worked=({CHANNEL: x}, {f"c_{j + 1}": float(j + 1) for j in free}, float(free[-1] + 1)),
+        worked=(
+            {CHANNEL: x},
+            {f"c_{j + 1}": float(j + 1) for j in free},
+            float(free[-1] + 1) - sum((j + 1) * _numbers(means, len(places))[j] for j in free),
+        ),
         physical=False,
     )
 
 
-def _spline(places: tuple[float, ...], zero: int, inputs: Mapping, **values) -> np.ndarray:
-    basis = _natural(places, np.asarray(inputs[CHANNEL], dtype=float))
+def _numbers(means: Sequence[float] | None, count: int) -> tuple[float, ...]:
+    return (0.0,) * count if means is None else tuple(float(m) for m in means)
+
+
+def _spline(places: tuple[float, ...], zero: int, means: tuple[float, ...], inputs: Mapping, **values) -> np.ndarray:
+    basis = natural(places, np.asarray(inputs[CHANNEL], dtype=float)) - means
     amplitude = np.array([0.0 if j == zero else values[f"c_{j + 1}"] for j in range(len(places))])
     return basis @ amplitude
 
@@ -94,21 +109,23 @@ def _cardinal(places: tuple[float, ...]):
     return spline, spline(places[0], 1), spline(places[-1], 1)
 
 
-def _natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
-    """Return every cardinal spline at x, shape (..., knots): straight beyond the outer knots."""
+def natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
+    """Return every cardinal spline B_j at x, shape (..., knots): straight beyond the outer knots."""
     spline, first, last = _cardinal(places)
     inside = np.clip(x, places[0], places[-1])
     below, above = np.minimum(x - places[0], 0.0), np.maximum(x - places[-1], 0.0)
     return spline(inside) + below[..., None] * first + above[..., None] * last
 
 
-def levels_effect(categories: Sequence[str]) -> Effect:
+def levels_effect(categories: Sequence[str], means: Sequence[float] | None = None) -> Effect:
     """Return one level per category of the channel, as differences from the first category.
 
     Parameters
     ----------
     categories : sequence of str
-        At least two different categories; the first is what the declared model stands for.
+        At least two different categories.
+    means : sequence of float, optional
+        Share of each category in the campaign, for levels whose mean is zero; else the first category is zero.
 
     Returns
     -------
@@ -127,26 +144,32 @@ def levels_effect(categories: Sequence[str]) -> Effect:
         id=LEVELS,
         label="levels of {x}",
         equation=r"h = \sum_k d_k [x = k]",
-        form=f"d_k for category k of {_listed(names)}; 0 for {names[0]}",
+        form=f"d_k for category k of {_listed(names)}; 0 for {names[0]}" + LESS_MEAN * (means is not None),
         reads=(CHANNEL,),
         acts_on=ANYWHERE,
         parameters=tuple(
             Parameter(f"d_{k}", "{y}", 0.0, AMPLITUDE, f"{name} less {names[0]}", linear=True)
             for k, name in enumerate(names[1:], start=1)
         ),
-        shape=partial(_levels, names),
+        shape=partial(_levels, names, _numbers(means, len(names))),
         source="Form: ours. One number per category, as in any analysis of variance.",
         # By hand: the last category has its own difference.
-        worked=({CHANNEL: names[-1]}, {f"d_{k}": k / 10 for k in range(1, len(names))}, (len(names) - 1) / 10),
+        worked=(
+            {CHANNEL: names[-1]},
+            {f"d_{k}": k / 10 for k in range(1, len(names))},
+            (len(names) - 1) / 10 - sum(k / 10 * m for k, m in enumerate(_numbers(means, len(names)))),
+        ),
         physical=False,
     )
 
 
-def _levels(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
+def _levels(names: tuple[str, ...], means: tuple[float, ...], inputs: Mapping, **values) -> np.ndarray:
     given = np.asarray(inputs[CHANNEL]).astype(str)
+    level = [0.0, *(values[f"d_{k}"] for k in range(1, len(names)))]
+    mean = sum(d * m for d, m in zip(level, means, strict=True))
     result = np.full(given.shape, np.nan)
-    for k, name in enumerate(names):
-        result[given == name] = 0.0 if k == 0 else values[f"d_{k}"]
+    for name, d in zip(names, level, strict=True):
+        result[given == name] = d - mean
     return result
 
 
@@ -265,8 +288,8 @@ def _slopes(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
 
 
 FREE: Mapping[str, tuple[Callable[..., Effect], tuple[str, ...]]] = {
-    SMOOTH: (lambda fixed: smooth_effect(fixed["knots"], fixed.get("x_ref")), ("knots",)),
-    LEVELS: (lambda fixed: levels_effect(fixed["categories"]), ("categories",)),
+    SMOOTH: (lambda fixed: smooth_effect(fixed["knots"], fixed.get("x_ref"), fixed.get("means")), ("knots",)),
+    LEVELS: (lambda fixed: levels_effect(fixed["categories"], fixed.get("means")), ("categories",)),
     SURFACE: (lambda fixed: surface_effect(fixed["x_knots"], fixed["z_knots"]), ("x_knots", "z_knots")),
     SLOPES: (lambda fixed: slopes_effect(fixed["categories"]), ("categories",)),
 }
@@ -280,8 +303,8 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
     id : str
         `smooth`, `levels`, `surface` or `slopes`.
     fixed : mapping
-        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `x_knots` and `z_knots` for
-        a surface. Other entries are not looked at.
+        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `means`, if any, for smooth
+        and levels; `x_knots` and `z_knots` for a surface. Other entries are not looked at.
 
     Raises
     ------

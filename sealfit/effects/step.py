@@ -27,7 +27,7 @@ STEP = Effect(
     acts_on=ANYWHERE,
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "height of the step", linear=True),
-        Parameter("x_0", "{x}", 0.0, (-1e12, 1e12), "where it steps", search="inside"),
+        Parameter("x_0", "{x}", 0.0, (-1e12, 1e12), "where it steps", search="between"),
     ),
     shape=shape,
     source="Form: ours. Definition of a step.",
