@@ -1,4 +1,4 @@
-"""closure.json's entries: effects with intervals, what is left, and which runs would tell rivals apart."""
+"""closure.json's entries: effects with intervals, and what is left."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.effects.contract import fill_unit
 from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.joint import Term, evaluate
+from sealfit.fit.joint import Term
 from sealfit.fit.rows import Rows
 from sealfit.tables import Units
 
@@ -199,45 +199,3 @@ def _largest(fitted: Fitted, candidates: Sequence[Candidate]) -> Candidate | Non
         if explained > most:
             best, most = candidate, explained
     return best
-
-
-def next_runs(grown: Grown, config: Config) -> list[dict]:
-    """Return the runs that would tell rivals apart: where their fitted forces differ most, by computing them."""
-    wanted = []
-    for item in grown.added:
-        for rival in item.rivals[:1]:
-            found = _where_apart(item, rival.fitted, config)
-            if found is not None:
-                wanted.append(
-                    {
-                        "why": f"tells {describe(item.proposal.term)} from {describe(rival.term)}: "
-                        f"they differ there by {found[1]:.3g} {config.units.unit('force')}",
-                        "conditions": found[0],
-                    }
-                )
-    return wanted
-
-
-def _where_apart(item: Added, rival: Fitted, config: Config) -> tuple[dict, float] | None:
-    """Return the run, tested or at half and double speed, at which two fitted models differ most, and by how much."""
-    rows = item.proposal.fitted.rows
-    best: tuple[dict, float] | None = None
-    for factor in (0.5, 1.0, 2.0):
-        table = rows.table.assign(speed_mm_s=rows.speed * factor, time_s=rows.table["time_s"] / factor)
-        moved = Rows(**{**rows.__dict__, "table": table, "speed": rows.speed * factor})
-        one = evaluate(item.proposal.fitted.model, moved, jacobian=False)[0]
-        other = evaluate(rival.model, moved, jacobian=False)[0]
-        apart = np.abs(one - other)
-        apart[~np.isfinite(apart)] = 0.0
-        k = int(np.argmax(apart))
-        if best is None or apart[k] > best[1]:
-            where = {name: _plain(table[name].iloc[k]) for name in config.condition if name in table}
-            where["speed_mm_s"] = float(table["speed_mm_s"].iloc[k])
-            for name in dict.fromkeys((*item.proposal.term.channels,)):
-                where[name] = _plain(table[name].iloc[k])
-            best = (where, float(apart[k]))
-    return best if best is not None and best[1] > 0 else None
-
-
-def _plain(value: object) -> object:
-    return value.item() if hasattr(value, "item") else value

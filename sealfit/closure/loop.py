@@ -12,9 +12,10 @@ import pandas as pd
 
 from sealfit.closure.confirm import folds, heldout_level
 from sealfit.closure.curves import channel_table, curve_table, shape_table
-from sealfit.closure.document import effect_entries, effect_table, left_entry, next_runs
+from sealfit.closure.document import effect_entries, effect_table, left_entry
 from sealfit.closure.grow import Grown, grow, numbered, predict_rows, steady_samples
 from sealfit.closure.levels import errors, lack_of_fit, level_table, noise_floor, scatter_list
+from sealfit.closure.next_runs import next_runs
 from sealfit.closure.record import to_record
 from sealfit.closure.ripple import find_ripple
 from sealfit.config import Config

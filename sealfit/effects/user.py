@@ -149,7 +149,7 @@ def _description_fault(effect: Effect) -> str:
         if not np.isfinite(p.bounds).all():
             return f"the bounds of {p.name} are not finite"
         if not p.linear and isinstance(p.search, str) and p.search not in ("inside", "between", "span", "ratio"):
-            return f"search of {p.name} is '{p.search}': use numbers, 'inside', 'span' or 'ratio'"
+            return f"search of {p.name} is '{p.search}': use numbers, 'inside', 'between', 'span' or 'ratio'"
     inputs, values, _ = effect.worked
     missing = [name for name in effect.reads if name not in inputs]
     if missing:

@@ -1,0 +1,112 @@
+"""Which runs to make next: where rival models differ most, found by computing them, tested combinations or not."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from sealfit.closure.grow import Added, Grown, describe
+from sealfit.config import Config
+from sealfit.fit.estimate import Fitted
+from sealfit.fit.joint import Model, evaluate
+from sealfit.fit.rows import Rows
+
+BEYOND = 0.5  # of a channel's range by which a run may go beyond what was tested
+ROWS = 4  # of each stroke at which forces are compared
+
+
+def next_runs(grown: Grown, config: Config) -> list[dict]:
+    """Return for each effect with rivals the run that would tell it from the nearest one.
+
+    Parameters
+    ----------
+    grown : Grown
+        The end of the loop.
+    config : Config
+        The rig.
+
+    Returns
+    -------
+    list of dict
+        `why` in words and `conditions`: the run's condition and the channels to set, of one run each.
+    """
+    wanted = []
+    for item in grown.added:
+        for rival in item.rivals[:1]:
+            found = where_apart(item, rival.fitted, config)
+            if found is not None:
+                wanted.append(
+                    {
+                        "why": f"tells {describe(item.proposal.term)} from {describe(rival.term)}: "
+                        f"they differ there by {found[1]:.3g} {config.units.unit('force')}",
+                        "conditions": found[0],
+                    }
+                )
+    return wanted
+
+
+def where_apart(item: Added, rival: Fitted, config: Config) -> tuple[dict, float] | None:
+    """Return the run at which two fitted models differ most, and by how much (force unit); None if nowhere.
+
+    Every tested run is tried with each combination of low, usual and high values of the channels that the two effects
+    read: what always went together in the campaign (a condition and the calendar) is taken apart here.
+    """
+    chosen = item.proposal.fitted.model
+    rows = item.proposal.fitted.rows.sparse(ROWS)
+    channels = tuple(dict.fromkeys((*item.proposal.term.channels, *rival.model.terms[-1].channels)))
+    best: tuple[dict, float] | None = None
+    for changes in ({}, *_combinations(chosen, rows, channels)):
+        moved = _moved(rows, changes)
+        apart = np.abs(evaluate(chosen, moved, jacobian=False)[0] - evaluate(rival.model, moved, jacobian=False)[0])
+        apart = np.where(np.isfinite(apart), apart, 0.0)
+        k = int(np.argmax(apart))
+        if apart[k] > (0.0 if best is None else best[1]):
+            names = dict.fromkeys((*config.condition, "speed_mm_s", *channels))
+            where = {name: _plain(moved.table[name].iloc[k]) for name in names if name in moved.table}
+            best = (where, float(apart[k]))
+    return best
+
+
+def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterator[dict[str, object]]:
+    """Yield values to set each channel to; a channel that makes a condition's own parameters is left alone."""
+    values: dict[str, list] = {}
+    for name in channels:
+        own = rows.values(name)
+        law = bool(model.declared.law) and all(model.declared.law.values())
+        if name in ("direction", "displacement_mm") or (name == "aging_days" and not law):
+            continue
+        if own.dtype.kind != "f":
+            values[name] = list(np.unique(own))
+            continue
+        own = np.abs(own)
+        low, high = float(own.min()), float(own.max())
+        beyond = high if name == "repeat" else high + BEYOND * (high - low)
+        values[name] = [low, float(np.median(own)), high, beyond]
+    for point in itertools.product(*values.values()):
+        yield dict(zip(values, point, strict=True))
+
+
+def _moved(rows: Rows, changes: Mapping[str, object]) -> Rows:
+    """Return rows with channels set to other values; time follows the speed."""
+    if not changes:
+        return rows
+    table = rows.table.assign(**changes)
+    speed, days, load = rows.speed, rows.days, rows.load
+    if "speed_mm_s" in changes:
+        speed = np.sign(rows.speed) * float(changes["speed_mm_s"])
+        table["speed_mm_s"] = speed
+        if "time_s" not in changes:
+            table["time_s"] = rows.table["time_s"] * np.abs(rows.speed / speed)
+    if "aging_days" in changes:
+        days = np.where(rows.days > 0, float(changes["aging_days"]), rows.days)  # unaged rubber has no law of its own
+        table["aging_days"] = days
+    if "load_N" in changes:
+        load = np.full_like(rows.load, float(changes["load_N"]))
+    return replace(rows, table=table, speed=speed, days=days, load=load, cache={})
+
+
+def _plain(value: object) -> object:
+    return value.item() if hasattr(value, "item") else value
