@@ -34,7 +34,7 @@ def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]
 
     Day 0 and the last day are never held out with all their groups, as a law is not asked to extrapolate.
     """
-    start, code = rows.groups.starts[level], rows.codes(level)
+    start = rows.groups.starts[level]
     count = min(count, start.size)
     condition = rows.condition[start]
     rng = np.random.default_rng(seed)
@@ -42,13 +42,7 @@ def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]
     order = shuffled[np.argsort(condition[shuffled], kind="stable")]
     number = np.empty(start.size, dtype=int)
     number[order] = np.arange(start.size) % count
-    for k in range(count):
-        out = number == k
-        for c in np.unique(condition[out]):
-            if not (~out & (condition == c)).any() and _edge(rows, c):
-                out &= condition != c
-        if out.any():
-            yield out[code]
+    yield from _masks(rows, level, number)
 
 
 def blocks(rows: Rows, level: str, count: int, channel: str) -> Iterator[np.ndarray]:
@@ -57,15 +51,22 @@ def blocks(rows: Rows, level: str, count: int, channel: str) -> Iterator[np.ndar
     Neighbours in time resemble each other, and so do the conditions that were tested one after the other: with groups
     left out here and there any wavy line through the calendar seems to be confirmed.
     """
-    start, code = rows.groups.starts[level], rows.codes(level)
+    start = rows.groups.starts[level]
+    count = min(count, start.size)
     number = np.empty(start.size, dtype=int)
     number[np.argsort(rows.values(channel)[start], kind="stable")] = np.arange(start.size) * count // start.size
-    for k in range(min(count, start.size)):
+    yield from _masks(rows, level, number)
+
+
+def _masks(rows: Rows, level: str, number: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield masks of the rows held out, shape (n,), from the fold of each group; no edge condition loses all groups."""
+    start, code = rows.groups.starts[level], rows.codes(level)
+    condition = rows.condition[start]
+    for k in range(number.max() + 1):
         out = number == k
-        if not rows.has_aging:
-            for c in np.unique(rows.condition[start][out]):
-                if not (~out & (rows.condition[start] == c)).any():
-                    out &= rows.condition[start] != c  # it cannot be predicted without its rows
+        for c in np.unique(condition[out]):
+            if not (~out & (condition == c)).any() and _edge(rows, c):
+                out = out & (condition != c)
         if out.any():
             yield out[code]
 

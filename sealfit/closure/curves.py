@@ -57,11 +57,9 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
     """Return each effect's shape along its channel with a 95 % band, and the free shape beside it."""
     records: list[dict] = []
     reach = t_quantile(degrees_of_freedom(after))
-    offset = after.model.theta.size
     for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True)):
-        place = slice(offset, offset + len(term.effect.parameters))
+        place = after.model.place(number)
         covariance = (robust_covariance(after, "file") if "held" in term.fixed else after.covariance)[place, place]
-        offset = place.stop
         inputs, x, labels = _along(term, after)
         value = np.asarray(term.effect.shape(inputs, **values), dtype=float)
         tangent = np.column_stack([np.broadcast_to(d, value.shape) for d in term_derivatives(term, values, inputs)])

@@ -186,7 +186,7 @@ def _drop_needless(fitted: Fitted, added: list[Added]) -> tuple[Fitted, list[Add
 
 def _wald(fitted: Fitted, number: int) -> float:
     """Return the squared standardised size of an effect's amplitudes, all together."""
-    at = fitted.model.theta.size + sum(len(t.effect.parameters) for t in fitted.model.terms[:number])
+    at = fitted.model.place(number).start
     effect, values = fitted.model.terms[number].effect, fitted.model.values[number]
     places = [at + k for k, p in enumerate(effect.parameters) if p.linear]
     amplitude = np.array([values[p.name] for p in effect.parameters if p.linear])

@@ -37,14 +37,12 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, tuple
     """
     term = fitted.model.terms[number]
     held = term.fixed.get("held", {})
-    p0 = fitted.model.theta.size + sum(len(t.effect.parameters) for t in fitted.model.terms[:number])
-    count = len(term.effect.parameters)
-    place = slice(p0, p0 + count)
+    place = fitted.model.place(number)
     variance = np.diag(robust_covariance(fitted, level))[place]
     if not held:  # a wave is finer than the shapes in which files differ, which the fitted scatter holds against it
         variance = np.maximum(variance, np.diag(fitted.covariance)[place])
     units = fitted.rows.groups.starts[level].size
-    reach = t_quantile(max(units - count - 1, 2)) * np.sqrt(variance)
+    reach = t_quantile(max(units - variance.size - 1, 2)) * np.sqrt(variance)
     values = fitted.model.values[number]
     result = {}
     for p, r in zip(term.effect.parameters, reach, strict=True):

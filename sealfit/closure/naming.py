@@ -197,7 +197,7 @@ def determined(proposal: Proposal) -> bool:
     Such a form is a straight line or a constant under another name, and the plain one says so better.
     """
     fitted, effect = proposal.fitted, proposal.term.effect
-    first = fitted.model.size - len(effect.parameters)
+    first = fitted.model.place(len(fitted.model.terms) - 1).start
     covariance = np.maximum(fitted.covariance, robust_covariance(fitted, proposal.unit))
     for k, parameter in enumerate(effect.parameters):
         if parameter.linear or parameter.name == "phi":

@@ -124,6 +124,11 @@ class Model:
         """Number of fitted numbers."""
         return self.theta.size + sum(len(t.effect.parameters) for t in self.terms)
 
+    def place(self, number: int) -> slice:
+        """Return where a term's numbers stand in `vector`."""
+        first = self.theta.size + sum(len(t.effect.parameters) for t in self.terms[:number])
+        return slice(first, first + len(self.terms[number].effect.parameters))
+
     def vector(self) -> np.ndarray:
         """Return all fitted numbers, declared ones first, shape (size,)."""
         tail = [v[p.name] for t, v in zip(self.terms, self.values, strict=True) for p in t.effect.parameters]
