@@ -19,7 +19,7 @@ from truths import NO_INTERVAL, TrueEffect, test_true_forms, true_effects, truth
 
 from sealfit.closure.grow import numbered
 from sealfit.closure.judge import project
-from sealfit.closure.loop import MOST_ROWS, MOST_ROWS_OF_RIPPLE, Closure, close_loop
+from sealfit.closure.loop import MOST_ROWS, Closure, close_loop
 from sealfit.closure.predict import predict
 from sealfit.closure.record import from_record
 from sealfit.config import load_config
@@ -131,8 +131,8 @@ def run_campaign(task: Task) -> dict:
 def _rows(bins: pd.DataFrame, spec: Spec, config) -> Rows:
     """Return the rows the loop works on: merged as it does, bins as they are where there is a ripple."""
     counted = numbered(bins.reset_index(drop=True))
-    most = MOST_ROWS_OF_RIPPLE if any(e.id == "ripple" for e in spec.effects) else MOST_ROWS
-    return make_rows(thin(counted, most), has_aging=config.aging)
+    as_they_are = any(e.id == "ripple" for e in spec.effects)  # merged bins would blur it
+    return make_rows(counted if as_they_are else thin(counted, MOST_ROWS), has_aging=config.aging)
 
 
 def _scatter(record: dict) -> Scatter:

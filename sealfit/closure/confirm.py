@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,14 +10,17 @@ import pandas as pd
 from scipy import stats
 
 from sealfit.closure.channels import CALENDAR, FINER, unit_of
-from sealfit.closure.naming import Proposal
+from sealfit.closure.forms import describe
+from sealfit.closure.naming import Proposal, rivals
 from sealfit.closure.waves import agreement, pass_shifts
+from sealfit.config import Config
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import Rows
 from sealfit.fit.whitening import Whitening
 
 SURE = 0.005  # p-value, over files (Wilcoxon), at which a ripple of free phase helps the half it was not fitted to
+TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
 LEAST_RUNS = 6  # below six runs whole files are held out, below six files strokes (design: held-out unit)
 
 
@@ -170,3 +173,47 @@ def _inside(rows: Rows, force: np.ndarray) -> np.ndarray:
     """Return measured minus model about its mean in each stroke, shape (n,)."""
     residual = rows.force - force
     return residual - rows.groups.means(residual, "stroke")[rows.codes("stroke")]
+
+
+@dataclass(frozen=True)
+class Added:
+    """An accepted effect: the proposal, its gain on held-out data and the rivals these data cannot tell from it."""
+
+    proposal: Proposal
+    gain_N: float
+    rivals: tuple[Proposal, ...]
+    round: int
+
+
+def confirmed(
+    fitted: Fitted,
+    proposals: Sequence[Proposal],
+    samples: pd.DataFrame,
+    config: Config,
+    number: int,
+    say: Callable[[str], None],
+) -> Added | None:
+    """Return the first of a round's best proposals that gains on held-out data; None where none does.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The current model.
+    proposals : sequence of Proposal
+        Best first.
+    samples : DataFrame
+        Raw samples with `residual_N`.
+    config : Config
+        Folds, seed and units.
+    number : int
+        Of the round.
+    say : callable
+        Told in words what is being done.
+    """
+    for proposal in proposals[:TRIES]:
+        gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed, samples)
+        unit = config.units.unit("force")
+        say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
+        if gain.real:
+            return Added(proposal, gain.rmse_N, tuple(rivals(proposal, proposals)), number)
+    return None

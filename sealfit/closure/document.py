@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import FINER, Channel, unit_of
-from sealfit.closure.forms import free_term
-from sealfit.closure.grow import Added, Grown, describe
+from sealfit.closure.confirm import Added
+from sealfit.closure.forms import describe, free_term
+from sealfit.closure.grow import Grown
 from sealfit.closure.intervals import effect_intervals
 from sealfit.closure.judge import Candidate, Judge
 from sealfit.closure.ripple import Peak

@@ -204,3 +204,9 @@ def _grids(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
             grid = np.array(p.search or (p.start,))
         grids[p.name] = tuple(float(x) for x in np.unique(np.clip(grid, *p.bounds)))
     return grids
+
+
+def describe(term: Term) -> str:
+    """Return an effect in words, e.g. "ripple along displacement_mm, on force"."""
+    label = term.effect.label.replace("{x}", term.channels[0]).replace("{z}", term.channels[-1])
+    return f"{label}, {'added to' if term.operation == 'add' else 'factor on'} {term.acts_on}"

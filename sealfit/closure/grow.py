@@ -9,30 +9,19 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel, find_channels
-from sealfit.closure.confirm import heldout_gain
+from sealfit.closure.confirm import TRIES, Added, confirmed
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.judge import Candidate, Judge
-from sealfit.closure.naming import HALF, Proposal, propose, rivals
+from sealfit.closure.naming import HALF, propose
 from sealfit.closure.pairs import pairs_in_disguise, search_pairs
-from sealfit.closure.ripple import Peak, find_ripple
+from sealfit.closure.periodic import Ripples
+from sealfit.closure.ripple import Peak
 from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit, fit_declared
-from sealfit.fit.joint import Term, evaluate, passes
+from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import Rows
-
-TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
-
-
-@dataclass(frozen=True)
-class Added:
-    """An accepted effect: the proposal, its gain on held-out data and the rivals these data cannot tell from it."""
-
-    proposal: Proposal
-    gain_N: float
-    rivals: tuple[Proposal, ...]
-    round: int
 
 
 @dataclass(frozen=True)
@@ -54,6 +43,7 @@ def grow(
     config: Config,
     effects: Mapping[str, Effect],
     *,
+    fine: Rows | None = None,
     start: Fitted | None = None,
     on_found: Callable[[Fitted], None] | None = None,
     on_progress: Callable[[str], None] | None = None,
@@ -63,13 +53,15 @@ def grow(
     Parameters
     ----------
     rows : Rows
-        Bins as arrays.
+        Bins as arrays, merged along their strokes where there are many.
     samples : DataFrame
         Steady samples for the ripple search: as `steady_samples` gives them.
     config : Config
         Levels of error, rounds, folds.
     effects : mapping
         The catalogue.
+    fine : Rows, optional
+        The bins as they are, to fit ripples to, which merged bins would blur; they are held as found there.
     start : Fitted, optional
         The declared model fitted to more rows: where the fit begins, so that it need not search again.
     on_found : callable, optional
@@ -79,57 +71,42 @@ def grow(
     """
     say = on_progress or (lambda text: None)
     rng = np.random.default_rng(config.loop.seed)
-    unit = config.units.unit("force")
     rig = config.position_origin == "rig"
-    before = fitted = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
+    alpha = config.loop.family_error
+    before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
     channels = {
         c.name: c
         for c in find_channels(rows, config.loop.ignore_channels, conditions=config.condition, rig_position=rig)
     }
-    alpha = config.loop.family_error
-    added: list[Added] = []
+    judge = Judge(before)
+    last = first = tuple(search(judge, list(channels.values()), rng))
+    ripples = Ripples(samples, config, effects, say)
+    if on_found is not None and (ripples.found or any(c.p_value <= alpha for c in first)):
+        on_found(before)
+    fitted = ripples.added_to(before, fine)
+    added = list(ripples.added)
     refused: set[tuple] = set()
-    first: tuple[Candidate, ...] = ()
-    last: tuple[Candidate, ...] = ()
     left: Candidate | Peak | None = None
-    strongest: Peak | None = None
-    periodic: tuple | None = None
-    for number in range(1, config.loop.max_rounds + 2):
-        judge = Judge(fitted)
-        candidates = search(judge, list(channels.values()), rng)
-        last = tuple(candidates)
-        first = first or last
-        if periodic != _periodic_terms(fitted):  # only these change what the spectrum sees
-            periodic = _periodic_terms(fitted)
-            seen = _residual_samples(samples, fitted)
-            strongest = find_ripple(seen, common_phase=rig, known=_wavelengths(fitted))
-        peak = strongest
-        peak = peak if peak is not None and peak.p_value <= alpha and ("peak", peak.axis) not in refused else None
-        significant = [c for c in candidates if c.p_value <= alpha]
-        say(f"round {number}: {len(candidates)} candidates on {len(channels)} channels, {len(significant)} significant")
-        if not significant and peak is None:
-            pairs = search_pairs(judge, list(channels.values()), candidates, rng)
+    for number in range(len(added) + 1, config.loop.max_rounds + 2):
+        if fitted is not judge.fitted:
+            judge = Judge(fitted)
+            last = tuple(search(judge, list(channels.values()), rng))
+        significant = [c for c in last if c.p_value <= alpha]
+        say(f"round {number}: {len(last)} candidates on {len(channels)} channels, {len(significant)} significant")
+        if not significant:
+            pairs = search_pairs(judge, list(channels.values()), last, rng)
             significant = [c for c in pairs if c.p_value <= alpha]
             say(f"round {number}: {len(pairs)} pairs, {len(significant)} significant")
-        left = significant[0] if significant else peak
+        left = significant[0] if significant else None
         significant += pairs_in_disguise(judge, significant, channels)
         open_ = [c for c in significant if c.key not in refused]
-        if (not open_ and peak is None) or number > config.loop.max_rounds:
+        if not open_ or number > config.loop.max_rounds:
             break
-        if number == 1 and on_found is not None:
-            on_found(before)
-        open_ += [c for c in _standing_for(open_, candidates) if c.key not in refused]
-        proposals = propose(fitted, open_, channels, peak, seen, effects)
-        accepted = None
-        for proposal in proposals[:TRIES]:
-            gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed, seen)
-            say(f"  {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
-            if gain.real:
-                accepted = Added(proposal, gain.rmse_N, tuple(rivals(proposal, proposals)), number)
-                break
+        open_ += [c for c in _standing_for(open_, last) if c.key not in refused]
+        proposals = propose(fitted, open_, channels, effects=effects)
+        accepted = confirmed(fitted, proposals, ripples.samples, config, number, say)
         if accepted is None:
-            tried = {p.source for p in proposals[:TRIES]}
-            refused |= tried or {c.key for c in open_}
+            refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
             continue
         added.append(accepted)
         fitted = fit(accepted.proposal.fitted.model, rows, fitted.scatter, turns=2)
@@ -157,22 +134,16 @@ def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> 
     return found
 
 
-def describe(term: Term) -> str:
-    """Return an effect in words, e.g. "ripple along displacement_mm, on force"."""
-    label = term.effect.label.replace("{x}", term.channels[0]).replace("{z}", term.channels[-1])
-    return f"{label}, {'added to' if term.operation == 'add' else 'factor on'} {term.acts_on}"
-
-
 def _drop_needless(fitted: Fitted, added: list[Added]) -> tuple[Fitted, list[Added]]:
     """Return the fit without effects that a later one has made needless, by Schwarz's price.
 
-    A ripple whose phase is each file's own was judged on the raw samples, which bins cannot overrule.
+    A ripple was judged on the raw samples, which bins cannot overrule.
     """
     k = 0
     while k < len(added) - 1:
         price = added[k].proposal.price
-        own_phases = "shift" in added[k].proposal.term.fixed
-        if own_phases or _wald(fitted, k) > 2 * price:  # far from needless: no refit is wanted to see that
+        periodic = added[k].proposal.term.effect.id in PERIODIC
+        if periodic or _wald(fitted, k) > 2 * price:  # far from needless: no refit is wanted to see that
             k += 1
             continue
         without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
@@ -234,43 +205,6 @@ def steady_samples(traces: pd.DataFrame, rows: Rows) -> pd.DataFrame:
             **table,
         }
     )
-
-
-def _periodic_terms(fitted: Fitted) -> tuple:
-    """Return the periodic effects of a model with their values."""
-    pairs = zip(fitted.model.terms, fitted.model.values, strict=True)
-    return tuple((t.key(), *v.values()) for t, v in pairs if t.effect.id in PERIODIC)
-
-
-def _wavelengths(fitted: Fitted) -> list[tuple[str, float]]:
-    """Return (axis, wavelength) of the periodic effects of a model."""
-    pairs = zip(fitted.model.terms, fitted.model.values, strict=True)
-    return [(t.channels[0], v["lambda_"]) for t, v in pairs if t.effect.id in PERIODIC]
-
-
-def _residual_samples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
-    """Return the samples with `residual_N`: force less the periodic effects already in the model.
-
-    Everything slow is taken out of each stroke by the spectrum itself; what is periodic is evaluated at the samples.
-    """
-    residual = samples["force_N"].to_numpy(dtype=float)
-    terms = [(t, v) for t, v in zip(fitted.model.terms, fitted.model.values, strict=True) if t.effect.id in PERIODIC]
-    if terms:
-        rows = fitted.rows
-        strokes = rows.table.iloc[rows.groups.starts["stroke"]]
-        ids, own = strokes["stroke_id"].to_numpy(), samples["stroke_id"].to_numpy()
-        level = np.zeros(max(ids.max(), own.max()) + 1)
-        level[ids] = rows.groups.means(fitted.force, "stroke")
-        for term, values in terms:
-            place = samples[term.channels[0]].to_numpy(dtype=float)
-            shift = term.fixed.get("shift")
-            if shift is not None:
-                shifts = np.zeros_like(level)
-                shifts[ids] = passes(strokes).map(shift).to_numpy(dtype=float)
-                place = place + shifts[own]
-            shape = term.effect.shape({term.effect.reads[0]: place, **term.fixed}, **values)
-            residual = residual - shape * (1.0 if term.operation == "add" else level[own])
-    return samples.assign(residual_N=residual)
 
 
 def predict_rows(fitted: Fitted, rows: Rows) -> np.ndarray:

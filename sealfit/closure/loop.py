@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +17,14 @@ from sealfit.closure.grow import Grown, grow, numbered, predict_rows, steady_sam
 from sealfit.closure.levels import errors, lack_of_fit, level_table, noise_floor, scatter_list
 from sealfit.closure.next_runs import next_runs
 from sealfit.closure.record import to_record
-from sealfit.closure.ripple import find_ripple
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
 from sealfit.engine import begin_map, run_map
-from sealfit.fit.estimate import Fitted, fit, fit_declared
+from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.rows import Rows, make_rows, thin
 
-MOST_ROWS = 12_000  # rows the search works on; more are merged along their strokes
-MOST_ROWS_OF_RIPPLE = 40_000  # as above where a ripple is there, which coarse bins would blur
+MOST_ROWS = 8_000  # rows the search works on; more are merged along their strokes
 
 
 @dataclass(frozen=True)
@@ -71,18 +69,15 @@ def close_loop(
     counted = numbered(bins)
     rows = make_rows(counted, has_aging=config.aging)
     samples = steady_samples(traces, rows)
-    peak = find_ripple(samples.assign(residual_N=samples["force_N"]), common_phase=config.position_origin == "rig")
-    ripple = peak is not None and peak.p_value <= config.loop.family_error
-    most = MOST_ROWS_OF_RIPPLE if ripple else MOST_ROWS
-    coarse = rows if len(bins) <= most else make_rows(thin(counted, most), has_aging=config.aging)
+    merged = len(bins) > MOST_ROWS
+    coarse = make_rows(thin(counted, MOST_ROWS), has_aging=config.aging) if merged else rows
     heldout = _HeldOut(rows, coarse, samples, config, effects, workers)
     with closing(heldout):
-        grown = grow(coarse, samples, config, effects, on_found=heldout.begin, on_progress=say)
+        fine = rows if merged else None
+        grown = grow(coarse, samples, config, effects, fine=fine, on_found=heldout.begin, on_progress=say)
         say("before and after on all rows")
-        before = grown.before if coarse is rows else fit_declared(rows)
-        after = before
-        if grown.added:
-            after = grown.after if coarse is rows else fit(grown.after.model, rows, grown.after.scatter, turns=2)
+        before, after = (_on_all(rows, grown, f) if merged else f for f in (grown.before, grown.after))
+        after = after if grown.added else before
         say(f"held out by {heldout.level}: the search repeated without each fold")
         held_before, held_after = heldout.forces(grown, say)
     document = _document(config, grown, before, after, held_before, held_after, heldout.level)
@@ -99,6 +94,12 @@ def close_loop(
         "curves": curve_table(before, after),
     }
     return Closure(document, to_record(before, after, config), tables)
+
+
+def _on_all(rows: Rows, grown: Grown, fitted: Fitted) -> Fitted:
+    """Return a model refitted to rows as they are, ripples that were held included."""
+    terms = tuple(a.proposal.term for a in grown.added) if fitted.model.terms else ()
+    return fit(replace(fitted.model, terms=terms), rows, fitted.scatter, turns=2)
 
 
 class _HeldOut:
@@ -141,8 +142,14 @@ class _HeldOut:
     def _folds(self, before: Fitted, *, search: bool) -> Iterator[_Fold]:
         samples = self.samples if search else self.samples.head(0)
         for out in self.masks:
-            train, seen = _without(self.coarse, samples, self.rows, out)
-            yield _Fold(train, seen, self.rows.subset(out), self.config, self.effects, before, search)
+            gone = self.rows.table["stroke_id"].to_numpy()[out]
+            coarse = self.rows.subset(~out)
+            fine = None
+            if self.coarse is not self.rows:
+                fine = coarse
+                coarse = self.coarse.subset(~self.coarse.table["stroke_id"].isin(gone).to_numpy())
+            seen = samples[~samples["stroke_id"].isin(gone)]
+            yield _Fold(coarse, fine, seen, self.rows.subset(out), self.config, self.effects, before, search)
 
 
 @dataclass(frozen=True)
@@ -150,6 +157,7 @@ class _Fold:
     """One fold: the rows and samples the fit may see, and those it is asked for."""
 
     train: Rows
+    fine: Rows | None
     seen: pd.DataFrame
     test: Rows
     config: Config
@@ -158,19 +166,13 @@ class _Fold:
     search: bool
 
 
-def _without(coarse: Rows, samples: pd.DataFrame, rows: Rows, out: np.ndarray) -> tuple[Rows, pd.DataFrame]:
-    """Return the (merged) rows and the samples without the strokes of a fold."""
-    gone = rows.table["stroke_id"].to_numpy()[out]
-    return coarse.subset(~coarse.table["stroke_id"].isin(gone).to_numpy()), samples[~samples["stroke_id"].isin(gone)]
-
-
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
     """Return the forces before and after at a fold's rows; before twice where the whole campaign lacks nothing."""
     if not fold.search:
         kept = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
         force = predict_rows(kept, fold.test)
         return force, force
-    part = grow(fold.train, fold.seen, fold.config, fold.effects, start=fold.start)
+    part = grow(fold.train, fold.seen, fold.config, fold.effects, fine=fold.fine, start=fold.start)
     return predict_rows(part.before, fold.test), predict_rows(part.after, fold.test)
 
 

@@ -8,7 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealfit.closure.grow import Added, Grown, describe
+from sealfit.closure.confirm import Added
+from sealfit.closure.forms import describe
+from sealfit.closure.grow import Grown
 from sealfit.config import Config
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import Model, evaluate

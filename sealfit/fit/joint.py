@@ -302,11 +302,12 @@ def term_derivatives(
         return list(_linear_columns(term, inputs).T)
     result = []
     zero = {name: 0.0 for name in term.effect.linear}
+    held = () if only_linear else term.fixed.get("held", ())
     for p in term.effect.parameters:
-        if p.linear:
+        if p.name in held:
+            result.append(np.zeros_like(inputs[term.effect.reads[0]], dtype=float))
+        elif p.linear:
             result.append(term.effect.shape(inputs, **{**values, **zero, p.name: 1.0}))
-        elif p.name in term.fixed.get("held", ()):
-            result.append(np.zeros_like(result[0]))
         elif not only_linear:
             step = 1e-5 * max(abs(values[p.name]), 1e-3)
             up = term.effect.shape(inputs, **{**values, p.name: values[p.name] + step})

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.grow import Added
+from sealfit.closure.confirm import Added
 from sealfit.closure.naming import Proposal
 from sealfit.closure.next_runs import where_apart
 from sealfit.config import Config

@@ -1,0 +1,118 @@
+"""Ripples first: they are found and confirmed on the raw samples, and nothing slow changes what is seen there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.confirm import Added, confirmed
+from sealfit.closure.forms import PERIODIC
+from sealfit.closure.naming import propose
+from sealfit.closure.ripple import Peak, find_ripple
+from sealfit.config import Config
+from sealfit.effects.contract import Effect
+from sealfit.fit.estimate import Fitted, fit
+from sealfit.fit.joint import Model, passes
+from sealfit.fit.rows import Rows
+
+
+class Ripples:
+    """The periodic effects of a campaign.
+
+    Parameters
+    ----------
+    samples : DataFrame
+        Steady samples, as `steady_samples` gives them.
+    config : Config
+        Levels of error, rounds, folds.
+    effects : mapping
+        The catalogue.
+    say : callable
+        Told in words what is being done.
+
+    Attributes
+    ----------
+    samples : DataFrame
+        The samples with `residual_N`: the force less the ripples added so far.
+    found : Peak or None
+        The significant one that is not in the model yet.
+    added : list of Added
+        Those confirmed.
+    """
+
+    def __init__(
+        self, samples: pd.DataFrame, config: Config, effects: Mapping[str, Effect], say: Callable[[str], None]
+    ) -> None:
+        self.config, self.effects, self.say = config, effects, say
+        self.added: list[Added] = []
+        self.samples = samples.assign(residual_N=samples["force_N"])
+        self.found = self._strongest()
+
+    def added_to(self, fitted: Fitted, fine: Rows | None) -> Fitted:
+        """Return a fit with every ripple that is significant and holds on data it was not fitted to.
+
+        Parameters
+        ----------
+        fitted : Fitted
+            The declared model.
+        fine : Rows, optional
+            Rows to fit ripples to; on the rows of `fitted` they are then held as found there.
+        """
+        if self.found is None:
+            return fitted
+        own = fitted if fine is None else fit(fitted.model, fine, fitted.scatter, turns=1)
+        while self.found is not None and len(self.added) < self.config.loop.max_rounds:
+            proposals = propose(own, [], {}, self.found, self.samples, self.effects)
+            number = len(self.added) + 1
+            accepted = confirmed(own, proposals, self.samples, self.config, number, self.say)
+            if accepted is None:
+                break
+            self.added.append(accepted)
+            own = fit(accepted.proposal.fitted.model, own.rows, own.scatter, turns=2)
+            self.samples = without_ripples(self.samples, own)
+            self.found = self._strongest(own.model)
+        if fine is None or not self.added:
+            return own if self.added else fitted
+        return fit(_held(own.model), fitted.rows, own.scatter, turns=2)
+
+    def _strongest(self, model: Model | None = None) -> Peak | None:
+        known = [(t.channels[0], v["lambda_"]) for t, v in zip(model.terms, model.values, strict=True)] if model else []
+        peak = find_ripple(self.samples, common_phase=self.config.position_origin == "rig", known=known)
+        return peak if peak is not None and peak.p_value <= self.config.loop.family_error else None
+
+
+def _held(model: Model) -> Model:
+    """Return a model whose terms no fit moves."""
+    terms = [
+        replace(t, fixed={**t.fixed, "held": {name: (value, value) for name, value in v.items()}})
+        for t, v in zip(model.terms, model.values, strict=True)
+    ]
+    return replace(model, terms=tuple(terms))
+
+
+def without_ripples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
+    """Return the samples with `residual_N`: force less the periodic effects already in the model.
+
+    Everything slow is taken out of each stroke by the spectrum itself; what is periodic is evaluated at the samples.
+    """
+    residual = samples["force_N"].to_numpy(dtype=float)
+    terms = [(t, v) for t, v in zip(fitted.model.terms, fitted.model.values, strict=True) if t.effect.id in PERIODIC]
+    if terms:
+        rows = fitted.rows
+        strokes = rows.table.iloc[rows.groups.starts["stroke"]]
+        ids, own = strokes["stroke_id"].to_numpy(), samples["stroke_id"].to_numpy()
+        level = np.zeros(max(ids.max(), own.max()) + 1)
+        level[ids] = rows.groups.means(fitted.force, "stroke")
+        for term, values in terms:
+            place = samples[term.channels[0]].to_numpy(dtype=float)
+            shift = term.fixed.get("shift")
+            if shift is not None:
+                shifts = np.zeros_like(level)
+                shifts[ids] = passes(strokes).map(shift).to_numpy(dtype=float)
+                place = place + shifts[own]
+            shape = term.effect.shape({term.effect.reads[0]: place, **term.fixed}, **values)
+            residual = residual - shape * (1.0 if term.operation == "add" else level[own])
+    return samples.assign(residual_N=residual)
