@@ -116,7 +116,10 @@ def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int, samp
         for k, model in enumerate((before.model, after.model)):
             kept = fit(model, train, scatter, turns=0, friction=before.friction[~out])
             residual = test.force - evaluate(kept.model, test, jacobian=False)[0]
-            squares[k] += float(weight @ _about(residual, test, proposal) ** 2)
+            inside = (
+                residual if calendar else _about(residual, test, proposal)
+            )  # a block of time is asked for as a whole
+            squares[k] += float(weight @ inside**2)
             whitening = Whitening(scatter, before.friction[out], test.groups)
             white[k] += float((whitening(residual[:, None]) ** 2).sum())
     rmse = np.sqrt(squares / max(known, 1e-300))

@@ -43,7 +43,10 @@ def terms_of(
     """
     target = (candidate.acts_on, candidate.operation)
     if candidate.pair:
-        yield from _terms_of_pair(*(channels[name] for name in candidate.channels), target, effects)
+        pair = [channels[name] for name in candidate.channels]
+        scatter_known = any(c.level == "specimen" for c in fitted.scatter.components)
+        alone = scatter_known or all(c.unit != "specimen" for c in pair)
+        yield from _terms_of_pair(*pair, target, effects, alone=alone)
         return
     name = candidate.channels[-1]
     channel = channels[name]
@@ -71,9 +74,12 @@ def terms_of(
 
 
 def _terms_of_pair(
-    one: Channel, other: Channel, target: tuple[str, str], effects: Mapping[str, Effect]
+    one: Channel, other: Channel, target: tuple[str, str], effects: Mapping[str, Effect], *, alone: bool
 ) -> Iterator[tuple[Term, dict]]:
-    """Yield the forms of a pair of channels: products, or a slope for each category."""
+    """Yield the forms of a pair of channels: products, or a slope for each category.
+
+    Forms that also hold what each channel does `alone` would be given the specimens' scatter where that is not known.
+    """
     if not (one.numeric and other.numeric):
         number, category = (one, other) if one.numeric else (other, one)
         fixed = {"categories": tuple(np.unique(category.values)), "x_ref": reference(number.values)}
@@ -82,6 +88,8 @@ def _terms_of_pair(
     for x, z in ((one, other), (other, one)):
         for effect in effects.values():
             if effect.reads != (CHANNEL, SECOND) or target not in effect.acts_on:
+                continue
+            if len(effect.linear) > 1 and not alone:
                 continue
             fixed = {"x_ref": reference(x.values), "z_ref": reference(z.values)}
             inputs = {CHANNEL: x.values, SECOND: z.values, **fixed}

@@ -21,7 +21,7 @@ from sealfit.closure.intervals import robust_covariance
 from sealfit.closure.judge import LEAST_LEFT, Candidate, project
 from sealfit.closure.ripple import Peak
 from sealfit.effects import EFFECTS
-from sealfit.effects.contract import Effect
+from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.estimate import Fitted, fit, settled
 from sealfit.fit.joint import Term, mean_derivatives
@@ -38,6 +38,7 @@ HELD = 0.5  # relative standard error beyond which a form's own number is not de
 OVERTURNED = 1 / 3  # share of its size by which a new effect may change an earlier one, where it has equals
 ALIKE = 0.5  # correlation below which two candidates explain different things
 SAME = 0.98  # correlation above which two candidates are one effect here
+LINEAR = "linear"
 UNNAMED = (SMOOTH, SURFACE)
 OFFSET = (("direction",), "force", "add")
 PREFERRED = ("mu", "mu_c", "mu_s", "v_s", "sigma_2", "a", "b", "mu_0", "force")
@@ -171,11 +172,20 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
     held = [p for p in equals if determined(p)]
     fewest = min((len(p.term.effect.parameters) for p in held), default=0)
     held += [p for p in equals if p.term.effect.physical and p not in held and len(p.term.effect.parameters) <= fewest]
+    alike = [p for p in found if p.fitted.deviance - best.fitted.deviance < TIED]
+    if not any(p.term.effect.id == LINEAR for p in alike):  # a straight line shows no mechanism
+        held += [p for p in alike if _own_mechanism(p) and p not in held]
     if held:
         first = min(held, key=lambda p: (_overturns(fitted, p), p.rank, p.criterion))
     else:
         first = next((p for p in found if p.criterion - best.criterion < RIVAL and determined(p)), best)
     return [first, *(p for p in found if p is not first)]
+
+
+def _own_mechanism(proposal: Proposal) -> bool:
+    """Whether a form is the mechanism of just these channels: it need not pay then for what the data leave open."""
+    effect = proposal.term.effect
+    return effect.physical and CHANNEL not in effect.reads
 
 
 def _overturns(fitted: Fitted, proposal: Proposal) -> bool:
