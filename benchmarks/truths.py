@@ -22,8 +22,9 @@ from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Effect, Parameter
 from sealfit.effects.free import LEVELS, levels_effect
 from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.joint import Model, Term
+from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows
+from sealfit.fit.terms import Term
 from sealfit.simulate import Spec
 from sealfit.simulation.formula import evaluate_formula, parse_formula
 from sealfit.simulation.law import SteadyLaw, steady_law

@@ -11,7 +11,8 @@ from scipy import stats
 
 from sealfit.closure.channels import CALENDAR, FINER, unit_of
 from sealfit.closure.forms import describe
-from sealfit.closure.naming import Proposal, rivals
+from sealfit.closure.linearised import Proposal
+from sealfit.closure.naming import rivals
 from sealfit.closure.waves import agreement, pass_shifts
 from sealfit.config import Config
 from sealfit.fit.estimate import Fitted, fit

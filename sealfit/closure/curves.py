@@ -13,8 +13,9 @@ from sealfit.closure.intervals import degrees_of_freedom, mean_se, robust_covari
 from sealfit.config import Config
 from sealfit.effects.contract import SECOND
 from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.joint import Term, evaluate, term_derivatives
+from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import point_rows
+from sealfit.fit.terms import Term, term_derivatives
 from sealfit.tables import CHANNELS, CURVES, SHAPES
 
 GROUPS = 12  # groups of a numeric channel in the residual plot

@@ -18,8 +18,8 @@ from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.effects.contract import fill_unit
 from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.joint import Term
 from sealfit.fit.rows import Rows
+from sealfit.fit.terms import Term
 from sealfit.tables import Units
 
 LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}

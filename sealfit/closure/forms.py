@@ -16,7 +16,7 @@ from sealfit.closure.waves import common_wavelength, pass_shifts
 from sealfit.effects.contract import CHANNEL, SECOND, Effect
 from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, free_effect, natural
 from sealfit.fit.estimate import Fitted
-from sealfit.fit.joint import Term
+from sealfit.fit.terms import Term
 
 WAVY = ("bump", "quadratic")  # through a calendar they follow whatever was tested when
 MOST_PLACES = 60  # between neighbouring values that are tried

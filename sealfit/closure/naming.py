@@ -8,9 +8,8 @@ Where rivals do equally well, a named mechanism comes before a closed form, and 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -18,20 +17,18 @@ import pandas as pd
 from sealfit.closure.channels import CALENDAR, Channel
 from sealfit.closure.forms import periodic_terms, terms_of
 from sealfit.closure.intervals import robust_covariance
-from sealfit.closure.judge import LEAST_LEFT, Candidate, project
+from sealfit.closure.judge import Candidate
+from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripple import Peak
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.estimate import Fitted, fit, settled
-from sealfit.fit.joint import Term, mean_derivatives
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly
 HALF = 0.5  # share of what the calendar explains from which anything else comes before it
 CALENDAR_RIVALS = 2  # refitted as rivals where something else comes first
 BEHIND = 0.3  # share of the best one's gain by which a proposal may be behind before each has its own scatter
-PART = 32  # points of a grid whitened at once
 TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
 RIVAL = 10.0  # an alternative: the data favour the chosen one by less than exp(5)
 HELD = 0.5  # relative standard error beyond which a form's own number is not determined
@@ -39,47 +36,6 @@ OVERTURNED = 1 / 3  # share of its size by which a new effect may change an earl
 ALIKE = 0.5  # correlation below which two candidates explain different things
 SAME = 0.98  # correlation above which two candidates are one effect here
 LINEAR = "linear"
-UNNAMED = (SMOOTH, SURFACE)
-OFFSET = (("direction",), "force", "add")
-PREFERRED = ("mu", "mu_c", "mu_s", "v_s", "sigma_2", "a", "b", "mu_0", "force")
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """A term with start values, how much it explains, and, once refitted, the joint fit."""
-
-    term: Term
-    values: Mapping[str, float]
-    unit: str  # level of its whole units
-    units: int
-    chi2: float
-    p_value: float
-    column: np.ndarray  # (n,) what it adds to the force, whitened and projected
-    source: tuple  # key of the candidate it stands for
-    fitted: Fitted | None = None
-
-    @property
-    def price(self) -> float:
-        """Schwarz's price of its parameters."""
-        return len(self.term.effect.parameters) * np.log(max(self.units, 2))
-
-    @property
-    def criterion(self) -> float:
-        """Twice the negative log likelihood plus the price; smaller is better."""
-        return (self.fitted.deviance if self.fitted is not None else -self.chi2) + self.price
-
-    @property
-    def named(self) -> bool:
-        """Whether the form has a name."""
-        return self.term.effect.id not in UNNAMED
-
-    @property
-    def rank(self) -> tuple:
-        """Order among equals: mechanism, closed form, free shape; then fewer parameters; then what it acts on."""
-        effect = self.term.effect
-        kind = 0 if effect.physical else 2 if effect.id in UNNAMED else 1
-        offset = self.source == OFFSET  # an amplifier's zero is off more often than a friction differs by direction
-        return (kind, len(effect.parameters), -1 if offset else PREFERRED.index(self.term.acts_on))
 
 
 def propose(
@@ -130,7 +86,7 @@ def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
     """
     if not significant:
         return
-    best = next((c for c in significant if c.key == OFFSET), significant[0])
+    best = next((c for c in significant if c.key == ZERO_OFFSET), significant[0])
     seen = set()
     for candidate in significant:
         if candidate.chi2 < CONTENDER * best.chi2 or candidate.key in seen:
@@ -256,73 +212,3 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
 def _joint(fitted: Fitted, proposal: Proposal) -> Fitted:
     model = fitted.model.with_term(proposal.term, proposal.values)
     return fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
-
-
-class Linearised:
-    """Terms fitted to the residual in the tangent space of a model: amplitudes exact, a grid over the rest.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        The current model.
-    """
-
-    def __init__(self, fitted: Fitted) -> None:
-        self.fitted = fitted
-        self._kept: tuple[tuple, np.ndarray] | None = None  # shapes are the same on every quantity a form may act on
-
-    def __call__(self, term: Term, search: Mapping[str, tuple], candidate: Candidate) -> list[Proposal]:
-        """Return the term at the best point of its grid; nothing where none of it is left here."""
-        fitted, effect = self.fitted, term.effect
-        points = [dict(zip(search, point, strict=True)) for point in itertools.product(*search.values())]
-        shapes = self._shapes(term, points)
-        slope = fitted.slope(term.acts_on, term.operation)
-        count = len(effect.linear)
-        chi2 = np.concatenate(
-            [
-                _explained(fitted, slope[:, None] * shapes[:, k : k + PART * count], count)
-                for k in range(0, shapes.shape[1], PART * count)
-            ]
-        )
-        best = int(np.argmax(chi2))
-        if not chi2[best] > 0:
-            return []
-        left = project(fitted, slope[:, None] * shapes[:, best * count : (best + 1) * count])
-        amplitude, *_ = np.linalg.lstsq(left, fitted.white_residual, rcond=1e-10)
-        column = left @ amplitude
-        chosen = {**effect.start(), **points[best], **dict(zip(effect.linear, amplitude.tolist(), strict=True))}
-        values = {p.name: chosen[p.name] for p in effect.parameters}
-        found = float(2 * column @ fitted.white_residual - column @ column)
-        units = candidate.judgement.units
-        return [Proposal(term, values, candidate.unit, units, found, candidate.p_value, column, candidate.key)]
-
-    def _shapes(self, term: Term, points: list[dict[str, float]]) -> np.ndarray:
-        """Return the shape per unit of each amplitude at every point, shape (n, points * amplitudes)."""
-        key = (term.effect.id, term.channels, points, term.fixed)
-        if self._kept is None or self._kept[0] != key:
-            start = term.effect.start()
-            with np.errstate(all="ignore"):
-                columns = [
-                    c
-                    for point in points
-                    for c in mean_derivatives(term, {**start, **point}, self.fitted.rows, only_linear=True)
-                ]
-            self._kept = (key, np.column_stack(columns))
-        return self._kept[1]
-
-
-def _explained(fitted: Fitted, columns: np.ndarray, count: int) -> np.ndarray:
-    """Return the sum of squares that each `count` neighbouring columns of the force explain, shape (points,)."""
-    good = np.isfinite(columns).all(axis=0)
-    white = fitted.whitening(np.where(good, columns, 0.0))
-    taken = fitted.basis.T @ white
-    white, taken = (a.reshape(a.shape[0], -1, count) for a in (white, taken))
-    whole = np.einsum("npi,npj->pij", white, white)
-    gram = whole - np.einsum("npi,npj->pij", taken, taken)
-    score = np.einsum("npi,n->pi", white, fitted.white_residual)
-    size, least = (np.einsum("pii->pi", a) for a in (gram, whole))
-    kept = (size > LEAST_LEFT * least) & good.reshape(-1, count)
-    score = np.where(kept, score / np.sqrt(np.where(kept, size, 1.0)), 0.0)
-    unit = np.where(kept, 1 / np.sqrt(np.where(kept, size, 1.0)), 0.0)
-    inverse = np.linalg.pinv(gram * unit[:, :, None] * unit[:, None, :], rcond=1e-10, hermitian=True)
-    return np.einsum("pi,pij,pj->p", score, inverse, score)

@@ -15,8 +15,9 @@ from sealfit.closure.ripple import Peak, find_ripple
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.joint import Model, passes
+from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows
+from sealfit.fit.terms import passes
 
 
 class Ripples:

@@ -17,7 +17,8 @@ from sealfit.closure.record import from_record
 from sealfit.conditions import add_keys
 from sealfit.config import Config
 from sealfit.errors import RequestError
-from sealfit.fit.joint import Declared, Model, evaluate
+from sealfit.fit.declared import Declared
+from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import LEVELS, point_rows
 from sealfit.fit.whitening import Component, Scatter
 

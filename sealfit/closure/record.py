@@ -9,9 +9,11 @@ from sealfit.closure.intervals import degrees_of_freedom
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.free import FREE, free_effect
+from sealfit.fit.declared import QUANTITIES, Declared, JointParameter
 from sealfit.fit.estimate import Fitted
-from sealfit.fit.joint import QUANTITIES, Declared, JointParameter, Model, Term
+from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows
+from sealfit.fit.terms import Term
 
 
 def to_record(before: Fitted, after: Fitted, config: Config) -> dict:

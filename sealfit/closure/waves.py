@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from sealfit.fit.joint import passes
 from sealfit.fit.rows import Rows
+from sealfit.fit.terms import passes
 
 LEAST_SAMPLES = 16  # a stroke with fewer steady samples says nothing of a ripple
 AROUND = np.linspace(-0.5, 0.5, 101)  # periods per stroke on each side of a peak that are looked at once more

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import nnls
 
-from sealfit.fit.joint import declare
+from sealfit.fit.declared import declare
 from sealfit.fit.reml import reml
 from sealfit.fit.rows import LEVELS, Rows
 from sealfit.fit.whitening import Component, Scatter

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealfit.fit.joint import SAME_SPEED, JointParameter, Model, declare
+from sealfit.fit.declared import SAME_SPEED, JointParameter, declare
+from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows
 
 

@@ -3,13 +3,13 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.confirm import Added
-from sealfit.closure.naming import Proposal
+from sealfit.closure.linearised import Proposal
 from sealfit.closure.next_runs import where_apart
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.estimate import fit_declared, fitted_at
-from sealfit.fit.joint import Term
 from sealfit.fit.rows import make_rows
+from sealfit.fit.terms import Term
 
 
 def bound(fitted, effect, channel, **values):

@@ -4,10 +4,12 @@ import numpy.testing as npt
 import pytest
 
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
+from sealfit.fit.declared import declare, levels_of
 from sealfit.fit.estimate import fit, fit_declared
-from sealfit.fit.joint import Model, Term, declare, evaluate, levels_of
+from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import make_rows, thin
 from sealfit.fit.start import start_model
+from sealfit.fit.terms import Term
 
 WAVE = Effect(
     id="wave",

@@ -1,0 +1,123 @@
+"""What the declared model can carry at these conditions and speeds, and which fitted number serves which condition."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from sealfit.fit.rows import Rows
+
+QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
+SPEEDS_FOR_STRIBECK = 4  # mu_s, mu_c, v_s and sigma_2 are four numbers
+SPEEDS_FOR_VISCOUS = 2
+DAYS_FOR_LAW = 3  # mu_0, a and b are three numbers
+SAME_SPEED = 1.25  # measured speeds within 25 % are one setting: rigs without speed control wander that much
+
+
+@dataclass(frozen=True, slots=True)
+class JointParameter:
+    """One fitted number of the declared model: which quantity, and of which rubber, series or condition."""
+
+    quantity: str
+    owner: str
+
+
+@dataclass(frozen=True)
+class Declared:
+    """Which fitted number each condition uses for each quantity; -1 where the quantity is absent."""
+
+    parameters: tuple[JointParameter, ...]
+    index: Mapping[str, np.ndarray]  # quantity -> (conditions,) number of the parameter
+    conditions: tuple[str, ...]
+    has_load: bool
+    stribeck: Mapping[str, str]  # series -> "full" | "viscous" | "constant"
+    law: Mapping[str, bool]  # series -> whether Eq. 15 is fitted across its days
+
+
+def declare(rows: Rows) -> Declared:
+    """Return the declared model that these conditions and speeds can carry.
+
+    A series needs four speeds in one direction for Eq. 14, two for the viscous term; Eq. 15 needs three days, the
+    unaged day included. What cannot be fitted is left out, not guessed. Speeds are counted within one direction, as an
+    offset between directions would otherwise pass for a Stribeck curve.
+    """
+    conditions = rows.conditions
+    names = tuple(conditions["condition"])
+    aging = rows.has_aging
+    series_of = _fit_series(conditions, aging)
+    stribeck = {s: _speed_form(rows, series_of == s) for s in dict.fromkeys(series_of)}
+    law = {}
+    for s in stribeck:
+        own = conditions[series_of == s]
+        shared = conditions[(conditions["aging_days"] == 0) & conditions["rubber"].isin(own["rubber"])]
+        days = set(own["aging_days"]) | set(shared["aging_days"])
+        law[s] = bool(aging and len(days) >= DAYS_FOR_LAW and (own["aging_days"] > 0).any())
+    law_rubbers = {conditions["rubber"].iloc[c] for c in range(len(names)) if law[series_of[c]]}
+    parameters: dict[JointParameter, int] = {}
+    index = {quantity: np.full(len(names), -1) for quantity in QUANTITIES}
+
+    def use(c: int, quantity: str, owner: str) -> None:
+        index[quantity][c] = parameters.setdefault(JointParameter(quantity, owner), len(parameters))
+
+    for c, name in enumerate(names):
+        series, rubber = series_of[c], conditions["rubber"].iloc[c]
+        unaged = aging and conditions["aging_days"].iloc[c] == 0 and rubber in law_rubbers
+        for end in "sc":
+            if end == "s" and stribeck[series] != "full":
+                continue
+            if law[series]:
+                for quantity, owner in ((f"mu_0{end}", rubber), (f"a_{end}", series), (f"b_{end}", series)):
+                    use(c, quantity, owner)
+            else:
+                use(c, f"mu_0{end}", rubber if unaged else name)
+        if stribeck[series] == "full":
+            use(c, "v_s", series)
+        if stribeck[series] != "constant":
+            use(c, "sigma_2", series)
+    return Declared(tuple(parameters), index, names, rows.has_load, stribeck, law)
+
+
+def _fit_series(conditions, aging: bool) -> np.ndarray:
+    """Return the series whose v_s and sigma_2 a condition uses: a lone series takes its unaged rubber in."""
+    series = conditions["series"].to_numpy(dtype=object).copy()
+    if aging:
+        for rubber in conditions["rubber"].unique():
+            own = (conditions["rubber"] == rubber).to_numpy()
+            aged = own & (conditions["aging_days"] > 0).to_numpy()
+            if len(set(series[aged])) == 1:
+                series[own] = series[aged][0]
+    return series
+
+
+def _speed_form(rows: Rows, of_condition: np.ndarray) -> str:
+    mask = of_condition[rows.condition]
+    most = 0
+    for sign in (1.0, -1.0):
+        chosen = mask & (np.sign(rows.speed) == sign)
+        if chosen.any():
+            most = max(most, speed_levels(rows, chosen))
+    if most >= SPEEDS_FOR_STRIBECK:
+        return "full"
+    return "viscous" if most >= SPEEDS_FOR_VISCOUS else "constant"
+
+
+def speed_levels(rows: Rows, mask: np.ndarray) -> int:
+    """Return how many speeds were set: commanded ones, or measured ones that differ by more than 25 %."""
+    commanded = rows.table.loc[mask, "speed_set_mm_s"]
+    if commanded.notna().all():
+        return commanded.abs().round(9).nunique()
+    stroke = rows.codes("stroke")[mask]
+    total = np.bincount(stroke, np.abs(rows.speed[mask]))
+    count = np.bincount(stroke)
+    return levels_of(np.sort(total[count > 0] / count[count > 0]))
+
+
+def levels_of(speeds: np.ndarray) -> int:
+    """Return the number of clusters of sorted positive speeds, each within 25 % of its slowest."""
+    count, base = 0, 0.0
+    for speed in speeds:
+        if count == 0 or speed > SAME_SPEED * base:
+            count, base = count + 1, speed
+    return count
