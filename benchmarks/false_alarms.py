@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from campaigns import campaign, names
-from scipy import stats
+from counts import bounds
 
 from sealfit.closure.loop import close_loop
 from sealfit.config import load_config
@@ -34,13 +34,6 @@ def close(name: str, seed: int, *, size: str, strength: str) -> tuple[dict, floa
     started = time.process_time()
     closure = close_loop(tables["bins"], tables["traces"], config)
     return closure.document, time.process_time() - started
-
-
-def bounds(count: int, of: int) -> tuple[float, float]:
-    """Return the 95 % Clopper-Pearson interval of a share."""
-    low = stats.beta.ppf(0.025, count, of - count + 1) if count else 0.0
-    high = stats.beta.ppf(0.975, count + 1, of - count) if count < of else 1.0
-    return float(low), float(high)
 
 
 def main() -> None:

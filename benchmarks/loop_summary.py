@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
+from counts import bounds
 
 CLEAR, UNSEEN = 8.0, 0.5
 RIVALS = ("plain", "boosting", "ebm", "pygam", "pysindy")
@@ -19,19 +19,6 @@ ORDER = ("-", "faint", "weak", "medium", "strong")
 WORSE = 1.02  # after-error above this times before counts as worse
 NEAR = 1.3  # the after-error may be this times that of the true form
 POWER_EDGES = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
-
-
-def bounds(count: int, of: int) -> tuple[float, float]:
-    """Return the 95 % Clopper-Pearson interval of a share.
-
-    Examples
-    --------
-    >>> [round(x, 4) for x in bounds(0, 24)]
-    [0.0, 0.1425]
-    """
-    low = stats.beta.ppf(0.025, count, of - count + 1) if count else 0.0
-    high = stats.beta.ppf(0.975, count + 1, of - count) if count < of else 1.0
-    return float(low), float(high)
 
 
 def share(flags: Iterable[bool]) -> str:

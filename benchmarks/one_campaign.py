@@ -137,7 +137,8 @@ def _rows(bins: pd.DataFrame, spec: Spec, config) -> Rows:
 
 def _scatter(record: dict) -> Scatter:
     kept = record["scatter"]
-    return Scatter(kept["s0"], kept["g"], tuple(Component(**c) for c in kept["components"]))
+    components = tuple(Component(**c) for c in kept["components"])
+    return Scatter(kept["s0"], kept["g"], components, kept["alike"], kept["shape"])
 
 
 def _rms(values: np.ndarray) -> float:

@@ -131,11 +131,10 @@ def test_true_forms(declared: Model, rows: Rows, scatter, true: list[TrueEffect]
         own = dict(effect.term.fixed) | ({"held": fixed} if fixed else {})
         held = held.with_term(replace(effect.term, fixed=own), effect.values)
     known = fit(held, rows, scatter, turns=2)
-    tests, at = [], held.theta.size
+    tests = []
     for number, effect in enumerate(true):
-        names = [p.name for p in effect.term.effect.parameters]
-        places = [at + k for k, p in enumerate(effect.term.effect.parameters) if p.linear]
-        at += len(names)
+        first = held.place(number).start
+        places = [first + k for k, p in enumerate(effect.term.effect.parameters) if p.linear]
         covariance = _wider(known, effect.unit)[np.ix_(places, places)]
         fitted = known.model.values[number]
         linear = list(effect.term.effect.linear)

@@ -2,9 +2,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from campaigns import campaign
+from counts import bounds
 from loop import key, plan, read
 from loop_cost import with_idle_columns
-from loop_summary import bounds, clustered, summarise
+from loop_summary import clustered, summarise
 from points import draw_points
 from scoring import LENIENT, NONE, STRICT, Target, correlations, grade, match, misplaced, named_right
 from truths import true_effects, true_term, truth_in_claim

@@ -53,9 +53,7 @@ class Proposal:
         """Order among equals: mechanism, closed form, free shape; then fewer parameters; then what it acts on."""
         effect = self.term.effect
         kind = 0 if effect.physical else 2 if effect.id in UNNAMED else 1
-        offset = (
-            self.source == ZERO_OFFSET
-        )  # an amplifier is off more often than friction by direction
+        offset = self.source == ZERO_OFFSET  # an amplifier is off more often than friction by direction
         return (kind, len(effect.parameters), -1 if offset else PREFERRED.index(self.term.acts_on))
 
 

@@ -38,6 +38,8 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
         "scatter": {
             "s0": float(after.scatter.s0),
             "g": float(after.scatter.g),
+            "alike": float(after.scatter.alike),
+            "shape": float(after.scatter.shape),
             "components": [
                 {"level": c.level, "kind": c.kind, "variance": float(c.variance)} for c in after.scatter.components
             ],
