@@ -17,7 +17,7 @@ from sealfit.closure.judge import Candidate, Judge, judged
 from sealfit.closure.search import MAIN_TARGETS
 from sealfit.effects.free import BENDS, evenly
 
-BEHIND = {"a": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along what a parameter acts
+BEHIND = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along it each acts
 ALONE = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; the calendar drifts by itself
 LOGARITHMIC = 5.0  # span of a positive channel from which its logarithm is tried as well
 RARE = 2.0  # pairs are many and seldom at work: they get half of their share of the error

@@ -32,6 +32,7 @@ TARGETS = (
     ("v_s", "multiply"),
     ("sigma_2", "add"),
     ("a", "multiply"),
+    ("b", "multiply"),
 )
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 

@@ -79,3 +79,14 @@ def test_a_channel_that_orders_the_residual_is_found_at_its_unit():
 def test_unit_of_a_constant_is_the_coarsest_level():
     rows = rows_of(repeats=1, bins=4)
     assert unit_of(np.ones(rows.force.size), rows) == "specimen"
+
+
+def test_a_channel_may_change_how_soon_a_rubber_ages():
+    def sooner(table, force):  # b halves with every 4 degrees: the logarithm grows where days have passed
+        days, warmer = table["aging_days"].to_numpy(), table["lab_temperature_C"].to_numpy() - 22
+        return force - 49.03 * 0.04 * (np.log1p(days / (0.1 * 2 ** (-warmer / 4))) - np.log1p(days / 0.1))
+
+    rows = rows_of(bins=6, effect=sooner)
+    found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    keys = {c.key for c in found if c.p_value < 0.005}
+    assert (("lab_temperature_C",), "b", "multiply") in keys
