@@ -200,6 +200,7 @@ def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
     slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
     rows = rows.sparse(ROWS_FOR_START)
     held = prior_precision(model) > 0
+    low, high = _bounds(model, rows)
     whitening = Whitening(scatter, rows.force, rows.groups)
     places = [k for k, parameter in enumerate(model.declared.parameters) if parameter.quantity == "v_s"]
     for group in [places, *([k] for k in places)] if len(places) > 1 else [places] if places else []:
@@ -215,7 +216,7 @@ def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
             cost = float(residual @ residual - step @ gradient)
             if cost < best - 1e-9:
                 vector[~held] += step
-                best, chosen = cost, vector
+                best, chosen = cost, np.clip(vector, low, high)
         model = model.at(chosen)
     return model
 

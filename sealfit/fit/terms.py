@@ -110,9 +110,9 @@ def term_derivatives(
             result.append(term.effect.shape(inputs, **{**values, **zero, p.name: 1.0}))
         elif not only_linear:
             step = 1e-5 * max(abs(values[p.name]), 1e-3)
-            up = term.effect.shape(inputs, **{**values, p.name: values[p.name] + step})
-            down = term.effect.shape(inputs, **{**values, p.name: values[p.name] - step})
-            result.append((up - down) / (2 * step))
+            ends = np.clip([values[p.name] - step, values[p.name] + step], *p.bounds)  # beyond, a form need not exist
+            down, up = (term.effect.shape(inputs, **{**values, p.name: float(end)}) for end in ends)
+            result.append((up - down) / (ends[1] - ends[0]))
     return result
 
 

@@ -3,13 +3,14 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
+from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
 from sealfit.fit.declared import declare, levels_of
 from sealfit.fit.estimate import fit, fit_declared
 from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import make_rows, thin
 from sealfit.fit.start import start_model
-from sealfit.fit.terms import Term
+from sealfit.fit.terms import Term, term_derivatives
 
 WAVE = Effect(
     id="wave",
@@ -121,3 +122,12 @@ def test_an_effect_that_is_there_is_fitted_with_the_physics():
     assert fitted.model.values[0]["A"] == pytest.approx(0.05, abs=0.002)
     assert fitted.model.values[0]["k"] == pytest.approx(0.3, abs=0.002)
     assert isinstance(fitted.model, Model)
+
+
+def test_a_number_at_its_bound_is_not_moved_beyond_it():
+    effect = EFFECTS["rest_strengthening"]
+    t_0 = next(p for p in effect.parameters if p.name == "t_0")
+    term = Term(effect, ("rest_s",), "mu_s", "multiply")
+    inputs = {"rest_s": np.array([1.0, 10.0, 100.0])}
+    derivatives = term_derivatives(term, {"A": 0.01, "t_0": t_0.bounds[0]}, inputs)
+    assert np.isfinite(derivatives).all()
