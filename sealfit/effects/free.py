@@ -137,9 +137,7 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
     ParameterError
         If there are fewer than two categories, or one stands twice.
     """
-    names = tuple(str(c) for c in categories)
-    if len(names) < 2 or len(set(names)) != len(names):
-        raise ParameterError(f"levels: {list(names)} must be two or more different categories.", mend="List each once.")
+    names = _different(LEVELS, categories)
     return Effect(
         id=LEVELS,
         label="levels of {x}",
@@ -161,6 +159,13 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
         ),
         physical=False,
     )
+
+
+def _different(id: str, categories: Sequence[str]) -> tuple[str, ...]:
+    names = tuple(str(c) for c in categories)
+    if len(names) < 2 or len(set(names)) != len(names):
+        raise ParameterError(f"{id}: {list(names)} must be two or more different categories.", mend="List each once.")
+    return names
 
 
 def _levels(names: tuple[str, ...], means: tuple[float, ...], inputs: Mapping, **values) -> np.ndarray:
@@ -252,9 +257,7 @@ def slopes_effect(categories: Sequence[str]) -> Effect:
     ParameterError
         If there are fewer than two categories, or one stands twice.
     """
-    names = tuple(str(c) for c in categories)
-    if len(names) < 2 or len(set(names)) != len(names):
-        raise ParameterError(f"slopes: {list(names)} must be two or more different categories.", mend="List each once.")
+    names = _different(SLOPES, categories)
     return Effect(
         id=SLOPES,
         label="linear in {x}, by {z}",
