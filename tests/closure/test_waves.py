@@ -1,10 +1,10 @@
 import numpy as np
 import pandas as pd
 import pytest
+from bins_helpers import make_bins
 
 from sealfit.closure.waves import agreement, common_wavelength, freed_of_trend, pass_shifts
 from sealfit.fit.rows import make_rows
-from tests.bins_helpers import make_bins
 
 
 def made(seed=0, files=10, wavelength=3.0, amplitude=0.1, trend=4.0, noise_N=0.1, periods=9.0):
