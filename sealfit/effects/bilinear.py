@@ -7,15 +7,13 @@ What either channel does alone depends on where the other is, so a product rarel
 
 from __future__ import annotations
 
-import numpy as np
-
-from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, reference
+from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, deviation
 
 
 def shape(inputs, *, A, B, C):
     """Product and both terms alone, shape (n,), in the unit of what the effect gives."""
-    u = np.asarray(inputs[CHANNEL], dtype=float) - reference(inputs, CHANNEL, 0.0)
-    w = np.asarray(inputs[SECOND], dtype=float) - reference(inputs, SECOND, 0.0)
+    u = deviation(inputs, CHANNEL)
+    w = deviation(inputs, SECOND)
     return A * u * w + B * u + C * w
 
 

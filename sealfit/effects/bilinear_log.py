@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, positive, reference
+from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, deviation, log_ratio
 
 
 def shape(inputs, *, A, B, C):
     """Product and both terms alone, shape (n,), in the unit of what the effect gives."""
-    u = np.log(positive(inputs[CHANNEL]) / reference(inputs, CHANNEL, 1.0))
-    w = np.asarray(inputs[SECOND], dtype=float) - reference(inputs, SECOND, 0.0)
+    u = log_ratio(inputs, CHANNEL)
+    w = deviation(inputs, SECOND)
     return A * u * w + B * u + C * w
 
 

@@ -17,16 +17,15 @@ from sealfit.effects.contract import (
     SECOND,
     Effect,
     Parameter,
-    not_negative,
-    positive,
-    reference,
+    log_ratio,
+    log_ratio_from_zero,
 )
 
 
 def shape(inputs, *, A, B, C):
     """Product and both terms alone, shape (n,), in the unit of what the effect gives."""
-    u = np.log(positive(inputs[CHANNEL]) / reference(inputs, CHANNEL, 1.0))
-    w = np.log1p(not_negative(inputs[SECOND])) - np.log1p(max(reference(inputs, SECOND, 0.0), 0.0))
+    u = log_ratio(inputs, CHANNEL)
+    w = log_ratio_from_zero(inputs, SECOND)
     return A * u * w + B * u + C * w
 
 

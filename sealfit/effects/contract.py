@@ -165,6 +165,21 @@ def not_negative(values) -> np.ndarray:
     return np.where(values >= 0, values, np.nan)
 
 
+def deviation(inputs: Mapping[str, object], name: str) -> np.ndarray:
+    """Return a channel less its reference value, shape (n,)."""
+    return np.asarray(inputs[name], dtype=float) - reference(inputs, name, 0.0)
+
+
+def log_ratio(inputs: Mapping[str, object], name: str) -> np.ndarray:
+    """Return the logarithm of a channel over its reference value, shape (n,); NaN where the channel is not positive."""
+    return np.log(positive(inputs[name]) / reference(inputs, name, 1.0))
+
+
+def log_ratio_from_zero(inputs: Mapping[str, object], name: str) -> np.ndarray:
+    """Return ln((1 + z) / (1 + z_ref)) of a channel that starts at zero, shape (n,); NaN where it is negative."""
+    return np.log1p(not_negative(inputs[name])) - np.log1p(max(reference(inputs, name, 0.0), 0.0))
+
+
 def fill_unit(unit: str, x: str, y: str, z: str = "") -> str:
     """Return a parameter's unit with those of the channels and of what the effect gives put in.
 

@@ -8,15 +8,12 @@ days: the aged rubber loses more of its friction at high speed than the fresh on
 
 from __future__ import annotations
 
-import numpy as np
-
-from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, reference
+from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, deviation
 
 
 def shape(inputs, *, A):
     """Product of two deviations, shape (n,), in the unit of A times both channels' units."""
-    x, z = (np.asarray(inputs[name], dtype=float) - reference(inputs, name, 0.0) for name in (CHANNEL, SECOND))
-    return A * x * z
+    return A * deviation(inputs, CHANNEL) * deviation(inputs, SECOND)
 
 
 PRODUCT = Effect(

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, positive, reference
+from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, deviation, log_ratio
 
 
 def shape(inputs, *, A):
     """Product of a logarithm and a deviation, shape (n,), in the unit of A times the second channel's unit."""
-    x = positive(inputs[CHANNEL])
-    z = np.asarray(inputs[SECOND], dtype=float) - reference(inputs, SECOND, 0.0)
-    return A * np.log(x / reference(inputs, CHANNEL, 1.0)) * z
+    return A * log_ratio(inputs, CHANNEL) * deviation(inputs, SECOND)
 
 
 PRODUCT_LOG = Effect(

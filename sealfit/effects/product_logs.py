@@ -16,17 +16,14 @@ from sealfit.effects.contract import (
     SECOND,
     Effect,
     Parameter,
-    not_negative,
-    positive,
-    reference,
+    log_ratio,
+    log_ratio_from_zero,
 )
 
 
 def shape(inputs, *, A):
     """Product of two logarithms, shape (n,), in the unit of A."""
-    x, z = positive(inputs[CHANNEL]), not_negative(inputs[SECOND])
-    late = np.log1p(z) - np.log1p(max(reference(inputs, SECOND, 0.0), 0.0))
-    return A * np.log(x / reference(inputs, CHANNEL, 1.0)) * late
+    return A * log_ratio(inputs, CHANNEL) * log_ratio_from_zero(inputs, SECOND)
 
 
 PRODUCT_LOGS = Effect(
