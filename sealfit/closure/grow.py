@@ -97,13 +97,13 @@ def grow(
             pairs = search_pairs(judge, list(channels.values()), last, rng)
             significant = [c for c in pairs if c.p_value <= alpha]
             say(f"round {number}: {len(pairs)} pairs, {len(significant)} significant")
-        left = significant[0] if significant else None
+        left = significant[0] if significant else ripples.found
         significant += pairs_in_disguise(judge, significant, channels)
         open_ = [c for c in significant if c.key not in refused]
         if not open_ or number > config.loop.max_rounds:
             break
         open_ += [c for c in _standing_for(open_, last) if c.key not in refused]
-        proposals = propose(fitted, open_, channels, effects=effects)
+        proposals = propose(fitted, open_, channels, effects)
         accepted = confirmed(fitted, proposals, ripples.samples, config, number, say)
         if accepted is None:
             refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
@@ -111,9 +111,8 @@ def grow(
         added.append(accepted)
         fitted = fit(accepted.proposal.fitted.model, rows, fitted.scatter, turns=2)
         fitted, kept = _drop_needless(fitted, added)
-        refused |= {
-            a.proposal.source for a in added if all(a is not k for k in kept)
-        }  # what came and went does not come again
+        # What came and went does not come again.
+        refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}
         added = kept
     return Grown(before, fitted if added else before, tuple(added), first, last, left, channels)
 

@@ -20,7 +20,6 @@ from sealfit.closure.intervals import robust_covariance
 from sealfit.closure.judge import Candidate
 from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripple import Peak
-from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.estimate import Fitted, fit, settled
 
@@ -42,9 +41,7 @@ def propose(
     fitted: Fitted,
     significant: Sequence[Candidate],
     channels: Mapping[str, Channel],
-    peak: Peak | None = None,
-    samples: pd.DataFrame | None = None,
-    effects: Mapping[str, Effect] = EFFECTS,
+    effects: Mapping[str, Effect],
 ) -> list[Proposal]:
     """Return jointly refitted proposals for what orders the residual most, best first.
 
@@ -56,10 +53,6 @@ def propose(
         Candidates accepted by the search, strongest first.
     channels : mapping
         Channels by name.
-    peak : Peak, optional
-        A periodic component found on the raw samples.
-    samples : DataFrame, optional
-        The samples it was found on, with `residual_N`; wanted with a peak.
     effects : mapping
         The catalogue, the user's own effects included.
     """
@@ -67,9 +60,6 @@ def propose(
     forms = [(t, search, c) for c in _contenders(significant) for t, search in terms_of(c, channels, fitted, effects)]
     forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # a shape made once serves every quantity
     found = [p for form in forms for p in linearised(*form)]
-    if peak is not None:
-        for form in periodic_terms(fitted, peak, samples, effects):
-            found += [replace(p, source=("peak", peak.axis)) for p in linearised(*form)]
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
     others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
     if not (calendar and others and max(p.chi2 for p in others) >= HALF * max(p.chi2 for p in calendar)):
@@ -77,6 +67,25 @@ def propose(
     # Conditions are tested one after the other and the calendar follows them: what was set or measured comes first.
     others, calendar = (_refitted(fitted, part) for part in (_spread(others), _spread(calendar)[:CALENDAR_RIVALS]))
     return _ordered(fitted, others) + sorted(calendar, key=lambda p: p.criterion)
+
+
+def propose_ripples(fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]) -> list[Proposal]:
+    """Return jointly refitted proposals for a periodic component, best first.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The current model.
+    peak : Peak
+        The component.
+    samples : DataFrame
+        The samples it was found on, with `residual_N`.
+    effects : mapping
+        The catalogue.
+    """
+    linearised = Linearised(fitted)
+    found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(*form)]
+    return _ordered(fitted, _refitted(fitted, _spread(found)))
 
 
 def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:

@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.confirm import Added, confirmed
-from sealfit.closure.forms import PERIODIC
-from sealfit.closure.naming import propose
+from sealfit.closure.naming import propose_ripples
 from sealfit.closure.ripple import Peak, find_ripple
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
@@ -39,7 +38,7 @@ class Ripples:
     samples : DataFrame
         The samples with `residual_N`: the force less the ripples added so far.
     found : Peak or None
-        The significant one that is not in the model yet.
+        The significant one that is not in the model yet and may still be.
     added : list of Added
         Those confirmed.
     """
@@ -66,17 +65,20 @@ class Ripples:
             return fitted
         own = fitted if fine is None else fit(fitted.model, fine, fitted.scatter, turns=1)
         while self.found is not None and len(self.added) < self.config.loop.max_rounds:
-            proposals = propose(own, [], {}, self.found, self.samples, self.effects)
+            proposals = propose_ripples(own, self.found, self.samples, self.effects)
             number = len(self.added) + 1
             accepted = confirmed(own, proposals, self.samples, self.config, number, self.say)
             if accepted is None:
+                self.found = None
                 break
             self.added.append(accepted)
             own = fit(accepted.proposal.fitted.model, own.rows, own.scatter, turns=2)
             self.samples = without_ripples(self.samples, own)
             self.found = self._strongest(own.model)
-        if fine is None or not self.added:
-            return own if self.added else fitted
+        if fine is None:
+            return own
+        if not self.added:
+            return fitted
         return fit(_held(own.model), fitted.rows, own.scatter, turns=2)
 
     def _strongest(self, model: Model | None = None) -> Peak | None:
@@ -95,25 +97,23 @@ def _held(model: Model) -> Model:
 
 
 def without_ripples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
-    """Return the samples with `residual_N`: force less the periodic effects already in the model.
+    """Return the samples with `residual_N`: force less the effects of a model that has no others than ripples.
 
     Everything slow is taken out of each stroke by the spectrum itself; what is periodic is evaluated at the samples.
     """
+    rows = fitted.rows
+    strokes = rows.table.iloc[rows.groups.starts["stroke"]]
+    ids, own = strokes["stroke_id"].to_numpy(), samples["stroke_id"].to_numpy()
+    level = np.zeros(max(ids.max(), own.max()) + 1)
+    level[ids] = rows.groups.means(fitted.force, "stroke")
     residual = samples["force_N"].to_numpy(dtype=float)
-    terms = [(t, v) for t, v in zip(fitted.model.terms, fitted.model.values, strict=True) if t.effect.id in PERIODIC]
-    if terms:
-        rows = fitted.rows
-        strokes = rows.table.iloc[rows.groups.starts["stroke"]]
-        ids, own = strokes["stroke_id"].to_numpy(), samples["stroke_id"].to_numpy()
-        level = np.zeros(max(ids.max(), own.max()) + 1)
-        level[ids] = rows.groups.means(fitted.force, "stroke")
-        for term, values in terms:
-            place = samples[term.channels[0]].to_numpy(dtype=float)
-            shift = term.fixed.get("shift")
-            if shift is not None:
-                shifts = np.zeros_like(level)
-                shifts[ids] = passes(strokes).map(shift).to_numpy(dtype=float)
-                place = place + shifts[own]
-            shape = term.effect.shape({term.effect.reads[0]: place, **term.fixed}, **values)
-            residual = residual - shape * (1.0 if term.operation == "add" else level[own])
+    for term, values in zip(fitted.model.terms, fitted.model.values, strict=True):
+        place = samples[term.channels[0]].to_numpy(dtype=float)
+        shift = term.fixed.get("shift")
+        if shift is not None:
+            shifts = np.zeros_like(level)
+            shifts[ids] = passes(strokes).map(shift).to_numpy(dtype=float)
+            place = place + shifts[own]
+        shape = term.effect.shape({term.effect.reads[0]: place, **term.fixed}, **values)
+        residual = residual - shape * (1.0 if term.operation == "add" else level[own])
     return samples.assign(residual_N=residual)
