@@ -121,10 +121,10 @@ def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
     df = min(most, distinct.size - 1)
     columns = [x]
     if df >= 2:
-        if distinct.size <= most + 1 or most == FEW_DF:
+        if distinct.size <= most + 1 or df == 2:  # a cubic spline has three columns at least
             columns += [x**k for k in range(2, df + 1)]
         else:
-            inner = np.quantile(distinct, np.linspace(0, 1, df)[1:-1]) if df > 2 else []
+            inner = np.quantile(distinct, np.linspace(0, 1, df)[1:-1])
             knots = np.r_[[distinct[0]] * 4, inner, [distinct[-1]] * 4]
             spline = BSpline.design_matrix(x, knots, 3).toarray()
             columns += list(spline[:, 1:-1].T)
@@ -148,16 +148,18 @@ def even_knots(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(k) for k in np.unique(knots))
 
 
+def off_zero(values: np.ndarray) -> np.ndarray:
+    """Return values moved by their smallest positive one where they start at 0, so that they have logarithms."""
+    return values + values[values > 0].min() if values.min() == 0 < values.max() else values
+
+
 def scaled(values: np.ndarray) -> np.ndarray:
     """Return a channel on the scale it is looked at, mapped to [-1, 1]: logarithmic where it spans a factor of 20.
 
-    A channel that starts at 0, such as days of aging, is moved by its smallest positive value where it spans 10 of it.
+    One that starts at 0, such as days of aging, is looked at from its smallest positive value on.
     """
+    values = off_zero(values)
     low, high = float(values.min()), float(values.max())
-    if low == 0 < high:
-        least = float(values[values > 0].min())
-        if high / least >= WIDE / 2:
-            values, low, high = values + least, least, high + least
     if low > 0 and high / low >= WIDE:
         values, low, high = np.log(values), np.log(low), np.log(high)
     return np.clip(2 * (values - low) / (high - low) - 1, -1.0, 1.0)

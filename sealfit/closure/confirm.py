@@ -112,16 +112,13 @@ def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int, samp
     masks = blocks(rows, proposal.unit, count, calendar[0]) if calendar else folds(rows, proposal.unit, count, seed)
     for out in masks:
         train, test = rows.subset(~out), rows.subset(out)
-        weight = rows.weight[out]
+        weight, whitening = rows.weight[out], Whitening(scatter, before.friction[out], test.groups)
         known += float(weight.sum())
         for k, model in enumerate((before.model, after.model)):
             kept = fit(model, train, scatter, turns=0, friction=before.friction[~out])
             residual = test.force - evaluate(kept.model, test, jacobian=False)[0]
-            inside = (
-                residual if calendar else _about(residual, test, proposal)
-            )  # a block of time is asked for as a whole
+            inside = residual if calendar else _about(residual, test, proposal)  # a block of time is asked for whole
             squares[k] += float(weight @ inside**2)
-            whitening = Whitening(scatter, before.friction[out], test.groups)
             white[k] += float((whitening(residual[:, None]) ** 2).sum())
     rmse = np.sqrt(squares / max(known, 1e-300))
     return Gain(float(rmse[0] - rmse[1]), float(white[0] - white[1]))

@@ -44,24 +44,25 @@ def terms_of(
     target = (candidate.acts_on, candidate.operation)
     if candidate.pair:
         pair = [channels[name] for name in candidate.channels]
-        scatter_known = any(c.level == "specimen" for c in fitted.scatter.components)
-        alone = scatter_known or all(c.unit != "specimen" for c in pair)
+        alone = fitted.scatter.knows("specimen") or all(c.unit != "specimen" for c in pair)
         yield from _terms_of_pair(*pair, target, effects, alone=alone)
         return
     name = candidate.channels[-1]
     channel = channels[name]
     for effect in effects.values():
+        if effect.id in PERIODIC:
+            continue
         if target not in effect.acts_on or not set(effect.reads) <= channels.keys() | {CHANNEL}:
             continue  # a channel that does not vary makes of an effect another one under a longer name
         if effect.reads == (CHANNEL,):
-            if not channel.numeric or name == "direction" or effect.id in ("sinusoid", "sinusoid_harmonics"):
+            if not channel.numeric or name == "direction":
                 continue
             if not _in_domain(effect, channel.values) or (name in CALENDAR and effect.id in WAVY):
                 continue
             fixed = {"x_ref": reference(channel.values)}
             held = _within_reach(effect, channel.values)
             yield Term(held, (name,), *target, fixed=fixed), _grids(held, channel.values)
-        elif name in effect.reads and effect.id != "ripple":
+        elif name in effect.reads:
             fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
             grids = _grids(effect, np.abs(channel.values))
             yield Term(effect, effect.reads, *target, fixed=fixed), grids

@@ -88,8 +88,7 @@ class Candidate:
 
 def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
     """Return columns of the force, whitened and freed of the current model's tangent space, shape (n, k)."""
-    white = fitted.whitening(columns)
-    return _freed(white, fitted.basis)
+    return _freed(fitted.whitening(columns), fitted.basis)
 
 
 def _freed(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
@@ -134,8 +133,7 @@ class Judge:
         """Basis of what tells specimens apart, shape (n, k); None where their scatter is known or nothing can be."""
         rows = self.fitted.rows
         starts = rows.groups.starts
-        known = any(c.level == "specimen" for c in self.fitted.scatter.components)
-        if known or not 1 < starts["specimen"].size < starts["run"].size:
+        if self.fitted.scatter.knows("specimen") or not 1 < starts["specimen"].size < starts["run"].size:
             return None
         own = rows.codes("specimen")[:, None] == np.arange(starts["specimen"].size)[None, :]
         return orthonormal(project(self.fitted, own * self.fitted.friction[:, None]))
@@ -199,7 +197,7 @@ class Judge:
         square = np.eye(k) - np.stack([c.T @ c for c in parts]) - through @ mixed
         total = left.T @ fitted.white_residual
         right = total - own - np.einsum("uij,uj->ui", through, product)
-        without = np.einsum("uij,uj->ui", _inverses(square), right)
+        without = np.einsum("uij,uj->ui", _inverse_of(*np.linalg.eigh(square)), right)
         spread = (without - total).T @ (without - total) * (units - 1) / units
         t = float(total @ np.linalg.pinv(spread, hermitian=True) @ total)
         return float(stats.f.logsf(t * (units - k) / (k * (units - 1)), k, units - k))
@@ -208,16 +206,15 @@ class Judge:
         """Return per unit the inverse of 1 - B'B, shape (units, p, p), and B'r, shape (units, p)."""
         if level not in self._kept:
             fitted = self.fitted
-            square = np.stack([b.T @ b for b in np.split(fitted.basis, fitted.rows.groups.starts[level][1:])])
-            inverse = _inverses(np.eye(fitted.basis.shape[1]) - square)
+            share, axes = fitted.unit_shares(level)
+            inverse = _inverse_of(1 - share, axes)
             product = fitted.rows.groups.sums(fitted.basis * fitted.white_residual[:, None], level)
             self._kept[level] = (inverse, product)
         return self._kept[level]
 
 
-def _inverses(square: np.ndarray) -> np.ndarray:
-    """Return the inverses of symmetric matrices, shape (u, k, k); what one unit alone determines is left as it is."""
-    size, axes = np.linalg.eigh(square)
+def _inverse_of(size: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return inverses, shape (u, k, k), from eigenvalues and axes; what one unit alone determines is left as it is."""
     shrink = np.where(size > OWN, 1 / np.maximum(size, OWN), 0.0)
     return (axes * shrink[:, None, :]) @ axes.transpose(0, 2, 1)
 
@@ -267,8 +264,7 @@ def adjust(
         for own in scores:
             most = np.maximum(most, _wald(signs[level, units] @ own, own))
         least = np.minimum(least, log_p_of(most, df, units))
-    own = np.array([j.log_p for j in judgements])
-    return (1 + np.searchsorted(np.sort(least), own, side="right")) / (flips + 1)
+    return _adjusted([j.log_p for j in judgements], least)
 
 
 def adjust_few(
@@ -283,6 +279,10 @@ def adjust_few(
         for k in tried:
             test = judgements[k].few
             least = np.minimum(least, few.log_p_of(drawn[test.target], test.basis, test.known))
-        own = [judgements[k].few.log_p for k in tried]
-        p_values[tried] = (1 + np.searchsorted(np.sort(least), own, side="right")) / (draws + 1)
+        p_values[tried] = _adjusted([judgements[k].few.log_p for k in tried], least)
     return p_values
+
+
+def _adjusted(own: Sequence[float], least: np.ndarray) -> np.ndarray:
+    """Return p-values from log p and the least of all candidates under chance, drawn many times."""
+    return (1 + np.searchsorted(np.sort(least), own, side="right")) / (least.size + 1)

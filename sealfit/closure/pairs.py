@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealfit.closure.channels import FINER, Channel, even_knots, flip_level
+from sealfit.closure.channels import FINER, Channel, even_knots, flip_level, off_zero
 from sealfit.closure.judge import Candidate, Judge, judged
 from sealfit.closure.search import MAIN_TARGETS
 from sealfit.effects.free import BENDS, evenly
@@ -117,11 +117,11 @@ def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
         return []
     if one.numeric and other.numeric:
         products = [(u * w)[:, None] for u in _scales(one) for w in _scales(other)]
-        u, w = (_centred(evenly(c.values, even_knots(c.values))) for c in (one, other))
+        u, w = _even(one), _even(other)
         blocks = [*products, np.column_stack([u**j * w**k for j, k in BENDS])]
     else:
         number, category = (one, other) if one.numeric else (other, one)
-        u = _centred(evenly(number.values, even_knots(number.values)))
+        u = _even(number)
         levels = np.unique(category.values)
         blocks = [(category.values[:, None] == levels[None, 1:]) * u[:, None]]
     sizes = [np.sqrt((columns**2).mean(axis=0)) for columns in blocks]
@@ -133,10 +133,13 @@ def _scales(channel: Channel) -> list[np.ndarray]:
     """Return a channel, centred, and its logarithm where that is another shape (from 0 on, moved by its least)."""
     x = channel.values
     scales = [x]
-    least = float(x[x > 0].min(initial=np.inf))
-    if x.min() >= 0 and x.max() > LOGARITHMIC * least:
-        scales.append(np.log(x if x.min() > 0 else x + least))
+    if x.min() >= 0 and x.max() > LOGARITHMIC * x[x > 0].min(initial=np.inf):
+        scales.append(np.log(off_zero(x)))
     return [_centred(x) / max(float(np.ptp(x)), 1e-300) for x in scales]
+
+
+def _even(channel: Channel) -> np.ndarray:
+    return _centred(evenly(channel.values, even_knots(channel.values)))
 
 
 def _centred(values: np.ndarray) -> np.ndarray:

@@ -43,6 +43,7 @@ class Fitted:
     white_residual: np.ndarray  # (n,)
     white_jacobian: np.ndarray  # (n, p)
     deviance: float  # whitened sum of squares + log det: twice the negative log likelihood, constants left out
+    whitening: Whitening  # of columns on the rows, at this scatter and friction
 
     @property
     def residual(self) -> np.ndarray:
@@ -57,12 +58,11 @@ class Fitted:
         return q[:, np.abs(np.diag(r)) > 1e-8]
 
     @cached_property
-    def whitening(self) -> Whitening:
-        """What whitens columns on the rows, at this fit's force."""
-        return Whitening(self.scatter, self.friction, self.rows.groups)
+    def _widened(self) -> dict[str, np.ndarray]:
+        return {}
 
     @cached_property
-    def _widened(self) -> dict[str, np.ndarray]:
+    def _shares(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         return {}
 
     @cached_property
@@ -75,6 +75,13 @@ class Fitted:
             self._slopes[acts_on, operation] = term_slope(self.model, self.rows, acts_on, operation)
         return self._slopes[acts_on, operation]
 
+    def unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return eigenvalues, shape (g, p), and axes, shape (g, p, p), of what the fit took out of each group."""
+        if level not in self._shares:
+            starts = self.rows.groups.starts[level]
+            self._shares[level] = np.linalg.eigh(np.stack([b.T @ b for b in np.split(self.basis, starts[1:])]))
+        return self._shares[level]
+
     def unit_residual(self, level: str) -> np.ndarray:
         """Return the whitened residual widened by (I - H_gg)^(-1/2) in each group of a level, shape (n,).
 
@@ -82,10 +89,8 @@ class Fitted:
         (the CR2 correction of Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181).
         """
         if level not in self._widened:
-            starts = self.rows.groups.starts[level]
             code = self.rows.codes(level)
-            gram = np.stack([part.T @ part for part in np.split(self.basis, starts[1:])])
-            size, axes = np.linalg.eigh(gram)
+            size, axes = self.unit_shares(level)
             size = np.clip(size, 0.0, 0.98)  # a group that the fit owns whole has nothing left to widen
             grow = np.where(size > 1e-12, (1 / np.sqrt(1 - size) - 1) / np.maximum(size, 1e-12), 0.0)
             inner = self.rows.groups.sums(self.basis * self.white_residual[:, None], level)
@@ -171,7 +176,7 @@ def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray |
     whitening = Whitening(scatter, friction, rows.groups)
     residual, white = whitening((rows.force - force)[:, None])[:, 0], whitening(jacobian)
     deviance = float(residual @ residual) + whitening.logdet
-    return Fitted(model, scatter, rows, force, friction, jacobian, residual, white, deviance)
+    return Fitted(model, scatter, rows, force, friction, jacobian, residual, white, deviance, whitening)
 
 
 def settled(fitted: Fitted) -> Fitted:

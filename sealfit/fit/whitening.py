@@ -47,6 +47,10 @@ class Scatter:
     alike: float = 1.0  # by which neighbours that resemble each other widen the variance of a mean
     shape: float = 1.0  # by which files' own shapes widen the variance of a pattern along the stroke, beyond that
 
+    def knows(self, level: str) -> bool:
+        """Whether the variance of a level could be told from that of the others, be it zero."""
+        return any(part.level == level for part in self.components)
+
     def noise_sd(self, friction: np.ndarray) -> np.ndarray:
         """Return the standard deviation of a row's own noise, shape of `friction`."""
         return np.sqrt(self.s0**2 + (self.g * friction) ** 2)
