@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -104,7 +105,8 @@ def _in_processes(function: Callable[[Given], Made], items: Sequence[Given], wor
 
     def send(count: int) -> None:
         with _no_interrupt_for_children():
-            sent.extend(executor.submit(_apply, function, chunk) for chunk in islice(chunks, count))
+            # Pickled here, not by the executor's thread, while the caller goes on to use and change the items.
+            sent.extend(executor.submit(_apply, pickle.dumps((function, chunk))) for chunk in islice(chunks, count))
 
     finished = False
     try:
@@ -130,7 +132,8 @@ def _in_processes(function: Callable[[Given], Made], items: Sequence[Given], wor
                 process.join()
 
 
-def _apply(function: Callable[[Given], Made], chunk: Sequence[Given]) -> list[Made]:
+def _apply(pickled: bytes) -> list:
+    function, chunk = pickle.loads(pickled)
     return [function(item) for item in chunk]
 
 

@@ -4,7 +4,9 @@ import pickle
 import signal
 import subprocess
 import sys
+import threading
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -188,3 +190,19 @@ def test_begun_work_gives_the_same_and_can_be_given_up():
             break
         time.sleep(0.1)
     assert not multiprocessing.active_children()
+
+
+class PickledBy:
+    """Remembers which thread pickled it."""
+
+    def __getstate__(self):
+        return {"thread": threading.current_thread() is threading.main_thread()}
+
+
+def pickled_by_main(item):
+    return item.thread
+
+
+def test_items_are_pickled_before_the_caller_goes_on_to_change_them():
+    with closing(begin_map(pickled_by_main, [PickledBy() for _ in range(6)], workers=2)) as made:
+        assert list(made) == [True] * 6
