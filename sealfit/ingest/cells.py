@@ -123,18 +123,18 @@ def _patient(body: bytes, layout: Layout, settings: TraceFormat, numeric: dict[i
             rows.append(split_line(without_strays(line, settings), settings.delimiter))
             number.append(layout.first_line + i)
     line = np.array(number, dtype=np.int64)
-    width = len(layout.names) or max(len(row) for row in rows)
+    width = len(layout.names) or max((len(row) for row in rows), default=0)
     columns: dict[int, np.ndarray] = {}
     bad = np.zeros(len(rows), bool)
     faults: list[Fault] = []
     for i, name in numeric.items():
         cells = [row[i] if i < len(row) else None for row in rows]
-        values = np.array([_float(cell, settings.decimal) for cell in cells])
+        values = np.array([_float(cell, settings.decimal) for cell in cells], dtype=float)
         wrong = ~np.isfinite(values)
         bad |= wrong
         faults += _cell_faults(np.flatnonzero(wrong), cells, rows, line, name, settings.decimal, file)
         columns[i] = values
-    beyond = np.array([any(cell.strip() for cell in row[width:]) for row in rows])
+    beyond = np.array([any(cell.strip() for cell in row[width:]) for row in rows], dtype=bool)
     faults += _beyond_faults(np.flatnonzero(beyond & ~bad), rows, line, width, file)
     bad |= beyond
     for i in range(width):
