@@ -230,6 +230,9 @@ def main() -> None:
 
 
 def _exit_code() -> int:
+    from sealfit.engine import one_thread
+
+    one_thread()
     try:
         code = app(standalone_mode=False, prog_name="sealfit") or 0
         return _interrupted() if code == INTERRUPTED else code

@@ -36,6 +36,16 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
+def one_thread() -> None:
+    """Let linear algebra use one thread in this process and those it starts, unless the user has said otherwise.
+
+    Its products are small, and here processes share the cores: more threads only wait for each other, and their
+    rounding depends on how many there are. To be called before numpy loads.
+    """
+    for name in ONE_THREAD:
+        os.environ.setdefault(name, "1")
+
+
 def run_map(
     function: Callable[[Given], Made], items: Iterable[Given], *, workers: int = 1, trial_s: float = 0.0
 ) -> Iterator[Made]:
@@ -156,8 +166,7 @@ def _no_interrupt_for_children() -> Iterator[None]:
 def _start_worker() -> None:
     if sys.platform == "win32":
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for name in ONE_THREAD:  # read when numpy loads, which is later: the processes share the cores, not the threads
-        os.environ.setdefault(name, "1")
+    one_thread()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
