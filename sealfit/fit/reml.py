@@ -131,25 +131,26 @@ class RestrictedLikelihood:
             size[level][k] = v
         own = self.variance + self.loads**2 @ size[self.finest]
         loads, columns = self.loads / own[:, None], self.columns / own[:, None]
-        square = loads[:, :, None] * self.loads[:, None, :]  # B' V^-1 B, (groups, 2, 2)
-        cross = loads[:, :, None] * self.columns[:, None, :]  # B' V^-1 [X r], (groups, 2, p + 1)
+        square = (loads[:, 0], loads[:, 1], loads[:, 1] * self.loads[:, 1])  # B' V^-1 B: 11, 12 and 22, each (groups,)
+        cross = (columns, columns * self.loads[:, 1:])  # B' V^-1 [X r], a row of each, (groups, p + 1)
         gram = self.columns.T @ columns
         value = float(np.log(own).sum())
         steps = [(square, cross)]
         inner = []
         for level in self.above:
             start, _ = self.groups[level]
-            q, t = np.add.reduceat(square, start), np.add.reduceat(cross, start)
-            root = np.sqrt(size[level])
-            m, logdet = _inverse(np.eye(2) + root[:, None] * q * root)
-            m *= root[:, None] * root
-            mt = np.einsum("gij,gjk->gik", m, t)
+            q = tuple(np.add.reduceat(part, start) for part in square)
+            t = tuple(np.add.reduceat(part, start) for part in cross)
+            m, logdet = _shrinkage(q, size[level])
+            mt = _applied(m, t)
             value += float(logdet.sum())
-            gram -= t.reshape(-1, t.shape[2]).T @ mt.reshape(-1, t.shape[2])
-            mq = np.einsum("gij,gjk->gik", m, q)
-            inner.append((m, mt, np.eye(2) - mq))
-            square = q - np.einsum("gij,gjk->gik", q, mq)
-            cross = t - np.einsum("gij,gjk->gik", q, mt)
+            gram -= t[0].T @ mt[0] + t[1].T @ mt[1]
+            mq = _product(m, q)
+            left = (1.0 - mq[0], -mq[1], -mq[2], 1.0 - mq[3])
+            inner.append((m, mt, left))
+            # q - q m q and t - q m t: what is left between the groups of this level
+            square = (q[0] * left[0] + q[1] * left[2], q[0] * left[1] + q[1] * left[3], q[1] * left[1] + q[2] * left[3])
+            cross = tuple(x - y for x, y in zip(t, _applied(q, mt), strict=True))
             steps.append((square, cross))
         chol = np.linalg.cholesky(gram[:-1, :-1] + 1e-12 * np.eye(gram.shape[0] - 1))
         half = solve_triangular(chol, gram[:-1, -1], lower=True)
@@ -168,24 +169,59 @@ class RestrictedLikelihood:
                     n, y = m, mt
                 else:
                     code = self.groups[self.above[k + 1]][1]
-                    n = m + np.einsum("gij,gjk,glk->gil", left, n[code], left)
-                    y = mt + np.einsum("gij,gjk->gik", left, y[code])
+                    n = tuple(x + z for x, z in zip(m, _sandwich(left, tuple(x[code] for x in n)), strict=True))
+                    first, second = (x[code] for x in y)
+                    y = (
+                        mt[0] + left[0][:, None] * first + left[1][:, None] * second,
+                        mt[1] + left[2][:, None] * first + left[3][:, None] * second,
+                    )
                 code = self.groups[self.above[k]][1]
-                cross = cross - np.einsum("gij,gjk->gik", square, y[code])
-                square = square - np.einsum("gij,gjk,gkl->gil", square, n[code], square)
-            turned = (cross.reshape(-1, cross.shape[2]) @ turn).reshape(cross.shape)
+                cross = tuple(x - z for x, z in zip(cross, _applied(square, tuple(x[code] for x in y)), strict=True))
+                taken = _sandwich((square[0], square[1], square[1], square[2]), tuple(x[code] for x in n))
+                square = tuple(x - z for x, z in zip(square, taken, strict=True))
             level = self.above[k - 1] if k else self.finest
-            slope[level] = np.einsum("gii->i", square) - np.einsum("gik,gik->i", turned, turned)
+            turned = [part @ turn for part in cross]
+            slope[level] = [float(square[0].sum()) - _sum(turned[0]), float(square[2].sum()) - _sum(turned[1])]
         return 0.5 * value, 0.5 * np.array([slope[level][k] for level, k in self.places])
 
 
-def _inverse(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inverse and log determinant of symmetric positive 2 x 2 matrices, shapes (g, 2, 2) and (g,)."""
-    det = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
-    turned = np.empty_like(a)
-    turned[:, 0, 0], turned[:, 1, 1] = a[:, 1, 1], a[:, 0, 0]
-    turned[:, 0, 1], turned[:, 1, 0] = -a[:, 0, 1], -a[:, 1, 0]
-    return turned / det[:, None, None], np.log(det)
+Symmetric = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""2 x 2 matrices by their entries 11, 12 and 22, each (groups,): far quicker than products of stacks so small."""
+
+
+def _shrinkage(q: Symmetric, size: np.ndarray) -> tuple[Symmetric, np.ndarray]:
+    """Return (S^-1 + q)^-1 and log det (1 + S q), shape (groups,), for S the diagonal of `size`; S may hold zeros."""
+    a, b, c = 1.0 + size[0] * q[0], np.sqrt(size[0] * size[1]) * q[1], 1.0 + size[1] * q[2]
+    det = a * c - b * b
+    return (size[0] * c / det, -np.sqrt(size[0] * size[1]) * b / det, size[1] * a / det), np.log(det)
+
+
+def _applied(m: Symmetric, rows: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return m times two rows of columns, each (groups, columns)."""
+    off = m[1][:, None]
+    return m[0][:, None] * rows[0] + off * rows[1], off * rows[0] + m[2][:, None] * rows[1]
+
+
+def _product(m: Symmetric, q: Symmetric) -> tuple[np.ndarray, ...]:
+    """Return m q by its entries 11, 12, 21 and 22."""
+    return (
+        m[0] * q[0] + m[1] * q[1],
+        m[0] * q[1] + m[1] * q[2],
+        m[1] * q[0] + m[2] * q[1],
+        m[1] * q[1] + m[2] * q[2],
+    )
+
+
+def _sandwich(left: Sequence[np.ndarray], n: Symmetric) -> Symmetric:
+    """Return L n L' for L by its entries 11, 12, 21 and 22."""
+    a, b, c, d = left
+    first, second = a * n[0] + b * n[1], a * n[1] + b * n[2]
+    third, fourth = c * n[0] + d * n[1], c * n[1] + d * n[2]
+    return first * a + second * b, first * c + second * d, third * c + fourth * d
+
+
+def _sum(columns: np.ndarray) -> float:
+    return float(np.vdot(columns, columns))
 
 
 def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
