@@ -9,12 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from sealfit.closure.judge import LEAST_LEFT, Candidate, project
+from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.terms import Term, mean_derivatives
 
 PART = 32  # points of a grid whitened at once
 UNNAMED = (SMOOTH, SURFACE)
+PAIR = 10.0  # two channels together must be favoured over one by exp(5): there are many more to be chosen from
 ZERO_OFFSET = (("direction",), "force", "add")
 PREFERRED = ("mu", "mu_c", "mu_s", "v_s", "sigma_2", "a", "b", "mu_0", "force")
 
@@ -35,8 +37,9 @@ class Proposal:
 
     @property
     def price(self) -> float:
-        """Schwarz's price of its parameters."""
-        return len(self.term.effect.parameters) * np.log(max(self.units, 2))
+        """Schwarz's price of its parameters, and of being one of the many pairs of channels."""
+        pair = PAIR if SECOND in self.term.effect.reads else 0.0
+        return len(self.term.effect.parameters) * np.log(max(self.units, 2)) + pair
 
     @property
     def criterion(self) -> float:
