@@ -19,7 +19,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtrc
 
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.reml import orthonormal
@@ -39,6 +39,7 @@ class FewTest(NamedTuple):
     known: float  # degrees of freedom that the variance components count for
     chi2: float  # whitened sum of squares they explain
     log_p: float  # not adjusted
+    share: float  # of the columns' sum of squares that is one number a unit
 
 
 class Numbers(NamedTuple):
@@ -106,7 +107,8 @@ class FewUnits:
             return None
         chi2 = float(((numbers.values @ basis) ** 2).sum())
         log_p = float(log_p_of(numbers.values[None, :], basis, numbers.known)[0])
-        return FewTest(target, basis, numbers.known, chi2, log_p)
+        share = float((columns**2).sum() / max((left**2).sum(), 1e-300))
+        return FewTest(target, basis, numbers.known, chi2, log_p, share)
 
     def draws(self, count: int, rng: np.random.Generator) -> dict[tuple[str, str], np.ndarray]:
         """Return numbers as chance alone would give them, for each quantity of shape (count, d), correlated as here."""
@@ -137,4 +139,4 @@ def log_p_of(values: np.ndarray, basis: np.ndarray, known: float) -> np.ndarray:
     explained = ((values @ basis) ** 2).sum(axis=1)
     left = np.maximum((values**2).sum(axis=1) - explained, 1e-300)
     df = known + d - k
-    return stats.f.logsf(explained / k / ((known + left) / df), k, df)
+    return np.log(np.maximum(fdtrc(k, df, explained / k / ((known + left) / df)), 1e-300))

@@ -28,8 +28,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
-from scipy.special import betainc
+from scipy.special import betainc, chdtrc, fdtrc
 
 from sealfit.closure import few
 from sealfit.closure.channels import FINER
@@ -39,8 +38,10 @@ from sealfit.fit.reml import orthonormal
 
 FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
 JACKKNIFE_UNITS = 30  # from which the jackknife is tried
-PROMISING = 0.01  # p-value by sign flips, not adjusted, below which it is
+PROMISING = 1e-3  # p-value of what columns explain, not adjusted, below which it is
 SEARCHES = 2  # single channels and pairs of them: each search has half of the error
+WORTH_A_LOOK = 0.05  # as above, below which columns that are constant in a run are held against the runs' own scatter
+CONSTANT = 0.9  # share of columns that is one number a run
 OWN = 1e-6  # eigenvalue of what is left without a unit, below which the unit alone determines it
 LEAST_LEFT = 0.01  # share of a column's variance that must survive projection to be identifiable here
 
@@ -114,6 +115,7 @@ class Judge:
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
         self.few = FewUnits(fitted)
+        self._runs = FewUnits(fitted, "run")
         self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
@@ -152,7 +154,7 @@ class Judge:
         """
         found = []
         for left in variants:
-            judgement = self._judge(left, level)
+            judgement = self._judge(left, level, target)
             if judgement is None:
                 return None
             found.append(judgement)
@@ -163,7 +165,7 @@ class Judge:
                 return weakest._replace(chi2=test.chi2, df=test.basis.shape[1], few=test)
         return weakest
 
-    def _judge(self, left: np.ndarray, level: str) -> Judgement | None:
+    def _judge(self, left: np.ndarray, level: str, target: tuple[str, str]) -> Judgement | None:
         fitted = self.fitted
         units = fitted.rows.groups.starts[level].size
         size = np.sqrt(_squares(left))
@@ -177,8 +179,14 @@ class Judge:
         total = left.T @ fitted.white_residual
         log_p = float(log_p_of(_wald(total[None, :], scores)[0], left.shape[1], units))
         jackknife = 0.0
-        if units >= JACKKNIFE_UNITS and log_p < np.log(PROMISING):
-            jackknife = max(self._jackknife(left, level), float(stats.chi2.logsf(total @ total, left.shape[1])))
+        if units >= JACKKNIFE_UNITS:
+            explained = _log(chdtrc(left.shape[1], total @ total))
+            if level == "run" and explained < np.log(WORTH_A_LOOK):
+                test = self._runs.test(left, target)
+                if test is not None and test.share > CONSTANT:
+                    explained = min(explained, test.log_p)
+            if explained < np.log(PROMISING):
+                jackknife = max(self._jackknife(left, level), explained)
         return Judgement(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
 
     def _jackknife(self, left: np.ndarray, level: str) -> float:
@@ -200,7 +208,7 @@ class Judge:
         without = np.einsum("uij,uj->ui", _inverse_of(*np.linalg.eigh(square)), right)
         spread = (without - total).T @ (without - total) * (units - 1) / units
         t = float(total @ np.linalg.pinv(spread, hermitian=True) @ total)
-        return float(stats.f.logsf(t * (units - k) / (k * (units - 1)), k, units - k))
+        return _log(fdtrc(k, units - k, t * (units - k) / (k * (units - 1))))
 
     def _without(self, level: str) -> tuple[np.ndarray, np.ndarray]:
         """Return per unit the inverse of 1 - B'B, shape (units, p, p), and B'r, shape (units, p)."""
@@ -211,6 +219,10 @@ class Judge:
             product = fitted.rows.groups.sums(fitted.basis * fitted.white_residual[:, None], level)
             self._kept[level] = (inverse, product)
         return self._kept[level]
+
+
+def _log(p_value: float) -> float:
+    return float(np.log(max(p_value, 1e-300)))
 
 
 def _inverse_of(size: np.ndarray, axes: np.ndarray) -> np.ndarray:
