@@ -118,17 +118,23 @@ def grow(
 
 
 def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
-    """Return candidates of a condition that explain at least half of what the calendar does on the same quantity.
+    """Return candidates that may be what the significant ones show, though chance alone might explain them.
 
-    Conditions are tested one after the other, so the calendar follows them, and a dozen specimens alone may not say so.
+    That a channel orders the residual is shown once; on which quantity it acts is for the forms to tell, so the same
+    channel on others comes along. So do conditions that explain half of what the calendar does on the same quantity:
+    they are tested one after the other, so the calendar follows them, and a dozen specimens may not say so.
     """
     found = []
     keys = {c.key for c in significant}
-    for calendar in (c for c in significant if c.channels[0] in CALENDAR):
+    for shown in significant:
         for c in candidates:
-            alike = c.unit == "specimen" and (c.acts_on, c.operation) == (calendar.acts_on, calendar.operation)
-            if alike and c.key not in keys and c.chi2 >= HALF * calendar.chi2:
-                found.append(replace(c, p_value=calendar.p_value))
+            alike = (c.acts_on, c.operation) == (shown.acts_on, shown.operation)
+            behind = shown.channels[0] in CALENDAR and c.unit == "specimen" and alike
+            beside = (
+                c.channels[-1:] == shown.channels[-1:] and not shown.pair and c.columns.shape == shown.columns.shape
+            )
+            if (behind or beside) and c.key not in keys and c.chi2 >= HALF * shown.chi2:
+                found.append(replace(c, p_value=shown.p_value))
                 keys.add(c.key)
     return found
 
