@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, FINE_DF, FREE_DF, WIDE, Channel, even_knots
+from sealfit.closure.channels import CALENDAR, FREE_DF, WIDE, Channel, even_knots
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.judge import Candidate, Judgement
 from sealfit.closure.ripple import Peak
@@ -19,6 +19,8 @@ from sealfit.fit.estimate import Fitted
 from sealfit.fit.terms import Term
 
 WAVY = ("bump", "quadratic")  # through a calendar they follow whatever was tested when
+FINE_SHAPES = (9, 14, 20)  # knots of finer free shapes, where a finer one than usual was significant
+UNITS_PER_KNOT = 3
 MOST_PLACES = 60  # between neighbouring values that are tried
 REACH = 4.0  # spans of a channel that a width or a time constant may have
 PHASES = tuple(np.arange(4) * np.pi / 4)
@@ -71,7 +73,9 @@ def terms_of(
     if name != "direction":
         yield free_term(channel, *target), {}
         if candidate.judgement.df > FREE_DF + 1 and channel.numeric:
-            yield free_term(channel, *target, df=FINE_DF), {}
+            for df in FINE_SHAPES:
+                if df <= candidate.judgement.units // UNITS_PER_KNOT:
+                    yield free_term(channel, *target, df=df), {}
 
 
 def _terms_of_pair(
