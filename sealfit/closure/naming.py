@@ -22,12 +22,13 @@ from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripple import Peak
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.estimate import Fitted, fit, settled
+from sealfit.fit.whitening import Scatter, Whitening
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly
 HALF = 0.5  # share of what the calendar explains from which anything else comes before it
 CALENDAR_RIVALS = 2  # refitted as rivals where something else comes first
-BEHIND = 0.3  # share of the best one's gain by which a proposal may be behind before each has its own scatter
+BEHIND = 60.0  # by which a proposal may be behind under the best one's scatter and still be worth one of its own
 TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
 RIVAL = 10.0  # an alternative: the data favour the chosen one by less than exp(5)
 HELD = 0.5  # relative standard error beyond which a form's own number is not determined
@@ -209,13 +210,28 @@ def _identical(one: Proposal, other: Proposal) -> bool:
 
 
 def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
-    """Return proposals fitted jointly with the physics; those in reach of the best with a scatter of their own."""
-    refitted = [replace(p, fitted=_joint(fitted, p)) for p in found]
+    """Return proposals fitted jointly with the physics, best first; those in reach with a scatter of their own.
+
+    What is in reach shows under the scatter of the best: there a rival has no room left to hide what it lacks.
+    """
+    refitted = sorted((replace(p, fitted=_joint(fitted, p)) for p in found), key=lambda p: p.criterion)
     if not refitted:
         return []
-    best = min(p.criterion for p in refitted)
-    reach = max(3 * RIVAL, BEHIND * (fitted.deviance - best))
-    return [replace(p, fitted=settled(p.fitted)) if p.criterion < best + reach else p for p in refitted]
+    best = replace(refitted[0], fitted=settled(refitted[0].fitted))
+    least = min(best.criterion, refitted[0].criterion)
+    scatter = best.fitted.scatter
+    near = [_deviance_under(p.fitted, scatter) + p.price < least + BEHIND for p in refitted[1:]]
+    own = [replace(p, fitted=settled(p.fitted)) if n else p for p, n in zip(refitted[1:], near, strict=True)]
+    return [best, *own]
+
+
+def _deviance_under(fitted: Fitted, scatter: Scatter) -> float:
+    """Return the deviance that a fit would have under another scatter, refitted in its tangent space."""
+    whitening = Whitening(scatter, fitted.friction, fitted.rows.groups)
+    residual = whitening(fitted.residual[:, None])[:, 0]
+    normal, gradient = whitening.normal(fitted.jacobian, residual)
+    step, *_ = np.linalg.lstsq(normal, gradient, rcond=1e-10)
+    return float(residual @ residual - step @ gradient) + whitening.logdet
 
 
 def _joint(fitted: Fitted, proposal: Proposal) -> Fitted:
