@@ -19,13 +19,13 @@ from truths import NO_INTERVAL, TrueEffect, test_true_forms, true_effects, truth
 
 from sealfit.closure.grow import numbered
 from sealfit.closure.judge import project
-from sealfit.closure.loop import MOST_ROWS, Closure, close_loop
+from sealfit.closure.loop import Closure, close_loop, merged_bins
 from sealfit.closure.predict import predict
 from sealfit.closure.record import from_record
 from sealfit.config import load_config
 from sealfit.fit.estimate import fitted_at
 from sealfit.fit.joint import Model, evaluate
-from sealfit.fit.rows import Rows, make_rows, thin
+from sealfit.fit.rows import Rows, make_rows
 from sealfit.fit.whitening import Component, Scatter
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.simulate import Spec, load_truth, simulate, true_force, truth_path
@@ -132,7 +132,7 @@ def _rows(bins: pd.DataFrame, spec: Spec, config) -> Rows:
     """Return the rows the loop works on: merged as it does, bins as they are where there is a ripple."""
     counted = numbered(bins.reset_index(drop=True))
     as_they_are = any(e.id == "ripple" for e in spec.effects)  # merged bins would blur it
-    return make_rows(counted if as_they_are else thin(counted, MOST_ROWS), has_aging=config.aging)
+    return make_rows(counted if as_they_are else merged_bins(counted), has_aging=config.aging)
 
 
 def _scatter(record: dict) -> Scatter:

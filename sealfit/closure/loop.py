@@ -24,7 +24,9 @@ from sealfit.engine import begin_map, run_map
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.rows import Rows, make_rows, thin
 
-MOST_ROWS = 8_000  # rows the search works on; more are merged along their strokes
+ROWS = 4_000  # that the search works on; more are merged along their strokes,
+PER_STROKE = 10  # to no fewer than these of each stroke,
+MOST_ROWS = 8_000  # unless there are more than so many then
 
 
 @dataclass(frozen=True)
@@ -69,8 +71,9 @@ def close_loop(
     counted = numbered(bins)
     rows = make_rows(counted, has_aging=config.aging)
     samples = steady_samples(traces, rows)
-    merged = len(bins) > MOST_ROWS
-    coarse = make_rows(thin(counted, MOST_ROWS), has_aging=config.aging) if merged else rows
+    coarse = make_rows(merged_bins(counted), has_aging=config.aging)
+    merged = coarse.force.size < rows.force.size
+    coarse = coarse if merged else rows
     heldout = _HeldOut(rows, coarse, samples, config, effects, workers)
     with closing(heldout):
         fine = rows if merged else None
@@ -94,6 +97,17 @@ def close_loop(
         "curves": curve_table(before, after),
     }
     return Closure(document, to_record(before, after, config), tables)
+
+
+def merged_bins(bins: pd.DataFrame) -> pd.DataFrame:
+    """Return the bins that the search works on: neighbours of a stroke merged where there are many.
+
+    Parameters
+    ----------
+    bins : DataFrame
+        As `numbered` gives them.
+    """
+    return thin(bins, int(np.clip(PER_STROKE * bins["stroke_id"].nunique(), ROWS, MOST_ROWS)))
 
 
 def _on_all(rows: Rows, grown: Grown, fitted: Fitted) -> Fitted:
