@@ -25,6 +25,7 @@ import numpy as np
 
 SAME = 0.98
 SAME_EQUATION = {
+    ("product", "bilinear"),  # about another centre
     ("drift", "linear"),
     ("campaign_drift", "linear"),
     ("lab_temperature", "linear"),

@@ -88,7 +88,8 @@ def _edge(rows: Rows, condition: int) -> bool:
 class Gain:
     """What a proposal gains on held-out groups: in RMSE, and in the sum of squares with scatter accounted for."""
 
-    rmse_N: float
+    rmse_N: float  # fall of the RMSE
+    left_N: float  # RMSE with it
     deviance: float  # fall of the whitened sum of squares: what a piece of scatter moves as a whole counts once
 
     @property
@@ -121,7 +122,7 @@ def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int, samp
             squares[k] += float(weight @ inside**2)
             white[k] += float((whitening(residual[:, None]) ** 2).sum())
     rmse = np.sqrt(squares / max(known, 1e-300))
-    return Gain(float(rmse[0] - rmse[1]), float(white[0] - white[1]))
+    return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(white[0] - white[1]))
 
 
 def _about(residual: np.ndarray, rows: Rows, proposal: Proposal) -> np.ndarray:
@@ -157,7 +158,7 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
     both = agreement(samples, sample_first, length, axis)
     there = both.size > 1 and stats.wilcoxon(both, alternative="greater").pvalue < SURE
     rmse = np.sqrt(squares)
-    return Gain(float(rmse[0] - rmse[1]), float(squares[0] - squares[1]) if there else -1.0)
+    return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(squares[0] - squares[1]) if there else -1.0)
 
 
 def _first_half(table: pd.DataFrame, in_turn: bool) -> np.ndarray:
@@ -178,11 +179,15 @@ def _inside(rows: Rows, force: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Added:
-    """An accepted effect: the proposal, its gain on held-out data and the rivals these data cannot tell from it."""
+    """An accepted effect: the proposal, its gain on held-out data and the rivals these data cannot tell from it.
+
+    `rivals_rmse_N` is the RMSE on the same held-out data with each rival in its place; NaN where it was not asked for.
+    """
 
     proposal: Proposal
     gain_N: float
     rivals: tuple[Proposal, ...]
+    rivals_rmse_N: tuple[float, ...]
     round: int
 
 
@@ -193,6 +198,8 @@ def confirmed(
     config: Config,
     number: int,
     say: Callable[[str], None],
+    *,
+    compare: bool,
 ) -> Added | None:
     """Return the first of a round's best proposals that gains on held-out data; None where none does.
 
@@ -210,11 +217,16 @@ def confirmed(
         Of the round.
     say : callable
         Told in words what is being done.
+    compare : bool
+        Whether its rivals are asked for the held-out data too.
     """
     for proposal in proposals[:TRIES]:
         gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed, samples)
         unit = config.units.unit("force")
         say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
         if gain.real:
-            return Added(proposal, gain.rmse_N, tuple(rivals(proposal, proposals)), number)
+            others = rivals(proposal, proposals)
+            tried = [heldout_gain(fitted, o, config.loop.folds, config.loop.seed, samples) for o in others if compare]
+            rmse = [g.left_N for g in tried] if compare else [np.nan] * len(others)
+            return Added(proposal, gain.rmse_N, tuple(others), tuple(rmse), number)
     return None

@@ -30,50 +30,56 @@ UNSTEADY = 0.2  # share of an offset by which it may differ from run to run and 
 QUANTITY_UNIT = {"sigma_2": ("force", "speed"), "v_s": ("speed",), "b": ("days",)}
 
 
-def effect_entries(after: Fitted, added: Sequence[Added], config: Config) -> list[dict]:
-    """Return closure.json's `effects`, one per term of the after-model."""
-    entries = []
-    for number, (item, term) in enumerate(zip(added, after.model.terms, strict=True)):
-        proposal = item.proposal
-        intervals = effect_intervals(after, number, proposal.unit)
-        free = (
-            {"phi"} if "shift" in term.fixed else set()
-        )  # each pass has a phase of its own: there is not one to print
-        parameters = [
-            {
-                "name": p.symbol,
-                "value": None if p.name in free else intervals[p.name][0],
-                "ci95": [None, None] if p.name in free else list(intervals[p.name][1:]),
-                "unit": parameter_unit(p.unit, term, config.units),
-            }
-            for p in term.effect.parameters
-        ]
-        entries.append(
-            {
-                "id": term.effect.id,
-                "label": describe(term) + (", its phase each pass's own" if "shift" in term.fixed else ""),
-                "level": effect_level(term, after.rows),
-                "channels": channels_of(term, after.rows),
-                "acts_on": term.acts_on,
-                "operation": term.operation,
-                "form": form_of(term),
-                "named": proposal.named,
-                "candidate": False,
-                "parameters": parameters,
-                "p_value": proposal.p_value,
-                "heldout_gain_N": None if not np.isfinite(item.gain_N) else item.gain_N,
-                "alternatives": [
-                    {
-                        "id": rival.term.effect.id,
-                        "channels": channels_of(rival.term, after.rows),
-                        "acts_on": rival.term.acts_on,
-                        "heldout_rmse_N": None,
-                    }
-                    for rival in item.rivals
-                ],
-            }
-        )
+def effect_entries(after: Fitted, grown: Grown, config: Config) -> list[dict]:
+    """Return closure.json's `effects`: one per term of the after-model, then what is a candidate only."""
+    entries = [_entry(after, number, item, config) for number, item in enumerate(grown.added)]
+    if grown.unsure is not None:
+        alone = grown.unsure.proposal.fitted
+        entries.append({**_entry(alone, len(alone.model.terms) - 1, grown.unsure, config), "candidate": True})
     return entries
+
+
+def _entry(after: Fitted, number: int, item: Added, config: Config) -> dict:
+    """Return the entry of one effect of a fit's model."""
+    term, proposal = after.model.terms[number], item.proposal
+    own_phase = "shift" in term.fixed  # each pass has a phase of its own: there is not one to print
+    intervals = effect_intervals(after, number, proposal.unit)
+    parameters = [
+        {
+            "name": p.symbol,
+            "value": None if own_phase and p.name == "phi" else intervals[p.name][0],
+            "ci95": [None, None] if own_phase and p.name == "phi" else list(intervals[p.name][1:]),
+            "unit": parameter_unit(p.unit, term, config.units),
+        }
+        for p in term.effect.parameters
+    ]
+    return {
+        "id": term.effect.id,
+        "label": describe(term) + (", its phase each pass's own" if own_phase else ""),
+        "level": effect_level(term, after.rows),
+        "channels": channels_of(term, after.rows),
+        "acts_on": term.acts_on,
+        "operation": term.operation,
+        "form": form_of(term),
+        "named": proposal.named,
+        "candidate": False,
+        "parameters": parameters,
+        "p_value": proposal.p_value,
+        "heldout_gain_N": _number(item.gain_N),
+        "alternatives": [
+            {
+                "id": rival.term.effect.id,
+                "channels": channels_of(rival.term, after.rows),
+                "acts_on": rival.term.acts_on,
+                "heldout_rmse_N": _number(rmse),
+            }
+            for rival, rmse in zip(item.rivals, item.rivals_rmse_N, strict=True)
+        ],
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def channels_of(term: Term, rows: Rows) -> list[str]:

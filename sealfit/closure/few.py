@@ -28,7 +28,7 @@ from sealfit.fit.whitening import Whitening
 LEAST_LEFT = 0.01  # of a number's variance: what the model has taken out beyond that is no number any more
 KNOWN = 8.0  # degrees of freedom that a variance counts for which runs and files explain
 LEAST_KNOWN = 0.5  # of these degrees of freedom; with fewer the scale is free and no draw depends on it
-LEAST_ERROR = 4  # degrees of freedom of the specimens' scatter below which it is not known
+LEAST_ERROR = 4  # degrees of freedom left for the specimens' scatter, with fewer of which nothing is claimed
 
 
 class FewTest(NamedTuple):
@@ -40,6 +40,7 @@ class FewTest(NamedTuple):
     chi2: float  # whitened sum of squares they explain
     log_p: float  # not adjusted
     share: float  # of the columns' sum of squares that is one number a unit
+    error_df: int  # numbers left for the units' own scatter
 
 
 class Numbers(NamedTuple):
@@ -103,12 +104,12 @@ class FewUnits:
         columns = self.fitted.rows.groups.sums(numbers.direction[:, None] * left, self.level)
         basis = orthonormal(numbers.root @ columns, 1e-3)
         d, k = basis.shape
-        if k == 0 or d - k < LEAST_ERROR:
+        if k == 0 or d == k:
             return None
         chi2 = float(((numbers.values @ basis) ** 2).sum())
         log_p = float(log_p_of(numbers.values[None, :], basis, numbers.known)[0])
         share = float((columns**2).sum() / max((left**2).sum(), 1e-300))
-        return FewTest(target, basis, numbers.known, chi2, log_p, share)
+        return FewTest(target, basis, numbers.known, chi2, log_p, share, d - k)
 
     def draws(self, count: int, rng: np.random.Generator) -> dict[tuple[str, str], np.ndarray]:
         """Return numbers as chance alone would give them, for each quantity of shape (count, d), correlated as here."""

@@ -63,10 +63,10 @@ def terms_of(
                 continue
             fixed = {"x_ref": reference(channel.values)}
             held = _within_reach(effect, channel.values)
-            yield Term(held, (name,), *target, fixed=fixed), _grids(held, channel.values)
+            yield Term(held, (name,), *target, fixed=fixed), grid_of(held, channel.values)
         elif name in effect.reads:
             fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
-            grids = _grids(effect, np.abs(channel.values))
+            grids = grid_of(effect, np.abs(channel.values))
             yield Term(effect, effect.reads, *target, fixed=fixed), grids
             if target == ("mu", "multiply") and ("mu", "add") in effect.acts_on:  # the search tries the factor for both
                 yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids
@@ -197,8 +197,8 @@ def _within_reach(effect: Effect, values: np.ndarray) -> Effect:
     return replace(effect, parameters=tuple(parameters))
 
 
-def _grids(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
-    """Return the values to try for each parameter that is searched."""
+def grid_of(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
+    """Return the values to try for each parameter that is searched, from those of the channel, shape (n,)."""
     span = float(np.ptp(values)) or 1.0
     grids = {}
     for p in effect.nonlinear:

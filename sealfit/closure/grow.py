@@ -12,7 +12,7 @@ from sealfit.closure.channels import CALENDAR, Channel, find_channels
 from sealfit.closure.confirm import TRIES, Added, confirmed
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.judge import Candidate, Judge
-from sealfit.closure.naming import HALF, propose
+from sealfit.closure.naming import HALF, propose, rivals
 from sealfit.closure.pairs import pairs_in_disguise, search_pairs
 from sealfit.closure.periodic import Ripples
 from sealfit.closure.ripple import Peak
@@ -34,6 +34,7 @@ class Grown:
     first: tuple[Candidate, ...]  # candidates on the declared model
     last: tuple[Candidate, ...]  # candidates on the final one
     left: Candidate | Peak | None  # what is still significant
+    unsure: Added | None  # the best form of what too few specimens show; not in any model
     channels: Mapping[str, Channel] = field(default_factory=dict)
 
 
@@ -80,7 +81,7 @@ def grow(
     }
     judge = Judge(before)
     last = first = tuple(search(judge, list(channels.values()), rng))
-    ripples = Ripples(samples, config, effects, say)
+    ripples = Ripples(samples, config, effects, say, compare=start is None)
     if on_found is not None and (ripples.found or any(c.p_value <= alpha for c in first)):
         on_found(before)
     fitted = ripples.added_to(before, fine)
@@ -91,7 +92,7 @@ def grow(
         if fitted is not judge.fitted:
             judge = Judge(fitted)
             last = tuple(search(judge, list(channels.values()), rng))
-        significant = [c for c in last if c.p_value <= alpha]
+        significant = [c for c in last if c.p_value <= alpha and c.sure]
         say(f"round {number}: {len(last)} candidates on {len(channels)} channels, {len(significant)} significant")
         if not significant:
             pairs = search_pairs(judge, list(channels.values()), last, rng)
@@ -104,7 +105,7 @@ def grow(
             break
         open_ += [c for c in _standing_for(open_, last) if c.key not in refused]
         proposals = propose(fitted, open_, channels, effects)
-        accepted = confirmed(fitted, proposals, ripples.samples, config, number, say)
+        accepted = confirmed(fitted, proposals, ripples.samples, config, number, say, compare=start is None)
         if accepted is None:
             refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
             continue
@@ -114,7 +115,14 @@ def grow(
         # What came and went does not come again.
         refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}
         added = kept
-    return Grown(before, fitted if added else before, tuple(added), first, last, left, channels)
+    unsure = None
+    doubtful = [c for c in last if c.p_value <= alpha and not c.sure]
+    if left is None and doubtful:
+        proposals = propose(fitted, doubtful, channels, effects)
+        others = tuple(rivals(proposals[0], proposals))
+        left = doubtful[0]
+        unsure = Added(proposals[0], np.nan, others, (np.nan,) * len(others), len(added) + 1)
+    return Grown(before, fitted if added else before, tuple(added), first, last, left, unsure, channels)
 
 
 def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:

@@ -32,7 +32,7 @@ from scipy.special import betainc, chdtrc, fdtrc
 
 from sealfit.closure import few
 from sealfit.closure.channels import FINER
-from sealfit.closure.few import FewTest, FewUnits
+from sealfit.closure.few import LEAST_ERROR, FewTest, FewUnits
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.reml import orthonormal
 
@@ -75,6 +75,11 @@ class Candidate:
     def key(self) -> tuple:
         """What it acts with and on."""
         return (self.channels, self.acts_on, self.operation)
+
+    @property
+    def sure(self) -> bool:
+        """Whether it may be claimed: too few specimens do not show their own scatter."""
+        return self.judgement.few is None or self.judgement.few.error_df >= LEAST_ERROR
 
     @property
     def chi2(self) -> float:

@@ -83,9 +83,9 @@ def close_loop(
         after = after if grown.added else before
         say(f"held out by {heldout.level}: the search repeated without each fold")
         held_before, held_after = heldout.forces(grown, say)
-    document = _document(config, grown, before, after, held_before, held_after, heldout.level)
+    document = _document(config, effects, grown, before, after, held_before, held_after, heldout.level)
     tables = {
-        "effects": effect_table(document["effects"], grown.added),
+        "effects": effect_table([e for e in document["effects"] if not e["candidate"]], grown.added),
         "residuals_before": _residual_table(bins, before, held_before),
         "residuals_after": _residual_table(bins, after, held_after),
         "levels": pd.concat(
@@ -190,9 +190,11 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
     return predict_rows(part.before, fold.test), predict_rows(part.after, fold.test)
 
 
-def _document(config, grown: Grown, before: Fitted, after: Fitted, held_before, held_after, level: str) -> dict:
+def _document(
+    config, effects, grown: Grown, before: Fitted, after: Fitted, held_before, held_after, level: str
+) -> dict:
     floor = noise_floor(after)
-    entries = effect_entries(after, grown.added, config)
+    entries = effect_entries(after, grown, config)
     numbers = {}
     for name, fitted, held in (("before", before, held_before), ("after", after, held_after)):
         found = errors(fitted.rows, fitted.residual)
@@ -220,7 +222,7 @@ def _document(config, grown: Grown, before: Fitted, after: Fitted, held_before, 
         "effects": entries,
         "scatter": scatter_list(after),
         "left": left_entry(grown, numbers["after"]["rmse_N"], floor),
-        "next_runs": next_runs(grown, config),
+        "next_runs": next_runs(grown, config, effects),
     }
 
 

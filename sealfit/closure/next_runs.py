@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from sealfit.closure.aliases import Alias, find_aliases
 from sealfit.closure.confirm import Added
 from sealfit.closure.forms import describe
 from sealfit.closure.grow import Grown
 from sealfit.config import Config
+from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import Rows
 
 BEYOND = 0.5  # of a channel's range by which a run may go beyond what was tested
+SHOWN = 0.5  # of its size by which a run must show an effect to be worth making for it
 ROWS = 4  # of each stroke at which forces are compared
 
 
-def next_runs(grown: Grown, config: Config) -> list[dict]:
-    """Return for each effect with rivals the run that would tell it from the nearest one.
+def next_runs(grown: Grown, config: Config, effects: Mapping[str, Effect]) -> list[dict]:
+    """Return for each effect with rivals the run that would tell it from the nearest one, and for what cannot be seen
+    here the run that would show it.
 
     Parameters
     ----------
@@ -29,6 +33,8 @@ def next_runs(grown: Grown, config: Config) -> list[dict]:
         The end of the loop.
     config : Config
         The rig.
+    effects : mapping
+        The catalogue.
 
     Returns
     -------
@@ -38,7 +44,9 @@ def next_runs(grown: Grown, config: Config) -> list[dict]:
     wanted = []
     for item in grown.added:
         for rival in item.rivals[:1]:
-            found = where_apart(item, rival.fitted, config)
+            chosen = item.proposal
+            channels = (*chosen.term.channels, *rival.term.channels)
+            found = where_apart(chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, config)
             if found is not None:
                 wanted.append(
                     {
@@ -47,22 +55,56 @@ def next_runs(grown: Grown, config: Config) -> list[dict]:
                         "conditions": found[0],
                     }
                 )
-    return wanted
+    if grown.unsure is not None:
+        wanted.append(_replicates(grown.unsure, config))
+    return [*wanted, *_unseen(grown.after, config, effects)]
 
 
-def where_apart(item: Added, rival: Fitted, config: Config) -> tuple[dict, float] | None:
-    """Return the run at which two fitted models differ most, and by how much (force unit); None if nowhere.
+def _unseen(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> Iterator[dict]:
+    """Yield the run that would show each effect that the model takes up whole here; one for those of like channels."""
+    taken = tuple(name for name in (*config.condition, *config.rubber) if name != "aging_days")
+    alike: dict[tuple[str, ...], list[Alias]] = {}
+    for alias in find_aliases(fitted, effects, taken):
+        alike.setdefault(alias.term.channels, []).append(alias)
+    for channels, aliases in alike.items():
+        first = aliases[0]
+        found = where_apart(first.holding, first.lacking, fitted.rows, channels, config)
+        if found is not None and found[1] > SHOWN * first.size_N:
+            names = " or ".join(describe(a.term) for a in aliases)
+            yield {
+                "why": f"would show {names}: in this campaign the model takes it up whole",
+                "conditions": found[0],
+            }
 
-    Every tested run is tried with each combination of low, usual and high values of the channels that the two effects
-    read: what always went together in the campaign (a condition and the calendar) is taken apart here.
+
+def _replicates(item: Added, config: Config) -> dict:
+    """Return the condition to repeat on a new specimen: where an effect that too few specimens show is largest."""
+    fitted = item.proposal.fitted
+    without = evaluate(fitted.model.without_term(len(fitted.model.terms) - 1), fitted.rows, jacobian=False)[0]
+    k = int(np.argmax(np.abs(fitted.force - without)))
+    count = fitted.rows.groups.starts["specimen"].size
+    return {
+        "why": f"{count} specimens are too few to tell {describe(item.proposal.term)} from how specimens scatter: "
+        "test a second specimen of the same conditions, here first",
+        "conditions": {name: _plain(fitted.rows.table[name].iloc[k]) for name in (*config.condition, "speed_mm_s")},
+    }
+
+
+def where_apart(
+    chosen: Model, rival: Model, rows: Rows, channels: Sequence[str], config: Config
+) -> tuple[dict, float] | None:
+    """Return the run at which two models differ most, and by how much (force unit); None if nowhere.
+
+    Every tested run is tried with each combination of low, usual and high values of the channels, which the effects
+    read that tell the models apart: what always went together in the campaign (a condition and the calendar) is taken
+    apart here.
     """
-    chosen = item.proposal.fitted.model
-    rows = item.proposal.fitted.rows.sparse(ROWS)
-    channels = tuple(dict.fromkeys((*item.proposal.term.channels, *rival.model.terms[-1].channels)))
+    rows = rows.sparse(ROWS)
+    channels = tuple(dict.fromkeys(channels))
     best: tuple[dict, float] | None = None
     for changes in ({}, *_combinations(chosen, rows, channels)):
         moved = _moved(rows, changes)
-        apart = np.abs(evaluate(chosen, moved, jacobian=False)[0] - evaluate(rival.model, moved, jacobian=False)[0])
+        apart = np.abs(evaluate(chosen, moved, jacobian=False)[0] - evaluate(rival, moved, jacobian=False)[0])
         apart = np.where(np.isfinite(apart), apart, 0.0)
         k = int(np.argmax(apart))
         if apart[k] > (0.0 if best is None else best[1]):
@@ -78,7 +120,10 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
     for name in channels:
         own = rows.values(name)
         law = bool(model.declared.law) and all(model.declared.law.values())
-        if name in ("direction", "displacement_mm") or (name == "aging_days" and not law):
+        if name == "direction":
+            values[name] = [-1.0, 1.0]
+            continue
+        if name == "displacement_mm" or (name == "aging_days" and not law):
             continue
         if own.dtype.kind != "f":
             values[name] = list(np.unique(own))
@@ -97,8 +142,11 @@ def _moved(rows: Rows, changes: Mapping[str, object]) -> Rows:
         return rows
     table = rows.table.assign(**changes)
     speed, days, load = rows.speed, rows.days, rows.load
+    if "direction" in changes:
+        speed = np.abs(speed) * float(changes["direction"])
+        table["speed_mm_s"] = speed
     if "speed_mm_s" in changes:
-        speed = np.sign(rows.speed) * float(changes["speed_mm_s"])
+        speed = np.sign(speed) * float(changes["speed_mm_s"])
         table["speed_mm_s"] = speed
         if "time_s" not in changes:
             table["time_s"] = rows.table["time_s"] * np.abs(rows.speed / speed)
@@ -111,4 +159,5 @@ def _moved(rows: Rows, changes: Mapping[str, object]) -> Rows:
 
 
 def _plain(value: object) -> object:
-    return value.item() if hasattr(value, "item") else value
+    value = value.item() if hasattr(value, "item") else value
+    return float(f"{value:.4g}") if isinstance(value, float) else value

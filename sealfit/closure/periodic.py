@@ -32,6 +32,8 @@ class Ripples:
         The catalogue.
     say : callable
         Told in words what is being done.
+    compare : bool
+        Whether rivals of an accepted ripple are asked for the held-out data too.
 
     Attributes
     ----------
@@ -44,9 +46,15 @@ class Ripples:
     """
 
     def __init__(
-        self, samples: pd.DataFrame, config: Config, effects: Mapping[str, Effect], say: Callable[[str], None]
+        self,
+        samples: pd.DataFrame,
+        config: Config,
+        effects: Mapping[str, Effect],
+        say: Callable[[str], None],
+        *,
+        compare: bool,
     ) -> None:
-        self.config, self.effects, self.say = config, effects, say
+        self.config, self.effects, self.say, self.compare = config, effects, say, compare
         self.added: list[Added] = []
         self.samples = samples.assign(residual_N=samples["force_N"])
         self.found = self._strongest()
@@ -67,7 +75,7 @@ class Ripples:
         while self.found is not None and len(self.added) < self.config.loop.max_rounds:
             proposals = propose_ripples(own, self.found, self.samples, self.effects)
             number = len(self.added) + 1
-            accepted = confirmed(own, proposals, self.samples, self.config, number, self.say)
+            accepted = confirmed(own, proposals, self.samples, self.config, number, self.say, compare=self.compare)
             if accepted is None:
                 self.found = None
                 break

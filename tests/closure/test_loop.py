@@ -126,3 +126,22 @@ def test_predict_refuses_a_request_without_a_channel_of_the_model(warming):
     points = points_of(warming[0]).drop(columns=["time_s"])
     with pytest.raises(RequestError, match=r"time_s.*missing"):
         predict(warming[1].model, points)
+
+
+def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
+    bins = make_bins(1, temperatures=(60.0,), repeats=2, bins=4, specimen=0.0003)
+    rng = np.random.default_rng(3)
+    hardness = {piece: rng.normal(70, 3) for piece in bins["specimen_id"].unique()}
+    bins["hardness_ShA"] = bins["specimen_id"].map(hardness)
+    speed, slower = bins["speed_mm_s"], 1 + 0.04 * (bins["hardness_ShA"] - 70)  # v_s follows the hardness
+    bins["force_N"] += 15 * (np.exp(-((speed / (15 * slower)) ** 2)) - np.exp(-((speed / 15) ** 2)))
+    # Three degrees of freedom are left: however strong, F says no more than 0.004 to 0.009 after all that is searched.
+    made = close_loop(bins, make_traces(bins), Config(loop={"family_error": 0.02}))
+    document = made.document
+    assert document["verdict"] == "unexplained"
+    (effect,) = document["effects"]
+    assert effect["candidate"]
+    assert (effect["channels"], effect["acts_on"], effect["level"]) == (["hardness_ShA"], "v_s", "condition")
+    assert document["after"]["rmse_N"] == document["before"]["rmse_N"]
+    assert made.tables["effects"].empty
+    assert any("second specimen" in run["why"] for run in document["next_runs"])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.confirm import Added
+from sealfit.closure.aliases import find_aliases
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.next_runs import where_apart
 from sealfit.config import Config
@@ -19,13 +19,18 @@ def bound(fitted, effect, channel, **values):
     return Proposal(term, values, "run", 10, 1.0, 0.001, np.zeros(fitted.force.size), ((channel,),), after)
 
 
+def between(chosen, rival):
+    channels = (*chosen.term.channels, *rival.term.channels)
+    return where_apart(chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, Config())
+
+
 def test_channels_that_always_went_together_are_taken_apart():
     bins = make_bins(bins=4, repeats=1)
     bins["humidity_pct"] = 30.0 + 2.0 * bins["elapsed_h"]  # rose with the calendar
     fitted = fit_declared(make_rows(bins, has_aging=True))
     chosen = bound(fitted, "linear", "humidity_pct", A=0.01)
     rival = bound(fitted, "linear", "elapsed_h", A=0.02)
-    where, apart = where_apart(Added(chosen, 0.1, (rival,), 1), rival.fitted, Config())
+    where, apart = between(chosen, rival)
     hours = bins["elapsed_h"]
     assert {"humidity_pct", "elapsed_h"} <= where.keys()
     # Dry at the end, or humid at the start: by the whole range, and half of it beyond, of the factor on some 45 N.
@@ -37,7 +42,23 @@ def test_forms_of_one_channel_differ_most_beyond_what_was_tested():
     fitted = fit_declared(make_rows(make_bins(bins=4, repeats=1), has_aging=True))
     chosen = bound(fitted, "linear", "elapsed_h", A=0.01)
     rival = bound(fitted, "exponential_approach", "elapsed_h", A=0.05, tau=5.0)
-    where, apart = where_apart(Added(chosen, 0.1, (rival,), 1), rival.fitted, Config())
+    where, apart = between(chosen, rival)
     assert where["elapsed_h"] > fitted.rows.values("elapsed_h").max()
     assert where["aging_days"] in fitted.rows.days
     assert apart == pytest.approx(abs(0.01 * where["elapsed_h"] - 0.05) * 45.0, rel=0.5)
+
+
+def test_an_offset_is_friction_where_all_runs_go_one_way():
+    fitted = fit_declared(make_rows(make_bins(bins=4, repeats=2, noise_N=0.05), has_aging=True))
+    alias = next(a for a in find_aliases(fitted, EFFECTS, ("temperature_C",)) if a.term.effect.id == "zero_offset")
+    force = 49.03 * 0.6
+    assert alias.size_N == pytest.approx(0.01 * force, rel=0.3)
+    where, apart = where_apart(alias.holding, alias.lacking, fitted.rows, ("direction",), Config())
+    assert where["speed_mm_s"] < 0  # the other way, where the offset helps the friction it stood for
+    assert apart == pytest.approx(2 * alias.size_N, rel=0.05)
+
+
+def test_an_offset_is_no_alias_where_runs_go_both_ways():
+    fitted = fit_declared(make_rows(make_bins(bins=4, repeats=1, directions=(1, -1)), has_aging=True))
+    found = {a.term.effect.id for a in find_aliases(fitted, EFFECTS, ("temperature_C", "compression_ratio_pct"))}
+    assert not found & {"zero_offset", "asymmetry", "drift", "warming_time"}
