@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from sealfit.closure.record import to_record
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
-from sealfit.engine import begin_map, run_map
+from sealfit.engine import begin_map
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.rows import Rows, make_rows, thin
 
@@ -134,7 +134,7 @@ class _HeldOut:
     def begin(self, before: Fitted) -> None:
         """Set processes to work, on the assumption that something will be added."""
         if self.workers > 1:
-            self._begun = begin_map(_held_out, list(self._folds(before, search=True)), workers=self.workers)
+            self._begun = begin_map(_held_out, _Folds(self, before, search=True), workers=self.workers)
 
     def close(self) -> None:
         """End what is still being computed."""
@@ -147,23 +147,11 @@ class _HeldOut:
         made = self._begun
         if made is None or not grown.added:
             self.close()
-            made = run_map(_held_out, self._folds(grown.before, search=bool(grown.added)), workers=self.workers)
+            made = begin_map(_held_out, _Folds(self, grown.before, search=bool(grown.added)), workers=self.workers)
         for k, (out, parts) in enumerate(zip(self.masks, made, strict=True)):
             say(f"  fold {k + 1} of {len(self.masks)}")
             before[out], after[out] = parts
         return before, after
-
-    def _folds(self, before: Fitted, *, search: bool) -> Iterator[_Fold]:
-        samples = self.samples if search else self.samples.head(0)
-        for out in self.masks:
-            gone = self.rows.table["stroke_id"].to_numpy()[out]
-            coarse = self.rows.subset(~out)
-            fine = None
-            if self.coarse is not self.rows:
-                fine = coarse
-                coarse = self.coarse.subset(~self.coarse.table["stroke_id"].isin(gone).to_numpy())
-            seen = samples[~samples["stroke_id"].isin(gone)]
-            yield _Fold(coarse, fine, seen, self.rows.subset(out), self.config, self.effects, before, search)
 
 
 @dataclass(frozen=True)
@@ -178,6 +166,30 @@ class _Fold:
     effects: dict[str, Effect]
     start: Fitted
     search: bool
+
+
+class _Folds(Sequence):
+    """The folds of a campaign, each made when it is asked for: it holds most of the campaign."""
+
+    def __init__(self, campaign: _HeldOut, before: Fitted, *, search: bool) -> None:
+        self.campaign, self.before, self.search = campaign, before, search
+
+    def __len__(self) -> int:
+        return len(self.campaign.masks)
+
+    def __getitem__(self, number):
+        if isinstance(number, slice):
+            return [self[k] for k in range(*number.indices(len(self)))]
+        own, out = self.campaign, self.campaign.masks[number]
+        samples = own.samples if self.search else own.samples.head(0)
+        gone = own.rows.table["stroke_id"].to_numpy()[out]
+        coarse = own.rows.subset(~out)
+        fine = None
+        if own.coarse is not own.rows:
+            fine = coarse
+            coarse = own.coarse.subset(~own.coarse.table["stroke_id"].isin(gone).to_numpy())
+        seen = samples[~samples["stroke_id"].isin(gone)]
+        return _Fold(coarse, fine, seen, own.rows.subset(out), own.config, own.effects, self.before, self.search)
 
 
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
