@@ -16,6 +16,7 @@ from sealfit.closure.waves import common_wavelength, pass_shifts
 from sealfit.effects.contract import CHANNEL, SECOND, Effect
 from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, free_effect, natural
 from sealfit.fit.estimate import Fitted
+from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term
 
 WAVY = ("bump", "quadratic")  # through a calendar they follow whatever was tested when
@@ -54,8 +55,8 @@ def terms_of(
     for effect in effects.values():
         if effect.id in PERIODIC:
             continue
-        if target not in effect.acts_on or not set(effect.reads) <= channels.keys() | {CHANNEL}:
-            continue  # a channel that does not vary makes of an effect another one under a longer name
+        if target not in effect.acts_on or not _all_read(effect, channels, fitted.rows, effects):
+            continue
         if effect.reads == (CHANNEL,):
             if not channel.numeric or name == "direction":
                 continue
@@ -76,6 +77,20 @@ def terms_of(
             for df in FINE_SHAPES:
                 if df <= candidate.judgement.units // UNITS_PER_KNOT:
                     yield free_term(channel, *target, df=df), {}
+
+
+def _all_read(effect: Effect, channels: Mapping[str, Channel], rows: Rows, effects: Mapping[str, Effect]) -> bool:
+    """Whether an effect has what it reads.
+
+    A channel that does not vary (the one load of a campaign) may stay what it is, unless that makes of the effect
+    another one under a longer name.
+    """
+    varying = {name for name in effect.reads if name in channels or name == CHANNEL}
+    still = set(effect.reads) - varying
+    if not still:
+        return True
+    constant = all(name in rows.channels and rows.values(name).dtype.kind == "f" for name in still)
+    return bool(varying) and constant and not any(set(other.reads) == varying for other in effects.values())
 
 
 def _terms_of_pair(

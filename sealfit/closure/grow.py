@@ -12,9 +12,11 @@ from sealfit.closure.channels import CALENDAR, Channel, find_channels
 from sealfit.closure.confirm import TRIES, Added, confirmed
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.judge import Candidate, Judge
+from sealfit.closure.laws import richer_laws
 from sealfit.closure.naming import HALF, propose, rivals
 from sealfit.closure.pairs import pairs_in_disguise, search_pairs
 from sealfit.closure.periodic import Ripples
+from sealfit.closure.revisit import Revisit
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import search
 from sealfit.config import Config
@@ -86,9 +88,11 @@ def grow(
         on_found(before)
     fitted = ripples.added_to(before, fine)
     added = list(ripples.added)
+    revisit = Revisit(channels, effects, ripples.samples, config, say, compare=start is None)
     refused: set[tuple] = set()
     left: Candidate | Peak | None = None
-    for number in range(len(added) + 1, config.loop.max_rounds + 2):
+    again = False  # whether earlier effects have been asked again
+    for number in range(len(added) + 1, config.loop.max_rounds + 3):
         if fitted is not judge.fitted:
             judge = Judge(fitted)
             last = tuple(search(judge, list(channels.values()), rng))
@@ -98,18 +102,27 @@ def grow(
             pairs = search_pairs(judge, list(channels.values()), last, rng)
             significant = [c for c in pairs if c.p_value <= alpha]
             say(f"round {number}: {len(pairs)} pairs, {len(significant)} significant")
+        laws = richer_laws(fitted, channels, effects) if not significant else []
+        significant += [c for c, _ in laws if c.p_value <= alpha and c.sure]
         left = significant[0] if significant else ripples.found
         significant += pairs_in_disguise(judge, significant, channels)
         open_ = [c for c in significant if c.key not in refused]
         if not open_ or number > config.loop.max_rounds:
-            break
+            if again or len(added) < 2:
+                break
+            again, before_that = True, added
+            fitted, added = revisit.all_but_last(fitted, added)
+            if added is before_that:
+                break
+            continue
         open_ += [c for c in _standing_for(open_, last) if c.key not in refused]
-        proposals = propose(fitted, open_, channels, effects)
+        proposals = propose(fitted, open_, channels, effects, [p for _, p in laws])
         accepted = confirmed(fitted, proposals, ripples.samples, config, number, say, compare=start is None)
         if accepted is None:
             refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
             continue
-        added.append(accepted)
+        added, accepted = revisit.one_for_two(fitted, added, accepted)
+        added = [*added, accepted]
         fitted = fit(accepted.proposal.fitted.model, rows, fitted.scatter, turns=2)
         fitted, kept = _drop_needless(fitted, added)
         # What came and went does not come again.

@@ -43,6 +43,7 @@ def propose(
     significant: Sequence[Candidate],
     channels: Mapping[str, Channel],
     effects: Mapping[str, Effect],
+    also: Sequence[Proposal] = (),
 ) -> list[Proposal]:
     """Return jointly refitted proposals for what orders the residual most, best first.
 
@@ -56,11 +57,13 @@ def propose(
         Channels by name.
     effects : mapping
         The catalogue, the user's own effects included.
+    also : sequence of Proposal, optional
+        Proposals found in another way.
     """
     linearised = Linearised(fitted)
     forms = [(t, search, c) for c in _contenders(significant) for t, search in terms_of(c, channels, fitted, effects)]
     forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # a shape made once serves every quantity
-    found = [p for form in forms for p in linearised(*form)]
+    found = [*also, *(p for form in forms for p in linearised(*form))]
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
     others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
     if not (calendar and others and max(p.chi2 for p in others) >= HALF * max(p.chi2 for p in calendar)):
@@ -134,7 +137,7 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
         return []
     found = sorted(found, key=lambda p: p.criterion)
     best = found[0]
-    equals = [p for p in found if p.criterion - best.criterion < TIED or _same(p, best, TIED * 2)]
+    equals = [p for p in found if p.criterion - best.criterion < TIED or _simpler(p, best)]
     held = [p for p in equals if determined(p)]
     fewest = min((len(p.term.effect.parameters) for p in held), default=0)
     held += [p for p in equals if p.term.effect.physical and p not in held and len(p.term.effect.parameters) <= fewest]
@@ -184,8 +187,10 @@ def determined(proposal: Proposal) -> bool:
     return True
 
 
-def _same(one: Proposal, other: Proposal, margin: float) -> bool:
-    return correlation(one, other) > SAME and one.criterion - other.criterion < margin
+def _simpler(proposal: Proposal, best: Proposal) -> bool:
+    """Whether a proposal adds what the best one does, hardly worse, and says it more simply."""
+    plain = proposal.rank[:2] < best.rank[:2] or proposal.source == ZERO_OFFSET
+    return plain and correlation(proposal, best) > SAME and proposal.criterion - best.criterion < 2 * TIED
 
 
 def correlation(one: Proposal, other: Proposal) -> float:

@@ -49,11 +49,12 @@ def search(judge: Judge, channels: Sequence[Channel], rng: np.random.Generator) 
     rng : Generator
         For the sign flips.
     """
-    candidates = [c for channel in channels for c in _of_channel(judge, channel)]
+    candidates = [c for channel in channels for c in of_channel(judge, channel)]
     return judged(judge, candidates, rng) if candidates else []
 
 
-def _of_channel(judge: Judge, channel: Channel) -> Iterator[Candidate]:
+def of_channel(judge: Judge, channel: Channel) -> Iterator[Candidate]:
+    """Yield the candidates of one channel, not adjusted for any search."""
     rows = judge.fitted.rows
     if channel.name == "direction":
         yield from _of_shapes(judge, channel, np.ones((rows.force.size, 1)), TARGETS)

@@ -35,6 +35,11 @@ class Declared:
     stribeck: Mapping[str, str]  # series -> "full" | "viscous" | "constant"
     law: Mapping[str, bool]  # series -> whether Eq. 15 is fitted across its days
 
+    @property
+    def numbers_of_mu(self) -> int:
+        """How many numbers the model fits to one coefficient across conditions: specimens beyond them show scatter."""
+        return sum(p.quantity in ("mu_0c", "a_c", "b_c") for p in self.parameters)
+
 
 def declare(rows: Rows) -> Declared:
     """Return the declared model that these conditions and speeds can carry.

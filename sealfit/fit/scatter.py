@@ -96,9 +96,7 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
 def _specimens_free(rows: Rows) -> bool:
     """Whether specimens scatter about something: replicate specimens of a condition, or a law across conditions."""
     specimens = rows.groups.starts["specimen"].size
-    declared = declare(rows)
-    levels = len([p for p in declared.parameters if p.quantity in ("mu_0c", "a_c", "b_c")])
-    return specimens - levels >= 2
+    return specimens - declare(rows).numbers_of_mu >= 2
 
 
 def _df(rows: Rows, component: Component) -> float:

@@ -1,0 +1,96 @@
+"""Effects asked again: what was named while others were still missing may read otherwise beside them.
+
+While an effect is missing it stands in the scatter, and one that is named then is told from its rivals less well than
+the data allow: a factor from an added force, a line from a logarithm. Where a second effect of one channel is found,
+the first was not its whole shape: one effect that does as well as the two says so better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import pandas as pd
+
+from sealfit.closure.channels import Channel
+from sealfit.closure.confirm import Added, confirmed
+from sealfit.closure.forms import PERIODIC
+from sealfit.closure.judge import Candidate, Judge
+from sealfit.closure.linearised import Proposal
+from sealfit.closure.naming import TIED, propose
+from sealfit.closure.search import of_channel
+from sealfit.config import Config
+from sealfit.effects.contract import Effect
+from sealfit.fit.estimate import Fitted, fit
+
+
+@dataclass(frozen=True)
+class Revisit:
+    """What naming an effect anew needs besides the model.
+
+    Parameters
+    ----------
+    channels, effects, samples, config, say
+        As for `grow`.
+    compare : bool
+        Whether rivals of what is named anew are asked for the held-out data too.
+    """
+
+    channels: Mapping[str, Channel]
+    effects: Mapping[str, Effect]
+    samples: pd.DataFrame
+    config: Config
+    say: Callable[[str], None]
+    compare: bool
+
+    def all_but_last(self, fitted: Fitted, added: list[Added]) -> tuple[Fitted, list[Added]]:
+        """Return a fit and its effects with each but the last named anew beside all the others."""
+        for item in added[:-1]:
+            number = next(k for k, a in enumerate(added) if a is item)
+            without, proposals = self._anew(fitted, number, item)
+            if not proposals or proposals[0].term.key() == item.proposal.term.key():
+                continue
+            better = self._confirmed(without, proposals, item.round)
+            if better is not None and better.proposal.term.key() != item.proposal.term.key():
+                fitted = fit(better.proposal.fitted.model, fitted.rows, fitted.scatter, turns=2)
+                added = [*added[:number], *added[number + 1 :], better]
+        return fitted, added
+
+    def one_for_two(self, fitted: Fitted, added: list[Added], new: Added) -> tuple[list[Added], Added]:
+        """Return earlier effects and a new one that is not in `fitted` yet.
+
+        An earlier effect of the same channel goes where one alone, of another shape, does as well as the two.
+        """
+        name = self._channel(new)
+        number = next((k for k, a in enumerate(added) if name is not None and self._channel(a) == name), None)
+        if number is None or name == "direction":
+            return added, new
+        without, proposals = self._anew(fitted, number, new)
+        if proposals and proposals[0].criterion < new.proposal.criterion + added[number].proposal.price + TIED:
+            one = self._confirmed(without, proposals[:1], new.round)
+            if one is not None:
+                return [*added[:number], *added[number + 1 :]], one
+        return added, new
+
+    def _anew(self, fitted: Fitted, number: int, item: Added) -> tuple[Fitted, Sequence[Proposal]]:
+        """Return the fit without a term, and what may stand in its place on the channel of `item`."""
+        name = self._channel(item)
+        if name is None:
+            return fitted, ()
+        without = fit(fitted.model.without_term(number), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
+        finest: dict[tuple, Candidate] = {}
+        for c in of_channel(Judge(without), self.channels[name]):
+            if c.key not in finest or c.judgement.df > finest[c.key].judgement.df:
+                finest[c.key] = replace(c, p_value=item.proposal.p_value)
+        found = sorted(finest.values(), key=lambda c: -c.chi2)
+        return without, propose(without, found, self.channels, self.effects)
+
+    def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> Added | None:
+        self.say(f"  round {number} again:")
+        return confirmed(without, proposals, self.samples, self.config, number, self.say, compare=self.compare)
+
+    def _channel(self, item: Added) -> str | None:
+        """Return the channel along which an effect was found; None for a pair and for a ripple."""
+        names = item.proposal.source[0]
+        single = len(set(names) - {"direction"}) <= 1 and names[-1] in self.channels
+        return names[-1] if single and item.proposal.term.effect.id not in PERIODIC else None
