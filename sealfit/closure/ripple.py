@@ -36,6 +36,7 @@ class Peak:
     statistic: float
     p_value: float  # adjusted over the frequencies, axes and ways of acting looked at
     amplitude: float  # in force units, mean over units
+    energy: float  # squared amplitudes of all passes that reach the frequency
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,15 @@ def find_ripple(
         spectrum = spectrum_along(samples, axis, [wavelength for place, wavelength in known if place == axis])
         if spectrum is None:
             continue
-        if common_phase and axis == "displacement_mm":
+        if common_phase or axis == "time_s":  # time counts from the start of every stroke
             peaks += _coherent(spectrum, axis)
         peaks.append(_incoherent(spectrum, axis))
     if not peaks:
         return None
-    best = min(peaks, key=lambda peak: (peak.p_value, -peak.statistic))
+    # What is periodic in time shows in displacement too, speed by speed, and the other way round: where both are sure,
+    # the axis along which it is the same wave in all files holds more of it.
+    sure = [peak for peak in peaks if peak.p_value < SHARED]
+    best = max(sure, key=lambda p: p.energy) if sure else min(peaks, key=lambda p: (p.p_value, -p.statistic))
     # A phase that all files share says more than power alone: where it is there, the ripple is the rig's.
     shared = [p for p in peaks if p.common_phase and p.axis == best.axis and p.p_value < SHARED]
     best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
@@ -193,7 +197,8 @@ def _coherent(spectrum: Spectrum, axis: str) -> list[Peak]:
         k = int(np.argmax(np.where(sharp & _tops(total) & ~spectrum.taken, statistic, 0)))
         p = _coherence_p(statistic[k], common.units) * spectrum.frequency.size * len(spectrum.common)
         wavelength, amplitude = _refined(total, spectrum.frequency, k), float(np.abs(common.amplitude[k]))
-        peaks.append(Peak(axis, wavelength, common.symmetric, True, float(statistic[k]), p, amplitude))
+        energy = amplitude**2 * float(spectrum.count[k])
+        peaks.append(Peak(axis, wavelength, common.symmetric, True, float(statistic[k]), p, amplitude, energy))
     return peaks
 
 
@@ -215,7 +220,9 @@ def _incoherent(spectrum: Spectrum, axis: str) -> Peak:
     k = int(np.argmin(np.where(_tops(spectrum.power) & ~spectrum.taken, own, 1.0)))
     p = float(np.exp(own[k])) * spectrum.frequency.size
     wavelength = _refined(spectrum.power, spectrum.frequency, k)
-    return Peak(axis, wavelength, True, False, float(ratio[k]), p, float(spectrum.amplitude[k]))
+    amplitude = float(spectrum.amplitude[k])
+    energy = amplitude**2 * float(spectrum.count[k]) * (1 - 1 / max(float(ratio[k]), 1.0))
+    return Peak(axis, wavelength, True, False, float(ratio[k]), p, amplitude, energy)
 
 
 def _alike(ratio: np.ndarray) -> np.ndarray:
