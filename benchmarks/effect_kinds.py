@@ -19,6 +19,9 @@ LABORATORY = {"kind": "slow", "name": "lab_temperature_C", "mean": 22.0, "sd": 1
 # No two files alike, and neither repeats nor the calendar order it: 5 to 740 s.
 REST = {"kind": "formula", "name": "rest_s", "formula": "5 * exp(2.5 + 2.5 * sin(12.9898 * run_order))", "decimals": 1}
 
+CURRENT = {"kind": "trace", "name": "motor_current_A", "mean": 2.0, "sd": 0.2, "correlation_s": 1.0}
+
+SIGMOID = "A * tanh((oil_ppm - 50) / 3)"
 TWO_HUMPS = "A * (exp(-((oil_ppm - 40) / 4) ** 2) + exp(-((oil_ppm - 60) / 4) ** 2))"
 PRODUCT = "A * (oil_ppm - 50) / 10 * (dust_mg - 5)"
 FORMULA_OF = {PRODUCT: "product"}  # formulas that the catalogue holds: to be named so
@@ -69,6 +72,24 @@ def _column(k: float) -> dict:
     return _factor("linear", A=0.0007 * k) | {"channels": ("oil_ppm",), "reference": {"x_ref": COLUMN["mean"]}}
 
 
+def _column_mu_c(k: float) -> dict:
+    return _one("linear", {"A": 0.0015 * k}, "mu_c", "multiply", channels=("oil_ppm",), reference={"x_ref": 50.0})
+
+
+def _current(k: float) -> dict:
+    return _one("linear", {"A": 0.4 * k}, "force", "add", channels=("motor_current_A",), reference={"x_ref": 2.0})
+
+
+def _hum(k: float) -> dict:
+    return _one("sinusoid", {"A": 0.1 * k, "lambda_": 1.7, "phi": 0.7}, "force", "add", channels=("time_s",))
+
+
+def _warming_power(k: float) -> dict:
+    return _factor("warming_power", A=0.0065 * k, tau=4.0) | {
+        "reference": {"speed_mm_s_ref": 10.0, "load_N_ref": 49.03}
+    }
+
+
 def _column_log(k: float) -> dict:
     reference = {"x_ref": COLUMN["mean"]}
     return _one("log", {"A": 0.7 * k}, "force", "add", channels=("oil_ppm",), reference=reference)
@@ -104,8 +125,10 @@ EFFECT_CAMPAIGNS: dict[str, Callable[[float], Ingredients]] = {
     "ripple": lambda k: ((_ripple(k),), ()),
     "warming_time": lambda k: ((_factor("warming_time", A=0.01 * k, tau=4.0),), ()),
     "warming_distance": lambda k: ((_warming_distance(k),), ()),
+    "warming_power": lambda k: ((_warming_power(k),), ()),
     "warming_conduction": lambda k: ((_warming_conduction(k),), ()),
     "drift": lambda k: ((_drift(k),), ()),
+    "periodic_in_time": lambda k: ((_hum(k),), ()),
     "bump": lambda k: ((_bump(k),), ()),
     "run_in": lambda k: ((_factor("run_in", A=-0.01 * k, n_0=1.5),), ()),
     "conditioning": lambda k: ((_conditioning(k),), ()),
@@ -125,15 +148,19 @@ EFFECT_CAMPAIGNS: dict[str, Callable[[float], Ingredients]] = {
     ),
     "viscosity_aging": lambda k: ((_one("viscosity_aging", {"A": 0.003 * k, "t_0": 1.0}, "sigma_2", "add"),), ()),
     "aging_floor": lambda k: ((_factor("aging_floor", A=0.012 * k, t_f=4.0),), ()),
+    "aging_induction": lambda k: ((_factor("aging_induction", A=0.015 * k, t_i=3.0),), ()),
     "lab_temperature": lambda k: ((_laboratory(k),), (LABORATORY,)),
     # columns that nobody declared
     "column_linear_mu": lambda k: ((_column(k),), (COLUMN,)),
+    "column_linear_mu_c": lambda k: ((_column_mu_c(k),), (COLUMN,)),
+    "column_of_the_trace": lambda k: ((_current(k),), (CURRENT,)),
     "column_log_force": lambda k: ((_column_log(k),), (COLUMN,)),
     "column_step": lambda k: ((_column_step(k),), (COLUMN,)),
     "column_category_mu": lambda k: ((_grades(k, "mu", "multiply", 0.008),), (GRADES,)),
     "column_category_force": lambda k: ((_grades(k, "force", "add", 0.2),), (GRADES,)),
     # outside the catalogue
     "two_humps": lambda k: ((_expression(TWO_HUMPS, 0.013 * k),), (COLUMN,)),
+    "sigmoid": lambda k: ((_expression(SIGMOID, 0.006 * k),), (COLUMN,)),
     "product": lambda k: ((_expression(PRODUCT, 0.007 * k),), (COLUMN, OTHER)),
     "speed_times_days": lambda k: ((_expression(SPEED_TIMES_DAYS, 0.006 * k),), ()),
     # pairs and triples
@@ -169,3 +196,4 @@ DESIGNS: dict[str, dict[Size, dict]] = {
         "large": {**_LONG_AGED, "compressions_pct": (80.0, 90.0)},
     },
 }
+DESIGNS["aging_induction"] = DESIGNS["aging_floor"]

@@ -43,7 +43,7 @@ def plan(
             own = null_seeds if null else [s for s in seeds if strength != "faint" or s in FAINT_SEEDS]
             for seed in own:
                 large = seed == LARGE_SEED["nulls" if null else "effects"] and strength != "faint"
-                with_rivals = rivals and (not null or seed <= RIVALS_ON_NULLS) and strength != "faint"
+                with_rivals = rivals and not large and (not null or seed <= RIVALS_ON_NULLS) and strength != "faint"
                 tasks.append(Task(kind, strength, seed, "large" if large else "small", with_rivals))
     return sorted(tasks, key=lambda t: t.seed)
 
