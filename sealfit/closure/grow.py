@@ -129,9 +129,9 @@ def grow(
         refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}
         added = kept
     unsure = None
-    doubtful = [c for c in last if c.p_value <= alpha and not c.sure]
+    doubtful = [c for c in (*last, *(c for c, _ in laws)) if c.p_value <= alpha and not c.sure]
     if left is None and doubtful:
-        proposals = propose(fitted, doubtful, channels, effects)
+        proposals = propose(fitted, doubtful, channels, effects, [p for _, p in laws])
         others = tuple(rivals(proposals[0], proposals))
         left = doubtful[0]
         unsure = Added(proposals[0], np.nan, others, (np.nan,) * len(others), len(added) + 1)

@@ -17,7 +17,7 @@ from sealfit.closure.confirm import Added, confirmed
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.judge import Candidate, Judge
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.naming import TIED, propose
+from sealfit.closure.naming import RIVAL, TIED, propose
 from sealfit.closure.search import of_channel
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
@@ -59,18 +59,23 @@ class Revisit:
     def one_for_two(self, fitted: Fitted, added: list[Added], new: Added) -> tuple[list[Added], Added]:
         """Return earlier effects and a new one that is not in `fitted` yet.
 
-        An earlier effect of the same channel goes where one alone, of another shape, does as well as the two.
+        An earlier effect of the same channel goes where one alone, of another shape, does as well as the two. Two forms
+        that are no mechanism are one shape in two pieces: then it is enough that the one fits as well, whatever the
+        number of its knots.
         """
         name = self._channel(new)
         number = next((k for k, a in enumerate(added) if name is not None and self._channel(a) == name), None)
         if number is None or name == "direction":
             return added, new
         without, proposals = self._anew(fitted, number, new)
-        if proposals and proposals[0].criterion < new.proposal.criterion + added[number].proposal.price + TIED:
-            one = self._confirmed(without, proposals[:1], new.round)
-            if one is not None:
-                return [*added[:number], *added[number + 1 :]], one
-        return added, new
+        two = new.proposal.criterion + added[number].proposal.price
+        better = [p for p in proposals[:1] if p.criterion < two + TIED]
+        if not (better or any(a.proposal.term.effect.physical for a in (added[number], new))):
+            pieces = new.proposal.price + added[number].proposal.price
+            fitting = [p for p in proposals if p.criterion - p.price < two - pieces + RIVAL]
+            better = sorted(fitting, key=lambda p: p.criterion)[:1]
+        one = self._confirmed(without, better, new.round) if better else None
+        return (added, new) if one is None else ([*added[:number], *added[number + 1 :]], one)
 
     def _anew(self, fitted: Fitted, number: int, item: Added) -> tuple[Fitted, Sequence[Proposal]]:
         """Return the fit without a term, and what may stand in its place on the channel of `item`."""

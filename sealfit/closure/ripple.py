@@ -15,13 +15,11 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 from scipy.fft import next_fast_len
-from scipy.special import digamma, polygamma
 
+from sealfit.closure.background import LOBE, alike, background, smooth_background, tops
 from sealfit.closure.waves import freed_of_trend, strokes_of
 
-NEIGHBOURS = 25  # frequencies on each side that make the local background
 SHARED = 1e-3  # p-value below which the phase is taken to be common to all files
-LOBE = 4  # frequencies on each side that the taper smears a peak over
 ABOVE_BACKGROUND = 4.0  # a peak's power over the median of its neighbours: a smooth trend has no peak
 
 
@@ -191,10 +189,10 @@ def _coherent(spectrum: Spectrum, axis: str) -> list[Peak]:
     for common in spectrum.common:
         total = np.abs(common.total) ** 2
         statistic = total / np.maximum(common.square, 1e-300)
-        sharp = total / _background(np.where(spectrum.taken, np.nan, total)) > ABOVE_BACKGROUND
+        sharp = total / background(np.where(spectrum.taken, np.nan, total)) > ABOVE_BACKGROUND
         if common.units < 4 or not sharp.any():
             continue
-        k = int(np.argmax(np.where(sharp & _tops(total) & ~spectrum.taken, statistic, 0)))
+        k = int(np.argmax(np.where(sharp & tops(total) & ~spectrum.taken, statistic, 0)))
         p = _coherence_p(statistic[k], common.units) * spectrum.frequency.size * len(spectrum.common)
         wavelength, amplitude = _refined(total, spectrum.frequency, k), float(np.abs(common.amplitude[k]))
         energy = amplitude**2 * float(spectrum.count[k])
@@ -214,92 +212,15 @@ def _incoherent(spectrum: Spectrum, axis: str) -> Peak:
     of the track, as if there were fewer of them.
     """
     open_power = np.where(spectrum.taken, np.nan, spectrum.power)
-    ratio = spectrum.power / _smooth_background(open_power, spectrum.frequency, spectrum.count)
-    count = np.minimum(spectrum.count, _alike(np.where(spectrum.taken, np.nan, ratio)))
+    ratio = spectrum.power / smooth_background(open_power, spectrum.frequency, spectrum.count)
+    count = np.minimum(spectrum.count, alike(np.where(spectrum.taken, np.nan, ratio)))
     own = stats.gamma.logsf(ratio * count, count)
-    k = int(np.argmin(np.where(_tops(spectrum.power) & ~spectrum.taken, own, 1.0)))
+    k = int(np.argmin(np.where(tops(spectrum.power) & ~spectrum.taken, own, 1.0)))
     p = float(np.exp(own[k])) * spectrum.frequency.size
     wavelength = _refined(spectrum.power, spectrum.frequency, k)
     amplitude = float(spectrum.amplitude[k])
     energy = amplitude**2 * float(spectrum.count[k]) * (1 - 1 / max(float(ratio[k]), 1.0))
     return Peak(axis, wavelength, True, False, float(ratio[k]), p, amplitude, energy)
-
-
-def _alike(ratio: np.ndarray) -> np.ndarray:
-    """Return of how many independent powers a spectrum behaves like the mean, by its neighbours' spread, shape (f,).
-
-    The logarithm of a mean of c powers has the variance trigamma(c); its spread is taken from the quartiles, which a
-    few peaks do not move.
-    """
-    low, high = _quantiles(_neighbours(np.log(np.maximum(ratio, 1e-300))), (0.25, 0.75))
-    spread = ((high - low) / 1.349) ** 2
-    numbers = np.geomspace(1e5, 1.0, 200)
-    return np.interp(spread, polygamma(1, numbers), numbers)
-
-
-def _quantiles(windows: np.ndarray, levels: Sequence[float]) -> list[np.ndarray]:
-    """Return quantiles of each row, NaN left out, by linear interpolation, each of shape (f,).
-
-    numpy's nanquantile takes the rows one by one, a hundred times slower.
-    """
-    ordered = np.sort(windows, axis=1)  # NaN last
-    last = np.maximum(np.isfinite(windows).sum(axis=1) - 1, 0)
-    every = np.arange(last.size)
-    found = []
-    for level in levels:
-        place = level * last
-        low = np.floor(place).astype(int)
-        high = np.minimum(low + 1, last)
-        found.append(ordered[every, low] + (place - low) * (ordered[every, high] - ordered[every, low]))
-    return found
-
-
-def _neighbours(value: np.ndarray) -> np.ndarray:
-    """Return each frequency's neighbours, its own main lobe and what lies beyond the ends NaN, shape (f, window)."""
-    padded = np.pad(value, NEIGHBOURS, constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1).copy()
-    windows[:, np.abs(np.arange(-NEIGHBOURS, NEIGHBOURS + 1)) <= LOBE] = np.nan
-    return windows
-
-
-def _tops(power: np.ndarray) -> np.ndarray:
-    """Return where a spectrum is highest within a main lobe each side, its low end left out, shape (f,).
-
-    At the low end stand the smooth shapes of a stroke (warming, drift), which are no ripple.
-    """
-    padded = np.pad(power, LOBE, constant_values=np.inf)[: power.size + LOBE]
-    padded = np.r_[padded, np.zeros(LOBE)]
-    highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * LOBE + 1).max(axis=1)
-    return power >= highest
-
-
-def _smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return the background of a mean of `count` powers: a straight line in log-log through each point's neighbours.
-
-    Correlated noise falls steeply towards high frequencies, which a plain median of neighbours would take for a peak at
-    the low end. Neighbours that stand out are clipped, the peak's own main lobe left out.
-    """
-    value = np.log(np.maximum(power, 1e-300))
-    place = np.log(frequency)
-    y, x = _neighbours(value), _neighbours(place)
-    for _ in range(3):
-        weight = np.isfinite(y).astype(float)
-        total = weight.sum(axis=1)
-        mean_x = np.nansum(np.where(weight > 0, x, 0.0), axis=1) / total
-        mean_y = np.nansum(y, axis=1) / total
-        dx = np.where(weight > 0, x - mean_x[:, None], 0.0)
-        dy = np.where(weight > 0, y - mean_y[:, None], 0.0)
-        slope = (dx * dy).sum(axis=1) / np.maximum((dx**2).sum(axis=1), 1e-300)
-        line = mean_y[:, None] + slope[:, None] * (x - mean_x[:, None])
-        spread = np.sqrt(np.nanmean((y - line) ** 2, axis=1))[:, None]
-        y = np.minimum(y, line + 2 * spread)
-    level = mean_y + slope * (place - mean_x)
-    return np.exp(level - (digamma(count) - np.log(count)))
-
-
-def _background(power: np.ndarray) -> np.ndarray:
-    """Return the median of each frequency's neighbours, the peak's own main lobe left out."""
-    return np.maximum(_quantiles(_neighbours(power), (0.5,))[0], 1e-300)
 
 
 def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:

@@ -5,7 +5,8 @@ import numpy.testing as npt
 import pytest
 from bins_helpers import make_bins, make_traces
 
-from sealfit.closure.loop import close_loop
+from sealfit.closure.grow import numbered
+from sealfit.closure.loop import MOST_ROWS, PER_STROKE, ROWS, close_loop, merged_bins
 from sealfit.closure.predict import predict
 from sealfit.config import Config
 from sealfit.errors import RequestError
@@ -145,3 +146,13 @@ def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
     assert document["after"]["rmse_N"] == document["before"]["rmse_N"]
     assert made.tables["effects"].empty
     assert any("second specimen" in run["why"] for run in document["next_runs"])
+
+
+@pytest.mark.parametrize(("bins", "repeats"), [(20, 1), (60, 3), (200, 6)])
+def test_the_search_works_on_few_rows_but_not_on_too_few_of_a_stroke(bins, repeats):
+    table = numbered(make_bins(1, bins=bins, repeats=repeats))
+    left, strokes = merged_bins(table), table["stroke_id"].nunique()
+    assert len(left) <= max(ROWS, min(PER_STROKE * strokes, MOST_ROWS))
+    assert len(left) == len(table) or len(left) > 0.4 * min(ROWS, PER_STROKE * strokes)
+    assert left["n"].sum() == table["n"].sum()
+    assert left["force_N"].mean() == pytest.approx(table["force_N"].mean(), rel=1e-6)

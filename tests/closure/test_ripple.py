@@ -76,3 +76,26 @@ def test_correlated_noise_is_not_a_ripple():
 def test_too_few_samples_say_nothing():
     samples = make_samples(files=2)
     assert find_ripple(samples[samples.groupby("stroke_id").cumcount() < 10], common_phase=True) is None
+
+
+def test_a_slow_wave_in_time_is_not_taken_for_one_wavelength_at_the_slowest_speed():
+    tables = []
+    for k, speed in enumerate((0.5, 1.0, 2.0, 4.0, 8.0) * 4):
+        t = np.linspace(0, 40 / speed, 300)
+        force = np.sin(2 * np.pi * t / 1.7 + k) + np.random.default_rng(k).normal(0, 0.1, t.size)
+        tables.append(
+            pd.DataFrame(
+                {
+                    "stroke_id": k,
+                    "direction": 1,
+                    "unit": k,
+                    "displacement_mm": 3.0 * np.sin(k) + speed * t,
+                    "time_s": t,
+                    "residual_N": force,
+                }
+            )
+        )
+    peak = find_ripple(pd.concat(tables, ignore_index=True), common_phase=True)
+    assert peak.axis == "time_s"
+    assert peak.wavelength == pytest.approx(1.7, rel=0.02)
+    assert peak.p_value < 1e-3

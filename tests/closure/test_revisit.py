@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+from bins_helpers import make_bins, make_traces
+
+from sealfit.closure.channels import find_channels
+from sealfit.closure.forms import terms_of
+from sealfit.closure.grow import grow, numbered, steady_samples
+from sealfit.closure.judge import Candidate, Judge, Judgement
+from sealfit.closure.linearised import PAIR, Linearised
+from sealfit.closure.search import search
+from sealfit.config import Config
+from sealfit.effects import EFFECTS
+from sealfit.fit.estimate import fit_declared
+from sealfit.fit.rows import make_rows
+
+OIL = {"oil_ppm": lambda rng: rng.normal(50, 10)}
+
+
+def fitted_of(**options):
+    return fit_declared(make_rows(make_bins(5, repeats=2, bins=6, setup=0.003, **options), has_aging=True))
+
+
+def test_a_shape_of_no_catalogue_is_one_effect_and_not_two_bumps():
+    def sigmoid(table, force):
+        return force * (1 + 0.06 * np.tanh((table["oil_ppm"].to_numpy() - 50) / 3))
+
+    bins = make_bins(5, setup=0.003, effect=sigmoid, run_channels=OIL, bins=6)
+    rows = make_rows(numbered(bins), has_aging=True)
+    grown = grow(rows, steady_samples(make_traces(bins), rows), Config(), EFFECTS)
+    (effect,) = grown.added
+    assert effect.proposal.term.channels == ("oil_ppm",)
+    assert grown.left is None
+    true = 0.06 * np.tanh((rows.values("oil_ppm") - 50) / 3) * rows.force
+    found = grown.after.force - grown.before.force
+    assert np.corrcoef(found, true)[0, 1] > 0.98
+
+
+def test_two_humps_that_hide_in_the_scatter_of_runs_are_found():
+    def humps(table, force):
+        oil = table["oil_ppm"].to_numpy()
+        return force * (1 + 0.03 * (np.exp(-(((oil - 40) / 4) ** 2)) + np.exp(-(((oil - 60) / 4) ** 2))))
+
+    rows = fitted_of(effect=humps, run_channels=OIL).rows
+    found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    best = min(found, key=lambda c: c.p_value)
+    assert best.channels == ("oil_ppm",)
+    assert best.p_value < 0.005
+
+
+def test_a_load_that_does_not_vary_may_be_read_where_that_is_another_equation():
+    fitted = fitted_of()
+    channels = {c.name: c for c in find_channels(fitted.rows)}
+    assert "load_N" not in channels
+    judgement = Judgement(1.0, 4, 72, -1.0)
+    candidate = Candidate(("time_s",), "mu", "multiply", "run", np.empty((0, 4)), judgement)
+    ids = {term.effect.id for term, _ in terms_of(candidate, channels, fitted, EFFECTS)}
+    assert {"warming_time", "warming_power"} <= ids
+    candidate = Candidate(("distance_mm",), "mu", "multiply", "run", np.empty((0, 4)), judgement)
+    ids = {term.effect.id for term, _ in terms_of(candidate, channels, fitted, EFFECTS)}
+    assert "warming_conduction" in ids
+    assert "warming_conduction_load" not in ids  # the same equation at one load
+
+
+def test_two_channels_together_pay_for_being_one_of_many():
+    fitted = fitted_of(run_channels=OIL)
+    channels = {c.name: c for c in find_channels(fitted.rows)}
+    judgement, linearised = Judgement(1.0, 1, 72, -1.0), Linearised(fitted)
+    price = {}
+    for names, pair in ((("oil_ppm",), False), (("oil_ppm", "time_s"), True)):
+        candidate = Candidate(names, "mu", "multiply", "run", np.empty((0, 1)), judgement, pair=pair)
+        for term, searched in terms_of(candidate, channels, fitted, EFFECTS):
+            for proposal in linearised(term, searched, candidate):
+                price[term.effect.id] = proposal.price
+    assert price["product"] - price["linear"] == pytest.approx(PAIR)
