@@ -80,13 +80,15 @@ def find_ripple(
     axes : tuple of str
         Axes to look along; time is the rival of displacement (mains, servo).
     """
-    peaks = []
+    peaks, locked = [], []
     for axis in axes:
         spectrum = spectrum_along(samples, axis, [wavelength for place, wavelength in known if place == axis])
         if spectrum is None:
             continue
-        if common_phase or axis == "time_s":  # time counts from the start of every stroke
+        if common_phase and axis == "displacement_mm":
             peaks += _coherent(spectrum, axis)
+        elif axis == "time_s":  # which counts from the start of every stroke: a wave may be locked to that
+            locked = _coherent(spectrum, axis)
         peaks.append(_incoherent(spectrum, axis))
     if not peaks:
         return None
@@ -94,8 +96,8 @@ def find_ripple(
     # the axis along which it is the same wave in all files holds more of it.
     sure = [peak for peak in peaks if peak.p_value < SHARED]
     best = max(sure, key=lambda p: p.energy) if sure else min(peaks, key=lambda p: (p.p_value, -p.statistic))
-    # A phase that all files share says more than power alone: where it is there, the ripple is the rig's.
-    shared = [p for p in peaks if p.common_phase and p.axis == best.axis and p.p_value < SHARED]
+    # A phase that all files share says more than power alone.
+    shared = [p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED]
     best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
 
