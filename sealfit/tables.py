@@ -109,6 +109,7 @@ _MEANING = {
     "temperature_C": "aging temperature",
     "compression_ratio_pct": "compression ratio",
     "speed_set_mm_s": "commanded speed",
+    "power": "sliding power (load times speed)",
 }
 
 

@@ -16,6 +16,9 @@ LEVELS = ("stroke", "file", "run", "specimen")
 ALONG = ("displacement_mm", "distance_mm", "time_s")
 """Channels that run along a stroke, so that a bin covers a piece of them."""
 
+POWER = "power"
+"""Derived channel where loads differ: load times the size of the speed, the power of friction over its coefficient."""
+
 NOT_CHANNELS = {
     "file",
     "run_id",
@@ -150,6 +153,8 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool) -> Rows:
         }
     )
     has_load = "load_N" in table and bool(table["load_N"].notna().all())
+    if has_load and table["load_N"].nunique() > 1 and POWER not in table:
+        table[POWER] = table["load_N"] * table["speed_mm_s"].abs()
     days = table["aging_days"].to_numpy(dtype=float) if has_aging else np.zeros(len(table))
     condition, names = pd.factorize(table["condition"], sort=True)
     first = table.drop_duplicates("condition").set_index("condition").loc[names]

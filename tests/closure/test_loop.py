@@ -156,3 +156,19 @@ def test_the_search_works_on_few_rows_but_not_on_too_few_of_a_stroke(bins, repea
     assert len(left) == len(table) or len(left) > 0.4 * min(ROWS, PER_STROKE * strokes)
     assert left["n"].sum() == table["n"].sum()
     assert left["force_N"].mean() == pytest.approx(table["force_N"].mean(), rel=1e-6)
+
+
+def test_an_effect_of_sliding_power_is_found_and_predicted_from_load_and_speed():
+    def warm_when_hard_driven(table, force):
+        load = 50.0 * 2.0 ** (table["repeat"].to_numpy() - 2.0)
+        return force * load / 49.03 * (1 - 0.1 * np.exp(-((np.log(load * table["speed_mm_s"].abs() / 400) / 0.7) ** 2)))
+
+    bins = make_bins(3, effect=warm_when_hard_driven, bins=4, setup=0.003, noise_N=0.1)
+    bins["load_N"] = 50.0 * 2.0 ** (bins["repeat"] - 2.0)
+    bins["run_id"] = bins["run_id"] + "|" + bins["load_N"].astype(str)
+    made = close(bins)
+    assert {"power"} in [set(e["channels"]) for e in made.document["effects"]]
+    point = bins.head(1).assign(speed_mm_s=8.0, load_N=50.0)
+    there, beyond = (predict(made.model, point.assign(load_N=load)) for load in (50.0, 25.0))
+    ratio = (there["force_after_N"] / there["force_before_N"]).iloc[0]
+    assert ratio < (beyond["force_after_N"] / beyond["force_before_N"]).iloc[0]

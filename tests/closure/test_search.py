@@ -90,3 +90,12 @@ def test_a_channel_may_change_how_soon_a_rubber_ages():
     found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     keys = {c.key for c in found if c.p_value < 0.005}
     assert (("lab_temperature_C",), "b", "multiply") in keys
+
+
+def test_sliding_power_is_a_channel_where_loads_differ():
+    bins = make_bins(repeats=1, bins=4)
+    assert "power" not in make_rows(bins, has_aging=True).channels
+    bins["load_N"] = np.where(bins["aging_days"] > 4, 25.0, 50.0)
+    rows = make_rows(bins, has_aging=True)
+    assert rows.values("power") == pytest.approx(rows.load * np.abs(rows.speed))
+    assert "power" in {c.name for c in find_channels(rows)}
