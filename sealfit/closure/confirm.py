@@ -181,11 +181,13 @@ def _inside(rows: Rows, force: np.ndarray) -> np.ndarray:
 class Added:
     """An accepted effect: the proposal, its gain on held-out data and the rivals these data cannot tell from it.
 
-    `rivals_rmse_N` is the RMSE on the same held-out data with each rival in its place; NaN where it was not asked for.
+    `left_N` is the RMSE on the held-out data with it, and `rivals_rmse_N` with each rival in its place; NaN where that
+    was not asked for. Where the effect varies inside files, runs or specimens, it is the RMSE about their means.
     """
 
     proposal: Proposal
     gain_N: float
+    left_N: float
     rivals: tuple[Proposal, ...]
     rivals_rmse_N: tuple[float, ...]
     round: int
@@ -228,5 +230,5 @@ def confirmed(
             others = rivals(proposal, proposals)
             tried = [heldout_gain(fitted, o, config.loop.folds, config.loop.seed, samples) for o in others if compare]
             rmse = [g.left_N for g in tried] if compare else [np.nan] * len(others)
-            return Added(proposal, gain.rmse_N, tuple(others), tuple(rmse), number)
+            return Added(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
     return None

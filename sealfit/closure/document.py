@@ -66,6 +66,7 @@ def _entry(after: Fitted, number: int, item: Added, config: Config) -> dict:
         "parameters": parameters,
         "p_value": proposal.p_value,
         "heldout_gain_N": _number(item.gain_N),
+        "heldout_rmse_N": _number(item.left_N),
         "alternatives": [
             {
                 "id": rival.term.effect.id,

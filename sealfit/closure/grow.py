@@ -134,7 +134,7 @@ def grow(
         proposals = propose(fitted, doubtful, channels, effects, [p for _, p in laws])
         others = tuple(rivals(proposals[0], proposals))
         left = doubtful[0]
-        unsure = Added(proposals[0], np.nan, others, (np.nan,) * len(others), len(added) + 1)
+        unsure = Added(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
     return Grown(before, fitted if added else before, tuple(added), first, last, left, unsure, channels)
 
 

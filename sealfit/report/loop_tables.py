@@ -63,7 +63,8 @@ def effect_cards(closure: Mapping, config: Config) -> list[dict]:
     for index, effect in enumerate(closure["effects"]):
         label = effect_label(effect, config.units)
         channels = joined([channel_label(name, config.units) for name in effect["channels"]])
-        gain = effect.get("heldout_gain_N")
+        gain, left = effect.get("heldout_gain_N"), effect.get("heldout_rmse_N")
+        unit = config.units.unit("force")
         cards.append(
             {
                 "index": index,
@@ -78,7 +79,8 @@ def effect_cards(closure: Mapping, config: Config) -> list[dict]:
                 "channels": channels,
                 "parameters": [_parameter(p, effect) for p in effect["parameters"]],
                 "p": p_value(effect.get("p_value")),
-                "gain": of_unit(number(gain, 2), config.units.unit("force")) if known(gain) else "",
+                "gain": of_unit(number(gain, 2), unit) if known(gain) else "",
+                "left": of_unit(number(left), unit) if known(left) else "",
                 "rivals": list(dict.fromkeys(_rival(rival, config) for rival in effect.get("alternatives") or [])),
             }
         )

@@ -193,6 +193,7 @@ def closure_document(found, verdict):
         ],
         "p_value": 0.0005,
         "heldout_gain_N": 0.93,
+        "heldout_rmse_N": 0.41,
         "alternatives": [
             {"id": "warming_distance", "channels": ["distance_mm"], "acts_on": "mu", "heldout_rmse_N": 0.61}
         ],
