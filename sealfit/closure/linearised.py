@@ -53,11 +53,16 @@ class Proposal:
 
     @property
     def rank(self) -> tuple:
-        """Order among equals: mechanism, closed form, free shape; then fewer parameters; then what it acts on."""
+        """Order among equals: mechanism, closed form, free shape; then fewer parameters; then what it acts on, and how.
+
+        A mechanism names first how it usually acts.
+        """
         effect = self.term.effect
         kind = 0 if effect.physical else 2 if effect.id in UNNAMED else 1
         offset = self.source == ZERO_OFFSET  # an amplifier is off more often than friction by direction
-        return (kind, len(effect.parameters), -1 if offset else PREFERRED.index(self.term.acts_on))
+        target = -1 if offset else PREFERRED.index(self.term.acts_on)
+        way = (self.term.acts_on, self.term.operation)
+        return (kind, len(effect.parameters), target, effect.acts_on.index(way) if effect.physical else 0)
 
 
 class Linearised:
