@@ -57,7 +57,19 @@ def next_runs(grown: Grown, config: Config, effects: Mapping[str, Effect]) -> li
                 )
     if grown.unsure is not None:
         wanted.append(_replicates(grown.unsure, config))
+    if grown.after.rows.has_aging and not grown.after.scatter.knows("specimen"):
+        wanted.append(_second_specimen(grown.after.rows, config))
     return [*wanted, *_unseen(grown.after, config, effects)]
+
+
+def _second_specimen(rows: Rows, config: Config) -> dict:
+    """Return the condition to test on a second specimen where nothing shows how specimens scatter: the last one."""
+    k = int(np.argmax(rows.days))
+    return {
+        "why": "would show how specimens scatter, which this campaign leaves unknown and every interval leaves out: "
+        "a second specimen of a tested condition",
+        "conditions": {name: _plain(rows.table[name].iloc[k]) for name in config.condition},
+    }
 
 
 def _unseen(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> Iterator[dict]:

@@ -52,6 +52,9 @@ def predict(model: dict, points: pd.DataFrame) -> pd.DataFrame:
     _check_values(table, after, model, notes)
     good = np.array([not note for note in notes]) & (code >= 0)
     answer = pd.DataFrame({name: np.full(len(table), np.nan) for name in ANSWERS})
+    if model["has_aging"] and not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
+        for k in np.flatnonzero(good):
+            notes[k].append("how specimens scatter is not known: the intervals are those of the tested ones")
     extrapolated = _outside(table, conditions, code, model, notes, after)
     if good.any():
         at = point_rows(

@@ -172,3 +172,14 @@ def test_an_effect_of_sliding_power_is_found_and_predicted_from_load_and_speed()
     there, beyond = (predict(made.model, point.assign(load_N=load)) for load in (50.0, 25.0))
     ratio = (there["force_after_N"] / there["force_before_N"]).iloc[0]
     assert ratio < (beyond["force_after_N"] / beyond["force_before_N"]).iloc[0]
+
+
+def test_too_few_specimens_to_show_their_scatter_are_said_to_be(null):
+    bins = make_bins(1, temperatures=(60.0,), days=(1.0, 4.0, 16.0), repeats=2, bins=4, specimen=0.01)
+    made = close(bins)
+    assert "specimen" not in {s["level"] for s in made.document["scatter"]}
+    assert any("how specimens scatter" in run["why"] for run in made.document["next_runs"])
+    answer = predict(made.model, bins.head(2))
+    assert answer["note"].str.contains("how specimens scatter is not known").all()
+    assert answer["force_after_N"].notna().all()
+    assert not any("how specimens scatter" in run["why"] for run in null[1].document["next_runs"])
