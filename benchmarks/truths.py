@@ -145,8 +145,16 @@ def test_true_forms(declared: Model, rows: Rows, scatter, true: list[TrueEffect]
     for _ in true:
         free = free.without_term(0)
     for number, effect in enumerate(true):
-        free = free.with_term(effect.term, known.model.values[number])
+        free = free.with_term(effect.term, {**known.model.values[number], **_between(effect, rows)})
     return tests, fit(free, rows, known.scatter, turns=2)
+
+
+def _between(effect: TrueEffect, rows: Rows) -> dict[str, float]:
+    """Return the place of a step as a fit finds it: halfway between the values of its channel on both sides."""
+    if effect.id != "step":
+        return {}
+    values, place = rows.values(effect.term.channels[0]), effect.values["x_0"]
+    return {"x_0": float((values[values < place].max() + values[values >= place].min()) / 2)}
 
 
 test_true_forms.__test__ = False  # a test of effects, not of this program

@@ -188,8 +188,12 @@ def determined(proposal: Proposal) -> bool:
 
 
 def _simpler(proposal: Proposal, best: Proposal) -> bool:
-    """Whether a proposal adds what the best one does, hardly worse, and says it more simply."""
-    plain = proposal.rank[:2] < best.rank[:2] or proposal.source == ZERO_OFFSET
+    """Whether a proposal adds what the best one does, hardly worse, and says it more simply.
+
+    A quantity of the declared model comes before a gain of the whole force.
+    """
+    gain = (best.term.acts_on, best.term.operation) == ("force", "multiply") and proposal.term.acts_on != "force"
+    plain = proposal.rank[:2] < best.rank[:2] or proposal.source == ZERO_OFFSET or gain
     return plain and correlation(proposal, best) > SAME and proposal.criterion - best.criterion < 2 * TIED
 
 
