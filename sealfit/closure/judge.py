@@ -6,40 +6,34 @@ projection on the tangent space of the current model, the score of unit u is :ma
 .. math:: T = S^T V^{-1} S, \quad S = \sum_u s_u, \quad V = \sum_u s_u s_u^T .
 
 The r_u in V are widened for what the fit has taken out of each unit (CR2, Bell & McCaffrey 2002), as residuals are
-smaller than errors and few units would otherwise look too quiet. V is unchanged when a unit's sign is flipped, so
-flipping all units at random many times costs one matrix product, and the largest standardised T over all candidates
-gives the p-value adjusted for the whole search (Westfall & Young 1993; sign flips of score contributions: Hemerik,
-Goeman & Finos 2020, doi:10.1111/rssb.12369).
+smaller than errors and few units would otherwise look too quiet. V is unchanged when a unit's sign is flipped,
+so that flips hold T against chance (`adjusted`).
 
 Sign flips hold whatever the units' scatter is, but a strong effect stands in V itself: T never exceeds the number of
 units over the kurtosis of c, and a few runs in extreme places hide what all others show. So from thirty units on the
 estimate is also held against its jackknife over whole units (CV3; MacKinnon, Nielsen & Webb 2023,
-doi:10.1016/j.jeconom.2022.04.001), adjusted by the number of candidates (Bonferroni); each way has half of the error.
-A few runs may hold nearly all that columns say and agree by chance, so what the columns explain must count as well.
-With fewer specimens than that, what is constant in them is held against their own scatter (`few`).
+doi:10.1016/j.jeconom.2022.04.001). A few runs may hold nearly all that columns say and agree by chance, so what the
+columns explain must count as well: by chi-squared, or by F against the runs' own scatter where they are one number a
+run. With fewer specimens than thirty, what is constant in them is held against their own scatter (`few`).
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import betainc, chdtrc, fdtrc
 
-from sealfit.closure import few
 from sealfit.closure.channels import FINER
 from sealfit.closure.few import LEAST_ERROR, FewTest, FewUnits
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.reml import orthonormal
 
-FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
 JACKKNIFE_UNITS = 30  # from which the jackknife is tried
 PROMISING = 1e-3  # p-value of what columns explain, not adjusted, below which it is
-SEARCHES = 2  # single channels and pairs of them: each search has half of the error
 WORTH_A_LOOK = 0.05  # as above, below which columns that are constant in a run are held against the runs' own scatter
 CONSTANT = 0.9  # share of columns that is one number a run
 OWN = 1e-6  # eigenvalue of what is left without a unit, below which the unit alone determines it
@@ -182,7 +176,7 @@ class Judge:
         left = (left @ u[:, keep] / np.sqrt(s[keep]))[:, : max(1, units // 5)]
         scores = fitted.rows.groups.sums(left * fitted.unit_residual(level)[:, None], level)
         total = left.T @ fitted.white_residual
-        log_p = float(log_p_of(_wald(total[None, :], scores)[0], left.shape[1], units))
+        log_p = float(log_p_of(wald(total[None, :], scores)[0], left.shape[1], units))
         jackknife = 0.0
         if units >= JACKKNIFE_UNITS:
             explained = _log(chdtrc(left.shape[1], total @ total))
@@ -236,70 +230,13 @@ def _inverse_of(size: np.ndarray, axes: np.ndarray) -> np.ndarray:
     return (axes * shrink[:, None, :]) @ axes.transpose(0, 2, 1)
 
 
-def _wald(totals: np.ndarray, scores: np.ndarray) -> np.ndarray:
+def wald(totals: np.ndarray, scores: np.ndarray) -> np.ndarray:
     """Return T for each row of `totals`, shape (m, k) -> (m,)."""
     inverse = np.linalg.pinv(scores.T @ scores, rcond=1e-10, hermitian=True)
     return np.einsum("ij,jk,ik->i", totals, inverse, totals)
-
-
-def judged(judge: Judge, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
-    """Return candidates with p-values adjusted over all of them, strongest evidence first."""
-    judgements = [c.judgement for c in candidates]
-    p_values = adjust(judgements, [c.unit for c in candidates], rng)
-    by_specimen = adjust_few(judge.few, judgements, rng)
-    for k, judgement in enumerate(judgements):
-        if judgement.units >= JACKKNIFE_UNITS:  # of two ways, each has half of the error
-            p_values[k] = 2 * min(p_values[k], len(candidates) * np.exp(judgement.log_p_jackknife))
-        elif judgement.few is not None:
-            p_values[k] = by_specimen[k]
-    found = [replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)]
-    return sorted(found, key=lambda c: -c.evidence)
 
 
 def log_p_of(t: np.ndarray, df: int, units: int) -> np.ndarray:
     """Return the log p-value of T, from Hotelling's F with as many units; T never exceeds their number."""
     share = np.clip(np.asarray(t) / units, 0.0, 1 - 1e-15)
     return np.log(np.maximum(betainc((units - df) / 2, df / 2, 1 - share), 1e-300))
-
-
-def adjust(
-    judgements: Sequence[Judgement], levels: Sequence[str], rng: np.random.Generator, flips: int = FLIPS
-) -> np.ndarray:
-    """Return each p-value adjusted over all judgements, by the maximum over sign flips, shape (m,).
-
-    Those of one level are flipped with the same signs, so that what they share counts once.
-    """
-    alike = defaultdict(list)
-    for judgement, level in zip(judgements, levels, strict=True):
-        alike[level, judgement.units, judgement.scores.shape[1]].append(judgement.scores)
-    signs = {
-        place: rng.choice([-1.0, 1.0], size=(flips, place[1])) for place in dict.fromkeys(key[:2] for key in alike)
-    }
-    least = np.zeros(flips)
-    for (level, units, df), scores in alike.items():
-        most = np.zeros(flips)  # the largest T has the smallest p-value where units and df are the same
-        for own in scores:
-            most = np.maximum(most, _wald(signs[level, units] @ own, own))
-        least = np.minimum(least, log_p_of(most, df, units))
-    return _adjusted([j.log_p for j in judgements], least)
-
-
-def adjust_few(
-    units: FewUnits, judgements: Sequence[Judgement], rng: np.random.Generator, draws: int = FLIPS
-) -> np.ndarray:
-    """Return the p-values of the tests on few specimens, adjusted over all of them, shape (m,); 1 for no test."""
-    p_values = np.ones(len(judgements))
-    tried = [k for k, j in enumerate(judgements) if j.few is not None]
-    if tried:
-        drawn = units.draws(draws, rng)
-        least = np.zeros(draws)
-        for k in tried:
-            test = judgements[k].few
-            least = np.minimum(least, few.log_p_of(drawn[test.target], test.basis, test.known))
-        p_values[tried] = _adjusted([judgements[k].few.log_p for k in tried], least)
-    return p_values
-
-
-def _adjusted(own: Sequence[float], least: np.ndarray) -> np.ndarray:
-    """Return p-values from log p and the least of all candidates under chance, drawn many times."""
-    return (1 + np.searchsorted(np.sort(least), own, side="right")) / (least.size + 1)

@@ -18,9 +18,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.special import fdtrc
 
+from sealfit.closure.adjusted import SEARCHES
 from sealfit.closure.channels import Channel
 from sealfit.closure.few import FewTest
-from sealfit.closure.judge import JACKKNIFE_UNITS, SEARCHES, Candidate, Judgement, project
+from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judgement, project
 from sealfit.closure.linearised import Proposal
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit, settled

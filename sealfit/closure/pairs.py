@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from sealfit.closure.adjusted import judged
 from sealfit.closure.channels import FINER, Channel, even_knots, flip_level, off_zero
-from sealfit.closure.judge import Candidate, Judge, judged
+from sealfit.closure.judge import Candidate, Judge
 from sealfit.closure.search import MAIN_TARGETS
 from sealfit.effects.free import BENDS, evenly
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from sealfit.closure.adjusted import judged
 from sealfit.closure.channels import (
     CALENDAR,
     FEW_DF,
@@ -19,7 +20,7 @@ from sealfit.closure.channels import (
     kinks,
     unit_of,
 )
-from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge, judged
+from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import Rows
 

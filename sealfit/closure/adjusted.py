@@ -1,0 +1,79 @@
+r"""P-values adjusted for the whole search: for every channel, quantity and width that was tried.
+
+Flipping the signs of whole units at random many times costs one matrix product a candidate, and the largest
+standardised T over all candidates gives the p-value adjusted for the search (Westfall & Young 1993; sign flips of score
+contributions: Hemerik, Goeman & Finos 2020, doi:10.1111/rssb.12369). P-values by the jackknife are adjusted by the
+number of candidates (Bonferroni); each way has half of the error. Tests on few specimens are adjusted by draws (`few`).
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sealfit.closure import few
+from sealfit.closure.few import FewUnits
+from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge, Judgement, log_p_of, wald
+
+FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
+SEARCHES = 2  # single channels and pairs of them: each search has half of the error
+
+
+def judged(judge: Judge, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
+    """Return candidates with p-values adjusted over all of them, strongest evidence first."""
+    judgements = [c.judgement for c in candidates]
+    p_values = adjust(judgements, [c.unit for c in candidates], rng)
+    by_specimen = adjust_few(judge.few, judgements, rng)
+    for k, judgement in enumerate(judgements):
+        if judgement.units >= JACKKNIFE_UNITS:  # of two ways, each has half of the error
+            p_values[k] = 2 * min(p_values[k], len(candidates) * np.exp(judgement.log_p_jackknife))
+        elif judgement.few is not None:
+            p_values[k] = by_specimen[k]
+    found = [replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)]
+    return sorted(found, key=lambda c: -c.evidence)
+
+
+def adjust(
+    judgements: Sequence[Judgement], levels: Sequence[str], rng: np.random.Generator, flips: int = FLIPS
+) -> np.ndarray:
+    """Return each p-value adjusted over all judgements, by the maximum over sign flips, shape (m,).
+
+    Those of one level are flipped with the same signs, so that what they share counts once.
+    """
+    alike = defaultdict(list)
+    for judgement, level in zip(judgements, levels, strict=True):
+        alike[level, judgement.units, judgement.scores.shape[1]].append(judgement.scores)
+    signs = {
+        place: rng.choice([-1.0, 1.0], size=(flips, place[1])) for place in dict.fromkeys(key[:2] for key in alike)
+    }
+    least = np.zeros(flips)
+    for (level, units, df), scores in alike.items():
+        most = np.zeros(flips)  # the largest T has the smallest p-value where units and df are the same
+        for own in scores:
+            most = np.maximum(most, wald(signs[level, units] @ own, own))
+        least = np.minimum(least, log_p_of(most, df, units))
+    return _adjusted([j.log_p for j in judgements], least)
+
+
+def adjust_few(
+    units: FewUnits, judgements: Sequence[Judgement], rng: np.random.Generator, draws: int = FLIPS
+) -> np.ndarray:
+    """Return the p-values of the tests on few specimens, adjusted over all of them, shape (m,); 1 for no test."""
+    p_values = np.ones(len(judgements))
+    tried = [k for k, j in enumerate(judgements) if j.few is not None]
+    if tried:
+        drawn = units.draws(draws, rng)
+        least = np.zeros(draws)
+        for k in tried:
+            test = judgements[k].few
+            least = np.minimum(least, few.log_p_of(drawn[test.target], test.basis, test.known))
+        p_values[tried] = _adjusted([judgements[k].few.log_p for k in tried], least)
+    return p_values
+
+
+def _adjusted(own: Sequence[float], least: np.ndarray) -> np.ndarray:
+    """Return p-values from log p and the least of all candidates under chance, drawn many times."""
+    return (1 + np.searchsorted(np.sort(least), own, side="right")) / (least.size + 1)
