@@ -18,7 +18,7 @@ PART = 32  # points of a grid whitened at once
 UNNAMED = (SMOOTH, SURFACE)
 PAIR = 10.0  # two channels together must be favoured over one by exp(5): there are many more to be chosen from
 ZERO_OFFSET = (("direction",), "force", "add")
-PREFERRED = ("mu", "mu_c", "mu_s", "v_s", "sigma_2", "a", "b", "mu_0", "force")
+PREFERRED = ("mu", "mu_c", "mu_s", "force", "v_s", "sigma_2", "a", "b", "mu_0")
 
 
 @dataclass(frozen=True)
