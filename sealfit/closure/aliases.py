@@ -16,7 +16,7 @@ import numpy as np
 from sealfit.closure.forms import grid_of, reference
 from sealfit.closure.judge import LEAST_LEFT
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.estimate import Fitted
+from sealfit.fit.estimate import Fitted, bounds_of
 from sealfit.fit.joint import Model
 from sealfit.fit.terms import Term, mean_derivatives
 
@@ -91,4 +91,5 @@ def _alias(fitted: Fitted, term: Term, values: Mapping[str, float], column: np.n
     scaled = {name: value * (scale if name in term.effect.linear else 1.0) for name, value in values.items()}
     chosen = {p.name: scaled[p.name] for p in term.effect.parameters}
     model = fitted.model
-    return Alias(term, model.with_term(term, chosen), model.at(model.vector() + change), size)
+    without = np.clip(model.vector() + change, *bounds_of(model, fitted.rows))
+    return Alias(term, model.with_term(term, chosen), model.at(without), size)

@@ -204,8 +204,8 @@ def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
     """
     slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
     rows = rows.sparse(ROWS_FOR_START)
-    held = prior_precision(model) > 0
-    low, high = _bounds(model, rows)
+    held = (prior_precision(model) > 0) | model.bent  # one step far from the optimum would throw these anywhere
+    low, high = bounds_of(model, rows)
     whitening = Whitening(scatter, rows.force, rows.groups)
     places = [k for k, parameter in enumerate(model.declared.parameters) if parameter.quantity == "v_s"]
     for group in [places, *([k] for k in places)] if len(places) > 1 else [places] if places else []:
@@ -240,7 +240,7 @@ def _descend(
     It ends where a step gains less than `near`.
     """
     precision = prior_precision(model)
-    low, high = _bounds(model, rows)
+    low, high = bounds_of(model, rows)
     vector = np.clip(model.vector(), low, high)
     model = model.at(vector)
     force, jacobian = evaluate(model, rows)
@@ -288,7 +288,8 @@ def _descend(
     return model
 
 
-def _bounds(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
+def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and greatest value of each fitted number, each of shape (model.size,)."""
     slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
     days = rows.days[rows.days > 0]
     first, last = (days.min(), days.max()) if days.size else (1.0, 1.0)

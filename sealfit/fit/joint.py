@@ -39,6 +39,12 @@ class Model:
         """Number of fitted numbers."""
         return self.theta.size + sum(len(t.effect.parameters) for t in self.terms)
 
+    @property
+    def bent(self) -> np.ndarray:
+        """Which numbers of effects act nonlinearly, in the order of `vector`, shape (size,); none of the declared."""
+        own = [not p.linear for t in self.terms for p in t.effect.parameters]
+        return np.r_[np.zeros(self.theta.size, dtype=bool), np.array(own, dtype=bool)]
+
     def place(self, number: int) -> slice:
         """Return where a term's numbers stand in `vector`."""
         first = self.theta.size + sum(len(t.effect.parameters) for t in self.terms[:number])

@@ -131,3 +131,11 @@ def test_a_number_at_its_bound_is_not_moved_beyond_it():
     inputs = {"rest_s": np.array([1.0, 10.0, 100.0])}
     derivatives = term_derivatives(term, {"A": 0.01, "t_0": t_0.bounds[0]}, inputs)
     assert np.isfinite(derivatives).all()
+
+
+def test_numbers_of_effects_that_act_nonlinearly_are_known():
+    rows = make_rows(bins_helpers.make_bins(1, bins=4, repeats=1), has_aging=True)
+    term = Term(EFFECTS["warming_time"], ("time_s",), "mu", "multiply")
+    model = start_model(rows).with_term(term, {"A": 0.05, "tau": 3.0})
+    assert model.bent.sum() == 1
+    assert model.vector()[model.bent] == [3.0]
