@@ -35,7 +35,7 @@ bench-coverage: .venv/.installed-test
 	$(BIN)/python benchmarks/coverage_steady.py 400
 
 # In an environment of its own, as pygam holds scipy back. What is in out/loop.jsonl already is not run again.
-bench-loop: .venv/.installed-bench ## close the loop on some 550 campaigns beside what people would use instead (90 minutes)
+bench-loop: .venv/.installed-bench ## close the loop on some 700 campaigns beside what people would use instead (90 minutes)
 	.venv/bench/bin/python benchmarks/loop.py --out out/loop.jsonl
 
 bench-loop-cost: .venv/.installed-test
