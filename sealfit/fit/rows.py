@@ -153,7 +153,7 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool) -> Rows:
         }
     )
     has_load = "load_N" in table and bool(table["load_N"].notna().all())
-    if has_load and table["load_N"].nunique() > 1 and POWER not in table:
+    if has_load and POWER not in table and np.ptp(table["load_N"]) > 1e-3 * table["load_N"].abs().max():
         table[POWER] = table["load_N"] * table["speed_mm_s"].abs()
     days = table["aging_days"].to_numpy(dtype=float) if has_aging else np.zeros(len(table))
     condition, names = pd.factorize(table["condition"], sort=True)
