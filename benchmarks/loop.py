@@ -24,7 +24,8 @@ from campaigns import STRENGTHS
 from effect_kinds import EFFECT_CAMPAIGNS
 from one_campaign import Task, run_campaign
 
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+from sealfit.threads import ONE_THREAD
+
 LARGE_SEED = {"effects": 4, "nulls": 20}
 RIVALS_ON_NULLS = 2  # first seeds of each kind of null on which the rivals are learned too: there is nothing to learn
 FAINT_SEEDS = (1, 2)
@@ -55,7 +56,7 @@ def run(tasks: list[Task], out: Path, workers: int, *, limit: float) -> None:
     print(f"{len(todo)} of {len(tasks)} campaigns to run", file=sys.stderr)
     started, waiting = time.monotonic(), iter(todo)
     out.parent.mkdir(parents=True, exist_ok=True)
-    os.environ.update(ONE_THREAD)  # before the processes load numpy
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # before the processes load numpy
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool, out.open("a", encoding="utf-8") as file:
         running = {pool.submit(guarded, t) for _, t in zip(range(workers), waiting, strict=False)}

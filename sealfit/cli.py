@@ -13,6 +13,7 @@ import typer
 
 from sealfit import __version__
 from sealfit.errors import SealfitError
+from sealfit.threads import one_thread
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
@@ -230,8 +231,6 @@ def main() -> None:
 
 
 def _exit_code() -> int:
-    from sealfit.engine import one_thread
-
     one_thread()
     try:
         code = app(standalone_mode=False, prog_name="sealfit") or 0

@@ -18,6 +18,7 @@ from itertools import islice
 from typing import TypeVar
 
 from sealfit.errors import WorkerError
+from sealfit.threads import one_thread
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
@@ -26,7 +27,6 @@ CHUNKS_PER_WORKER = 4  # enough to even out items of different cost, few enough 
 MAX_CHUNK = 32  # so that progress is shown often
 WAITING_PER_WORKER = 2  # chunks sent ahead of the one awaited: bounds the memory of results not yet taken
 PROCESSES_START_S = 3.0  # until two new processes have loaded numpy and pandas on two cores: 1.5 to 3 s
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def cores() -> int:
@@ -34,16 +34,6 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def one_thread() -> None:
-    """Let linear algebra use one thread in this process and those it starts, unless the user has said otherwise.
-
-    Its products are small, and here processes share the cores: more threads only wait for each other, and their
-    rounding depends on how many there are. To be called before numpy loads.
-    """
-    for name in ONE_THREAD:
-        os.environ.setdefault(name, "1")
 
 
 def run_map(

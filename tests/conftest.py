@@ -1,6 +1,6 @@
 """No test is judged by how long it takes: the first example of a process may load scipy on a busy machine."""
 
-from sealfit.engine import one_thread
+from sealfit.threads import one_thread
 
 one_thread()
 

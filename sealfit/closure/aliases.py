@@ -50,11 +50,13 @@ def find_aliases(fitted: Fitted, effects: Mapping[str, Effect], taken: tuple[str
     own = [e for e in effects.values() if e.physical and CHANNEL not in e.reads and set(e.reads) <= known]
     found = []
     for effect in own:
-        forms = [list(_at_grid(fitted, effect, target)) for target in effect.acts_on]
-        shown = [left for form in forms for _, _, _, left in form]
-        if shown and max(shown) < LEAST_LEFT:
-            term, values, column, _ = next(form for form in forms if form)[0]
-            found.append(_alias(fitted, term, values, column))
+        first = None
+        for *form, left in (f for target in effect.acts_on for f in _at_grid(fitted, effect, target)):
+            if left >= LEAST_LEFT:
+                break  # it shows there, and the rest of its grid need not be looked at
+            first = first or form
+        else:
+            found += [_alias(fitted, *first)] if first else []
     return found
 
 

@@ -228,7 +228,7 @@ def confirmed(
         say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
         if gain.real:
             others = rivals(proposal, proposals)
-            tried = [heldout_gain(fitted, o, config.loop.folds, config.loop.seed, samples) for o in others if compare]
-            rmse = [g.left_N for g in tried] if compare else [np.nan] * len(others)
+            folds_of = (config.loop.folds, config.loop.seed, samples)
+            rmse = [heldout_gain(fitted, o, *folds_of).left_N if compare else np.nan for o in others]
             return Added(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
     return None

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, FREE_DF, WIDE, Channel, even_knots
+from sealfit.closure.channels import CALENDAR, FINE_DF, FREE_DF, WIDE, Channel, even_knots
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.judge import Candidate, Judgement
 from sealfit.closure.ripple import Peak
@@ -20,7 +20,7 @@ from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term
 
 WAVY = ("bump", "quadratic")  # through a calendar they follow whatever was tested when
-FINE_SHAPES = (9, 14, 20)  # knots of finer free shapes, where a finer one than usual was significant
+FINE_SHAPES = (FINE_DF, 14, 20)  # knots of finer free shapes, where a finer one than usual was significant
 UNITS_PER_KNOT = 3
 MOST_PLACES = 60  # between neighbouring values that are tried
 REACH = 4.0  # spans of a channel that a width or a time constant may have

@@ -49,7 +49,7 @@ def richer_laws(
         The catalogue.
     """
     specimens = fitted.rows.groups.starts["specimen"].size
-    lawful = bool(fitted.model.declared.law) and any(fitted.model.declared.law.values())
+    lawful = any(fitted.model.declared.law.values())
     if AGING not in channels or channels[AGING].unit != "specimen" or not lawful or specimens >= JACKKNIFE_UNITS:
         return []
     known = {t.effect.id for t in fitted.model.terms}
@@ -77,12 +77,13 @@ def _judged(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[
     units = fitted.rows.groups.starts["specimen"].size
     q, left = Q, units - fitted.model.declared.numbers_of_mu
     error = left - q
-    at = after.model.place(place).start + effect.parameters.index(next(p for p in effect.parameters if p.linear))
+    amplitude = effect.linear[0]
+    at = after.model.place(place).start + [p.name for p in effect.parameters].index(amplitude)
     ratio = np.exp((gain + units * np.log(left / error) - q) / units)
-    t = after.model.vector()[at] / np.sqrt(max(after.covariance[at, at], 1e-300))
+    t = after.model.values[place][amplitude] / np.sqrt(max(after.covariance[at, at], 1e-300))
     f = max(min((ratio - 1) * error / q, t**2 / q), 0.0)
     p_value = fdtrc(q, error, f)
-    values = after.model.values[-1]
+    values = after.model.values[place]
     shape = shape_of(term, values, fitted.rows)
     column = project(fitted, (fitted.slope(*TARGET) * shape)[:, None])[:, 0]
     adjusted = float(min(1.0, (SEARCHES + 1) * laws * p_value))

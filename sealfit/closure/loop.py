@@ -71,9 +71,9 @@ def close_loop(
     counted = numbered(bins)
     rows = make_rows(counted, has_aging=config.aging)
     samples = steady_samples(traces, rows)
-    coarse = make_rows(merged_bins(counted), has_aging=config.aging)
-    merged = coarse.force.size < rows.force.size
-    coarse = coarse if merged else rows
+    fewer = merged_bins(counted)
+    merged = len(fewer) < len(counted)
+    coarse = make_rows(fewer, has_aging=config.aging) if merged else rows
     heldout = _HeldOut(rows, coarse, samples, config, effects, workers)
     with closing(heldout):
         fine = rows if merged else None

@@ -16,7 +16,7 @@ from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import Model, evaluate
-from sealfit.fit.rows import POWER, Rows
+from sealfit.fit.rows import POWER, Rows, sliding_power
 
 BEYOND = 0.5  # of a channel's range by which a run may go beyond what was tested
 SHOWN = 0.5  # of its size by which a run must show an effect to be worth making for it
@@ -168,7 +168,7 @@ def _moved(rows: Rows, changes: Mapping[str, object]) -> Rows:
     if "load_N" in changes:
         load = np.full_like(rows.load, float(changes["load_N"]))
     if POWER in table and POWER not in changes:
-        table[POWER] = load * np.abs(speed)
+        table[POWER] = sliding_power(load, speed)
     return replace(rows, table=table, speed=speed, days=days, load=load, cache={})
 
 

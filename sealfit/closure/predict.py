@@ -19,7 +19,7 @@ from sealfit.config import Config
 from sealfit.errors import RequestError
 from sealfit.fit.declared import Declared
 from sealfit.fit.joint import Model, evaluate
-from sealfit.fit.rows import LEVELS, POWER, point_rows
+from sealfit.fit.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.whitening import Component, Scatter
 
 BEYOND = 1e-6  # relative slack before a value counts as outside the tested range
@@ -96,8 +96,9 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
     if "direction" in needed and "direction" not in table and "speed_mm_s" in table:
         table["direction"] = np.sign(pd.to_numeric(table["speed_mm_s"], errors="coerce"))
     if POWER in needed and POWER not in table and {"load_N", "speed_mm_s"} <= set(table):
-        load, speed = (pd.to_numeric(table[name], errors="coerce") for name in ("load_N", "speed_mm_s"))
-        table[POWER] = load * speed.abs()
+        table[POWER] = sliding_power(
+            *(pd.to_numeric(table[name], errors="coerce") for name in ("load_N", "speed_mm_s"))
+        )
     for name in dict.fromkeys(needed):
         if name in table:
             continue

@@ -154,7 +154,7 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool) -> Rows:
     )
     has_load = "load_N" in table and bool(table["load_N"].notna().all())
     if has_load and POWER not in table and np.ptp(table["load_N"]) > 1e-3 * table["load_N"].abs().max():
-        table[POWER] = table["load_N"] * table["speed_mm_s"].abs()
+        table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
     days = table["aging_days"].to_numpy(dtype=float) if has_aging else np.zeros(len(table))
     condition, names = pd.factorize(table["condition"], sort=True)
     first = table.drop_duplicates("condition").set_index("condition").loc[names]
@@ -176,6 +176,11 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool) -> Rows:
         has_aging=has_aging,
         weight=1.0 / per_file / (files.max() + 1),
     )
+
+
+def sliding_power(load: np.ndarray | pd.Series, speed: np.ndarray | pd.Series) -> np.ndarray | pd.Series:
+    """Return the derived channel `POWER` from the load and the signed speed, of their shape."""
+    return load * np.abs(speed)
 
 
 def thin(bins: pd.DataFrame, most: int) -> pd.DataFrame:
