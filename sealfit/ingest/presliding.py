@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-SETTLED = np.log(5000.0)  # the rise is over when 1/5000 of it is left: below what the mean over a campaign could show
+SETTLED = np.log(50000.0)  # the rise is over when 1/50000 is left: 1/5000 showed in means over a campaign
 AFTER_RAMP = 3.0  # rise lengths after the speed ramp: the bristles follow the changing speed over one rise length
-ENOUGH = np.log(100.0)  # where 1/5000 would take more than a third of the stroke, 1 % of the rise may stay
+ENOUGH = np.log(100.0)  # where 1/50000 would take more than a third of the stroke, 1 % of the rise may stay
 HALF_WAY = 0.75  # a force that begins above this share of its level comes up, if at all, over a short distance:
 SHORT = 0.01  # this share of the stroke; a longer climb is an effect (run-in, warming), and stays inside
 EARLY = (0.05, 0.5)  # share of the distance in which the plateau is read: near the rise, past any ordinary rise
@@ -21,7 +21,7 @@ def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> 
     A bristle at constant speed follows dz/dx = 1 - z / z_ss (LuGre, Eq. 2 divided by v), so the force comes up as
     F(x) = A + B x - C exp(-x / x_0); A + B x stands for whatever changes slowly beside it. For every x_0 on a grid
     the rest is linear least squares; the x_0 with the smallest sum of squares is taken, and the rise ends where
-    1/5000 of it is left. A rig that comes up along a straight line (its own elasticity) is over well before.
+    1/50000 of it is left. A rig that comes up along a straight line (its own elasticity) is over well before.
 
     Where the rise takes more than a tenth of the stroke (a fretting stroke), no such law is asked: it ends where the
     force first arrives in the band of the late plateau.
@@ -50,8 +50,8 @@ def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> 
     Examples
     --------
     >>> x = np.linspace(0.0, 40.0, 1001)
-    >>> end = rise_end_mm(x, 30.0 * (1.0 - np.exp(-x / 0.5)), 0)  # 0.5 mm * ln(5000) = 4.26 mm
-    >>> 4.0 < end < 4.6
+    >>> end = rise_end_mm(x, 30.0 * (1.0 - np.exp(-x / 0.5)), 0)  # 0.5 mm * ln(50000) = 5.41 mm
+    >>> 5.1 < end < 5.8
     True
     """
     length = float(distance_mm[-1])
