@@ -50,8 +50,8 @@ class Task:
 
     @property
     def draw(self) -> int:
-        """Seed of the campaign: each kind draws its own rig, or one unlucky specimen would count in every kind."""
-        return 1000 * (zlib.crc32(self.kind.encode()) % 1_000_000) + self.seed
+        """Seed of the campaign: each draws its own rig, or one unlucky specimen would count many times."""
+        return 1000 * (zlib.crc32(f"{self.kind} {self.strength}".encode()) % 1_000_000) + self.seed
 
     def record(self) -> dict:
         """Return the head of the task's record."""
