@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import BSpline
 
+from sealfit.effects.free import WIDE
 from sealfit.fit.rows import LEVELS, Rows
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
@@ -21,7 +22,6 @@ FEW_DF = 2  # of a free shape along a dozen specimens: a line and a bend
 FREE_DF = 4  # columns of a free shape: enough for a peak, an approach or a step; more only costs power
 FINE_DF = 9  # of a second, finer shape, for two humps or a narrow one
 FINE_UNITS = 50  # units from which it is tried
-WIDE = 20.0  # a positive channel that spans this factor is looked at on a logarithmic scale
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
 from sealfit.closure.waves import agreement, pass_shifts
 from sealfit.config import Config
-from sealfit.fit.estimate import Fitted, fit
+from sealfit.fit.estimate import Fitted, as_smooth_as_wanted, fit
 from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import Rows
 from sealfit.fit.whitening import Whitening
@@ -116,6 +116,7 @@ def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int, samp
         weight, whitening = rows.weight[out], Whitening(scatter, before.friction[out], test.groups)
         known += float(weight.sum())
         for k, model in enumerate((before.model, after.model)):
+            model = as_smooth_as_wanted(model, train, scatter, before.friction[~out])
             kept = fit(model, train, scatter, turns=0, friction=before.friction[~out])
             residual = test.force - evaluate(kept.model, test, jacobian=False)[0]
             inside = residual if calendar else _about(residual, test, proposal)  # a block of time is asked for whole

@@ -17,7 +17,7 @@ from sealfit.closure.ripple import Peak
 from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.effects.contract import fill_unit
-from sealfit.fit.estimate import Fitted, fit
+from sealfit.fit.estimate import Fitted, fit, worth
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term
 from sealfit.tables import Units
@@ -60,7 +60,8 @@ def _entry(after: Fitted, number: int, item: Added, config: Config) -> dict:
         "channels": channels_of(term, after.rows),
         "acts_on": term.acts_on,
         "operation": term.operation,
-        "form": form_of(term),
+        "form": form_of(term)
+        + ("" if term.smoothness is None else f"; held smooth, worth {worth(after, number):.1f} numbers"),
         "named": proposal.named,
         "candidate": False,
         "parameters": parameters,

@@ -8,20 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, FINE_DF, FREE_DF, WIDE, Channel, even_knots
+from sealfit.closure.channels import CALENDAR, FREE_DF, Channel, even_knots, scaled
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.judge import Candidate, Judgement
 from sealfit.closure.ripple import Peak
 from sealfit.closure.waves import common_wavelength, pass_shifts
 from sealfit.effects.contract import CHANNEL, SECOND, Effect
-from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, free_effect, natural
+from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, WIDE, free_effect, natural
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term
 
 WAVY = ("bump", "quadratic")  # through a calendar they follow whatever was tested when
-FINE_SHAPES = (FINE_DF, 14, 20)  # knots of finer free shapes, where a finer one than usual was significant
+MOST_KNOTS = 24  # of a penalised free shape, whose smoothness the data decide
 UNITS_PER_KNOT = 3
+APART = 1e-3  # of a channel scaled to -1..1: knots that are nearer are one value measured twice
 MOST_PLACES = 60  # between neighbouring values that are tried
 REACH = 4.0  # spans of a channel that a width or a time constant may have
 PHASES = tuple(np.arange(4) * np.pi / 4)
@@ -72,11 +73,7 @@ def terms_of(
             if target == ("mu", "multiply") and ("mu", "add") in effect.acts_on:  # the search tries the factor for both
                 yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids
     if name != "direction":
-        yield free_term(channel, *target), {}
-        if candidate.judgement.df > FREE_DF + 1 and channel.numeric:
-            for df in FINE_SHAPES:
-                if df <= candidate.judgement.units // UNITS_PER_KNOT:
-                    yield free_term(channel, *target, df=df), {}
+        yield free_term(channel, *target, knots=min(MOST_KNOTS, candidate.judgement.units // UNITS_PER_KNOT)), {}
 
 
 def _all_read(effect: Effect, channels: Mapping[str, Channel], rows: Rows, effects: Mapping[str, Effect]) -> bool:
@@ -121,24 +118,43 @@ def _terms_of_pair(
     yield Term(free_effect(SURFACE, fixed), (one.name, other.name), *target, fixed=fixed), {}
 
 
-def free_term(channel: Channel, acts_on: str, operation: str, *, df: int = FREE_DF) -> Term:
-    """Return the free shape of a channel: a spline with knots at quantiles, or one level per category."""
+def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = FREE_DF + 1) -> Term:
+    """Return the free shape of a channel: one level per category, or a spline.
+
+    A spline of up to five knots at quantiles is as it is; one of more has them evenly and is held smooth.
+
+    Parameters
+    ----------
+    channel : Channel
+        The channel.
+    acts_on, operation : str
+        What it acts on, and how.
+    knots : int
+        How many the spline may have; five at least.
+    """
     if channel.numeric:
-        distinct = np.unique(channel.values)
-        count = min(df + 1, distinct.size)
-        if distinct.size <= df + 1:
-            knots = distinct
-        elif distinct[0] > 0 and distinct[-1] / distinct[0] >= WIDE:
-            knots = np.geomspace(distinct[0], distinct[-1], count)
-        else:
-            knots = np.quantile(distinct, np.linspace(0, 1, count))
-        places = tuple(float(k) for k in knots)
+        places = _knots(np.unique(channel.values), max(knots, FREE_DF + 1))
         means = natural(places, channel.values).mean(axis=0)
         fixed = {"knots": places, "x_ref": places[0], "means": tuple(means.tolist())}
-        return Term(free_effect(SMOOTH, fixed), (channel.name,), acts_on, operation, fixed)
+        smoothness = 1.0 if len(places) > FREE_DF + 1 else None
+        return Term(free_effect(SMOOTH, fixed), (channel.name,), acts_on, operation, fixed, smoothness)
     categories, count = np.unique(channel.values, return_counts=True)
     fixed = {"categories": tuple(categories.tolist()), "means": tuple((count / count.sum()).tolist())}
     return Term(free_effect(LEVELS, fixed), (channel.name,), acts_on, operation, fixed)
+
+
+def _knots(distinct: np.ndarray, count: int) -> tuple[float, ...]:
+    """Return `count` knots for rising values of a channel, or these themselves where no more of them lie apart."""
+    distinct = distinct[np.r_[True, np.diff(scaled(distinct)) > APART]]
+    if distinct.size <= count:
+        knots = distinct
+    elif distinct[0] > 0 and distinct[-1] / distinct[0] >= WIDE:
+        knots = np.geomspace(distinct[0], distinct[-1], count)
+    elif count > FREE_DF + 1:
+        knots = np.linspace(distinct[0], distinct[-1], count)
+    else:
+        knots = np.quantile(distinct, np.linspace(0, 1, count))
+    return tuple(float(k) for k in knots)
 
 
 def periodic_terms(

@@ -25,6 +25,8 @@ from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import Rows
 
+DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at too: a strong pair may leave a trace
+
 
 @dataclass(frozen=True)
 class Grown:
@@ -98,11 +100,12 @@ def grow(
             last = tuple(search(judge, list(channels.values()), rng))
         significant = [c for c in last if c.p_value <= alpha and c.sure]
         say(f"round {number}: {len(last)} candidates on {len(channels)} channels, {len(significant)} significant")
-        if not significant:
-            pairs = search_pairs(judge, list(channels.values()), last, rng)
-            significant = [c for c in pairs if c.p_value <= alpha]
-            say(f"round {number}: {len(pairs)} pairs, {len(significant)} significant")
         laws = richer_laws(fitted, channels, effects) if not significant else []
+        if not significant or significant[0].p_value > DOUBTFUL:
+            pairs = search_pairs(judge, list(channels.values()), last, rng)
+            together = [c for c in pairs if c.p_value <= alpha]
+            say(f"round {number}: {len(pairs)} pairs, {len(together)} significant")
+            significant = sorted([*significant, *together], key=lambda c: c.p_value)
         significant += [c for c, _ in laws if c.p_value <= alpha and c.sure]
         left = significant[0] if significant else ripples.found
         significant += pairs_in_disguise(judge, significant, channels)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from sealfit.closure.judge import LEAST_LEFT, Candidate, project
 from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
-from sealfit.fit.estimate import Fitted
+from sealfit.fit.estimate import Fitted, worth
+from sealfit.fit.prior import likely_smoothness, penalised, roughness_of
 from sealfit.fit.terms import Term, mean_derivatives
 
 PART = 32  # points of a grid whitened at once
@@ -33,13 +35,21 @@ class Proposal:
     p_value: float
     column: np.ndarray  # (n,) what it adds to the force, whitened and projected
     source: tuple  # key of the candidate it stands for
+    linear_size: float | None = None  # of a free shape that is held smooth, before it is refitted
     fitted: Fitted | None = None
+
+    @cached_property
+    def size(self) -> float:
+        """How many numbers it is worth: its parameters, fewer where a free shape is held smooth."""
+        if self.linear_size is None:
+            return float(len(self.term.effect.parameters))
+        return self.linear_size if self.fitted is None else worth(self.fitted, len(self.fitted.model.terms) - 1)
 
     @property
     def price(self) -> float:
         """Schwarz's price of its parameters, and of being one of the many pairs of channels."""
         pair = PAIR if SECOND in self.term.effect.reads else 0.0
-        return len(self.term.effect.parameters) * np.log(max(self.units, 2)) + pair
+        return self.size * np.log(max(self.units, 2)) + pair
 
     @property
     def criterion(self) -> float:
@@ -62,7 +72,7 @@ class Proposal:
         offset = self.source == ZERO_OFFSET  # an amplifier is off more often than friction by direction
         target = -1 if offset else PREFERRED.index(self.term.acts_on)
         way = (self.term.acts_on, self.term.operation)
-        return (kind, len(effect.parameters), target, effect.acts_on.index(way) if effect.physical else 0)
+        return (kind, self.size, target, effect.acts_on.index(way) if effect.physical else 0)
 
 
 class Linearised:
@@ -95,13 +105,17 @@ class Linearised:
         if not chi2[best] > 0:
             return []
         left = project(fitted, slope[:, None] * shapes[:, best * count : (best + 1) * count])
-        amplitude, *_ = np.linalg.lstsq(left, fitted.white_residual, rcond=1e-10)
+        size = None
+        if term.smoothness is None:
+            amplitude, *_ = np.linalg.lstsq(left, fitted.white_residual, rcond=1e-10)
+        else:
+            term, amplitude, size = _smooth(term, left, fitted.white_residual)
         column = left @ amplitude
         chosen = {**effect.start(), **points[best], **dict(zip(effect.linear, amplitude.tolist(), strict=True))}
         values = {p.name: chosen[p.name] for p in effect.parameters}
         found = float(2 * column @ fitted.white_residual - column @ column)
         units = candidate.judgement.units
-        return [Proposal(term, values, candidate.unit, units, found, candidate.p_value, column, candidate.key)]
+        return [Proposal(term, values, candidate.unit, units, found, candidate.p_value, column, candidate.key, size)]
 
     def _shapes(self, term: Term, points: list[dict[str, float]]) -> np.ndarray:
         """Return the shape per unit of each amplitude at every point, shape (n, points * amplitudes)."""
@@ -116,6 +130,14 @@ class Linearised:
                 ]
             self._kept = (key, np.column_stack(columns))
         return self._kept[1]
+
+
+def _smooth(term: Term, left: np.ndarray, residual: np.ndarray) -> tuple[Term, np.ndarray, float]:
+    """Return a free shape as smooth as the residual wants it, its amplitudes, and how many numbers it is worth."""
+    normal, gradient, rough = left.T @ left, left.T @ residual, roughness_of(term)
+    smoothness = likely_smoothness(normal, gradient, rough)
+    amplitude, size = penalised(normal, gradient, smoothness * rough)
+    return replace(term, smoothness=smoothness), amplitude, size
 
 
 def _explained(fitted: Fitted, columns: np.ndarray, count: int) -> np.ndarray:

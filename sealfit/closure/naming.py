@@ -127,7 +127,7 @@ def _spread(found: list[Proposal]) -> list[Proposal]:
 
 
 def _kind(proposal: Proposal) -> tuple[str, int]:
-    """What counts as one form: a free shape with more knots is another one."""
+    """What counts as one form."""
     return proposal.term.effect.id, len(proposal.term.effect.parameters)
 
 
@@ -139,8 +139,8 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
     best = found[0]
     equals = [p for p in found if p.criterion - best.criterion < TIED or _simpler(p, best)]
     held = [p for p in equals if determined(p)]
-    fewest = min((len(p.term.effect.parameters) for p in held), default=0)
-    held += [p for p in equals if p.term.effect.physical and p not in held and len(p.term.effect.parameters) <= fewest]
+    fewest = min((p.size for p in held), default=0)
+    held += [p for p in equals if p.term.effect.physical and p not in held and p.size <= fewest]
     alike = [p for p in found if p.fitted.deviance - best.fitted.deviance < TIED]
     if not any(p.term.effect.id == LINEAR for p in alike):  # a straight line shows no mechanism
         held += [p for p in alike if _own_mechanism(p) and p not in held]

@@ -59,6 +59,7 @@ def _model(model: Model) -> dict:
                 "operation": term.operation,
                 "fixed": {k: ({} if k == "shift" else _plain(v)) for k, v in term.fixed.items()},
                 "values": {k: float(v) for k, v in values.items()},
+                "smoothness": term.smoothness,
             }
             for term, values in zip(model.terms, model.values, strict=True)
         ],
@@ -108,7 +109,7 @@ def from_record(record: dict) -> tuple[Model, Model, pd.DataFrame]:
         for raw_term in record[stage]["terms"]:
             fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in raw_term["fixed"].items()}
             effect = free_effect(raw_term["id"], fixed) if raw_term["id"] in FREE else effects[raw_term["id"]]
-            term = Term(effect, tuple(raw_term["channels"]), raw_term["acts_on"], raw_term["operation"], fixed)
-            model = model.with_term(term, raw_term["values"])
+            own = (raw_term["acts_on"], raw_term["operation"], fixed, raw_term.get("smoothness"))
+            model = model.with_term(Term(effect, tuple(raw_term["channels"]), *own), raw_term["values"])
         models.append(model)
     return models[0], models[1], pd.DataFrame(record["conditions"])

@@ -21,6 +21,7 @@ from sealfit.errors import ParameterError
 
 SMOOTH, LEVELS, SURFACE, SLOPES = "smooth", "levels", "surface", "slopes"
 LESS_MEAN = "; less its mean over the campaign"
+WIDE = 20.0  # a positive channel that spans this factor is looked at on a logarithmic scale
 BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))  # powers of the two scaled channels in a free surface
 
 
@@ -56,7 +57,7 @@ def smooth_effect(
     places = tuple(float(k) for k in knots)
     if len(places) < 2 or not np.isfinite(places).all() or not (np.diff(places) > 0).all():
         raise ParameterError(f"smooth: knots {list(places)} must be two or more rising numbers.", mend="Sort them.")
-    zero = 0 if reference is None else int(np.argmin(np.abs(np.array(places) - reference)))
+    zero = _nearest(places, reference)
     free = [j for j in range(len(places)) if j != zero]
     x = places[free[-1]]
     return Effect(
@@ -115,6 +116,37 @@ def natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
     inside = np.clip(x, places[0], places[-1])
     below, above = np.minimum(x - places[0], 0.0), np.maximum(x - places[-1], 0.0)
     return spline(inside) + below[..., None] * first + above[..., None] * last
+
+
+@lru_cache(maxsize=64)
+def roughness(places: tuple[float, ...], reference: float | None = None) -> np.ndarray:
+    r"""Return S with :math:`c^T S c = \int h''^2` of the spline through c at the knots, each scaled to a range of 1.
+
+    Parameters
+    ----------
+    places : tuple of float
+        Knots; where they are positive and span a factor of 20, h'' is that in their logarithm.
+    reference : float, optional
+        As for `smooth_effect`: its knot has no amplitude.
+
+    Returns
+    -------
+    ndarray, shape (knots - 1, knots - 1)
+        Its null space is the straight line. A straight line in the logarithm, where that is meant.
+    """
+    x = np.log(places) if places[0] > 0 and places[-1] / places[0] >= WIDE else np.array(places)
+    bend = _cardinal(tuple(((x - x[0]) / (x[-1] - x[0])).tolist()))[0].derivative(2)
+    at, width = bend(bend.x), np.diff(bend.x)[:, None]  # h'' of each cardinal spline is straight between knots
+    left, right = at[:-1], at[1:]
+    across = left.T @ (width / 6 * right)
+    whole = left.T @ (width / 3 * left) + right.T @ (width / 3 * right) + across + across.T
+    free = np.arange(len(places)) != _nearest(places, reference)
+    return whole[np.ix_(free, free)]
+
+
+def _nearest(places: Sequence[float], reference: float | None) -> int:
+    """Return the number of the knot of reference."""
+    return 0 if reference is None else int(np.argmin(np.abs(np.array(places) - reference)))
 
 
 def levels_effect(categories: Sequence[str], means: Sequence[float] | None = None) -> Effect:

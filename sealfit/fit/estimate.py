@@ -1,6 +1,6 @@
 r"""One estimator for "before" and "after": generalised least squares with scatter at every level.
 
-The weights come from the variance components (`mixed.py`), which are estimated from the residual with the degrees of
+The weights come from the variance components (`reml.py`), which are estimated from the residual with the degrees of
 freedom of the model taken out; model and scatter are fitted in turn until neither moves. v_s and b carry a weak
 Gaussian prior on their logarithm (SD 3, a factor of 20) about the global search's value: it holds a number that the
 data do not determine, and is far weaker than any data that do.
@@ -13,13 +13,13 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.fit.joint import LOGARITHMIC, Model, evaluate, friction_of, term_slope
+from sealfit.fit.joint import Model, evaluate, friction_of, term_slope
+from sealfit.fit.prior import centre_of, covariance_of, free_of_others, penalised, precision_of, smoothed
 from sealfit.fit.rows import Rows
 from sealfit.fit.scatter import estimate_components, estimate_scatter
 from sealfit.fit.start import start_model, stribeck_range
 from sealfit.fit.whitening import Scatter, Whitening
 
-PRIOR_SD = 3.0
 MAX_STEPS = 60
 STRIBECK_GRID = 12  # points of log v_s tried when an effect has come in
 ROWS_FOR_START = 4  # of each stroke: v_s acts on a stroke as a whole
@@ -102,21 +102,7 @@ class Fitted:
     @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance of all fitted numbers (v_s and b as logarithms), shape (p, p)."""
-        return covariance_of(self.white_jacobian, prior_precision(self.model))
-
-
-def covariance_of(white_jacobian: np.ndarray, precision: np.ndarray) -> np.ndarray:
-    """Return the covariance of parameters from a whitened tangent, shape (n, p), and a diagonal prior precision."""
-    normal = white_jacobian.T @ white_jacobian + np.diag(precision)
-    size = np.sqrt(np.diag(normal))
-    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # 0: a number that nothing here moves
-    return scale[:, None] * np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
-
-
-def prior_precision(model: Model) -> np.ndarray:
-    """Return the prior's precision per fitted number: 1/3^2 on log v_s and log b, none elsewhere, shape (p,)."""
-    own = [1.0 / PRIOR_SD**2 if p.quantity in LOGARITHMIC else 0.0 for p in model.declared.parameters]
-    return np.r_[own, np.zeros(model.size - len(own))]
+        return covariance_of(self.white_jacobian, precision_of(self.model))
 
 
 def fit_declared(rows: Rows) -> Fitted:
@@ -151,7 +137,7 @@ def fit(
     friction : ndarray, shape (n,), optional
         Friction that gains and noise load on, where `turns` is 0: fits to be compared must share it.
     """
-    centre = model.vector()
+    centre = centre_of(model)
     if scatter is None:
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
         model = _descend(model, rows, scatter, centre, near=ROUGH)
@@ -162,7 +148,7 @@ def fit(
         scatter = estimate_scatter(
             rows, rows.force - force, friction_of(model, rows), jacobian, scatter if turn else None
         )
-        model = _descend(model, rows, scatter, centre)
+        model = _descend(as_smooth_as_wanted(model, rows, scatter), rows, scatter, centre)
     if not turns:
         model = _descend(model, rows, scatter, centre, friction, near=COMPARED)
         return fitted_at(model, rows, scatter, friction)
@@ -192,8 +178,25 @@ def settled(fitted: Fitted) -> Fitted:
     """
     rows = fitted.rows
     scatter = estimate_components(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
-    model = _descend(fitted.model, rows, scatter, fitted.model.vector(), fitted.friction, near=COMPARED)
+    model = as_smooth_as_wanted(fitted.model, rows, scatter, fitted.friction)
+    model = _descend(model, rows, scatter, centre_of(model), fitted.friction, near=COMPARED)
     return fitted_at(model, rows, scatter, fitted.friction)
+
+
+def worth(fitted: Fitted, number: int) -> float:
+    """Return how many numbers a term's free shape is worth, held as smooth as it is."""
+    model, white = fitted.model, fitted.white_jacobian
+    place = model.place(number)
+    own, pull = free_of_others(model, white.T @ white, white.T @ fitted.white_residual, place)
+    return penalised(own, pull, precision_of(model)[place, place])[1]
+
+
+def as_smooth_as_wanted(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Model:
+    """Return the model with its free shapes as smooth as the data want them under this scatter."""
+    if all(term.smoothness is None for term in model.terms):
+        return model
+    at = fitted_at(model, rows, scatter, friction)
+    return smoothed(model, at.white_jacobian.T @ at.white_jacobian, at.white_jacobian.T @ at.white_residual)
 
 
 def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
@@ -204,7 +207,8 @@ def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
     """
     slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
     rows = rows.sparse(ROWS_FOR_START)
-    held = (prior_precision(model) > 0) | model.bent  # one step far from the optimum would throw these anywhere
+    precision, centre = precision_of(model), centre_of(model)
+    held = model.bent  # one step far from the optimum would throw these anywhere
     low, high = bounds_of(model, rows)
     whitening = Whitening(scatter, rows.force, rows.groups)
     places = [k for k, parameter in enumerate(model.declared.parameters) if parameter.quantity == "v_s"]
@@ -217,8 +221,11 @@ def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
             force, jacobian = evaluate(model.at(vector), rows)
             residual = whitening((rows.force - force)[:, None])[:, 0]
             normal, gradient = whitening.normal(jacobian[:, ~held], residual)
-            step, *_ = np.linalg.lstsq(normal, gradient, rcond=1e-10)
-            cost = float(residual @ residual - step @ gradient)
+            prior = precision[np.ix_(~held, ~held)]
+            away = (vector - centre)[~held]
+            gradient = gradient - prior @ away
+            step, *_ = np.linalg.lstsq(normal + prior, gradient, rcond=1e-10)
+            cost = float(residual @ residual + away @ prior @ away - step @ gradient)
             if cost < best - 1e-9:
                 vector[~held] += step
                 best, chosen = cost, np.clip(vector, low, high)
@@ -239,7 +246,7 @@ def _descend(
 
     It ends where a step gains less than `near`.
     """
-    precision = prior_precision(model)
+    precision = precision_of(model)
     low, high = bounds_of(model, rows)
     vector = np.clip(model.vector(), low, high)
     model = model.at(vector)
@@ -250,15 +257,15 @@ def _descend(
     whitening = Whitening(scatter, friction, rows.groups)
 
     def cost_of(residual: np.ndarray, at: np.ndarray) -> float:
-        return float(residual @ residual + precision @ (at - centre) ** 2)
+        return float(residual @ residual + (at - centre) @ precision @ (at - centre))
 
     residual = whitening((rows.force - force)[:, None])[:, 0]
     cost = cost_of(residual, vector)
     damping, crept = 1e-4, 0
     for _ in range(MAX_STEPS):
         normal, gradient = whitening.normal(jacobian, residual)
-        gradient = gradient - precision * (vector - centre)
-        normal = normal + np.diag(precision)
+        gradient = gradient - precision @ (vector - centre)
+        normal = normal + precision
         blocked = ((vector <= low) & (gradient < 0)) | ((vector >= high) & (gradient > 0))
         free = ~blocked & (np.diag(normal) > 0)
         scale = np.sqrt(np.diag(normal)[free])

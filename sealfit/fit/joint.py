@@ -41,9 +41,9 @@ class Model:
 
     @property
     def bent(self) -> np.ndarray:
-        """Which numbers of effects act nonlinearly, in the order of `vector`, shape (size,); none of the declared."""
-        own = [not p.linear for t in self.terms for p in t.effect.parameters]
-        return np.r_[np.zeros(self.theta.size, dtype=bool), np.array(own, dtype=bool)]
+        """Which numbers act nonlinearly, v_s and b among them, in the order of `vector`, shape (size,)."""
+        declared = [p.quantity in LOGARITHMIC for p in self.declared.parameters]
+        return np.array(declared + [not p.linear for t in self.terms for p in t.effect.parameters], dtype=bool)
 
     def place(self, number: int) -> slice:
         """Return where a term's numbers stand in `vector`."""

@@ -12,8 +12,10 @@ from sealfit.effects.contract import CHANNEL, SECOND, Effect
 from sealfit.fit.rows import ALONG, Rows
 
 FINE = ("ripple", "sinusoid", "sinusoid_harmonics", "bump")  # effects that may be as fine as a bin
-GAUSS = tuple(zip(*(part.tolist() for part in np.polynomial.legendre.leggauss(4)), strict=True))
-GAUSS = tuple((place, weight / 2) for place, weight in GAUSS)
+FEW, MANY = (
+    tuple((float(place), float(weight) / 2) for place, weight in zip(*np.polynomial.legendre.leggauss(k), strict=True))
+    for k in (2, 4)
+)
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,8 @@ class Term:
     """An effect bound to the channels it reads and the quantity it acts on, with fixed reference values.
 
     In `fixed`, `shift` holds each pass's own origin, and `held` the 95 % interval of each parameter that comes from the
-    raw samples and that no fit to bins moves.
+    raw samples and that no fit to bins moves. `smoothness` is the weight on how much a free shape bends (`prior.py`),
+    None where nothing holds its amplitudes.
     """
 
     effect: Effect
@@ -29,6 +32,7 @@ class Term:
     acts_on: str
     operation: str
     fixed: Mapping[str, object] = field(default_factory=dict)
+    smoothness: float | None = None
 
     def inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         """Return what the effect's shape reads, from the rows' channels."""
@@ -50,16 +54,17 @@ class Term:
     def nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
         """Return (weight, inputs) at the points of each row where the shape is averaged.
 
-        A row is the mean over a bin, and the mean of a short wave is smaller than its value in the middle: what may be
-        as fine as the bins is averaged by Gauss-Legendre quadrature along the bin, the rest taken in the middle.
+        A row is the mean over a bin, and the mean of a short wave is smaller than its value in the middle, that of an
+        exponential larger: what bends within a bin is averaged by Gauss-Legendre quadrature along it, more closely
+        where it may be as fine as the bin. The rest is taken in the middle.
         """
         inputs = self.inputs(rows)
-        if self.effect.id not in FINE or not set(self.channels) & set(ALONG):
+        if not self.effect.nonlinear or not set(self.channels) & set(ALONG):
             return [(1.0, inputs)]
         key = ("nodes", self.key(), id(self.fixed))
         if key not in rows.cache:
             found = []
-            for place, weight in GAUSS:
+            for place, weight in MANY if self.effect.id in FINE else FEW:
                 moved = dict(inputs)
                 for name, channel in zip(self.effect.reads, self.channels, strict=True):
                     if channel in ALONG:

@@ -16,7 +16,7 @@ def bound(fitted, effect, channel, **values):
     """The declared fit with one effect as a factor on mu, its numbers given."""
     term = Term(EFFECTS[effect], (channel,), "mu", "multiply", fixed={"x_ref": 0.0})
     after = fitted_at(fitted.model.with_term(term, values), fitted.rows, fitted.scatter)
-    return Proposal(term, values, "run", 10, 1.0, 0.001, np.zeros(fitted.force.size), ((channel,),), after)
+    return Proposal(term, values, "run", 10, 1.0, 0.001, np.zeros(fitted.force.size), ((channel,),), fitted=after)
 
 
 def between(chosen, rival):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sealfit.effects.free import free_effect, levels_effect, slopes_effect, smooth_effect, surface_effect
+from sealfit.effects.free import free_effect, levels_effect, roughness, slopes_effect, smooth_effect, surface_effect
 from sealfit.errors import ParameterError
 
 
@@ -42,6 +42,19 @@ def test_smooth_against_a_natural_spline_solved_by_hand():
     # Knots 0, 1, 2 with values 0, 1, 0: the middle second derivative m solves 4 m = 6 (0 - 2 + 0), m = -3, so at 1/2
     # h = 1/2 - m/6 (1/2 - 1/8) = 1/2 + 3/16 = 11/16.
     npt.assert_allclose(smooth_effect([0, 1, 2]).shape({"x": np.array([0.5])}, c_2=1.0, c_3=0.0), [11 / 16], rtol=1e-14)
+
+
+def test_roughness_is_the_integral_of_the_squared_second_derivative():
+    # Knots 0, 1, 2 scaled to 0, 1/2, 1: h'' rises to m and falls to 0, m = -3 * 4 at values 0, 1, 0; m^2/3.
+    npt.assert_allclose(np.array([1.0, 0.0]) @ roughness((0.0, 1.0, 2.0)) @ [1.0, 0.0], 12**2 / 3, rtol=1e-12)
+
+
+@pytest.mark.parametrize("knots", [(0.0, 1.0, 4.0, 5.0, 9.0), (0.5, 2.0, 9.0, 40.0)])
+def test_a_straight_line_is_not_rough(knots):
+    line = np.log(knots) if knots[0] > 0 else np.array(knots)  # over a factor of 20: straight in the logarithm
+    value = (line - line[0])[1:]
+    npt.assert_allclose(roughness(knots) @ value, 0.0, atol=1e-10)
+    assert np.linalg.matrix_rank(roughness(knots), tol=1e-8) == len(knots) - 2
 
 
 def test_a_category_that_was_not_fitted_gets_no_value():

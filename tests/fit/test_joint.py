@@ -10,7 +10,7 @@ from sealfit.fit.estimate import fit, fit_declared
 from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import make_rows, thin
 from sealfit.fit.start import start_model
-from sealfit.fit.terms import Term, term_derivatives
+from sealfit.fit.terms import Term, shape_of, term_derivatives
 
 WAVE = Effect(
     id="wave",
@@ -137,5 +137,32 @@ def test_numbers_of_effects_that_act_nonlinearly_are_known():
     rows = make_rows(bins_helpers.make_bins(1, bins=4, repeats=1), has_aging=True)
     term = Term(EFFECTS["warming_time"], ("time_s",), "mu", "multiply")
     model = start_model(rows).with_term(term, {"A": 0.05, "tau": 3.0})
-    assert model.bent.sum() == 1
-    assert model.vector()[model.bent] == [3.0]
+    own = model.bent[model.theta.size :]
+    assert own.tolist() == [False, True]
+    bent = {p.quantity for p, b in zip(model.declared.parameters, model.bent, strict=False) if b}
+    assert bent == {"v_s", "b_s", "b_c"}
+
+
+def test_a_bin_is_the_mean_of_its_samples_and_an_exponential_bends_within_it():
+    rows = make_rows(bins_helpers.make_bins(1, bins=4, repeats=1), has_aging=True)
+    tau, width = 3.0, np.diff(rows.values("time_s")[:2])[0]
+    term = Term(EFFECTS["warming_time"], ("time_s",), "mu", "multiply")
+    found = shape_of(term, {"A": 1.0, "tau": tau}, rows)
+    n = rows.table["n"].iloc[0]
+    samples = rows.values("time_s")[0] + width * ((np.arange(n) + 0.5) / n - 0.5)
+    exact = term.effect.shape({"time_s": samples}, A=1.0, tau=tau).mean()
+    middle = term.effect.shape({"time_s": rows.values("time_s")[:1]}, A=1.0, tau=tau)[0]
+    assert abs(found[0] - exact) < 0.1 * abs(middle - exact)
+
+
+@pytest.mark.parametrize("n", [2, 5, 50])
+def test_a_wave_is_smaller_in_bins_of_many_samples_than_in_bins_of_few(n):
+    bins = bins_helpers.make_bins(1, bins=12, repeats=1).assign(n=n)
+    rows = make_rows(bins, has_aging=True)
+    width = abs(np.diff(rows.values("displacement_mm")[:2])[0])
+    length = 2.5 * width
+    term = Term(EFFECTS["ripple"], ("displacement_mm",), "force", "add", fixed={"x_ref": 0.0})
+    found = shape_of(term, {"A": 1.0, "lambda_": length, "phi": 0.0}, rows)
+    samples = rows.values("displacement_mm")[:, None] + width * ((np.arange(n) + 0.5) / n - 0.5)
+    exact = term.effect.shape({"displacement_mm": samples, "x_ref": 0.0}, A=1.0, lambda_=length, phi=0.0).mean(axis=1)
+    npt.assert_allclose(found, exact, atol=0.03 if n == 2 else 0.003)
