@@ -25,7 +25,7 @@ from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import Rows
 
-DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at too: a strong pair may leave a trace
+DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at: a far surer one may show in it
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def grow(
         laws = richer_laws(fitted, channels, effects) if not significant else []
         if not significant or significant[0].p_value > DOUBTFUL:
             pairs = search_pairs(judge, list(channels.values()), last, rng)
-            together = [c for c in pairs if c.p_value <= alpha]
+            together = [c for c in pairs if c.p_value <= alpha * min((s.p_value for s in significant), default=1.0)]
             say(f"round {number}: {len(pairs)} pairs, {len(together)} significant")
             significant = sorted([*significant, *together], key=lambda c: c.p_value)
         significant += [c for c, _ in laws if c.p_value <= alpha and c.sure]

@@ -34,7 +34,7 @@ class Peak:
     statistic: float
     p_value: float  # adjusted over the frequencies, axes and ways of acting looked at
     amplitude: float  # in force units, mean over units
-    energy: float  # squared amplitudes of all passes that reach the frequency
+    energy: float  # squared amplitudes, all passes that reach the frequency: of the largest sure wave along the axis
 
 
 @dataclass(frozen=True)
@@ -217,12 +217,16 @@ def _incoherent(spectrum: Spectrum, axis: str) -> Peak:
     ratio = spectrum.power / smooth_background(open_power, spectrum.frequency, spectrum.count)
     count = np.minimum(spectrum.count, alike(np.where(spectrum.taken, np.nan, ratio)))
     own = stats.gamma.logsf(ratio * count, count)
-    k = int(np.argmin(np.where(tops(spectrum.power) & ~spectrum.taken, own, 1.0)))
+    peaks = tops(spectrum.power) & ~spectrum.taken
+    k = int(np.argmin(np.where(peaks, own, 1.0)))
     p = float(np.exp(own[k])) * spectrum.frequency.size
     wavelength = _refined(spectrum.power, spectrum.frequency, k)
-    amplitude = float(spectrum.amplitude[k])
-    energy = amplitude**2 * float(spectrum.count[k]) * (1 - 1 / max(float(ratio[k]), 1.0))
-    return Peak(axis, wavelength, True, False, float(ratio[k]), p, amplitude, energy)
+    energy = spectrum.amplitude**2 * spectrum.count * (1 - 1 / np.maximum(ratio, 1.0))
+    sure = peaks & (own < np.log(SHARED / spectrum.frequency.size))
+    sure[k] = True
+    return Peak(
+        axis, wavelength, True, False, float(ratio[k]), p, float(spectrum.amplitude[k]), float(energy[sure].max())
+    )
 
 
 def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
