@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -99,6 +100,52 @@ PRESSURES: dict[str, Callable] = {
     "exponential": exponential,
     "parabolic": parabolic,
 }
+
+
+@dataclass(frozen=True)
+class Contact:
+    r"""A contact whose friction depends on the local pressure, :math:`\mu \propto p^{n-1}`.
+
+    Attributes
+    ----------
+    pressure : callable
+        One of `PRESSURES`, or another of the same arguments, in N/mm.
+    width_mm : float
+        Contact width L in mm.
+    exponent : float
+        n, of the friction force over the load; 1: friction does not depend on the pressure. Rubber: 2/3 to 1.
+    reference_N_mm : float, optional
+        Load per width at which mu_s and mu_c hold; default: the mean of the load at hand.
+    shape : mapping
+        Further arguments of the distribution, such as `decay`.
+    """
+
+    pressure: Callable = uniform
+    width_mm: float = 1.0
+    exponent: float = 1.0
+    reference_N_mm: float | None = None
+    shape: Mapping[str, float] = field(default_factory=dict)
+
+    def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return each element's share of the load, and its mu over that at the reference, of shape (elements,) each.
+
+        Raises
+        ------
+        ParameterError
+            If the load, the width or the reference is not positive.
+
+        Examples
+        --------
+        >>> share, factor = Contact(sine, width_mm=2.0, exponent=0.8).elements(50.0)
+        >>> round(float(share.sum()), 12), round(float(share @ factor), 3)
+        (1.0, 0.975)
+        """
+        reference = load_N / self.width_mm if self.reference_N_mm is None else self.reference_N_mm
+        if not (load_N > 0 and reference > 0):
+            raise ParameterError(f"load_N = {load_N:g}, reference {reference:g} N/mm: both must be positive.")
+        local = self.pressure(self.width_mm / 2 * (1 + _NODES), load_N, width_mm=self.width_mm, **self.shape)
+        share = _WEIGHTS * local
+        return share / share.sum(), (local / reference) ** (self.exponent - 1)
 
 
 def total_load(pressure: Callable, load_N: float, *, width_mm: float, **shape) -> float:

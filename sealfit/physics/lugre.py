@@ -1,0 +1,202 @@
+r"""The dynamic LuGre model (Eqs. 1 to 7): friction force for any speed history, over any pressure distribution.
+
+.. math::
+    \dot z = v - \frac{|v|}{g(v)} z, \quad g(v) = \frac{N}{\sigma_0} [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}], \quad
+    F = \sigma_0 z + \sigma_1 \dot z + \sigma_2 v
+
+Every element of the contact carries the share :math:`f_n / F_n` of sigma_0 and sigma_1, as Eqs. 5 to 7 have it: all
+then have the same deflection, and the distribution cancels. It matters where friction depends on the local pressure,
+:math:`\mu \propto p^{n-1}`: elements under less pressure reach their limit over another distance, and the force no
+longer rises along one exponential.
+
+Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10.1109/9.376053; Wu et al. 2020, Polymers
+12(1), 102, doi:10.3390/polym12010102.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from sealfit.errors import ParameterError
+from sealfit.physics.pressure import Contact
+from sealfit.physics.stribeck import stribeck_decay
+
+RTOL, ATOL = 1e-9, 1e-12  # of the solver; the second times the largest deflection
+LEAST_STEPS = 200  # of the solver: a speed may turn round between two times that are asked for
+
+
+@dataclass(frozen=True)
+class Bristles:
+    """What the bristles do along a history.
+
+    Attributes
+    ----------
+    force_N : ndarray, shape (n,)
+        Friction force.
+    deflection_mm : ndarray, shape (n,)
+        Mean deflection z, each element weighing by its stiffness.
+    heat_mW : ndarray, shape (n,)
+        Power turned into heat, in mW: that of the force less what the bristles store.
+    """
+
+    force_N: np.ndarray
+    deflection_mm: np.ndarray
+    heat_mW: np.ndarray
+
+
+def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
+    r"""Deflection of the bristles in steady sliding, g(v) of Eqs. 3 and 6, in mm.
+
+    .. math:: g(v) = \frac{N}{\sigma_0} [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}]
+
+    Parameters
+    ----------
+    speed_mm_s, load_N : float or ndarray, shape (n,)
+        Sliding speed in mm/s; normal load in N. A load of 1 turns the coefficients into forces.
+    mu_s, mu_c, v_s : float or ndarray
+        Static and Coulomb coefficients, Stribeck speed in mm/s.
+    sigma_0 : float or ndarray
+        Stiffness of the bristles in N/mm.
+
+    Raises
+    ------
+    ParameterError
+        If `v_s` or `sigma_0` is not positive.
+
+    Examples
+    --------
+    >>> float(bristle_limit(0.0, 50.0, mu_s=0.6, mu_c=0.4, v_s=5.0, sigma_0=100.0))
+    0.3
+    """
+    if not np.all(np.asarray(sigma_0) > 0):
+        raise ParameterError(f"sigma_0 = {np.min(sigma_0):g}: the bristles' stiffness must be positive.")
+    mu_c = np.asarray(mu_c, float)
+    return (
+        np.asarray(load_N, float)
+        / sigma_0
+        * (mu_c + (np.asarray(mu_s, float) - mu_c) * stribeck_decay(speed_mm_s, v_s))
+    )
+
+
+def lugre_force(
+    time_s,
+    speed_mm_s,
+    load_N: float,
+    *,
+    mu_s: float,
+    mu_c: float,
+    v_s: float,
+    sigma_0: float,
+    sigma_1: float = 0.0,
+    sigma_2: float = 0.0,
+    deflection_mm: float = 0.0,
+    contact: Contact | None = None,
+) -> Bristles:
+    """Friction force of the dynamic LuGre model along a history of the speed (Eqs. 1 to 7), in N.
+
+    A speed given as numbers is constant between two times, and each step is then exact; one given as a function is
+    followed by a stiff solver (LSODA).
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (n,)
+        Rising times in s.
+    speed_mm_s : ndarray, shape (n,), or callable
+        Speed in mm/s, signed: number k holds until time k, the first at the first time. Or a function of the time.
+    load_N : float
+        Normal load in N.
+    mu_s, mu_c, v_s : float
+        Static and Coulomb coefficients, Stribeck speed in mm/s.
+    sigma_0, sigma_1, sigma_2 : float
+        Stiffness in N/mm, damping of the bristles in N s/mm, viscous coefficient in N s/mm.
+    deflection_mm : float
+        Of all bristles at the first time; 0: relaxed.
+    contact : Contact, optional
+        Where friction depends on the local pressure.
+
+    Returns
+    -------
+    Bristles
+        Force, mean deflection and heat at every time.
+
+    Raises
+    ------
+    ParameterError
+        If a parameter is out of its range, times do not rise, or shapes differ.
+
+    Notes
+    -----
+    The heat is never negative with sigma_1 = 0. With damping it is for every history if, and only if,
+    sigma_2 >= sigma_1 (mu_s - mu_c) / mu_c: Barahanov & Ortega 2000, IEEE Trans. Automatic Control 45(4), 830-832,
+    doi:10.1109/9.847131.
+
+    Examples
+    --------
+    From rest at 2 mm/s: the force comes up over 0.25 mm, here half of it in one step.
+
+    >>> import numpy as np
+    >>> model = {"mu_s": 0.5, "mu_c": 0.5, "v_s": 5.0, "sigma_0": 100.0}
+    >>> found = lugre_force([0.0, 0.125 * np.log(2), 10.0], [0.0, 2.0, 2.0], 50.0, **model)
+    >>> [round(float(f), 6) for f in found.force_N]
+    [0.0, 12.5, 25.0]
+    """
+    time = np.asarray(time_s, float)
+    if time.ndim != 1 or not time.size or not (np.diff(time) > 0).all():
+        raise ParameterError("time_s must be one row of rising times.", mend="Sort the rows and drop repeated times.")
+    if not (sigma_1 >= 0 and sigma_2 >= 0):
+        raise ParameterError(f"sigma_1 = {sigma_1:g}, sigma_2 = {sigma_2:g}: neither can be negative.")
+    share, factor = (np.ones(1), np.ones(1)) if contact is None else contact.elements(load_N)
+
+    def limit(speed):  # (..., elements), in mm
+        whole = bristle_limit(speed, load_N, mu_s=mu_s, mu_c=mu_c, v_s=v_s, sigma_0=sigma_0)
+        return np.asarray(whole)[..., None] * factor
+
+    start = np.full(share.size, float(deflection_mm))
+    if callable(speed_mm_s):
+        speed = np.array([float(speed_mm_s(t)) for t in time])
+        z = _solved(time, speed_mm_s, limit, start)
+    else:
+        speed = np.asarray(speed_mm_s, float)
+        if speed.shape != time.shape:
+            raise ParameterError(f"speed_mm_s has shape {speed.shape}, time_s {time.shape}: give one speed a time.")
+        z = _stepped(time, speed, limit(speed), start)
+    rate = speed[:, None] - np.abs(speed)[:, None] * z / limit(speed)
+    force = (sigma_0 * z + sigma_1 * rate) @ share + sigma_2 * speed
+    return Bristles(force, z @ share, force * speed - sigma_0 * (z * rate) @ share)
+
+
+def _stepped(time: np.ndarray, speed: np.ndarray, limit: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return every element's deflection, shape (n, elements), exact where the speed is constant between times."""
+    slid = np.abs(speed) * np.diff(time, prepend=time[0])
+    kept, end = np.exp(-slid[:, None] / limit), np.sign(speed)[:, None] * limit
+    z, now = np.empty_like(limit), start
+    for k in range(time.size):
+        now = end[k] + (now - end[k]) * kept[k]
+        z[k] = now
+    return z
+
+
+def _solved(time: np.ndarray, speed: Callable, limit: Callable, start: np.ndarray) -> np.ndarray:
+    """Return every element's deflection at the times, shape (n, elements), by a stiff solver."""
+
+    def rate(t: float, z: np.ndarray) -> np.ndarray:
+        v = float(speed(t))
+        return v - abs(v) * z / limit(v)
+
+    if time.size == 1:
+        return start[None, :]
+    scale = max(float(np.max(limit(0.0))), float(np.max(np.abs(start))))
+    span = (float(time[0]), float(time[-1]))
+    found = solve_ivp(
+        rate, span, start, method="LSODA", t_eval=time, rtol=RTOL, atol=ATOL * scale, lband=0, uband=0,
+        max_step=(span[1] - span[0]) / LEAST_STEPS,
+    )  # fmt: skip
+    if not found.success:
+        raise ParameterError(
+            f"the speed cannot be followed: {found.message}", mend="Give it without jumps, or as numbers."
+        )
+    return found.y.T
