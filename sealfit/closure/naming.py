@@ -21,11 +21,13 @@ from sealfit.closure.judge import Candidate
 from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripple import Peak
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.estimate import Fitted, fit, settled
+from sealfit.fit.estimate import Fitted, fit, search_stribeck, settled
 from sealfit.fit.whitening import Scatter, Whitening
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly
+FORMS_EACH = 2  # of each further quantity
+DOMINANT = 20.0  # by which an effect's own scatter lowers the deviance where it had stood in most of the scatter
 HALF = 0.5  # share of what the calendar explains from which anything else comes before it
 CALENDAR_RIVALS = 2  # refitted as rivals where something else comes first
 BEHIND = 60.0  # by which a proposal may be behind under the best one's scatter and still be worth one of its own
@@ -113,17 +115,27 @@ def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
 def _spread(found: list[Proposal]) -> list[Proposal]:
     """Return the few best, each effect and target once, no effect on more than two; the best free shape among them.
 
-    A grid is coarse, so a mechanism gets the benefit of the doubt until it has been refitted.
+    A grid is coarse, so a mechanism gets the benefit of the doubt until it has been refitted. So does every other
+    quantity that explains nearly as much: what is missing bends the model it is looked for in.
     """
     kept: list[Proposal] = []
-    for proposal in sorted(found, key=lambda p: p.criterion - TIED * p.term.effect.physical):
+    ranked = sorted(found, key=lambda p: p.criterion - TIED * p.term.effect.physical)
+    for proposal in ranked:
         kind = _kind(proposal)
         same = [p for p in kept if _kind(p) == kind]
         if len(same) >= 2 or any(p.term.key() == proposal.term.key() for p in same):
             continue
         if len(kept) < REFITTED or (not proposal.named and not same):
             kept.append(proposal)
+    known, most = {_target(p) for p in kept}, max((p.chi2 for p in found), default=0.0)
+    for target in dict.fromkeys(_target(p) for p in ranked if p.chi2 >= CONTENDER * most):
+        if target not in known:
+            kept += [p for p in ranked if _target(p) == target][:FORMS_EACH]
     return kept
+
+
+def _target(proposal: Proposal) -> tuple[str, str]:
+    return proposal.term.acts_on, proposal.term.operation
 
 
 def _kind(proposal: Proposal) -> tuple[str, int]:
@@ -227,11 +239,21 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
     if not refitted:
         return []
     best = replace(refitted[0], fitted=settled(refitted[0].fitted))
+    if refitted[0].fitted.deviance - best.fitted.deviance > DOMINANT:
+        own = (replace(p, fitted=_from_anew(p.fitted, best.fitted.scatter)) for p in refitted)
+        refitted = sorted(own, key=lambda p: p.criterion)
+        best = replace(refitted[0], fitted=settled(refitted[0].fitted))
     least = min(best.criterion, refitted[0].criterion)
     scatter = best.fitted.scatter
     near = [_deviance_under(p.fitted, scatter) + p.price < least + BEHIND for p in refitted[1:]]
     own = [replace(p, fitted=settled(p.fitted)) if n else p for p, n in zip(refitted[1:], near, strict=True)]
     return [best, *own]
+
+
+def _from_anew(fitted: Fitted, scatter: Scatter) -> Fitted:
+    """Return a joint fit under another scatter, v_s sought anew: what was missing may have bent it out of reach."""
+    model = search_stribeck(fitted.model, fitted.rows, scatter)
+    return fit(model, fitted.rows, scatter, turns=0, friction=fitted.friction)
 
 
 def _deviance_under(fitted: Fitted, scatter: Scatter) -> float:

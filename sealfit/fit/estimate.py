@@ -142,7 +142,7 @@ def fit(
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
         model = _descend(model, rows, scatter, centre, near=ROUGH)
     if turns and model.terms:
-        model = _search_stribeck(model, rows, scatter)
+        model = search_stribeck(model, rows, scatter)
     for turn in range(turns):
         force, jacobian = evaluate(model, rows)
         scatter = estimate_scatter(
@@ -199,7 +199,7 @@ def as_smooth_as_wanted(model: Model, rows: Rows, scatter: Scatter, friction: np
     return smoothed(model, at.white_jacobian.T @ at.white_jacobian, at.white_jacobian.T @ at.white_residual)
 
 
-def _search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
+def search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
     """Return the model with each v_s at the best point of a grid, everything linear solved anew at each.
 
     What an effect explains may have stood in v_s before, and the way out of there can lead over a hill. Series share

@@ -173,6 +173,12 @@ def _stepped(time: np.ndarray, speed: np.ndarray, limit: np.ndarray, start: np.n
     """Return every element's deflection, shape (n, elements), exact where the speed is constant between times."""
     slid = np.abs(speed) * np.diff(time, prepend=time[0])
     kept, end = np.exp(-slid[:, None] / limit), np.sign(speed)[:, None] * limit
+    if start.size == 1:  # numbers are much faster than arrays of one
+        now, single = float(start[0]), []
+        for steady, left in zip(end[:, 0].tolist(), kept[:, 0].tolist(), strict=True):
+            now = steady + (now - steady) * left
+            single.append(now)
+        return np.array(single)[:, None]
     z, now = np.empty_like(limit), start
     for k in range(time.size):
         now = end[k] + (now - end[k]) * kept[k]
