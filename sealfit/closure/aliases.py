@@ -16,7 +16,8 @@ import numpy as np
 from sealfit.closure.forms import grid_of, reference
 from sealfit.closure.judge import LEAST_LEFT
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.estimate import Fitted, bounds_of
+from sealfit.fit.descent import bounds_of
+from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import Model
 from sealfit.fit.terms import Term, mean_derivatives
 

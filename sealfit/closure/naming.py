@@ -21,7 +21,8 @@ from sealfit.closure.judge import Candidate
 from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripple import Peak
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.estimate import Fitted, fit, search_stribeck, settled
+from sealfit.fit.descent import search_stribeck
+from sealfit.fit.estimate import Fitted, fit, settled
 from sealfit.fit.whitening import Scatter, Whitening
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming

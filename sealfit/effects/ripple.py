@@ -15,12 +15,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealfit.effects.averaged import left_of_wave
 from sealfit.effects.contract import AMPLITUDE, Effect, Parameter
 
 
 def shape(inputs, *, A, lambda_, phi):
     """Sine of the position, shape (n,), in the unit of A; `displacement_mm` in its slot's unit."""
-    return A * np.sin(2 * np.pi * np.asarray(inputs["displacement_mm"], dtype=float) / lambda_ + phi)
+    angle = 2 * np.pi * np.asarray(inputs["displacement_mm"], dtype=float) / lambda_ + phi
+    return A * np.sin(angle) * left_of_wave(inputs, "displacement_mm", lambda_)
 
 
 RIPPLE = Effect(

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealfit.effects.averaged import left_of_wave
 from sealfit.effects.contract import AMPLITUDE, CHANNEL, Effect, Parameter
 
 
 def shape(inputs, *, A, lambda_, phi):
     """Sine of the channel, shape (n,), in the unit of A."""
-    return A * np.sin(2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_ + phi)
+    angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_ + phi
+    return A * np.sin(angle) * left_of_wave(inputs, CHANNEL, lambda_)
 
 
 SINUSOID = Effect(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealfit.effects.averaged import left_of_wave
 from sealfit.effects.contract import AMPLITUDE, CHANNEL, Effect, Parameter
 
 TURN = 4 * np.pi  # two turns either way: a phase may pass its end
@@ -19,7 +20,8 @@ TURN = 4 * np.pi  # two turns either way: a phase may pass its end
 def shape(inputs, *, A, B, lambda_, phi, phi_2):
     """Sum of two sines of the channel, shape (n,), in the unit of A and B."""
     angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_
-    return A * np.sin(angle + phi) + B * np.sin(2 * angle + phi_2)
+    once, twice = (left_of_wave(inputs, CHANNEL, lambda_ / k) for k in (1, 2))
+    return A * np.sin(angle + phi) * once + B * np.sin(2 * angle + phi_2) * twice
 
 
 SINUSOID_HARMONICS = Effect(

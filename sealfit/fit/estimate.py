@@ -13,19 +13,15 @@ from functools import cached_property
 
 import numpy as np
 
+from sealfit.fit.descent import descend, search_stribeck
 from sealfit.fit.joint import Model, evaluate, friction_of, term_slope
 from sealfit.fit.prior import centre_of, covariance_of, free_of_others, penalised, precision_of, smoothed
 from sealfit.fit.rows import Rows
 from sealfit.fit.scatter import estimate_components, estimate_scatter
-from sealfit.fit.start import start_model, stribeck_range
+from sealfit.fit.start import start_model
 from sealfit.fit.whitening import Scatter, Whitening
 
-MAX_STEPS = 60
-STRIBECK_GRID = 12  # points of log v_s tried when an effect has come in
-ROWS_FOR_START = 4  # of each stroke: v_s acts on a stroke as a whole
-CREEPING = 1e-2  # several such steps in a row go along a valley in which the data hold nothing
-SETTLED = 1e-4  # of the whitened sum of squares: the estimates then lie within a hundredth of a standard error
-COMPARED = 1e-2  # as above where fits are only compared: rivals are told apart by several units
+COMPARED = 1e-2  # of the whitened sum of squares, where fits are only compared: rivals are several units apart
 ROUGH = 1.0  # as above before anything is known of the scatter
 TURNS = 3  # of model and scatter; the third moves no estimate by a tenth of its standard error
 
@@ -140,7 +136,7 @@ def fit(
     centre = centre_of(model)
     if scatter is None:
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
-        model = _descend(model, rows, scatter, centre, near=ROUGH)
+        model = descend(model, rows, scatter, centre, near=ROUGH)
     if turns and model.terms:
         model = search_stribeck(model, rows, scatter)
     for turn in range(turns):
@@ -148,9 +144,9 @@ def fit(
         scatter = estimate_scatter(
             rows, rows.force - force, friction_of(model, rows), jacobian, scatter if turn else None
         )
-        model = _descend(as_smooth_as_wanted(model, rows, scatter), rows, scatter, centre)
+        model = descend(as_smooth_as_wanted(model, rows, scatter), rows, scatter, centre)
     if not turns:
-        model = _descend(model, rows, scatter, centre, friction, near=COMPARED)
+        model = descend(model, rows, scatter, centre, friction, near=COMPARED)
         return fitted_at(model, rows, scatter, friction)
     return fitted_at(model, rows, scatter)
 
@@ -179,7 +175,7 @@ def settled(fitted: Fitted) -> Fitted:
     rows = fitted.rows
     scatter = estimate_components(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
     model = as_smooth_as_wanted(fitted.model, rows, scatter, fitted.friction)
-    model = _descend(model, rows, scatter, centre_of(model), fitted.friction, near=COMPARED)
+    model = descend(model, rows, scatter, centre_of(model), fitted.friction, near=COMPARED)
     return fitted_at(model, rows, scatter, fitted.friction)
 
 
@@ -197,117 +193,3 @@ def as_smooth_as_wanted(model: Model, rows: Rows, scatter: Scatter, friction: np
         return model
     at = fitted_at(model, rows, scatter, friction)
     return smoothed(model, at.white_jacobian.T @ at.white_jacobian, at.white_jacobian.T @ at.white_residual)
-
-
-def search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
-    """Return the model with each v_s at the best point of a grid, everything linear solved anew at each.
-
-    What an effect explains may have stood in v_s before, and the way out of there can lead over a hill. Series share
-    mu_0, so that one v_s alone may not get out: all are tried together first, then each by itself.
-    """
-    slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
-    rows = rows.sparse(ROWS_FOR_START)
-    precision, centre = precision_of(model), centre_of(model)
-    held = model.bent  # one step far from the optimum would throw these anywhere
-    low, high = bounds_of(model, rows)
-    whitening = Whitening(scatter, rows.force, rows.groups)
-    places = [k for k, parameter in enumerate(model.declared.parameters) if parameter.quantity == "v_s"]
-    for group in [places, *([k] for k in places)] if len(places) > 1 else [places] if places else []:
-        best, chosen = np.inf, model.vector()
-        for value in (None, *np.linspace(np.log(slowest), np.log(fastest), STRIBECK_GRID)):
-            vector = model.vector()
-            if value is not None:
-                vector[group] = value
-            force, jacobian = evaluate(model.at(vector), rows)
-            residual = whitening((rows.force - force)[:, None])[:, 0]
-            normal, gradient = whitening.normal(jacobian[:, ~held], residual)
-            prior = precision[np.ix_(~held, ~held)]
-            away = (vector - centre)[~held]
-            gradient = gradient - prior @ away
-            step, *_ = np.linalg.lstsq(normal + prior, gradient, rcond=1e-10)
-            cost = float(residual @ residual + away @ prior @ away - step @ gradient)
-            if cost < best - 1e-9:
-                vector[~held] += step
-                best, chosen = cost, np.clip(vector, low, high)
-        model = model.at(chosen)
-    return model
-
-
-def _descend(
-    model: Model,
-    rows: Rows,
-    scatter: Scatter,
-    centre: np.ndarray,
-    friction: np.ndarray | None = None,
-    *,
-    near: float = SETTLED,
-) -> Model:
-    """Return the model at the least whitened sum of squares, by Levenberg-Marquardt with the scatter held fixed.
-
-    It ends where a step gains less than `near`.
-    """
-    precision = precision_of(model)
-    low, high = bounds_of(model, rows)
-    vector = np.clip(model.vector(), low, high)
-    model = model.at(vector)
-    force, jacobian = evaluate(model, rows)
-    if friction is None:
-        friction = friction_of(model, rows)  # held, so that the criterion does not move under the search
-
-    whitening = Whitening(scatter, friction, rows.groups)
-
-    def cost_of(residual: np.ndarray, at: np.ndarray) -> float:
-        return float(residual @ residual + (at - centre) @ precision @ (at - centre))
-
-    residual = whitening((rows.force - force)[:, None])[:, 0]
-    cost = cost_of(residual, vector)
-    damping, crept = 1e-4, 0
-    for _ in range(MAX_STEPS):
-        normal, gradient = whitening.normal(jacobian, residual)
-        gradient = gradient - precision @ (vector - centre)
-        normal = normal + precision
-        blocked = ((vector <= low) & (gradient < 0)) | ((vector >= high) & (gradient > 0))
-        free = ~blocked & (np.diag(normal) > 0)
-        scale = np.sqrt(np.diag(normal)[free])
-        scaled = normal[np.ix_(free, free)] / np.outer(scale, scale)
-        for _ in range(12):
-            move = np.zeros_like(vector)
-            move[free] = (
-                np.linalg.solve(scaled + (damping + 1e-12) * np.eye(scale.size), gradient[free] / scale) / scale
-            )
-            trial = np.clip(vector + move, low, high)
-            trial_model = model.at(trial)
-            trial_force, _none = evaluate(trial_model, rows, jacobian=False)
-            trial_residual = whitening((rows.force - trial_force)[:, None])[:, 0]
-            trial_cost = cost_of(trial_residual, trial)
-            if np.isfinite(trial_cost) and trial_cost <= cost:
-                break
-            damping = max(damping, 1e-6) * 8
-        else:
-            return model
-        gain = cost - trial_cost
-        vector, model, residual, cost = trial, trial_model, trial_residual, trial_cost
-        damping /= 10
-        crept = crept + 1 if gain < CREEPING else 0
-        if crept > 3 or (gain < near and damping < 1e-3):  # a step under heavy damping gains little anywhere
-            return model
-        _, jacobian = evaluate(model, rows)
-    return model
-
-
-def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and greatest value of each fitted number, each of shape (model.size,)."""
-    slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
-    days = rows.days[rows.days > 0]
-    first, last = (days.min(), days.max()) if days.size else (1.0, 1.0)
-    limits = {
-        "v_s": (np.log(slowest), np.log(fastest)),
-        "b_s": (np.log(first / 1000), np.log(last * 30)),
-        "b_c": (np.log(first / 1000), np.log(last * 30)),
-    }
-    low = [limits.get(p.quantity, (-np.inf, np.inf))[0] for p in model.declared.parameters]
-    high = [limits.get(p.quantity, (-np.inf, np.inf))[1] for p in model.declared.parameters]
-    for term in model.terms:
-        low += [p.bounds[0] for p in term.effect.parameters]
-        high += [p.bounds[1] for p in term.effect.parameters]
-    return np.array(low, dtype=float), np.array(high, dtype=float)

@@ -73,22 +73,25 @@ class Rows:
         return self.cache[channel]
 
     def bin_width(self, channel: str) -> np.ndarray:
-        """Return how far a channel goes within each row's bin, shape (n,): the step from bin to bin of its stroke.
+        """Return how far a channel goes within each row's bin, shape (n,): its samples times the step between them.
 
-        A bin is the mean of few samples: the width is that of an even spread with their variance, 1 - 1/n^2 of the
-        step's.
+        The step is that of the stroke there: from the middle of one bin to that of the next lie half the samples of
+        both.
         """
         key = ("width", channel)
         if key not in self.cache:
-            values, code = self.values(channel), self.codes("stroke")
-            step = np.diff(values)
+            values, code, samples = self.values(channel), self.codes("stroke"), self.samples
             inside = np.diff(code) == 0
-            left = np.r_[0.0, np.where(inside, step, 0.0)]
-            right = np.r_[np.where(inside, step, 0.0), 0.0]
-            width = np.where(left == 0, right, np.where(right == 0, left, (left + right) / 2))
-            samples = self.table["n"].to_numpy(dtype=float) if "n" in self.table else np.inf
-            self.cache[key] = width * np.sqrt(1 - 1 / np.maximum(samples, 1.0) ** 2)
+            step = np.where(inside, np.diff(values) / ((samples[1:] + samples[:-1]) / 2), 0.0)
+            left, right = np.r_[0.0, step], np.r_[step, 0.0]
+            own = np.where(left == 0, right, np.where(right == 0, left, (left + right) / 2))
+            self.cache[key] = samples * own
         return self.cache[key]
+
+    @property
+    def samples(self) -> np.ndarray:
+        """How many samples each row is the mean of, shape (n,); as good as endless where that is not told."""
+        return self.table["n"].to_numpy(dtype=float) if "n" in self.table else np.full(self.force.size, 1e9)
 
     def codes(self, level: str) -> np.ndarray:
         """Return each row's group number at a level."""
@@ -192,8 +195,8 @@ def sliding_power(load: np.ndarray | pd.Series, speed: np.ndarray | pd.Series) -
 def thin(bins: pd.DataFrame, most: int) -> pd.DataFrame:
     """Return `bins` with neighbouring bins of a stroke merged until at most about `most` rows are left.
 
-    Means of means: for shapes that are smooth over a few bins nothing is lost, and the cost no longer grows with how
-    finely the strokes were cut. A ripple needs the bins as they are.
+    Means over all their samples: for shapes that are smooth over a few bins nothing is lost, and the cost no longer
+    grows with how finely the strokes were cut. A ripple needs the bins as they are.
     """
     merged = int(np.ceil(len(bins) / most))
     if merged <= 1:
@@ -203,7 +206,9 @@ def thin(bins: pd.DataFrame, most: int) -> pd.DataFrame:
     numeric = [c for c in bins.columns if pd.api.types.is_float_dtype(bins[c])]
     first = [c for c in bins.columns if c not in numeric and c not in ("file", "stroke", "n")]
     grouped = bins.groupby(keys, sort=False)
-    table = pd.concat([grouped[numeric].mean(), grouped[first].first(), grouped["n"].sum()], axis=1)
+    samples = bins[numeric].notna().mul(bins["n"], axis=0).groupby(keys, sort=False).sum()
+    means = bins[numeric].mul(bins["n"], axis=0).groupby(keys, sort=False).sum() / samples  # 0 / 0: not known
+    table = pd.concat([means, grouped[first].first(), grouped["n"].sum()], axis=1)
     return table.reset_index(level="place", drop=True).reset_index()[list(bins.columns)]
 
 

@@ -8,10 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
+from sealfit.effects.averaged import SAMPLES, width_of
 from sealfit.effects.contract import CHANNEL, SECOND, Effect
 from sealfit.fit.rows import ALONG, Rows
 
-FINE = ("ripple", "sinusoid", "sinusoid_harmonics", "bump")  # effects that may be as fine as a bin
+WAVES = ("ripple", "sinusoid", "sinusoid_harmonics")  # whose mean over a bin is known
+FINE = ("bump",)  # that may be as fine as a bin
 FEW, MANY = (
     tuple((float(place), float(weight) / 2) for place, weight in zip(*np.polynomial.legendre.leggauss(k), strict=True))
     for k in (2, 4)
@@ -54,22 +56,25 @@ class Term:
     def nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
         """Return (weight, inputs) at the points of each row where the shape is averaged.
 
-        A row is the mean over a bin, and the mean of a short wave is smaller than its value in the middle, that of an
-        exponential larger: what bends within a bin is averaged by Gauss-Legendre quadrature along it, more closely
-        where it may be as fine as the bin. The rest is taken in the middle.
+        A row is the mean over the samples of a bin. Of a wave that is known; another shape that bends within the bin is
+        averaged by Gauss-Legendre quadrature along it (over an even spread with the variance of n samples), more
+        closely where it may be as fine as the bin. The rest is taken in the middle.
         """
         inputs = self.inputs(rows)
-        if not self.effect.nonlinear or not set(self.channels) & set(ALONG):
+        along = [(n, c) for n, c in zip(self.effect.reads, self.channels, strict=True) if c in ALONG]
+        if not self.effect.nonlinear or not along:
             return [(1.0, inputs)]
         key = ("nodes", self.key(), id(self.fixed))
         if key not in rows.cache:
-            found = []
-            for place, weight in MANY if self.effect.id in FINE else FEW:
-                moved = dict(inputs)
-                for name, channel in zip(self.effect.reads, self.channels, strict=True):
-                    if channel in ALONG:
-                        moved[name] = inputs[name] + 0.5 * place * rows.bin_width(channel)
-                found.append((weight, moved))
+            if self.effect.id in WAVES:
+                widths = {width_of(name): rows.bin_width(channel) for name, channel in along}
+                found = [(1.0, {**inputs, SAMPLES: rows.samples, **widths})]
+            else:
+                spread = np.sqrt(1 - 1 / np.maximum(rows.samples, 1.0) ** 2)
+                found = [
+                    (weight, {**inputs, **{n: inputs[n] + 0.5 * place * spread * rows.bin_width(c) for n, c in along}})
+                    for place, weight in (MANY if self.effect.id in FINE else FEW)
+                ]
             rows.cache[key] = (self.fixed, found)
         return rows.cache[key][1]
 

@@ -189,7 +189,7 @@ def test_lives_in_a_file_of_its_own_name(effect):
 
 def test_every_effect_file_is_registered():
     folder = Path(sys.modules["sealfit.effects"].__file__).parent
-    files = {path.stem for path in folder.glob("*.py")} - {"__init__", "contract", "free", "user"}
+    files = {path.stem for path in folder.glob("*.py")} - {"__init__", "averaged", "contract", "free", "user"}
     assert files == set(EFFECTS)
 
 

@@ -155,14 +155,26 @@ def test_a_bin_is_the_mean_of_its_samples_and_an_exponential_bends_within_it():
     assert abs(found[0] - exact) < 0.1 * abs(middle - exact)
 
 
+def test_merged_bins_are_means_over_all_their_samples():
+    bins = bins_helpers.make_bins(1, bins=7, repeats=1)
+    bins["n"] = 10 + np.arange(len(bins)) % 3
+    merged = thin(bins, len(bins) // 2)
+    one = (bins["file"] == bins["file"].iloc[0]) & (bins["stroke"] == bins["stroke"].iloc[0])
+    first = bins[one].head(2)
+    assert merged["n"].iloc[0] == first["n"].sum()
+    npt.assert_allclose(merged["force_N"].iloc[0], np.average(first["force_N"], weights=first["n"]))
+    npt.assert_allclose(merged["n"].sum(), bins["n"].sum())
+
+
+@pytest.mark.parametrize("waves", [0.4, 3.3])
 @pytest.mark.parametrize("n", [2, 5, 50])
-def test_a_wave_is_smaller_in_bins_of_many_samples_than_in_bins_of_few(n):
+def test_a_wave_is_smaller_in_bins_of_many_samples_than_in_bins_of_few(n, waves):
     bins = bins_helpers.make_bins(1, bins=12, repeats=1).assign(n=n)
     rows = make_rows(bins, has_aging=True)
     width = abs(np.diff(rows.values("displacement_mm")[:2])[0])
-    length = 2.5 * width
+    length = width / waves
     term = Term(EFFECTS["ripple"], ("displacement_mm",), "force", "add", fixed={"x_ref": 0.0})
     found = shape_of(term, {"A": 1.0, "lambda_": length, "phi": 0.0}, rows)
     samples = rows.values("displacement_mm")[:, None] + width * ((np.arange(n) + 0.5) / n - 0.5)
     exact = term.effect.shape({"displacement_mm": samples, "x_ref": 0.0}, A=1.0, lambda_=length, phi=0.0).mean(axis=1)
-    npt.assert_allclose(found, exact, atol=0.03 if n == 2 else 0.003)
+    npt.assert_allclose(found, exact, atol=1e-9)
