@@ -11,6 +11,7 @@ import pandas as pd
 from sealfit.closure.channels import CALENDAR, FREE_DF, Channel, even_knots, scaled
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.judge import Candidate, Judgement
+from sealfit.closure.linearised import middles
 from sealfit.closure.ripple import Peak
 from sealfit.closure.waves import common_wavelength, pass_shifts
 from sealfit.effects.contract import CHANNEL, SECOND, Effect
@@ -236,8 +237,7 @@ def grid_of(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
         if p.search == "inside":
             grid = np.quantile(np.unique(values), np.linspace(0.05, 0.95, 13))
         elif p.search == "between":
-            distinct = np.unique(values)
-            middle = (distinct[1:] + distinct[:-1]) / 2
+            middle = middles(values)
             grid = middle[np.unique(np.linspace(0, middle.size - 1, MOST_PLACES).astype(int))]
         elif p.search == "span":
             grid = np.geomspace(span / 100, span * 2, 13)

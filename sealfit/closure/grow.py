@@ -12,7 +12,7 @@ from sealfit.closure.channels import CALENDAR, Channel, find_channels
 from sealfit.closure.confirm import TRIES, Added, confirmed
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.judge import Candidate, Judge
-from sealfit.closure.laws import richer_laws
+from sealfit.closure.laws import AGING, richer_laws
 from sealfit.closure.naming import HALF, propose, rivals
 from sealfit.closure.pairs import pairs_in_disguise, search_pairs
 from sealfit.closure.periodic import Ripples
@@ -100,7 +100,8 @@ def grow(
             last = tuple(search(judge, list(channels.values()), rng))
         significant = [c for c in last if c.p_value <= alpha and c.sure]
         say(f"round {number}: {len(last)} candidates on {len(channels)} channels, {len(significant)} significant")
-        laws = richer_laws(fitted, channels, effects) if not significant else []
+        aged = not significant or any(c.channels == (AGING,) for c in significant)
+        laws = richer_laws(fitted, channels, effects) if aged else []
         if not significant or significant[0].p_value > DOUBTFUL:
             pairs = search_pairs(judge, list(channels.values()), last, rng)
             together = [c for c in pairs if c.p_value <= alpha * min((s.p_value for s in significant), default=1.0)]

@@ -14,6 +14,7 @@ from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.estimate import Fitted, worth
 from sealfit.fit.prior import likely_smoothness, penalised, roughness_of
+from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term, mean_derivatives
 
 PART = 32  # points of a grid whitened at once
@@ -92,44 +93,67 @@ class Linearised:
         """Return the term at the best point of its grid; nothing where none of it is left here."""
         fitted, effect = self.fitted, term.effect
         points = [dict(zip(search, point, strict=True)) for point in itertools.product(*search.values())]
-        shapes = self._shapes(term, points)
-        slope = fitted.slope(term.acts_on, term.operation)
-        count = len(effect.linear)
-        chi2 = np.concatenate(
-            [
-                _explained(fitted, slope[:, None] * shapes[:, k : k + PART * count], count)
-                for k in range(0, shapes.shape[1], PART * count)
-            ]
-        )
-        best = int(np.argmax(chi2))
-        if not chi2[best] > 0:
+        point, most, shape = self._best(term, points, self._shapes(term, points))
+        finer = _between(term, point, search, fitted.rows)
+        if finer:
+            point, most, shape = self._best(term, finer, self._made(term, finer))
+        if not most > 0:
             return []
-        left = project(fitted, slope[:, None] * shapes[:, best * count : (best + 1) * count])
+        left = project(fitted, fitted.slope(term.acts_on, term.operation)[:, None] * shape)
         size = None
         if term.smoothness is None:
             amplitude, *_ = np.linalg.lstsq(left, fitted.white_residual, rcond=1e-10)
         else:
             term, amplitude, size = _smooth(term, left, fitted.white_residual)
         column = left @ amplitude
-        chosen = {**effect.start(), **points[best], **dict(zip(effect.linear, amplitude.tolist(), strict=True))}
+        chosen = {**effect.start(), **point, **dict(zip(effect.linear, amplitude.tolist(), strict=True))}
         values = {p.name: chosen[p.name] for p in effect.parameters}
         found = float(2 * column @ fitted.white_residual - column @ column)
         units = candidate.judgement.units
         return [Proposal(term, values, candidate.unit, units, found, candidate.p_value, column, candidate.key, size)]
 
+    def _best(
+        self, term: Term, points: list[dict[str, float]], shapes: np.ndarray
+    ) -> tuple[dict[str, float], float, np.ndarray]:
+        """Return the best point of a grid, the sum of squares explained there, and its shapes, (n, amplitudes)."""
+        slope, count = self.fitted.slope(term.acts_on, term.operation), len(term.effect.linear)
+        parts = range(0, shapes.shape[1], PART * count)
+        chi2 = np.concatenate(
+            [_explained(self.fitted, slope[:, None] * shapes[:, k : k + PART * count], count) for k in parts]
+        )
+        best = int(np.argmax(chi2))
+        return points[best], float(chi2[best]), shapes[:, best * count : (best + 1) * count]
+
     def _shapes(self, term: Term, points: list[dict[str, float]]) -> np.ndarray:
-        """Return the shape per unit of each amplitude at every point, shape (n, points * amplitudes)."""
+        """Return the shape per unit of each amplitude at every point, shape (n, points * amplitudes), made once."""
         key = (term.effect.id, term.channels, points, term.fixed)
         if self._kept is None or self._kept[0] != key:
-            start = term.effect.start()
-            with np.errstate(all="ignore"):
-                columns = [
-                    c
-                    for point in points
-                    for c in mean_derivatives(term, {**start, **point}, self.fitted.rows, only_linear=True)
-                ]
-            self._kept = (key, np.column_stack(columns))
+            self._kept = (key, self._made(term, points))
         return self._kept[1]
+
+    def _made(self, term: Term, points: list[dict[str, float]]) -> np.ndarray:
+        start, rows = term.effect.start(), self.fitted.rows
+        with np.errstate(all="ignore"):
+            made = [mean_derivatives(term, {**start, **point}, rows, only_linear=True) for point in points]
+        return np.column_stack([column for columns in made for column in columns])
+
+
+def _between(term: Term, point: Mapping[str, float], search: Mapping[str, tuple], rows: Rows) -> list[dict[str, float]]:
+    """Return the points of a jump's places that lie between the best one's neighbours on a grid that left some out."""
+    jump = next((p.name for p in term.effect.nonlinear if p.search == "between"), None)
+    if jump is None:
+        return []
+    grid = np.array(search[jump])
+    at = int(np.searchsorted(grid, point[jump]))
+    places = middles(term.inputs(rows)[term.effect.reads[0]])
+    near = places[(places >= grid[max(at - 1, 0)]) & (places <= grid[min(at + 1, grid.size - 1)])]
+    return [{**point, jump: float(place)} for place in near] if places.size > grid.size else []
+
+
+def middles(values: np.ndarray) -> np.ndarray:
+    """Return the places halfway from one value of a channel to the next: where a jump may lie."""
+    distinct = np.unique(values)
+    return (distinct[1:] + distinct[:-1]) / 2
 
 
 def _smooth(term: Term, left: np.ndarray, residual: np.ndarray) -> tuple[Term, np.ndarray, float]:

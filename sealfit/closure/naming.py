@@ -21,7 +21,7 @@ from sealfit.closure.judge import Candidate
 from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripple import Peak
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.descent import search_stribeck
+from sealfit.fit.descent import search_bent
 from sealfit.fit.estimate import Fitted, fit, settled
 from sealfit.fit.whitening import Scatter, Whitening
 
@@ -252,8 +252,8 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
 
 
 def _from_anew(fitted: Fitted, scatter: Scatter) -> Fitted:
-    """Return a joint fit under another scatter, v_s sought anew: what was missing may have bent it out of reach."""
-    model = search_stribeck(fitted.model, fitted.rows, scatter)
+    """Return a joint fit under another scatter, v_s and b sought anew: what was missing may have bent them away."""
+    model = search_bent(fitted.model, fitted.rows, scatter)
     return fit(model, fitted.rows, scatter, turns=0, friction=fitted.friction)
 
 

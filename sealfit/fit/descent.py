@@ -1,4 +1,4 @@
-"""The way down: Levenberg-Marquardt on the whitened residual, and a grid over v_s for what lies behind a hill."""
+"""The way down: Levenberg-Marquardt on the whitened residual, and a grid over v_s and b for what lies behind a hill."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sealfit.fit.start import stribeck_range
 from sealfit.fit.whitening import Scatter, Whitening
 
 MAX_STEPS = 60
-STRIBECK_GRID = 12  # points of log v_s tried when an effect has come in
+GRID = 12  # points of log v_s and log b tried when an effect has come in
 ROWS_FOR_START = 4  # of each stroke: v_s acts on a stroke as a whole
 CREEPING = 1e-2  # several such steps in a row go along a valley in which the data hold nothing
 SETTLED = 1e-4  # of the whitened sum of squares: the estimates then lie within a hundredth of a standard error
@@ -79,38 +79,46 @@ def descend(
     return model
 
 
-def search_stribeck(model: Model, rows: Rows, scatter: Scatter) -> Model:
-    """Return the model with each v_s at the best point of a grid, everything linear solved anew at each.
+def search_bent(model: Model, rows: Rows, scatter: Scatter) -> Model:
+    """Return the model with each v_s, and all b together, at the best point of a grid, what is linear solved anew.
 
-    What an effect explains may have stood in v_s before, and the way out of there can lead over a hill. Series share
+    What an effect explains may have stood in them before, and the way out of there can lead over a hill. Series share
     mu_0, so that one v_s alone may not get out: all are tried together first, then each by itself.
     """
-    slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
     rows = rows.sparse(ROWS_FOR_START)
+    whitening = Whitening(scatter, rows.force, rows.groups)
+    quantities = [p.quantity for p in model.declared.parameters]
+    stribeck = [k for k, name in enumerate(quantities) if name == "v_s"]
+    groups = [stribeck, *([k] for k in stribeck if len(stribeck) > 1)]
+    groups.append([k for k, name in enumerate(quantities) if name in ("b_s", "b_c")])
+    for group in groups:
+        if group:
+            model = _best_on_grid(model, rows, whitening, group)
+    return model
+
+
+def _best_on_grid(model: Model, rows: Rows, whitening: Whitening, group: list[int]) -> Model:
+    """Return the model with the numbers of a group, equal to one another, at the best of a few values or as it is."""
     precision, centre = precision_of(model), centre_of(model)
     held = model.bent  # one step far from the optimum would throw these anywhere
     low, high = bounds_of(model, rows)
-    whitening = Whitening(scatter, rows.force, rows.groups)
-    places = [k for k, parameter in enumerate(model.declared.parameters) if parameter.quantity == "v_s"]
-    for group in [places, *([k] for k in places)] if len(places) > 1 else [places] if places else []:
-        best, chosen = np.inf, model.vector()
-        for value in (None, *np.linspace(np.log(slowest), np.log(fastest), STRIBECK_GRID)):
-            vector = model.vector()
-            if value is not None:
-                vector[group] = value
-            force, jacobian = evaluate(model.at(vector), rows)
-            residual = whitening((rows.force - force)[:, None])[:, 0]
-            normal, gradient = whitening.normal(jacobian[:, ~held], residual)
-            prior = precision[np.ix_(~held, ~held)]
-            away = (vector - centre)[~held]
-            gradient = gradient - prior @ away
-            step, *_ = np.linalg.lstsq(normal + prior, gradient, rcond=1e-10)
-            cost = float(residual @ residual + away @ prior @ away - step @ gradient)
-            if cost < best - 1e-9:
-                vector[~held] += step
-                best, chosen = cost, np.clip(vector, low, high)
-        model = model.at(chosen)
-    return model
+    prior = precision[np.ix_(~held, ~held)]
+    best, chosen = np.inf, model.vector()
+    for value in (None, *np.linspace(low[group[0]], high[group[0]], GRID)):
+        vector = model.vector()
+        if value is not None:
+            vector[group] = value
+        force, jacobian = evaluate(model.at(vector), rows)
+        residual = whitening((rows.force - force)[:, None])[:, 0]
+        normal, gradient = whitening.normal(jacobian[:, ~held], residual)
+        away = (vector - centre)[~held]
+        gradient = gradient - prior @ away
+        step, *_ = np.linalg.lstsq(normal + prior, gradient, rcond=1e-10)
+        cost = float(residual @ residual + away @ prior @ away - step @ gradient)
+        if cost < best - 1e-9:
+            vector[~held] += step
+            best, chosen = cost, np.clip(vector, low, high)
+    return model.at(chosen)
 
 
 def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:

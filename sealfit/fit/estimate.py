@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.fit.descent import descend, search_stribeck
+from sealfit.fit.descent import descend, search_bent
 from sealfit.fit.joint import Model, evaluate, friction_of, term_slope
 from sealfit.fit.prior import centre_of, covariance_of, free_of_others, penalised, precision_of, smoothed
 from sealfit.fit.rows import Rows
@@ -138,7 +138,7 @@ def fit(
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
         model = descend(model, rows, scatter, centre, near=ROUGH)
     if turns and model.terms:
-        model = search_stribeck(model, rows, scatter)
+        model = search_bent(model, rows, scatter)
     for turn in range(turns):
         force, jacobian = evaluate(model, rows)
         scatter = estimate_scatter(
