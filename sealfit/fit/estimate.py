@@ -1,9 +1,8 @@
 r"""One estimator for "before" and "after": generalised least squares with scatter at every level.
 
 The weights come from the variance components (`reml.py`), which are estimated from the residual with the degrees of
-freedom of the model taken out; model and scatter are fitted in turn until neither moves. v_s and b carry a weak
-Gaussian prior on their logarithm (SD 3, a factor of 20) about the global search's value: it holds a number that the
-data do not determine, and is far weaker than any data that do.
+freedom of the model taken out; model and scatter are fitted in turn until neither moves. What is known beforehand of
+some numbers is in `prior.py`.
 """
 
 from __future__ import annotations

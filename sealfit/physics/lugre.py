@@ -17,9 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
 from sealfit.errors import ParameterError
 from sealfit.physics.pressure import Contact
@@ -173,21 +173,18 @@ def _stepped(time: np.ndarray, speed: np.ndarray, limit: np.ndarray, start: np.n
     """Return every element's deflection, shape (n, elements), exact where the speed is constant between times."""
     slid = np.abs(speed) * np.diff(time, prepend=time[0])
     kept, end = np.exp(-slid[:, None] / limit), np.sign(speed)[:, None] * limit
-    if start.size == 1:  # numbers are much faster than arrays of one
-        now, single = float(start[0]), []
-        for steady, left in zip(end[:, 0].tolist(), kept[:, 0].tolist(), strict=True):
-            now = steady + (now - steady) * left
-            single.append(now)
-        return np.array(single)[:, None]
-    z, now = np.empty_like(limit), start
-    for k in range(time.size):
-        now = end[k] + (now - end[k]) * kept[k]
-        z[k] = now
-    return z
+    paths = []
+    for ends, shares, begin in zip(end.T.tolist(), kept.T.tolist(), start.tolist(), strict=True):
+        steps = accumulate(
+            zip(ends, shares, strict=True), lambda now, step: step[0] + (now - step[0]) * step[1], initial=begin
+        )
+        paths.append(list(steps)[1:])
+    return np.array(paths).T
 
 
 def _solved(time: np.ndarray, speed: Callable, limit: Callable, start: np.ndarray) -> np.ndarray:
     """Return every element's deflection at the times, shape (n, elements), by a stiff solver."""
+    from scipy.integrate import solve_ivp  # here, so that the other equations can be used without it
 
     def rate(t: float, z: np.ndarray) -> np.ndarray:
         v = float(speed(t))
