@@ -16,7 +16,7 @@ from sealfit.closure.naming import rivals
 from sealfit.closure.waves import agreement, pass_shifts
 from sealfit.config import Config
 from sealfit.fit.estimate import Fitted, as_smooth_as_wanted, fit
-from sealfit.fit.joint import evaluate
+from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import Rows
 from sealfit.fit.whitening import Whitening
 
@@ -98,32 +98,43 @@ class Gain:
         return self.deviance > 0 and self.rmse_N > 0
 
 
-def heldout_gain(before: Fitted, proposal: Proposal, count: int, seed: int, samples: pd.DataFrame) -> Gain:
+def heldout_gain(
+    before: Fitted, proposal: Proposal, count: int, seed: int, samples: pd.DataFrame, known: dict[tuple, np.ndarray]
+) -> Gain:
     """Return what a proposal gains on held-out groups of its own unit.
 
     The RMSE of a rig whose files scatter by newtons does not see a ripple of a tenth; the whitened sum of squares of
     the held-out groups does, as the offset and gain of a whole file or run cost it little. For the same reason the
-    RMSE is taken about the means of the groups inside which the effect's channels vary.
+    RMSE is taken about the means of the groups inside which the effect's channels vary. `known` keeps what the model
+    without it leaves in each fold, for the next proposal.
     """
     if "shift" in proposal.term.fixed:
         return _gain_within_files(before, proposal, samples)
     rows, after, scatter = before.rows, proposal.fitted, before.scatter
-    squares, white, known = np.zeros(2), np.zeros(2), 0.0
+    squares, white, total = np.zeros(2), np.zeros(2), 0.0
     calendar = [name for name in proposal.term.channels if name in CALENDAR]
     masks = blocks(rows, proposal.unit, count, calendar[0]) if calendar else folds(rows, proposal.unit, count, seed)
-    for out in masks:
-        train, test = rows.subset(~out), rows.subset(out)
+    for number, out in enumerate(masks):
+        test = rows.subset(out)
         weight, whitening = rows.weight[out], Whitening(scatter, before.friction[out], test.groups)
-        known += float(weight.sum())
-        for k, model in enumerate((before.model, after.model)):
-            model = as_smooth_as_wanted(model, train, scatter, before.friction[~out])
-            kept = fit(model, train, scatter, turns=0, friction=before.friction[~out])
-            residual = test.force - evaluate(kept.model, test, jacobian=False)[0]
+        total += float(weight.sum())
+        fold = (proposal.unit, *calendar[:1], number)
+        if fold not in known:
+            known[fold] = _left_in(before, before.model, out, test)
+        for k, residual in enumerate((known[fold], _left_in(before, after.model, out, test))):
             inside = residual if calendar else _about(residual, test, proposal)  # a block of time is asked for whole
             squares[k] += float(weight @ inside**2)
             white[k] += float((whitening(residual[:, None]) ** 2).sum())
-    rmse = np.sqrt(squares / max(known, 1e-300))
+    rmse = np.sqrt(squares / max(total, 1e-300))
     return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(white[0] - white[1]))
+
+
+def _left_in(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.ndarray:
+    """Return measured minus model in the rows held out, the model fitted to the others, shape (held out,)."""
+    train, friction = before.rows.subset(~out), before.friction[~out]
+    model = as_smooth_as_wanted(model, train, before.scatter, friction)
+    kept = fit(model, train, before.scatter, turns=0, friction=friction)
+    return test.force - evaluate(kept.model, test, jacobian=False)[0]
 
 
 def _about(residual: np.ndarray, rows: Rows, proposal: Proposal) -> np.ndarray:
@@ -223,13 +234,13 @@ def confirmed(
     compare : bool
         Whether its rivals are asked for the held-out data too.
     """
+    folds_of = (config.loop.folds, config.loop.seed, samples, {})
     for proposal in proposals[:TRIES]:
-        gain = heldout_gain(fitted, proposal, config.loop.folds, config.loop.seed, samples)
+        gain = heldout_gain(fitted, proposal, *folds_of)
         unit = config.units.unit("force")
         say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
         if gain.real:
             others = rivals(proposal, proposals)
-            folds_of = (config.loop.folds, config.loop.seed, samples)
             rmse = [heldout_gain(fitted, o, *folds_of).left_N if compare else np.nan for o in others]
             return Added(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
     return None
