@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from sealfit.errors import FitError
 
 SAME = 1e-13  # relative rise of the sum of squares that is rounding
+SHRINKS = 0.9  # from one step to the next where they converge: in a large residual they swing about the optimum
 RANK = 1e-11  # singular values this small against the largest, columns scaled to length 1, are zero
 
 
@@ -130,7 +131,7 @@ def _finish(residual, derivative, x, low, high):
     """
     rest = residual(x)
     rss, steps, length = rest @ rest, 0, np.inf
-    for steps in range(1, 31):
+    for steps in range(1, 61):
         tangent = derivative(x)
         # within 1e-9 of a bound the reflective method has stopped short of it: take the bound
         near = np.isfinite(low) & (x - low <= 1e-9 * np.maximum(1.0, np.abs(low)))
@@ -149,7 +150,7 @@ def _finish(residual, derivative, x, low, high):
         trial_rss = trial_rest @ trial_rest
         if not (trial_rss <= rss * (1 + SAME) and step < length):
             return x, steps, bool(np.isfinite(length))
-        x, rest, rss, length = trial, trial_rest, trial_rss, 0.7 * step
+        x, rest, rss, length = trial, trial_rest, trial_rss, SHRINKS * step
     return x, steps, False
 
 

@@ -130,11 +130,24 @@ def solve_separable(
     found = [polish(lambda t: projected(t[None, :]).residual[0], tangent, points[k], bounds) for k in candidates]
     best = min(found, key=lambda f: f.rss)
     point = projected(best.x[None, :])
-    c, support = point.coefficients[0], point.support[0]
-    columns = basis(best.x[None, :])[0] * root[:, None]
-    jacobian = np.hstack([columns, central_jacobian(lambda at: model(at, c), best.x)])
-    free = np.concatenate([support, ~best.at_bound])
+    support = point.support[0]
+
+    def parted(both):  # the coefficients in use and theta
+        c = np.zeros(p)
+        c[support] = both[: support.sum()]
+        return both[support.sum() :], c
+
+    # The projected sum of squares is flat to rounding along a valley, where all numbers together still have digits.
+    low, high = (np.full(len(axes), -np.inf), np.full(len(axes), np.inf)) if bounds is None else bounds
+    least = np.r_[np.where(held, 0.0, -np.inf)[support], low]
+    most = np.r_[np.full(support.sum(), np.inf), high]
+    start = np.r_[point.coefficients[0][support], best.x]
+    last = polish(lambda both: y * root - model(*parted(both)), None, start, (least, most))
+    theta, c = parted(last.x)
+    columns = basis(theta[None, :])[0] * root[:, None]
+    jacobian = np.hstack([columns, central_jacobian(lambda at: model(at, c), theta)])
+    free = np.concatenate([support, ~last.at_bound[support.sum() :]])
     covariance, rank = covariance_of(jacobian, free)
     return SeparableFit(
-        best.x, c, float(point.rss[0]), point.residual[0], jacobian, covariance, y.size - rank, best.converged
+        theta, c, last.rss, last.residual, jacobian, covariance, y.size - rank, best.converged and last.converged
     )
