@@ -1,8 +1,14 @@
-"""No test is judged by how long it takes: the first example of a process may load scipy on a busy machine."""
+"""No test is judged by how long it takes: the first example of a process may load scipy on a busy machine.
+
+A shell starts what it puts in the background with Ctrl-C ignored; tests that send one need it heard, wherever they run.
+"""
+
+import signal
 
 from sealfit.threads import one_thread
 
 one_thread()
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from hypothesis import settings  # noqa: E402
 
