@@ -21,6 +21,7 @@ from sealfit.fit.rows import Rows
 from sealfit.fit.whitening import Whitening
 
 SURE = 0.005  # p-value, over files (Wilcoxon), at which a ripple of free phase helps the half it was not fitted to
+COMPARED = 4  # rivals, best first, that are put to held-out data too
 TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
 LEAST_RUNS = 6  # below six runs whole files are held out, below six files strokes (design: held-out unit)
 
@@ -241,6 +242,7 @@ def confirmed(
         say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
         if gain.real:
             others = rivals(proposal, proposals)
-            rmse = [heldout_gain(fitted, o, *folds_of).left_N if compare else np.nan for o in others]
+            rmse = [heldout_gain(fitted, o, *folds_of).left_N for o in others[:COMPARED]] if compare else []
+            rmse += [np.nan] * (len(others) - len(rmse))
             return Added(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
     return None

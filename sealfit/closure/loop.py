@@ -71,6 +71,7 @@ def close_loop(
     counted = numbered(bins)
     rows = make_rows(counted, has_aging=config.aging)
     samples = steady_samples(traces, rows)
+    del traces  # much of the memory, and not read again
     fewer = merged_bins(counted)
     merged = len(fewer) < len(counted)
     coarse = make_rows(fewer, has_aging=config.aging) if merged else rows

@@ -21,13 +21,14 @@ from sealfit.closure.judge import Candidate
 from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripple import Peak
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.descent import search_bent
+from sealfit.fit.descent import linear_solved, search_bent
 from sealfit.fit.estimate import Fitted, fit, settled
 from sealfit.fit.whitening import Scatter, Whitening
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly
 FORMS_EACH = 2  # of each further quantity
+LIKELIEST = 3  # refitted first, to see whether an effect had stood in most of the scatter
 DOMINANT = 20.0  # by which an effect's own scatter lowers the deviance where it had stood in most of the scatter
 HALF = 0.5  # share of what the calendar explains from which anything else comes before it
 CALENDAR_RIVALS = 2  # refitted as rivals where something else comes first
@@ -234,27 +235,56 @@ def _identical(one: Proposal, other: Proposal) -> bool:
 def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
     """Return proposals fitted jointly with the physics, best first; those in reach with a scatter of their own.
 
-    What is in reach shows under the scatter of the best: there a rival has no room left to hide what it lacks.
+    What is in reach shows under the scatter of the best: there a rival has no room left to hide what it lacks. Where an
+    effect had stood in most of the scatter, as the few likeliest tell, all are fitted under theirs alone.
     """
-    refitted = sorted((replace(p, fitted=_joint(fitted, p)) for p in found), key=lambda p: p.criterion)
-    if not refitted:
+    if not found:
         return []
-    best = replace(refitted[0], fitted=settled(refitted[0].fitted))
+    likeliest = sorted(found, key=lambda p: p.criterion)
+    refitted = sorted((_joint(fitted, p) for p in likeliest[:LIKELIEST]), key=lambda p: p.criterion)
+    best = _settled(refitted[0])
     if refitted[0].fitted.deviance - best.fitted.deviance > DOMINANT:
-        own = (replace(p, fitted=_from_anew(p.fitted, best.fitted.scatter)) for p in refitted)
-        refitted = sorted(own, key=lambda p: p.criterion)
-        best = replace(refitted[0], fitted=settled(refitted[0].fitted))
+        refitted = sorted(_from_anew(fitted, likeliest, best.fitted.scatter), key=lambda p: p.criterion)
+        best = _settled(refitted[0])
+    elif len(found) > LIKELIEST:
+        refitted = sorted([*refitted, *(_joint(fitted, p) for p in likeliest[LIKELIEST:])], key=lambda p: p.criterion)
+        best = best if refitted[0].term is best.term else _settled(refitted[0])
     least = min(best.criterion, refitted[0].criterion)
     scatter = best.fitted.scatter
     near = [_deviance_under(p.fitted, scatter) + p.price < least + BEHIND for p in refitted[1:]]
-    own = [replace(p, fitted=settled(p.fitted)) if n else p for p, n in zip(refitted[1:], near, strict=True)]
-    return [best, *own]
+    own = [_settled(p) for p, n in zip(refitted[1:], near, strict=True) if n]
+    far = [p for p, n in zip(refitted[1:], near, strict=True) if not n]
+    return [best, *own, *far[:LIKELIEST]]
 
 
-def _from_anew(fitted: Fitted, scatter: Scatter) -> Fitted:
-    """Return a joint fit under another scatter, v_s and b sought anew: what was missing may have bent them away."""
-    model = search_bent(fitted.model, fitted.rows, scatter)
-    return fit(model, fitted.rows, scatter, turns=0, friction=fitted.friction)
+def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:
+    """Return a proposal fitted jointly with the physics, under the current scatter."""
+    model = fitted.model.with_term(proposal.term, proposal.values)
+    model = linear_solved(model, fitted.rows, fitted.scatter, fitted.friction)
+    return replace(proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction))
+
+
+def _settled(proposal: Proposal) -> Proposal:
+    return replace(proposal, fitted=settled(proposal.fitted))
+
+
+def _from_anew(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
+    """Yield proposals fitted under another scatter, v_s and b sought anew: what was missing may have bent them away.
+
+    They are sought with the likeliest effect on each quantity; its other effects begin where that ended.
+    """
+    rows, friction = fitted.rows, fitted.friction
+    begun: dict[tuple[str, str], np.ndarray] = {}
+    for proposal in found:
+        model = fitted.model.with_term(proposal.term, proposal.values)
+        target = _target(proposal)
+        if target in begun:
+            model = linear_solved(replace(model, theta=begun[target]), rows, scatter, friction)
+        else:
+            model = search_bent(model, rows, scatter)
+        anew = fit(model, rows, scatter, turns=0, friction=friction)
+        begun.setdefault(target, anew.model.theta)
+        yield replace(proposal, fitted=anew)
 
 
 def _deviance_under(fitted: Fitted, scatter: Scatter) -> float:
@@ -264,8 +294,3 @@ def _deviance_under(fitted: Fitted, scatter: Scatter) -> float:
     normal, gradient = whitening.normal(fitted.jacobian, residual)
     step, *_ = np.linalg.lstsq(normal, gradient, rcond=1e-10)
     return float(residual @ residual - step @ gradient) + whitening.logdet
-
-
-def _joint(fitted: Fitted, proposal: Proposal) -> Fitted:
-    model = fitted.model.with_term(proposal.term, proposal.values)
-    return fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)

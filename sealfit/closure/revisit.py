@@ -16,7 +16,7 @@ from sealfit.closure.channels import Channel
 from sealfit.closure.confirm import Added, confirmed
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.judge import Candidate, Judge
-from sealfit.closure.linearised import Proposal
+from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.naming import RIVAL, TIED, propose
 from sealfit.closure.search import of_channel
 from sealfit.config import Config
@@ -88,7 +88,11 @@ class Revisit:
             if c.key not in finest or c.judgement.df > finest[c.key].judgement.df:
                 finest[c.key] = replace(c, p_value=item.proposal.p_value)
         found = sorted(finest.values(), key=lambda c: -c.chi2)
-        return without, propose(without, found, self.channels, self.effects)
+        own, values = fitted.model.terms[number], fitted.model.values[number]
+        there = {p.name: (values[p.name],) for p in own.effect.nonlinear}
+        alike = next((c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None)
+        as_it_is = Linearised(without)(own, there, alike) if alike is not None else ()
+        return without, propose(without, found, self.channels, self.effects, as_it_is)
 
     def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> Added | None:
         self.say(f"  round {number} again:")

@@ -99,26 +99,44 @@ def search_bent(model: Model, rows: Rows, scatter: Scatter) -> Model:
 
 def _best_on_grid(model: Model, rows: Rows, whitening: Whitening, group: list[int]) -> Model:
     """Return the model with the numbers of a group, equal to one another, at the best of a few values or as it is."""
-    precision, centre = precision_of(model), centre_of(model)
-    held = model.bent  # one step far from the optimum would throw these anywhere
     low, high = bounds_of(model, rows)
-    prior = precision[np.ix_(~held, ~held)]
-    best, chosen = np.inf, model.vector()
-    for value in (None, *np.linspace(low[group[0]], high[group[0]], GRID)):
+    best, chosen = _linear_solved(model, model, rows, whitening)
+    for value in np.linspace(low[group[0]], high[group[0]], GRID):
         vector = model.vector()
-        if value is not None:
-            vector[group] = value
-        force, jacobian = evaluate(model.at(vector), rows)
-        residual = whitening((rows.force - force)[:, None])[:, 0]
-        normal, gradient = whitening.normal(jacobian[:, ~held], residual)
-        away = (vector - centre)[~held]
-        gradient = gradient - prior @ away
-        step, *_ = np.linalg.lstsq(normal + prior, gradient, rcond=1e-10)
-        cost = float(residual @ residual + away @ prior @ away - step @ gradient)
+        vector[group] = value
+        cost, solved = _linear_solved(model.at(vector), model, rows, whitening)
         if cost < best - 1e-9:
-            vector[~held] += step
-            best, chosen = cost, np.clip(vector, low, high)
-    return model.at(chosen)
+            best, chosen = cost, solved
+    return model.at(np.clip(chosen.vector(), low, high))
+
+
+def linear_solved(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
+    """Return the model with all that acts linearly solved for, v_s, b and the effects' own numbers where they stand.
+
+    A term that has just come in takes over what others had explained for it: until they have given that back, a
+    descent throws the rest anywhere.
+    """
+    low, high = bounds_of(model, rows)
+    solved = _linear_solved(model, model, rows, Whitening(scatter, friction, rows.groups))[1]
+    return model.at(np.clip(solved.vector(), low, high))
+
+
+def _linear_solved(model: Model, centre: Model, rows: Rows, whitening: Whitening) -> tuple[float, Model]:
+    """Return the whitened sum of squares left by, and the model with, its linear numbers solved for at once.
+
+    The priors lie about `centre`.
+    """
+    held = model.bent  # one step far from the optimum would throw these anywhere
+    vector = model.vector()
+    force, jacobian = evaluate(model, rows)
+    residual = whitening((rows.force - force)[:, None])[:, 0]
+    normal, gradient = whitening.normal(jacobian[:, ~held], residual)
+    prior = precision_of(model)[np.ix_(~held, ~held)]
+    away = (vector - centre_of(centre))[~held]
+    gradient = gradient - prior @ away
+    step, *_ = np.linalg.lstsq(normal + prior, gradient, rcond=1e-10)
+    vector[~held] += step
+    return float(residual @ residual + away @ prior @ away - step @ gradient), model.at(vector)
 
 
 def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
