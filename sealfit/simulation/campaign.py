@@ -19,7 +19,7 @@ from sealfit.simulation.defects import draw_defects, spoil
 from sealfit.simulation.design import plan_files
 from sealfit.simulation.draws import Draws
 from sealfit.simulation.law import SteadyLaw, steady_law
-from sealfit.simulation.motion import Motion, move, with_presliding
+from sealfit.simulation.motion import Motion, finer, move, move_at, with_presliding
 from sealfit.simulation.noise import displacement_noise_mm, draw_scatter, quantised, sample_noise_N
 from sealfit.simulation.spec import Spec
 from sealfit.simulation.truth import load_truth, truth_document, truth_path
@@ -88,6 +88,7 @@ def _refuse_foreign(out: Path) -> None:
 def _write(spec: Spec, folder: Path) -> dict:
     draws = Draws(spec.seed)
     law = steady_law(spec)
+    spec = spec.risen()
     files = add_channels(plan_files(spec.design, draws.stream("order")), spec.channels, draws)
     scatter = draw_scatter(spec.noise, files, draws)
     starts = spec.design.start_mm + spec.design.start_scatter_mm * draws.stream("start").standard_normal(len(files))
@@ -170,23 +171,48 @@ def _force(
     draws: Draws,
 ) -> np.ndarray:
     """Return a trace's measured force in N, shape (n,)."""
-    # At rest the bristles keep the last direction: a crawl stands for it, at which the law gives the break-away force.
-    crawl = motion.direction * np.maximum(np.abs(motion.speed_mm_s), CRAWL * speed)
-    # Within a bristle's length nothing has slid yet, nor at the clock's zero: a law in their logarithm starts after.
-    begun = {
-        "speed_mm_s": crawl,
-        "distance_mm": np.maximum(motion.distance_mm, spec.design.stiffness_mm),
-        "time_s": np.maximum(motion.stroke_time_s, motion.time_s[1]),
-    }
-    friction, added = law.parts({**channels, **begun})
-    if not (np.isfinite(friction).all() and np.isfinite(added).all()):
+    parts = law.parts({**channels, **_begun(spec, motion, speed)})
+    limit, viscous, added = (np.broadcast_to(part, motion.time_s.shape) for part in parts)
+    if not (np.isfinite(limit + viscous).all() and np.isfinite(added).all()):
         raise ConfigError(
             f"the effects give no number in {channels['file'][0]}.", mend="Check their parameters and formulas."
         )
-    friction = with_presliding(np.broadcast_to(friction, crawl.shape), motion, spec.design.stiffness_mm)
+    if spec.physics.sigma_0 is None:  # all that friction is comes up over one length
+        friction = with_presliding(limit + viscous, motion, np.full(motion.time_s.size, spec.design.stiffness_mm))
+    else:
+        friction = _dynamic(spec, law, motion, channels, speed) + viscous
     clean = gain * friction + added + offset_N
     noisy = clean + sample_noise_N(spec.noise, clean, motion.time_s, speed, number, draws)
     return np.round(quantised(spec.noise, noisy), spec.force_decimals)
+
+
+def _dynamic(spec: Spec, law: SteadyLaw, motion: Motion, channels: dict[str, np.ndarray], speed: float) -> np.ndarray:
+    """Return the bristles' force in N, shape (n,), followed through the ramps in steps finer than the file's rows."""
+    time = finer(motion, spec.design, speed)
+    between = {
+        name: np.interp(time, motion.time_s, values) if len(values) == motion.time_s.size else values
+        for name, values in channels.items()
+    }
+    start = motion.displacement_mm[0] - (0.0 if motion.direction[0] > 0 else spec.design.stroke_mm)
+    fine = move_at(spec.design, speed, int(motion.direction[0]), start, time)
+    limit, _, _ = law.parts({**between, **_begun(spec, fine, speed)})
+    limit = np.broadcast_to(limit, time.shape)
+    rise = np.abs(limit) / spec.physics.sigma_0
+    force = with_presliding(limit, fine, rise, spec.physics.sigma_1 / spec.physics.sigma_0)
+    return force[np.searchsorted(time, motion.time_s)]
+
+
+def _begun(spec: Spec, motion: Motion, speed: float) -> dict[str, np.ndarray]:
+    """Return the channels by which a rest is the beginning of motion.
+
+    At rest the bristles keep the last direction: a crawl stands for it, at which the law gives the break-away force.
+    Within a bristle's length nothing has slid yet, nor at the clock's zero: a law in their logarithm starts after.
+    """
+    return {
+        "speed_mm_s": motion.direction * np.maximum(np.abs(motion.speed_mm_s), CRAWL * speed),
+        "distance_mm": np.maximum(motion.distance_mm, spec.design.stiffness_mm),
+        "time_s": np.maximum(motion.stroke_time_s, motion.time_s[1]),
+    }
 
 
 def _write_trace(columns: dict[str, np.ndarray], path: Path) -> None:

@@ -38,8 +38,8 @@ class SteadyLaw:
         """Return the law without its effect `number`."""
         return replace(self, effects=tuple(e for k, e in enumerate(self.effects) if k != number))
 
-    def parts(self, channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the friction force and the added forces, in N, broadcast over the channels.
+    def parts(self, channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the bristles' limit, the viscous part and the added forces, in N, broadcast over the channels.
 
         Parameters
         ----------
@@ -65,18 +65,19 @@ class SteadyLaw:
         mu = now["mu_c"] + (now["mu_s"] - now["mu_c"]) * stribeck_decay(speed, now["v_s"])
         mu = self._changed("mu", mu, channels, factors_first=True)
         load = np.asarray(channels.get("load_N", 1.0), dtype=float)
-        friction = load * mu * np.sign(speed) + now["sigma_2"] * speed
+        limit, viscous = load * mu * np.sign(speed), now["sigma_2"] * speed
         for effect in self._acting("force", "multiply"):
-            friction = friction * (1.0 + effect.shape(channels))
+            factor = 1.0 + effect.shape(channels)
+            limit, viscous = limit * factor, viscous * factor
         added = np.zeros(1)
         for effect in self._acting("force", "add"):
             added = added + effect.shape(channels)
-        return friction, added
+        return limit, viscous, added
 
     def force_N(self, channels: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the force of steady sliding, in N, signed as in the file."""
-        friction, added = self.parts(channels)
-        return friction + added
+        limit, viscous, added = self.parts(channels)
+        return limit + viscous + added
 
     def _acting(self, target: str, operation: str) -> list[BoundEffect]:
         return [e for e in self.effects if (e.acts_on, e.operation) == (target, operation)]

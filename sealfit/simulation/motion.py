@@ -9,6 +9,7 @@ import numpy as np
 
 from sealfit.simulation.design import STEADY_LENGTHS, Design
 
+RAMP_STEPS = 256  # in which the bristles follow a ramp: the speed is constant in each
 TICK_S = 1e-5  # time is logged to this; sampling intervals are whole ticks
 
 
@@ -41,15 +42,17 @@ def move(design: Design, speed_mm_s: float, direction: int, start_mm: float) -> 
     start_mm : float
         Lower end of the stroke in the rig's coordinate.
     """
-    length = design.stroke_mm
-    ramp = min(design.ramp_s, 0.1 * length / speed_mm_s)
-    rest = min(design.dwell_s, 0.1 * length / speed_mm_s)
-    cruise = length / speed_mm_s - ramp
-    period = rest + 2.0 * ramp + cruise
+    _, rest, _, period = _phases(design, speed_mm_s)
     total = design.strokes_per_file * period + 0.5 * rest
     step = max(1.0 / design.sampling_Hz, total / (design.max_rows - 1))
     step = np.ceil(np.round(step / TICK_S, 6)) * TICK_S
-    time = np.round(np.arange(int(total / step) + 1) * step, 5)
+    return move_at(design, speed_mm_s, direction, start_mm, np.round(np.arange(int(total / step) + 1) * step, 5))
+
+
+def move_at(design: Design, speed_mm_s: float, direction: int, start_mm: float, time: np.ndarray) -> Motion:
+    """Return the motion of one file at given times, shape (n,), on the file's clock; the rest as `move`."""
+    length = design.stroke_mm
+    ramp, rest, cruise, period = _phases(design, speed_mm_s)
     number = np.minimum((time / period).astype(int), design.strokes_per_file - 1)
     since = time - number * period - rest  # since the stroke began to move
     along, speed = _trapezoid(since, ramp, cruise, speed_mm_s, length)
@@ -70,6 +73,25 @@ def move(design: Design, speed_mm_s: float, direction: int, start_mm: float) -> 
     )
 
 
+def _phases(design: Design, speed_mm_s: float) -> tuple[float, float, float, float]:
+    """Return the seconds of a ramp, of the rest before a stroke, of cruising, and of all of it together."""
+    ramp = min(design.ramp_s, 0.1 * design.stroke_mm / speed_mm_s)
+    rest = min(design.dwell_s, 0.1 * design.stroke_mm / speed_mm_s)
+    cruise = design.stroke_mm / speed_mm_s - ramp
+    return ramp, rest, cruise, rest + 2.0 * ramp + cruise
+
+
+def finer(motion: Motion, design: Design, speed_mm_s: float) -> np.ndarray:
+    """Return the file's times and those between them in which the speed changes, RAMP_STEPS of each ramp, sorted."""
+    time = motion.time_s
+    ramp, *_ = _phases(design, speed_mm_s)
+    changing = np.flatnonzero(~(motion.cruising[1:] & motion.cruising[:-1]))
+    step = time[1] - time[0]
+    count = int(np.ceil(step * RAMP_STEPS / ramp)) if ramp > 0.0 else 1
+    between = time[changing, None] + step * np.arange(1, count) / count
+    return np.union1d(time, between)
+
+
 def _trapezoid(
     since: np.ndarray, ramp: float, cruise: float, speed: float, length: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -86,36 +108,39 @@ def _trapezoid(
     return distance, np.where(moving, now, 0.0)
 
 
-def with_presliding(friction_N: np.ndarray, motion: Motion, stiffness_mm: float) -> np.ndarray:
-    r"""Return the friction with what the bristles make of it where the speed changes, shape (n,).
+def with_presliding(limit_N: np.ndarray, motion: Motion, rise_mm: np.ndarray, damping_s: float = 0.0) -> np.ndarray:
+    r"""Return the bristles' force, sigma_0 z + sigma_1 dz/dt, shape (n,).
 
-    .. math:: dF/dx = (F_{steady} - F) / x_0
+    .. math:: dF/dx = (F_{limit} - F) / x_0
 
-    which is Eq. 2 over the distance x, with x_0 = g / sigma_0 taken as constant: the force rises from rest over x_0,
-    passes a break-away where the ramp is longer than that, follows a stop as far as x_0 lets it, and holds at rest.
-    While the speed is constant only what is left of the start decays, so the truth of steady sliding has no lag.
+    which is Eq. 2 over the distance x for F = sigma_0 z, with x_0 = g, the rise's length: the force rises from rest
+    over x_0, passes a break-away where the ramp is longer than that, follows a stop as far as x_0 lets it, and holds
+    at rest. While the speed is constant only what is left of the start decays, so the truth of steady sliding has no
+    lag.
 
     Parameters
     ----------
-    friction_N : ndarray, shape (n,)
-        Force of steady sliding at every row's speed.
+    limit_N : ndarray, shape (n,)
+        Force of the bristles in steady sliding at every row's speed.
     motion : Motion
         The rows.
-    stiffness_mm : float
+    rise_mm : ndarray, shape (n,)
         x_0 in mm.
+    damping_s : float
+        sigma_1 / sigma_0 in s.
     """
-    left = np.exp(-np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0])) / stiffness_mm).tolist()
-    result = friction_N.astype(float)
+    left = np.exp(-np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0])) / rise_mm).tolist()
+    result = limit_N.astype(float)
     phase = 2 * motion.stroke + motion.cruising
     edges = np.flatnonzero(np.diff(phase, prepend=-1, append=-1))
     force = 0.0
     for first, last in pairwise(edges.tolist()):
         if motion.cruising[first]:
             slid = np.abs(motion.displacement_mm[first:last] - motion.displacement_mm[first])
-            result[first:last] += (force - friction_N[first]) * left[first] * np.exp(-slid / stiffness_mm)
+            result[first:last] += (force - limit_N[first]) * left[first] * np.exp(-slid / rise_mm[first])
             force = float(result[last - 1])
             continue
-        for row, target in enumerate(friction_N[first:last].tolist(), start=first):
+        for row, target in enumerate(limit_N[first:last].tolist(), start=first):
             force = target + (force - target) * left[row]
             result[row] = force
-    return result
+    return result + damping_s * np.abs(motion.speed_mm_s) / rise_mm * (limit_N - result)

@@ -63,6 +63,25 @@ class Spec(Strict):
         along = ["time_s", "displacement_mm", "distance_mm", "speed_mm_s", "direction", "stroke"]
         return (*along, "repeat", "specimen_id", *own, *dated, *(c.name for c in self.channels))
 
+    def risen(self) -> Spec:
+        """Return the SPEC whose `design.stiffness_mm` is the longest rise that `physics.sigma_0` makes, if it is given.
+
+        Raises
+        ------
+        ConfigError
+            If the stroke is too short for it.
+        """
+        if self.physics.sigma_0 is None:
+            return self
+        most = max(self.physics.mu_s.mu_0, self.physics.mu_c.mu_0) * max(self.design.loads_N, default=1.0)
+        design = {**self.design.model_dump(), "stiffness_mm": most / self.physics.sigma_0}
+        try:
+            return self.model_copy(update={"design": Design.model_validate(design)})
+        except ValidationError as error:
+            raise ConfigError(
+                explain(error), mend="Raise physics.sigma_0: the rise is load * mu / sigma_0 long."
+            ) from error
+
     @model_validator(mode="after")
     def _names_are_free(self) -> Spec:
         seen: set[str] = set()
