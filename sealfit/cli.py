@@ -76,6 +76,12 @@ def fit_aging(out: Results, force: Force = False, as_json: Json = False) -> None
     _single("fit-aging", out, force, as_json)
 
 
+@app.command("fit-dynamic")
+def fit_dynamic(out: Results, force: Force = False, as_json: Json = False) -> None:
+    """Fit sigma_0 and sigma_1 to the pre-sliding part."""
+    _single("fit-dynamic", out, force, as_json)
+
+
 @app.command("close-loop")
 def close_loop(out: Results, workers: Workers = None, force: Force = False, as_json: Json = False) -> None:
     """Find, name and add what the model lacks."""

@@ -16,10 +16,15 @@ from pathlib import Path
 from sealfit import __version__
 from sealfit.config import Config, Files, Loop, Sensor
 
-STEPS = ("ingest", "fit-steady", "fit-aging", "close-loop", "report")
+STEPS = ("ingest", "fit-steady", "fit-aging", "fit-dynamic", "close-loop", "report")
 """Every step, each reading what those before it wrote."""
 
-UNSEEN = {"ingest": {"sensor": Sensor(), "loop": Loop()}, "fit-steady": {"loop": Loop()}, "fit-aging": {"loop": Loop()}}
+UNSEEN = {
+    "ingest": {"sensor": Sensor(), "loop": Loop()},
+    "fit-steady": {"loop": Loop()},
+    "fit-aging": {"loop": Loop()},
+    "fit-dynamic": {"loop": Loop()},
+}
 """Parts of the config that a step is not given, so that a change of them does not make it stale."""
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
-FITTED = ("steady_fit", "aging_fit", "aging_curves")
+FITTED = ("steady_fit", "aging_fit", "aging_curves", "dynamic_fit", "dynamic_curves")
 FAULTY = ("warning", "error")  # severities that count as a fault
 
 
@@ -163,6 +163,16 @@ def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> 
     staged.table("aging_curves", aging_curves(fitted))
 
 
+def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+    from sealfit.fit.dynamic import fit_dynamic
+
+    progress.say("fitting the pre-sliding part")
+    traces = store.read("traces", ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"])
+    found = fit_dynamic(traces, store.read("steady"), store.read("steady_fit"), store.seen_config("fit-dynamic"))
+    staged.table("dynamic_fit", found.fit)
+    staged.table("dynamic_curves", found.curves)
+
+
 def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
     from sealfit.closure.loop import close_loop
 
@@ -195,6 +205,7 @@ _WORK: dict[str, Callable[[Store, Staged, int, Silent], None]] = {
     "ingest": _ingest,
     "fit-steady": _fit_steady,
     "fit-aging": _fit_aging,
+    "fit-dynamic": _fit_dynamic,
     "close-loop": _close_loop,
     "report": _report,
 }

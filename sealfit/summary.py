@@ -26,6 +26,7 @@ def of_steps(store: Store, steps: Iterable[str]) -> dict:
         "ingest": lambda: of_ingest({name: store.read(name) for name in ("inputs", "runs", "quality", "steady")}),
         "fit-steady": lambda: of_fit(store.read("steady_fit"), "condition"),
         "fit-aging": lambda: of_fit(store.read("aging_fit"), "series"),
+        "fit-dynamic": lambda: of_dynamic(store.read("dynamic_fit")),
         "close-loop": lambda: of_closure(store.read_json("closure"), store.config.units),
         "report": lambda: {"file": str(store.out / "report.html")},
     }
@@ -70,6 +71,20 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
             }
         )
     return {of: int(fit[of].nunique()), "parameters": ranges}
+
+
+def of_dynamic(fit: pd.DataFrame) -> dict:
+    """Return the ranges of sigma_0 and sigma_1, and the largest break-away above the sliding force."""
+    ratios = fit[fit["parameter"] == "F_ba/F"]
+    broken = ratios[ratios["identified"].astype(bool) & (ratios["reason"] == "")]
+    most = broken.loc[broken["value"].idxmax()] if len(broken) else None
+    return {
+        **of_fit(fit[fit["quantity"] == "dynamic"], "condition"),
+        "break_aways": len(ratios),
+        "above_sliding": len(broken),
+        "largest_ratio": None if most is None else float(most["value"]),
+        "largest_at": None if most is None else str(most["condition"]),
+    }
 
 
 def of_closure(closure: Mapping, units: Units) -> dict:
@@ -136,6 +151,7 @@ def lines(summary: Mapping) -> list[str]:
         "ingest": ingest_lines,
         "fit_steady": lambda part: _fit_lines("steady fit", part),
         "fit_aging": lambda part: _fit_lines("aging", part),
+        "fit_dynamic": dynamic_lines,
         "close_loop": closure_lines,
         "report": lambda part: [_line("report", part["file"])],
     }
@@ -177,6 +193,16 @@ def _fit_lines(title: str, part: Mapping) -> list[str]:
         ]
         reason = next((entry["reason"] for entry in lacking if entry["reason"]), "")
         found.append(_line("", f"not identified: {', '.join(texts)}. {reason}".rstrip()))
+    return found
+
+
+def dynamic_lines(part: Mapping) -> list[str]:
+    """Return the lines of the dynamic fit."""
+    found = _fit_lines("pre-sliding", part)
+    if part["above_sliding"]:
+        more = f"{part['largest_ratio'] - 1:.1%} at most, {part['largest_at']}"
+        text = f"above the sliding force at {part['above_sliding']} of {part['break_aways']} speeds, both ways ({more})"
+        found.append(_line("break-away", text))
     return found
 
 

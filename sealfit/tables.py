@@ -267,6 +267,7 @@ _FIT = (
 )
 STEADY_FIT = Schema("steady_fit", (CONDITION, SERIES, RUBBER, *_FIT), open_=True)
 AGING_FIT = Schema("aging_fit", (SERIES, RUBBER, *_FIT), open_=True)
+DYNAMIC_FIT = Schema("dynamic_fit", (CONDITION, SERIES, RUBBER, DIRECTION, SPEED_SET, *_FIT), open_=True)
 
 # ---------------------------------------------------------------- the loop
 EFFECTS = Schema(
@@ -354,6 +355,19 @@ CURVES = Schema(
     ),
     open_=True,
 )
+DYNAMIC_CURVES = Schema(
+    "dynamic_curves",
+    (
+        CONDITION,
+        SPEED_SET,
+        DIRECTION,
+        Column("distance_mm", "mm", FLOAT, "distance slid since the platform began to move"),
+        Column("force_N", "N", FLOAT, "mean force of the starts, in the direction of motion"),
+        Column("force_se_N", "N", FLOAT, "standard error of that mean, from the starts; null for one start"),
+        Column("n", "", INT, "starts averaged"),
+        Column("model_N", "N", FLOAT, "mean of the fitted dynamic model over the same samples; null without a fit"),
+    ),
+)
 AGING_CURVES = Schema(
     "aging_curves",
     (
@@ -386,5 +400,7 @@ SCHEMAS = {
         SHAPES,
         CURVES,
         AGING_CURVES,
+        DYNAMIC_FIT,
+        DYNAMIC_CURVES,
     )
 }

@@ -91,6 +91,13 @@ class Parts:
     def aging_curves(self, aging_fit, days=None):
         return small("aging_curves")
 
+    def fit_dynamic(self, traces, steady, steady_fit, config):
+        self._called("fit-dynamic", config)
+        fit = small("dynamic_fit", 2).assign(
+            quantity="dynamic", parameter=["sigma_0", "sigma_1"], value=[100.0, 0.5], unit=["N/mm", "N s/mm"], reason=""
+        )
+        return SimpleNamespace(fit=fit, curves=small("dynamic_curves"))
+
     def close_loop(self, bins, traces, config, *, workers=1, on_progress=None):
         self._called("close-loop", config)
         self.workers = workers
@@ -128,6 +135,7 @@ def put_in(monkeypatch):
         "sealfit.ingest.campaign": ["ingest_campaign"],
         "sealfit.fit.steady": ["fit_conditions"],
         "sealfit.fit.aging": ["fit_series", "aging_curves"],
+        "sealfit.fit.dynamic": ["fit_dynamic"],
         "sealfit.closure.loop": ["close_loop"],
         "sealfit.closure.predict": ["predict"],
         "sealfit.report.page": ["build_report"],

@@ -59,7 +59,8 @@ def sealfit(monkeypatch, capsys):
 # ---------------------------------------------------------------- help, documents, start-up
 def test_the_commands_are_those_of_the_design():
     assert set(COMMANDS) >= {
-        "ingest", "fit-steady", "fit-aging", "close-loop", "report", "run", "predict", "effects", "simulate", "check",
+        "ingest", "fit-steady", "fit-aging", "fit-dynamic", "close-loop", "report", "run", "predict", "effects",
+        "simulate", "check",
     }  # fmt: skip
 
 
@@ -200,7 +201,7 @@ def test_each_step_sees_only_what_its_key_holds(sealfit, parts, campaign, out, t
     sealfit("run", campaign, "--out", out, "--config", config)
     assert parts.configs["ingest"].sensor.accuracy == 0.2
     assert parts.configs["fit-steady"].sensor.accuracy == 0.9
-    assert [parts.configs[step].loop.seed for step in STEPS] == [1, 1, 1, 4, 4]
+    assert [parts.configs[step].loop.seed for step in STEPS] == [1, 1, 1, 1, 4, 4]
 
 
 def test_the_steps_one_by_one_are_the_run(sealfit, parts, campaign, out, tmp_path):

@@ -31,6 +31,7 @@ OUTPUTS = {  # table that stands for each step in these tests
     "ingest": "steady",
     "fit-steady": "steady_fit",
     "fit-aging": "aging_fit",
+    "fit-dynamic": "dynamic_fit",
     "close-loop": "effects",
     "report": "channels",
 }
@@ -251,14 +252,14 @@ def test_a_redone_step_makes_those_after_it_stale(out, campaign):
     do_all(out, campaign)
     with Store.writing(out) as store:
         do(store, "fit-steady")
-    assert stale(out) == ["fit-aging", "close-loop", "report"]
+    assert stale(out) == ["fit-aging", "fit-dynamic", "close-loop", "report"]
 
 
 def test_a_table_that_is_missing_or_was_cut_makes_its_step_stale(out, campaign):
     do_all(out, campaign)
     path = out / "aging_fit.parquet"
     path.write_bytes(path.read_bytes()[:-1])
-    assert stale(out) == ["fit-aging", "close-loop", "report"]
+    assert stale(out) == ["fit-aging", "fit-dynamic", "close-loop", "report"]
     path.unlink()
     with pytest.raises(StaleError, match=r"aging_fit.parquet is missing.*Run: sealfit fit-aging"):
         Store.open(out).require("close-loop")

@@ -13,10 +13,12 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from sealfit.effects.free import WIDE
+from sealfit.fit.declared import SAME_SPEED
 from sealfit.fit.rows import LEVELS, Rows
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 MANY_UNITS = 20  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up
+LEAST_UNITS = 6  # below six runs whole files are held out, below six files strokes (design: held-out unit)
 CALENDAR = ("run_order", "elapsed_h")  # conditions are tested one after the other, so the calendar follows them
 FEW_DF = 2  # of a free shape along a dozen specimens: a line and a bend
 FREE_DF = 4  # columns of a free shape: enough for a peak, an approach or a step; more only costs power
@@ -68,6 +70,8 @@ def find_channels(
         if values.dtype.kind == "f":
             if not np.isfinite(values).all() or np.ptp(values) <= 1e-9 * max(np.abs(values).max(), 1e-300):
                 continue
+            if name == "speed_mm_s" and values.max() <= SAME_SPEED * values.min():
+                continue  # one setting: what is left of the speed tells directions apart, or strokes
         elif np.unique(values).size < 2:
             continue
         unit = unit_of(values, rows)
@@ -95,10 +99,15 @@ def unit_of(values: np.ndarray, rows: Rows) -> str:
 
 
 def flip_level(unit: str, rows: Rows) -> str:
-    """Return the level whose whole groups are moved by sign flips, folds and bootstraps."""
+    """Return the level whose whole groups are moved by sign flips, folds and bootstraps.
+
+    Of a few files, or one, the strokes speak, and of these files alone.
+    """
     if FINER[unit] >= FINER["run"]:
         return unit
-    return "run" if rows.groups.starts["run"].size >= MANY_UNITS else "file"
+    if rows.groups.starts["run"].size >= MANY_UNITS:
+        return "run"
+    return "file" if rows.groups.starts["file"].size >= LEAST_UNITS or unit == "file" else "stroke"
 
 
 def _is_grouping(channel: Channel, rows: Rows) -> bool:

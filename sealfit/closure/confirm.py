@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from sealfit.closure.channels import CALENDAR, FINER, unit_of
+from sealfit.closure.channels import CALENDAR, FINER, LEAST_UNITS, unit_of
 from sealfit.closure.forms import describe
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
@@ -23,13 +23,12 @@ from sealfit.fit.whitening import Whitening
 SURE = 0.005  # p-value, over files (Wilcoxon), at which a ripple of free phase helps the half it was not fitted to
 COMPARED = 4  # rivals, best first, that are put to held-out data too
 TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
-LEAST_RUNS = 6  # below six runs whole files are held out, below six files strokes (design: held-out unit)
 
 
 def heldout_level(rows: Rows) -> str:
     """Return the level whose groups are held out: run, or file or stroke where there are fewer than six."""
     for level in ("run", "file"):
-        if rows.groups.starts[level].size >= LEAST_RUNS:
+        if rows.groups.starts[level].size >= LEAST_UNITS:
             return level
     return "stroke"
 

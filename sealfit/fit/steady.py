@@ -64,7 +64,7 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
             drop_flat_curve(condition, value, df)
     variance = _unit_variance(conditions, scatter)
     bound(conditions, variance.rise())
-    keys = _keys(steady, config)
+    keys = condition_keys(steady, config)
     rows = [
         {"condition": c.name, **row} for k, c in enumerate(conditions) for row in _rows(c, k, variance, scatter, config)
     ]
@@ -83,7 +83,7 @@ def _unit_variance(conditions: list[Condition], scatter: Scatter) -> UnitVarianc
     return unit_variance([c.chi2 for c in conditions], [c.df for c in conditions], scatter.df)
 
 
-def _keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
+def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     """One row per condition: series, rubber and the condition columns; null where unaged rubber has several."""
     names = [c for c in dict.fromkeys(["series", "rubber", *condition_columns(config)]) if c in steady.columns]
     grouped = steady[steady["condition"].notna()].groupby("condition", sort=True)

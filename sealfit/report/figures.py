@@ -8,6 +8,7 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.report.figures_curves import aging, traces_mean
+from sealfit.report.figures_dynamic import starts
 from sealfit.report.figures_loop import before_after, variance_levels
 from sealfit.report.figures_residual import effect_shapes, residual_channels
 from sealfit.report.figures_speed import force_speed
@@ -33,6 +34,7 @@ def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config
         residual_channels(tables, config),
         force_speed(tables, config),
         aging(tables, config),
+        starts(tables, config),
         traces_mean(tables, config),
     )
     return {plot.name: plot for plot in plots if plot is not None}

@@ -17,13 +17,14 @@ from sealfit.report.figures import draw_all
 from sealfit.report.figures_residual import MOST_CHANNELS
 from sealfit.report.loop_tables import channel_tests, effect_cards, error_rows, next_runs, scatter_rows
 from sealfit.report.numbers import count, given, number
-from sealfit.report.parameters import parameter_tables
+from sealfit.report.parameters import break_away_rows, parameter_tables
 from sealfit.report.style import Plot, compose, data_uri, panel_figure, svg
 from sealfit.report.symbols import ConditionNames, symbol_html
 from sealfit.report.words import left_over, verdict, with_left_channels
 
 TABLES = (
-    "inputs", "runs", "quality", "traces_mean", "steady", "steady_fit", "aging_fit", "aging_curves", "effects",
+    "inputs", "runs", "quality", "traces_mean", "steady", "steady_fit", "aging_fit", "aging_curves",
+    "dynamic_fit", "dynamic_curves", "effects",
     "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves",
 )  # fmt: skip
 VERDICTS = {
@@ -82,6 +83,8 @@ def _content(
 ) -> dict:
     fitted = parameter_tables(tables["steady_fit"], "condition", config)
     fitted += parameter_tables(tables["aging_fit"], "series", config)
+    dynamic = tables["dynamic_fit"]
+    fitted += parameter_tables(dynamic[dynamic["quantity"] == "dynamic"], "condition", config)
     findings, in_all = facts.quality_findings(tables["quality"], config)
     return {
         "closure": closure,
@@ -98,9 +101,11 @@ def _content(
         "parameter_tables": sorted(fitted, key=lambda table: table.single),  # how well the fits do comes last
         "aging_fitted": len(tables["aging_fit"]) > 0,
         "aging": config.aging,
+        "break_aways": break_away_rows(dynamic, config),
         "condition_key": ConditionNames.of(config).key,
         "sensor": config.sensor,
         "unit": config.units.unit("force"),
+        "speed_unit": config.units.unit("speed"),
         "force": config.units.quantity("force"),
         "counts": facts.quality_counts(tables["quality"]),
         "findings": findings,

@@ -44,6 +44,39 @@ class ParameterTable:
     single: bool = False  # values only: statistics have neither interval nor u_sys
 
 
+def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> list[dict]:
+    """Return the break-aways that stand above the sliding force, as plain values for the page.
+
+    Parameters
+    ----------
+    dynamic_fit : DataFrame
+        Table `dynamic_fit`, perhaps empty.
+    config : Config
+        Names the conditions and gives the true units.
+    """
+    names, found = ConditionNames.of(config), []
+    keys = ["condition", "speed_set_mm_s", "direction"]
+    rows = dynamic_fit[dynamic_fit["quantity"] == "break_away"]
+    for (condition, speed, direction), own in rows.groupby(keys, dropna=False, sort=False):
+        by = own.set_index("parameter")
+        if by.loc["F_ba/F", "reason"] or not by.loc["F_ba/F", "identified"]:
+            continue
+        force, interval = measured(*by.loc["F_ba", ["value", "lo95", "hi95"]])
+        share, share_interval = measured(*(100.0 * (by.loc["F_ba/F", ["value", "lo95", "hi95"]].astype(float) - 1.0)))
+        found.append(
+            {
+                "condition": names(condition),
+                "speed": given(speed) if known(speed) else NOTHING,
+                "direction": "forward" if direction > 0 else "backward",
+                "force": force,
+                "force_interval": interval,
+                "share": share,
+                "share_interval": share_interval,
+            }
+        )
+    return found
+
+
 def parameter_tables(fit: pd.DataFrame, key: str, config: Config) -> list[ParameterTable]:
     """Return the tables of `steady_fit` (key "condition") or `aging_fit` (key "series").
 
@@ -169,6 +202,8 @@ def _head(key: str) -> str:
 
 
 def _title(key: str, quantities: Sequence[str]) -> str:
+    if quantities == ["dynamic"]:
+        return "Bristles, fitted to the starts of each condition"
     if key == "condition":
         return "Steady friction, fitted to each condition on its own"
     return (

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from report.made_starts import starts
 from report.made_tables import (
     DROP,
     TAU,
@@ -38,6 +39,8 @@ NAMES = (
     "steady_fit",
     "aging_fit",
     "aging_curves",
+    "dynamic_fit",
+    "dynamic_curves",
     "effects",
     "residuals_before",
     "residuals_after",
@@ -174,6 +177,7 @@ def aging_campaign(
         "steady_fit": table("steady_fit", fits),
         "aging_fit": aging_fit(fits),
         "aging_curves": aging_curves(fits, max(days)),
+        **starts(conditions, speeds, config),
         "residuals_before": found["before"],
         "residuals_after": found["after"],
         "levels": levels(found),

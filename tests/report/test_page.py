@@ -89,7 +89,7 @@ def test_every_image_says_what_it_shows(name, pages):
 @pytest.mark.parametrize("name", MADE)
 def test_contents_lead_somewhere_and_ids_are_single(name, pages):
     targets = [address[1:] for address in pages[name].addresses if address.startswith("#")]
-    assert len(targets) == 10
+    assert len(targets) == 11
     assert set(targets) <= set(pages[name].ids)
     assert len(set(pages[name].ids)) == len(pages[name].ids)
 
@@ -101,7 +101,8 @@ def test_nothing_unavailable_is_printed_raw(name, pages):
 
 def test_figures_are_named_for_the_store(reports):
     assert set(reports["closed"].figures) == {
-        "before_after", "effect_shapes", "variance_levels", "residual_channels", "force_speed", "aging", "traces_mean",
+        "before_after", "effect_shapes", "variance_levels", "residual_channels", "force_speed", "aging",
+        "starts", "traces_mean",
     }  # fmt: skip
     assert set(reports["torque"].figures) == {"before_after", "force_speed"}
 
@@ -227,8 +228,8 @@ def test_paper_sized_campaign_gives_a_page_that_can_be_mailed():
     report = build_report(*made.arguments)
     assert len(report.html.encode()) < 8e6
     assert (
-        report.html.count("<img") == 12 + 12 + 9 + 6 + 2 + 1 + 1
-    )  # series, aging, channels, traces, errors, levels, shape
+        report.html.count("<img") == 12 + 12 + 9 + 6 + 6 + 2 + 1 + 1
+    )  # series, aging, channels, starts, traces, errors, levels, shape
 
 
 def test_empty_tables_may_lack_columns():

@@ -1,0 +1,95 @@
+"""The break-away force: the peak of the force before steady sliding, at each commanded speed and direction."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from sealfit.config import Config
+from sealfit.fit.starts import Start, cell_means
+from sealfit.fit.steady import table_row
+
+NEAR = 1  # cells to either side of the peak that count as it
+FORCE, RATIO = "F_ba", "F_ba/F"
+NO_PEAK = "the force comes up to its sliding value without passing above it"
+FEW = "no repeats: no scatter is known"
+FAMILY = 0.01  # chance of a peak anywhere in a campaign where there is none
+
+
+def peaks(starts: Sequence[Start], steady: pd.DataFrame) -> pd.DataFrame:
+    """Return the break-away force F_ba and its share of the sliding force, per file, or per stroke of a single file.
+
+    Where the peak lies is read from the mean of the other units, and a start's own force is then taken there: the
+    largest of noisy samples is always too high.
+
+    Parameters
+    ----------
+    starts : sequence of Start
+        At one condition, commanded speed and direction.
+    steady : DataFrame
+        Rows of table `steady`, one per start, in the same order.
+    """
+    unit = steady["file"].to_numpy() if steady["file"].nunique() > 1 else np.arange(len(starts))
+    peak = _peaks(starts, unit)
+    sliding = (steady["force_N"] * steady["direction"]).to_numpy(float)
+    return pd.DataFrame({FORCE: peak, RATIO: peak / sliding}).groupby(unit, sort=False).mean().dropna()
+
+
+def break_away_rows(found: Sequence[tuple[Mapping, pd.DataFrame]], config: Config) -> Iterator[dict]:
+    """Yield rows of table `dynamic_fit` for all break-aways of a campaign.
+
+    The scatter of repeats is pooled within a condition (in log force and log ratio). A peak is one where the ratio
+    stands above 1 by a t-test at 1 % for the whole campaign (Bonferroni); elsewhere `reason` says that there is none.
+
+    Parameters
+    ----------
+    found : sequence of (keys, DataFrame)
+        The condition, commanded speed and direction as columns of the table, and what `peaks` gave there.
+    config : Config
+        Gives the units and the sensor's accuracy.
+    """
+    pooled = {
+        (condition, name): _pooled([np.log(own[name].to_numpy()) for at, own in found if at["condition"] == condition])
+        for condition in dict.fromkeys(at["condition"] for at, _ in found)
+        for name in (FORCE, RATIO)
+    }
+    for at, own in found:
+        for name, unit, u_sys in ((FORCE, config.units.unit("force"), config.sensor.u), (RATIO, "", None)):
+            spread, df = pooled[at["condition"], name]
+            value = float(np.exp(np.log(own[name]).mean()))
+            row = {"quantity": "break_away", "parameter": name, "value": value, "unit": unit, "u_sys": u_sys}
+            if df < 1:
+                yield {**table_row(**row, identified=False, reason=FEW), **at}
+                continue
+            error = spread / np.sqrt(len(own))
+            half = stats.t.ppf(0.975, df) * error
+            row |= {"se": value * error, "lo95": value * np.exp(-half), "hi95": value * np.exp(half)}
+            ratio_error = pooled[at["condition"], RATIO][0] / np.sqrt(len(own))
+            above = float(np.log(own[RATIO]).mean()) > stats.t.isf(FAMILY / len(found), df) * ratio_error
+            yield {**table_row(**row, identified=True, reason="" if above else NO_PEAK), **at}
+
+
+def _pooled(groups: Sequence[np.ndarray]) -> tuple[float, int]:
+    """Return the standard deviation within groups, and its degrees of freedom."""
+    df = sum(values.size - 1 for values in groups)
+    squares = sum(float(((values - values.mean()) ** 2).sum()) for values in groups)
+    return float(np.sqrt(squares / df)) if df else np.nan, df
+
+
+def _peaks(starts: Sequence[Start], unit: np.ndarray) -> np.ndarray:
+    """Return each start's force where the mean of the other units is largest, shape (starts,); NaN without a sample."""
+    _, force = cell_means(starts, [s.force_N for s in starts])
+    hits, total = np.isfinite(force), np.nan_to_num(force)
+    found = np.full(len(starts), np.nan)
+    for k in range(len(starts)):
+        others = unit != unit[k] if (unit != unit[k]).any() else unit == unit[k]
+        count = hits[others].sum(axis=0)
+        mean = np.where(count > 0, total[others].sum(axis=0) / np.maximum(count, 1), -np.inf)
+        at = int(np.argmax(mean))
+        near = slice(max(at - NEAR, 0), at + NEAR + 1)
+        if hits[k, near].any() and (here := total[k, near].sum() / hits[k, near].sum()) > 0.0:
+            found[k] = here
+    return found

@@ -1,0 +1,181 @@
+"""The dynamic part of the model per condition: sigma_0 and sigma_1 from how the force comes up, and the break-away."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from sealfit.config import Config
+from sealfit.fit.breakaway import break_away_rows, peaks
+from sealfit.fit.presliding import Curve, Stiffness, Stroke, fit_stiffness
+from sealfit.fit.starts import Start, cell_means, starts_of
+from sealfit.fit.steady import condition_keys, parameter_units, table_row
+from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
+
+NO_START = "no stroke begins at rest or at a reversal within its rows: the rise of the force is not in these traces"
+TOO_FAST = "the force comes up within a few samples: sample faster, or start more slowly"
+NO_CURVE = "the Stribeck curve is not known: what it does along the ramp looks like damping"
+ONE_START = "one start alone: no scatter is known; measure repeats"
+WIDE = "the starts disagree: only that it lies between {low:.3g} and {high:.3g} {unit} is known"
+
+
+@dataclass(frozen=True)
+class Dynamic:
+    """Tables `dynamic_fit`, with the condition columns, and `dynamic_curves`."""
+
+    fit: pd.DataFrame
+    curves: pd.DataFrame
+
+
+def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataFrame, config: Config) -> Dynamic:
+    """Fit sigma_0 and sigma_1 of Eqs. 1 to 7 to the pre-sliding part of every condition's strokes.
+
+    Parameters
+    ----------
+    traces : DataFrame
+        Table `traces`.
+    steady : DataFrame
+        Table `steady`; rows with `used` false are left out.
+    steady_fit : DataFrame
+        Table `steady_fit`: the Stribeck curve of each condition; flat where that is not identified.
+    config : Config
+        Names the condition columns, the units and the sensor's accuracy.
+
+    Returns
+    -------
+    Dynamic
+        In its fit `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (rows per commanded speed and direction: the
+        force, and its share of the sliding force) or "statistics". Its curves are the mean starts and the model's.
+
+    Notes
+    -----
+    Files are the units of evidence for the length of the rise, runs for the level of the force; strokes where there is
+    one file or run alone. Intervals of sigma_0 are symmetric in its logarithm. `u_sys` takes the sensor's accuracy as
+    one unknown error of the force's size, the same for all samples.
+    """
+    steady = steady[steady["used"].astype(bool) & steady["condition"].notna()].reset_index(drop=True)
+    by_row = {start.row: start for start in starts_of(traces, steady)}
+    rows, curves, broken = [], [], []
+    for name, own in steady.groupby("condition", sort=True):
+        own = own[own.index.isin(list(by_row))]
+        starts = [by_row[row] for row in own.index]
+        curve = _curve(steady_fit, name, steady[steady["condition"] == name])
+        found = fit_stiffness(_strokes(starts, own, curve), curve)
+        rows += [{"condition": name, **row} for row in _rows(found, curve, config)]
+        models = found.forces_N if found is not None and found.seen else None
+        for (speed, direction), of in own.reset_index().groupby(["speed_set_mm_s", "direction"], dropna=False):
+            at = {"condition": name, "speed_set_mm_s": speed, "direction": direction}
+            places = of.index.to_numpy()
+            alike = [starts[k] for k in places]
+            broken.append((at, peaks(alike, of)))
+            curves.append(_mean_curve(alike, None if models is None else [models[k] for k in places]).assign(**at))
+    rows += break_away_rows([(at, own) for at, own in broken if len(own)], config)
+    keys = condition_keys(steady, config)
+    table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
+    fixed = DYNAMIC_FIT.names()
+    table = table.reindex(columns=[*fixed, *(name for name in keys.columns if name not in fixed)])
+    curves = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
+    return Dynamic(table.astype({"direction": "Int64"}), curves.reindex(columns=DYNAMIC_CURVES.names()))
+
+
+def _strokes(starts: Sequence[Start], own: pd.DataFrame, curve: Curve) -> list[Stroke]:
+    """Return the starts of a condition with their units of evidence and their share of the curve.
+
+    That is their load's; where the curve is flat, as the speeds do not tell it, that of their own sliding force.
+    """
+    size = own["load_N"] if curve.known else own["force_N"] * own["direction"]
+    ratio = (size / (size.mean() if curve.known else curve.coulomb_N)).fillna(1.0).to_numpy(float)
+    units = (_numbered(own[name]) for name in ("file", "run_id"))
+    return [
+        Stroke(file, run, part, s.distance_mm, s.speed_mm_s, s.force_N)
+        for file, run, part, s in zip(*units, ratio, starts, strict=True)
+    ]
+
+
+def _numbered(names: pd.Series) -> np.ndarray:
+    """Return the number of each stroke's file or run; the strokes' own where there is one alone."""
+    return pd.factorize(names)[0] if names.nunique() > 1 else np.arange(len(names))
+
+
+def _mean_curve(starts: Sequence[Start], models: Sequence[np.ndarray] | None) -> pd.DataFrame:
+    """Return the mean start at one speed and direction, and the fitted model's, as table `dynamic_curves`."""
+    distance, force = cell_means(starts, [s.force_N for s in starts])
+    cells = pd.DataFrame(force)
+    table = {"distance_mm": distance, "force_N": cells.mean(), "force_se_N": cells.sem(), "n": cells.count()}
+    table["model_N"] = np.nan if models is None else pd.DataFrame(cell_means(starts, models)[1]).mean()
+    return pd.DataFrame(table).query("n > 0")
+
+
+def _curve(steady_fit: pd.DataFrame, condition: str, own: pd.DataFrame) -> Curve:
+    """Return a condition's Stribeck curve under its mean load; flat at its mean force where it is not identified."""
+    load = own["load_N"].to_numpy(float).mean()
+    rows = steady_fit[(steady_fit["condition"] == condition) & (steady_fit["quantity"] == "steady")]
+    known = rows[rows["identified"].astype(bool)].set_index("parameter")["value"]
+    sigma_2 = max(float(known.get("sigma_2", 0.0)), 0.0)
+    size = (own["force_N"] * own["direction"]).to_numpy(float)
+    flat = float(np.median(size - sigma_2 * np.abs(own["speed_mm_s"].to_numpy(float))))
+    for static, coulomb, factor in (("mu_s", "mu_c", load), ("F_s", "F_c", 1.0)):
+        if {static, coulomb, "v_s"} <= set(known.index):
+            return Curve(known[static] * factor, known[coulomb] * factor, known["v_s"], sigma_2)
+    return Curve(flat, flat, np.inf, sigma_2)
+
+
+def _rows(found: Stiffness | None, curve: Curve, config: Config) -> Iterator[dict]:
+    """Yield the rows of one condition: sigma_0, sigma_1 and what the fit rests on."""
+    units = dynamic_units(config)
+    if found is None or not found.seen:
+        reason = NO_START if found is None else TOO_FAST
+        for name in ("sigma_0", "sigma_1"):
+            yield table_row(quantity="dynamic", parameter=name, unit=units[name], identified=False, reason=reason)
+        return
+    yield _stiffness_row(found, curve, units["sigma_0"], config)
+    yield _damping_row(found, curve, units["sigma_1"])
+    rise = curve.coulomb_N / found.sigma_0
+    for name, value, unit in (
+        ("rise", rise, config.units.unit("displacement")),
+        ("samples_in_rise", found.within, ""),
+        ("files", found.files, ""),
+        ("rmse", found.rmse_N, config.units.unit("force")),
+    ):
+        yield table_row(quantity="statistics", parameter=name, value=value, unit=unit, identified=True)
+
+
+def _stiffness_row(found: Stiffness, curve: Curve, unit: str, config: Config) -> dict:
+    value = found.sigma_0
+    row = {"quantity": "dynamic", "parameter": "sigma_0", "unit": unit, "value": value}
+    if found.files < 2:
+        return table_row(**row, identified=False, reason=ONE_START)
+    half = found.log_half_width()
+    low, high = (value * np.exp(np.clip(sign * half, -50, 50)) for sign in (-1.0, 1.0))
+    row |= {"se": value * np.sqrt(found.covariance[0, 0]), "lo95": low, "hi95": high}
+    row["u_sys"] = value * config.sensor.u / abs(curve.coulomb_N)
+    reason = "" if found.stiffness_known else WIDE.format(low=low, high=high, unit=unit)
+    return table_row(**row, identified=found.stiffness_known, reason=reason)
+
+
+def _damping_row(found: Stiffness, curve: Curve, unit: str) -> dict:
+    row = {"quantity": "dynamic", "parameter": "sigma_1", "unit": unit, "value": found.sigma_1}
+    if found.files < 2 or not found.stiffness_known:
+        why = ONE_START if found.files < 2 else "sigma_0 is not determined"
+        return table_row(**row, identified=False, reason=why)
+    if not curve.known:
+        return table_row(**row, identified=False, reason=NO_CURVE)
+    half = found.damping_half_width()
+    low, high = max(found.sigma_1 - half, 0.0), found.sigma_1 + half
+    row |= {"lo95": low, "hi95": high, "se": half / stats.t.ppf(0.975, max(found.df[1], 1.0))}
+    if low > 0.0:
+        return table_row(**row, identified=True)
+    return table_row(**row, identified=False, reason=f"no damping of the bristles is seen: at most {high:.2g} {unit}")
+
+
+def dynamic_units(config: Config) -> Mapping[str, str]:
+    """Return the units of sigma_0 and sigma_1 under the config's units."""
+    units = config.units
+    return {
+        "sigma_0": f"{units.unit('force')}/{units.unit('displacement')}",
+        "sigma_1": parameter_units(units, has_load=True)["sigma_2"],
+    }

@@ -1,0 +1,175 @@
+"""The beginnings of strokes: from where the platform begins to move to where it slides steadily."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.optimize import least_squares
+from scipy.signal import savgol_filter
+
+STANDSTILL = 0.05  # slower than this share of the steady speed: not moving yet
+ROUGH = 0.1  # wanted noise of the local speed, as a share of the steady speed
+RAMPS = np.geomspace(0.5, 200.0, 12)  # steps in time that a ramp may take, to begin with
+AS_NOISE = 1.2  # times the noise: what a ramp may leave that is that of the platform
+MOST_CELLS = 200  # of the distance over which starts are averaged
+LEAST = 4  # rows below which a beginning shows nothing
+
+
+@dataclass(frozen=True)
+class Start:
+    """The beginning of one stroke, its motion and force positive along it.
+
+    Attributes
+    ----------
+    row : int
+        Its row in table `steady`.
+    distance_mm, speed_mm_s, force_N : ndarray, shape (n,)
+        Distance slid, smoothed over the noise of the displacement, its rate, and the force.
+    """
+
+    row: int
+    distance_mm: np.ndarray
+    speed_mm_s: np.ndarray
+    force_N: np.ndarray
+
+
+def starts_of(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]:
+    """Yield the beginning of every stroke that has one; a stroke whose rows begin in steady sliding has none.
+
+    Parameters
+    ----------
+    traces : DataFrame
+        Table `traces`, the samples of a stroke one after the other.
+    steady : DataFrame
+        Table `steady`: the strokes.
+    """
+    file, stroke = pd.factorize(traces["file"])[0], traces["stroke"].to_numpy()
+    edges = np.flatnonzero(np.r_[True, (np.diff(file) != 0) | (np.diff(stroke) != 0), True])
+    first, last = edges[:-1], edges[1:]
+    own = pd.MultiIndex.from_frame(steady[["file", "stroke"]]).get_indexer(
+        pd.MultiIndex.from_arrays([traces["file"].to_numpy()[first], stroke[first]])
+    )
+    time, along, force = (traces[name].to_numpy(float) for name in ("time_s", "displacement_mm", "force_N"))
+    sliding, sign = traces["steady"].to_numpy(bool), steady["direction"].to_numpy()
+    pace = np.abs(steady["speed_mm_s"].to_numpy(float))
+    for begin, end, row in zip(first.tolist(), last.tolist(), own.tolist(), strict=True):
+        if row < 0 or not sliding[begin:end].any():
+            continue
+        part = slice(begin, end)
+        until = int(np.argmax(sliding[part]))
+        found = _begun(time[part], sign[row] * along[part], pace[row], until)
+        if found is not None:
+            since, distance, speed = found
+            yield Start(row, distance, speed, sign[row] * force[part][since:until])
+
+
+def cell_means(starts: Sequence[Start], values: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middles of cells of distance, shape (cells,), and each start's mean in each, shape (starts, cells).
+
+    The cells reach as far as half of the starts do and are as many as such a start has samples, MOST_CELLS at most; a
+    mean is NaN where a start has no sample.
+
+    Parameters
+    ----------
+    starts : sequence of Start
+        Starts at one speed.
+    values : sequence of ndarray, shape (n,) each
+        What is averaged, a number per sample of each start.
+    """
+    reach = float(np.median([s.distance_mm[-1] for s in starts]))
+    count = int(np.clip(np.median([s.force_N.size for s in starts]), LEAST, MOST_CELLS))
+    means = np.full((len(starts), count), np.nan)
+    for k, (start, value) in enumerate(zip(starts, values, strict=True)):
+        cell = (start.distance_mm / reach * count).astype(int)
+        cell, value = cell[cell < count], value[cell < count]
+        hits = np.bincount(cell, minlength=count)
+        means[k, hits > 0] = np.bincount(cell, value, minlength=count)[hits > 0] / hits[hits > 0]
+    return (np.arange(count) + 0.5) * reach / count, means
+
+
+def _begun(
+    time_s: np.ndarray, along_mm: np.ndarray, pace: float, until: int
+) -> tuple[int, np.ndarray, np.ndarray] | None:
+    """Return the row from which a stroke moves, and distance and speed from there to `until`; None where too short."""
+    if until < LEAST:
+        return None
+    smooth, speed = _motion(time_s, along_mm, pace, until) or _smoothed(time_s, along_mm, pace)
+    still = np.flatnonzero(speed[:until] < STANDSTILL * pace)
+    since = int(still[-1]) if len(still) else 0
+    distance = np.maximum.accumulate(smooth[since:until] - smooth[since])
+    return (since, distance, speed[since:until]) if until - since >= LEAST and distance[-1] > 0.0 else None
+
+
+def _motion(time_s: np.ndarray, along_mm: np.ndarray, pace: float, until: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return distance and speed of a platform that starts along a straight or a lagging ramp; None if it did not.
+
+    Noise of the displacement makes a local speed of little use where the speed changes most; a ramp of two numbers,
+    fitted to the rows up to steady sliding and as many after, does not care.
+    """
+    rows = slice(0, min(2 * until, len(time_s)))
+    time, along = time_s[rows], along_mm[rows]
+    step = float(np.median(np.diff(time)))
+    lagged = time[-1] - (along[-1] - along[0]) / pace  # when it would have started at full speed
+    fits = []
+    for shape, lag in ((_straight, 0.5), (_lagging, 1.0)):
+
+        def left(at, shape=shape):
+            return along - _linear(along, shape(time - at[0], np.exp(at[1]))[0])[1]
+
+        grid = [(lagged - lag * ramp, np.log(ramp)) for ramp in step * RAMPS]
+        start = min(grid, key=lambda at: float((left(at) ** 2).sum()))
+        fits.append((least_squares(left, start, x_scale=[step, 1.0], max_nfev=30), shape))
+    found, shape = min(fits, key=lambda fit: fit[0].cost)
+    distance, rate = shape(time_s - found.x[0], np.exp(found.x[1]))
+    speed = _linear(along, distance[rows])[0]
+    if np.sqrt(2 * found.cost / time.size) > AS_NOISE * _noise(along_mm) or not speed > 0.0:
+        return None
+    return speed * distance, speed * rate
+
+
+def _linear(along_mm: np.ndarray, shape: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the slope of a displacement on a shape, and the straight line through it, shape (n,)."""
+    centred = shape - shape.mean()
+    slope = float(centred @ along_mm / max(centred @ centred, 1e-300))
+    return slope, along_mm.mean() + slope * centred
+
+
+def _straight(since: np.ndarray, ramp: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return distance and speed for a final speed of 1 to which the speed rises along a straight line."""
+    share = np.clip(since / ramp, 0.0, 1.0)
+    return np.where(since < ramp, 0.5 * ramp * share**2, since - 0.5 * ramp), share
+
+
+def _lagging(since: np.ndarray, ramp: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return distance and speed for a final speed of 1 that is approached as by a first-order lag."""
+    since = np.maximum(since, 0.0)
+    left = np.exp(-since / ramp)
+    return since - ramp * (1 - left), 1 - left
+
+
+def _smoothed(time_s: np.ndarray, along_mm: np.ndarray, pace: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return distance and speed by a parabola through as many rows to either side as the noise asks for."""
+    rows, half = np.arange(len(time_s)), _half_width(time_s, along_mm, pace)
+    if half == 1:
+        smooth, rate = along_mm, np.gradient(along_mm, rows)
+    else:
+        smooth, rate = (savgol_filter(along_mm, 2 * half + 1, 2, deriv=k, mode="nearest") for k in (0, 1))
+    return smooth, np.maximum(rate / np.gradient(time_s, rows), 0.0)
+
+
+def _half_width(time_s: np.ndarray, along_mm: np.ndarray, pace: float) -> int:
+    """Return the rows to either side over which a parabola gives the local speed to `ROUGH` of the steady one."""
+    noise, step = _noise(along_mm), pace * float(np.median(np.diff(time_s)))
+    for half in range(1, max(2, len(time_s) // 16)):
+        if noise * np.sqrt(3.0 / (half * (half + 1) * (2 * half + 1))) <= ROUGH * step:
+            break
+    return half
+
+
+def _noise(along_mm: np.ndarray) -> float:
+    """Return the standard deviation of a sample of the displacement, from how neighbours bend."""
+    bend = np.diff(along_mm, 2)
+    return 1.4826 * float(np.median(np.abs(bend - np.median(bend)))) / np.sqrt(6.0)

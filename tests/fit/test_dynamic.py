@@ -1,0 +1,177 @@
+"""sigma_0, sigma_1 and the break-away from simulated starts with known truth, and from a micro-tribometer's."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealfit.config import load_config
+from sealfit.fit.dynamic import fit_dynamic
+from sealfit.fit.presliding import Curve, Stroke, fit_stiffness
+from sealfit.fit.starts import starts_of
+from sealfit.fit.steady import fit_conditions
+from sealfit.ingest.campaign import ingest_campaign
+from sealfit.physics import lugre_force
+from sealfit.simulate import Spec, simulate
+
+MODEL = {"mu_s": 0.9, "mu_c": 0.6, "v_s": 5.0, "sigma_2": 0.05, "sigma_0": 100.0, "sigma_1": 0.5}
+LOAD = 49.03
+CURVE = Curve(0.9 * LOAD, 0.6 * LOAD, 5.0, 0.05)
+NOISE = (
+    {"kind": "white", "sd_N": 0.1},
+    {"kind": "repeat_gain", "sd_rel": 0.005},
+    {"kind": "run_setup", "sd_rel": 0.005},
+)
+MEASURED = os.environ.get("SEALFIT_MEASURED")
+
+
+def start(file, speed, *, ramp=0.1, gain=1.0, deflection=0.0, rows=80, noise=0.0, seed=0, **other):
+    """A start along a straight ramp, exactly as the dynamic model has it."""
+    time = np.linspace(0.0, 3.0 / speed + ramp, rows)
+
+    def along(t):
+        return speed * min(max(t / ramp, 0.0), 1.0)
+
+    model = {**MODEL, **other}
+    force = gain * lugre_force(time, along, LOAD, deflection_mm=deflection, **model).force_N
+    share = np.clip(time / ramp, 0, 1)
+    distance = speed * np.where(time < ramp, 0.5 * ramp * share**2, time - 0.5 * ramp)
+    force = force + noise * np.random.default_rng([seed, file]).standard_normal(rows)
+    return Stroke(file, file // 3, 1.0, distance, speed * share, force)
+
+
+def test_exact_starts_give_both_numbers_back():
+    strokes = [start(k, speed) for k, speed in enumerate((0.5, 2.0, 8.0, 32.0, 50.0, 16.0))]
+    found = fit_stiffness(strokes, CURVE)
+    assert found.sigma_0 == pytest.approx(100.0, rel=0.01)
+    assert found.sigma_1 == pytest.approx(0.5, rel=0.03)
+    assert found.stiffness_known
+
+
+def test_a_start_from_a_reversal_and_a_gain_of_its_own_change_nothing():
+    strokes = [start(k, 4.0 * 2**k, gain=1 + 0.05 * (-1) ** k, deflection=-0.25) for k in range(4)]
+    found = fit_stiffness(strokes, CURVE)
+    assert found.sigma_0 == pytest.approx(100.0, rel=0.02)
+    assert found.sigma_1 == pytest.approx(0.5, rel=0.05)
+
+
+def test_no_damping_is_found_where_there_is_none():
+    strokes = [start(k, 2.0 ** (k % 6), noise=0.05, sigma_1=0.0) for k in range(12)]
+    found = fit_stiffness(strokes, CURVE)
+    assert found.sigma_1 - found.damping_half_width() <= 0.0 <= found.damping_half_width() < 0.3
+
+
+def test_a_rise_within_a_sample_is_not_seen():
+    strokes = [start(k, 30.0, rows=12, ramp=0.001, sigma_0=20_000.0) for k in range(4)]
+    found = fit_stiffness(strokes, CURVE)
+    assert not found.stiffness_known
+
+
+def made(tmp_path, *, physics=(), noise=NOISE, seed=1, **design):
+    physics = {
+        "mu_s": {"mu_0": 0.9, "a": 0.04, "b": 0.1}, "mu_c": {"mu_0": 0.6, "a": 0.03, "b": 0.1},
+        **{name: MODEL[name] for name in ("v_s", "sigma_2", "sigma_0", "sigma_1")}, **dict(physics),
+    }  # fmt: skip
+    design = {"days": (), "temperatures_C": (), "compressions_pct": (), **design}
+    simulate(Spec(seed=seed, physics=physics, design=design, noise=noise), tmp_path / "c")
+    config = load_config()
+    tables = ingest_campaign(tmp_path / "c", config, workers=1).tables
+    return tables, fit_dynamic(tables["traces"], tables["steady"], fit_conditions(tables["steady"], config), config)
+
+
+def dynamic(fit):
+    return fit[fit["quantity"] == "dynamic"].set_index("parameter")
+
+
+@pytest.mark.parametrize("jitter_mm", [0.0, 0.002, 0.01])
+def test_noise_of_the_displacement_does_not_hide_the_damping(tmp_path, jitter_mm):
+    noise = (*NOISE, {"kind": "displacement", "sd_mm": jitter_mm})
+    found = dynamic(made(tmp_path, noise=noise)[1].fit)
+    assert found.loc["sigma_0", "value"] == pytest.approx(100.0, rel=0.015)
+    assert found.loc["sigma_1", "value"] == pytest.approx(0.5, rel=0.06)
+    assert found["identified"].all()
+    assert found.loc["sigma_0", "lo95"] < found.loc["sigma_0", "value"] < found.loc["sigma_0", "hi95"]
+    assert list(found["unit"]) == ["N/mm", "N s/mm"]
+
+
+def test_strokes_both_ways_begin_with_bristles_bent_the_other_way(tmp_path):
+    design = {
+        "directions": (1, -1),
+        "strokes_per_file": 4,
+        "max_rows": 4000,
+        "dwell_s": 0.0,
+        "speeds_mm_s": (0.5, 2.0, 4.0, 8.0, 20.0, 40.0),
+    }
+    _, found = made(tmp_path, **design)
+    table = dynamic(found.fit)
+    assert table.loc["sigma_0", "value"] == pytest.approx(100.0, rel=0.02)
+    assert set(found.curves["direction"]) == {1, -1}
+    first = found.curves.groupby(["speed_set_mm_s", "direction"])["force_N"].first()
+    assert (first < 5.0).all()
+
+
+def test_without_a_stribeck_curve_the_stiffness_is_known_and_the_damping_is_not(tmp_path):
+    _, found = made(tmp_path, speeds_mm_s=(1.0, 4.0, 20.0), physics={"sigma_1": 0.0})
+    table = dynamic(found.fit)
+    assert table.loc["sigma_0", "value"] == pytest.approx(100.0, rel=0.1)
+    assert not table.loc["sigma_1", "identified"]
+    assert "Stribeck curve is not known" in table.loc["sigma_1", "reason"]
+
+
+def test_the_model_goes_through_the_mean_of_the_starts(tmp_path):
+    _, found = made(tmp_path)
+    curves = found.curves
+    assert (curves["n"] <= 3).all()
+    left = (curves["force_N"] - curves["model_N"])[curves["n"] == 3]
+    assert np.sqrt((left**2).mean()) < 0.1
+
+
+def test_a_peak_of_the_ramp_is_a_break_away_and_noise_is_none(tmp_path):
+    slow = {"ramp_s": 2.0, "speeds_mm_s": (8.0, 16.0), "sampling_Hz": 400.0, "max_rows": 4000}
+    _, found = made(tmp_path, **slow)
+    ratio = found.fit[found.fit["parameter"] == "F_ba/F"].set_index("speed_set_mm_s")
+    assert (ratio["lo95"] > 1.0).all()
+    assert (ratio["reason"] == "").all()
+    flat = {"mu_s": {"mu_0": 0.6}, "mu_c": {"mu_0": 0.6}, "sigma_1": 0.0, "sigma_2": 0.0}
+    _, found = made(tmp_path, physics=flat, seed=2)
+    ratio = found.fit[found.fit["parameter"] == "F_ba/F"]
+    assert ratio["reason"].str.contains("without passing above").all(), ratio["value"]
+
+
+def test_traces_that_begin_in_steady_sliding_say_so(tmp_path):
+    tables, _ = made(tmp_path)
+    config = load_config()
+    traces = tables["traces"][tables["traces"]["steady"]]
+    assert list(starts_of(traces, tables["steady"])) == []
+    found = fit_dynamic(traces, tables["steady"], fit_conditions(tables["steady"], config), config)
+    table = dynamic(found.fit)
+    assert not table["identified"].any()
+    assert table["reason"].str.contains("no stroke begins").all()
+    assert found.curves.empty
+
+
+def test_a_ramp_of_another_shape_is_followed_by_its_own_speed(tmp_path):
+    tables, _ = made(tmp_path)
+    traces = tables["traces"]
+    time = traces["time_s"].to_numpy()
+    bent = traces.assign(displacement_mm=traces["displacement_mm"] + 0.05 * np.sin(40 * time))
+    for one in list(starts_of(bent, tables["steady"]))[:3]:
+        assert (np.diff(one.distance_mm) >= 0).all()
+        assert one.speed_mm_s.min() >= 0
+
+
+@pytest.mark.skipif(MEASURED is None, reason="SEALFIT_MEASURED names no folder of measured data")
+def test_micro_tribometer(tmp_path):
+    config = load_config(Path(__file__).resolve().parents[2] / "configs" / "microtribo.toml")
+    tables = ingest_campaign(Path(MEASURED) / "microtribo", config, workers=1).tables
+    steady = tables["steady"]
+    assert steady["direction"].value_counts().to_dict() == {1: 50, -1: 50}
+    mu = (steady["force_N"] * steady["direction"] / steady["load_N"]).groupby(steady["direction"]).mean()
+    assert mu[1] == pytest.approx(0.466, abs=0.006)
+    assert mu[-1] == pytest.approx(0.468, abs=0.003)
+    found = fit_dynamic(tables["traces"], steady, fit_conditions(steady, config), config)
+    table = dynamic(found.fit)
+    assert 33 < table.loc["sigma_0", "value"] < 47
+    assert not table.loc["sigma_1", "identified"]
+    assert "Stribeck" in table.loc["sigma_1", "reason"]
