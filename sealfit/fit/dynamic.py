@@ -11,9 +11,10 @@ from scipy import stats
 
 from sealfit.config import Config
 from sealfit.fit.breakaway import break_away_rows, peaks
-from sealfit.fit.presliding import Curve, Stiffness, Stroke, fit_stiffness
+from sealfit.fit.rises import Curve, Stroke
 from sealfit.fit.starts import Start, cell_means, starts_of
 from sealfit.fit.steady import condition_keys, parameter_units, table_row
+from sealfit.fit.stiffness import Stiffness, fit_stiffness
 from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
 
 NO_START = "no stroke begins at rest or at a reversal within its rows: the rise of the force is not in these traces"
@@ -113,15 +114,31 @@ def _mean_curve(starts: Sequence[Start], models: Sequence[np.ndarray] | None) ->
 def _curve(steady_fit: pd.DataFrame, condition: str, own: pd.DataFrame) -> Curve:
     """Return a condition's Stribeck curve under its mean load; flat at its mean force where it is not identified."""
     load = own["load_N"].to_numpy(float).mean()
-    rows = steady_fit[(steady_fit["condition"] == condition) & (steady_fit["quantity"] == "steady")]
+    fitted = steady_fit[steady_fit["condition"] == condition]
+    rows = fitted[fitted["quantity"] == "steady"]
     known = rows[rows["identified"].astype(bool)].set_index("parameter")["value"]
     sigma_2 = max(float(known.get("sigma_2", 0.0)), 0.0)
     size = (own["force_N"] * own["direction"]).to_numpy(float)
     flat = float(np.median(size - sigma_2 * np.abs(own["speed_mm_s"].to_numpy(float))))
     for static, coulomb, factor in (("mu_s", "mu_c", load), ("F_s", "F_c", 1.0)):
         if {static, coulomb, "v_s"} <= set(known.index):
-            return Curve(known[static] * factor, known[coulomb] * factor, known["v_s"], sigma_2)
+            own_unit = np.array([factor, factor, 1.0, 1.0])
+            covariance, df = _uncertainty(fitted, (static, coulomb, "v_s", "sigma_2"))
+            scaled = covariance * np.outer(own_unit, own_unit)
+            return Curve(known[static] * factor, known[coulomb] * factor, known["v_s"], sigma_2, scaled, df)
     return Curve(flat, flat, np.inf, sigma_2)
+
+
+def _uncertainty(fitted: pd.DataFrame, names: Sequence[str]) -> tuple[np.ndarray, int]:
+    """Return the covariance of a steady fit's parameters, shape (p, p), zero where it is not known, and its df."""
+    rows = fitted[fitted["quantity"] == "covariance"].set_index("parameter")["value"]
+    covariance = np.zeros((len(names), len(names)))
+    for i, one in enumerate(names):
+        for j, other in enumerate(names):
+            value = rows.get(f"{one},{other}", rows.get(f"{other},{one}", np.nan))
+            covariance[i, j] = value if np.isfinite(value) else 0.0
+    df = fitted.loc[(fitted["quantity"] == "statistics") & (fitted["parameter"] == "df"), "value"]
+    return covariance, int(df.iloc[0]) if len(df) else 1
 
 
 def _rows(found: Stiffness | None, curve: Curve, config: Config) -> Iterator[dict]:

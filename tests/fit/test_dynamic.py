@@ -8,9 +8,10 @@ import pytest
 
 from sealfit.config import load_config
 from sealfit.fit.dynamic import fit_dynamic
-from sealfit.fit.presliding import Curve, Stroke, fit_stiffness
+from sealfit.fit.rises import Curve, Stroke
 from sealfit.fit.starts import starts_of
 from sealfit.fit.steady import fit_conditions
+from sealfit.fit.stiffness import fit_stiffness
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.physics import lugre_force
 from sealfit.simulate import Spec, simulate

@@ -1,36 +1,17 @@
-r"""sigma_0 and sigma_1 from the pre-sliding part of traces: one pair for the strokes of a condition.
-
-Over a stroke the bristles' force :math:`B = \sigma_0 z` follows Eqs. 2 and 6 exactly, step by step of the distance x,
-
-.. math::
-    \frac{dB}{dx} = \sigma_0 \Big(1 - \frac{B}{G}\Big), \quad F = B + \tau \dot B + \sigma_2 v, \quad
-    G = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}], \quad \tau = \sigma_1 / \sigma_0,
-
-with the Stribeck curve G of the condition's steady fit. It is linear in where the bristles begin, so each stroke has
-two linear numbers of its own, its level and its start (relaxed, or bent the other way after a reversal), and they are
-solved for exactly; sigma_0 and tau are searched on a grid and polished (Golub and Pereyra 1973, SIAM J. Numer. Anal.
-10(2), 413-432, doi:10.1137/0710036). The rise shows the length G / sigma_0, and its evidence are whole files, as
-neighbouring samples are not independent; what makes a stiffness of it is the level of the strokes, whose evidence are
-runs, as a set-up shifts all files of a run.
-"""
+"""The beginnings of a condition's strokes, which the bristles follow step by step, all strokes together."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import stats
 
-from sealfit.fit.polish import central_jacobian, polish
 from sealfit.physics.stribeck import stribeck_decay
 
 STIFFNESSES = 40  # of the grid: the rise's length from a third of a step to the whole stroke
 DAMPINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the grid: tau as a share of the time that the rise takes
 SHARE = (0.02, 0.98)  # of the rise: samples in between show its length
-LEAST = 3  # such samples below which nothing can be said
-RISES = 30.0  # residual variances by which a rise must do better than none
-OPEN = np.log(3.0)  # of log sigma_0: an interval that reaches further each way is no estimate
 
 
 @dataclass(frozen=True)
@@ -57,17 +38,33 @@ class Stroke:
 
 @dataclass(frozen=True)
 class Curve:
-    """The Stribeck curve of a condition under its load, in N: F_s, F_c; v_s in mm/s (inf: flat), sigma_2 in N s/mm."""
+    """The Stribeck curve of a condition under its load, in N: F_s, F_c; v_s in mm/s (inf: flat), sigma_2 in N s/mm.
+
+    `covariance`, shape (4, 4), is of these four in this order, with `df` degrees of freedom.
+    """
 
     static_N: float
     coulomb_N: float
     v_s: float
     sigma_2: float
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((4, 4)))
+    df: int = 1
 
     @property
     def known(self) -> bool:
         """Whether it bends at all."""
         return bool(np.isfinite(self.v_s))
+
+    def moved(self) -> Iterator[Curve]:
+        """Yield the curve moved by one standard deviation along each principal axis of its covariance."""
+        size = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        unit = np.where(size > 0, size, 1.0)
+        variance, axes = np.linalg.eigh(self.covariance / np.outer(unit, unit))
+        at = np.array([self.static_N, self.coulomb_N, self.v_s, self.sigma_2])
+        for step in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
+            if np.abs(step).max() > 1e-9:
+                static, coulomb, v_s, sigma_2 = at + step * size
+                yield replace(self, static_N=static, coulomb_N=coulomb, v_s=max(v_s, 0.1 * self.v_s), sigma_2=sigma_2)
 
     def limit_N(self, speed_mm_s: np.ndarray) -> np.ndarray:
         """Return G, the bristles' force in steady sliding, of the shape of the speed."""
@@ -76,130 +73,7 @@ class Curve:
         return self.coulomb_N + (self.static_N - self.coulomb_N) * stribeck_decay(speed_mm_s, self.v_s)
 
 
-@dataclass(frozen=True)
-class Stiffness:
-    """sigma_0 in N/mm and tau = sigma_1 / sigma_0 in s, with the covariance of (log sigma_0, tau) between units.
-
-    Attributes
-    ----------
-    sigma_0, tau_s : float
-        Estimates.
-    covariance : ndarray, shape (2, 2)
-        Of log sigma_0 and tau; NaN from fewer than two units.
-    df : ndarray, shape (2,)
-        Satterthwaite's degrees of freedom of the two.
-    within : int
-        Samples inside the rise.
-    gain : float
-        By how many residual variances a force that is there at once fits worse.
-    files : int
-        Files.
-    forces_N : tuple of ndarray, shape (n,) each
-        Fitted force of every stroke.
-    rmse_N : float
-        Of what the fit leaves.
-    """
-
-    sigma_0: float
-    tau_s: float
-    covariance: np.ndarray
-    df: np.ndarray
-    within: int
-    gain: float
-    files: int
-    forces_N: tuple[np.ndarray, ...]
-    rmse_N: float
-
-    @property
-    def seen(self) -> bool:
-        """Whether the samples show the rise: some lie within it, and a force that is there at once does worse."""
-        return self.within >= LEAST and self.gain > RISES
-
-    def log_half_width(self) -> float:
-        """Return half of the 95 % interval of log sigma_0."""
-        return float(stats.t.ppf(0.975, max(self.df[0], 1.0)) * np.sqrt(self.covariance[0, 0]))
-
-    @property
-    def stiffness_known(self) -> bool:
-        """Whether the interval of sigma_0 is one."""
-        return self.seen and np.isfinite(self.covariance[0, 0]) and self.log_half_width() < OPEN
-
-    @property
-    def sigma_1(self) -> float:
-        """sigma_0 tau, in N s/mm."""
-        return self.sigma_0 * self.tau_s
-
-    def damping_half_width(self) -> float:
-        """Return half of the 95 % interval of sigma_1, by the delta method, in N s/mm."""
-        slope = np.array([self.sigma_1, self.sigma_0])
-        return float(stats.t.ppf(0.975, max(self.df[1], 1.0)) * np.sqrt(slope @ self.covariance @ slope))
-
-
-def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
-    """Return sigma_0 and tau of the strokes of a condition; None where there is no stroke.
-
-    Parameters
-    ----------
-    strokes : sequence of Stroke
-        All strokes that begin at rest or at a reversal.
-    curve : Curve
-        Of the condition.
-    """
-    if not strokes:
-        return None
-    rises = _Rises(strokes, curve)
-    stiffness, tau = rises.grid()
-    squares = rises.squares(stiffness, tau)
-    best = int(np.argmin(squares))
-    start = np.array([np.log(stiffness[best]), tau[best]])
-    low = np.array([np.log(stiffness.min()) - 1.0, 0.0])
-    high = np.array([np.log(stiffness.max()) + 1.0, np.inf])
-    found = polish(rises.residual, None, start, (low, high))
-    sigma_0, tau_s = float(np.exp(found.x[0])), float(found.x[1])
-    jacobian = central_jacobian(rises.residual, found.x)
-    levels, start_N = rises.amplitudes(sigma_0, tau_s)
-    covariance, df = _between_files(jacobian, found.residual, rises.file)
-    level = rises.run_levels(levels)
-    spread = float(level.var(ddof=1) / level.size) if level.size > 1 else np.nan
-    total = covariance[0, 0] + spread
-    df[0] = total**2 / (covariance[0, 0] ** 2 / max(df[0], 1.0) + spread**2 / max(level.size - 1, 1))
-    covariance[0, 0] = total
-    return Stiffness(
-        sigma_0=sigma_0 * float(np.exp(level.mean())),
-        tau_s=tau_s,
-        covariance=covariance,
-        df=df,
-        gain=rises.gain_of(found.rss),
-        within=rises.inside(sigma_0, levels, start_N),
-        files=rises.files,
-        forces_N=rises.forces(found.residual),
-        rmse_N=float(np.sqrt(found.rss / found.residual.size)),
-    )
-
-
-def _between_files(jacobian: np.ndarray, residual: np.ndarray, file: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance of the estimates from how files pull at them, shape (p, p), and its degrees of freedom.
-
-    Each file's pull is that on a fit without it (the jackknife's, CR3); the degrees of freedom follow from how evenly
-    files share the information.
-    """
-    files = int(file.max()) + 1
-    p = jacobian.shape[1]
-    normal = jacobian.T @ jacobian
-    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    own = np.stack([jacobian[file == k].T @ jacobian[file == k] for k in range(files)])
-    pull = np.stack([jacobian[file == k].T @ residual[file == k] for k in range(files)])
-    if files < 2:
-        return np.full((p, p), np.nan), np.ones(p)
-    left = np.eye(p) - own @ inverse
-    moved = np.stack([inverse @ np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(left, pull, strict=True)])
-    covariance = (files - 1) / files * moved.T @ moved
-    information = np.einsum("pq,kqr,rp->kp", inverse, own, inverse) / np.maximum(np.diag(inverse), 1e-300)
-    df = 1 / np.maximum((information**2).sum(axis=0), 1e-12) - 1
-    return covariance, df
-
-
-class _Rises:
+class Rises:
     """The strokes of a condition, padded to one length, so that all are followed step by step together."""
 
     def __init__(self, strokes: Sequence[Stroke], curve: Curve) -> None:
@@ -283,9 +157,9 @@ class _Rises:
         fitted[self.there] = self.force[self.there] - residual
         return tuple(fitted[there, k] for k, there in enumerate(self.there.T))
 
-    def amplitudes(self, sigma_0: float, tau_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return level and start of every stroke, shape (strokes,) each."""
-        level, begin, _ = self._solved(np.array([sigma_0]), np.array([tau_s]))
+    def amplitudes(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return level and start of every stroke at (log sigma_0, tau), shape (strokes,) each."""
+        level, begin, _ = self._solved(np.exp(at[:1]), at[1:])
         return level[:, 0], begin[:, 0]
 
     def run_levels(self, levels: np.ndarray) -> np.ndarray:
