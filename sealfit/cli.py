@@ -118,10 +118,30 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Answer the force at new points."""
-    from sealfit import progress, steps, summary
+    from sealfit import progress, requests, summary
 
-    made = steps.predict(out, points, output, progress=progress.to_stderr())
+    made = requests.predict(out, points, output, progress=progress.to_stderr())
     _end("predict", made, summary.predict_lines, as_json)
+
+
+@app.command()
+def lifetime(
+    out: Results,
+    quantity: Annotated[str, typer.Option("--quantity", help="mu_s, mu_c, F_s or F_c.")] = "mu_s",
+    threshold: Annotated[float | None, typer.Option("--threshold", help="Value at which life ends.")] = None,
+    loss: Annotated[float | None, typer.Option("--loss", help="Or: percent of the start that may be lost.")] = None,
+    temperature: Annotated[float | None, typer.Option("--temperature", help="Of use, in degC.")] = None,
+    compression: Annotated[float | None, typer.Option("--compression", help="Height in use, in percent.")] = None,
+    years: Annotated[float | None, typer.Option("--years", help="Find the temperature that lasts so long.")] = None,
+    law: Annotated[str | None, typer.Option("--law", help="log, stretched, power, induction.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Tell the days until a quantity reaches a threshold."""
+    from sealfit import requests, summary_life
+
+    asked = {"quantity": quantity, "threshold": threshold, "loss_pct": loss, "law": law}
+    asked |= {"temperature_C": temperature, "compression_pct": compression, "years": years}
+    _end("lifetime", requests.lifetime(out, **asked), summary_life.lifetime_lines, as_json)
 
 
 @app.command()
@@ -130,9 +150,9 @@ def effects(
     as_json: Json = False,
 ) -> None:
     """List the catalogue of effects."""
-    from sealfit import steps, summary
+    from sealfit import requests, summary
 
-    _end("effects", steps.effects(out), summary.effects_lines, as_json)
+    _end("effects", requests.effects(out), summary.effects_lines, as_json)
 
 
 @app.command()
@@ -143,18 +163,18 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Write a campaign with known truth."""
-    from sealfit import steps
+    from sealfit import requests
 
-    made = steps.simulate(spec, out, force=force)
+    made = requests.simulate(spec, out, force=force)
     _end("simulate", made, lambda m: [f"{m['files']} trace files in {m['campaign']}", f"truth: {m['truth']}"], as_json)
 
 
 @app.command()
 def check(campaign: Campaign, config: ConfigFile = None, workers: Workers = None, as_json: Json = False) -> None:
     """List every fault of a campaign, write nothing."""
-    from sealfit import engine, progress, steps, summary
+    from sealfit import engine, progress, requests, summary
 
-    found, faults = steps.check(campaign, config, workers=workers or engine.cores(), progress=progress.to_stderr())
+    found, faults = requests.check(campaign, config, workers=workers or engine.cores(), progress=progress.to_stderr())
     if as_json:
         _print_json({"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]})
     else:

@@ -6,21 +6,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sealfit.errors import CampaignError, Fault, OutError
+from sealfit.errors import CampaignError, Fault
 from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, glob_names
-from sealfit.places import RUNS, campaign_folder, existing_file, existing_out, refuse_effects_in
+from sealfit.places import RUNS, campaign_folder, existing_out, refuse_effects_in
 from sealfit.progress import Silent
 from sealfit.staging import Staged
 from sealfit.state import ConfigCopy
 from sealfit.store import Store
-from sealfit.tables import Units
 
 if TYPE_CHECKING:
     import pandas as pd
 
 INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
-FITTED = ("steady_fit", "aging_fit", "aging_curves", "dynamic_fit", "dynamic_curves")
+FITTED = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
 FAULTY = ("warning", "error")  # severities that count as a fault
 
 
@@ -152,13 +151,17 @@ def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) ->
 
 def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
     from sealfit.fit.aging import aging_curves, fit_series
+    from sealfit.fit.all_series import joint_laws
 
     config = store.seen_config("fit-aging")
     if config.aging:
         progress.say("fitting the aging law")
     else:
         progress.say("no aging_days in the condition: there is no aging law to fit")
-    fitted = fit_series(store.read("steady_fit"), config)
+    steady_fit = store.read("steady_fit")
+    fitted = fit_series(steady_fit, config)
+    for name, table in zip(("aging_laws", "master_curve"), joint_laws(steady_fit, config), strict=True):
+        staged.table(name, table)
     staged.table("aging_fit", fitted)
     staged.table("aging_curves", aging_curves(fitted))
 
@@ -209,87 +212,3 @@ _WORK: dict[str, Callable[[Store, Staged, int, Silent], None]] = {
     "close-loop": _close_loop,
     "report": _report,
 }
-
-
-# ---------------------------------------------------------------- commands that keep nothing in OUT
-def check(
-    campaign: Path, config: Path | None = None, *, workers: int = 1, progress: Silent | None = None
-) -> tuple[dict, list[Fault]]:
-    """Read everything, write nothing, and return what was found and every fault.
-
-    Raises
-    ------
-    ConfigError
-        If the config cannot be used.
-    """
-    from sealfit import summary
-    from sealfit.ingest.campaign import ingest_campaign
-
-    checked = ConfigCopy.at(config).parse()
-    refuse_effects_in(campaign, checked)
-    try:
-        with (progress or Silent()).counting("reading trace files") as on_file:
-            ingested = ingest_campaign(campaign_folder(campaign, checked), checked, workers=workers, on_file=on_file)
-    except CampaignError as error:
-        return {"files": None}, list(error.faults)
-    faults = [fault for fault in ingested.faults if fault.severity in FAULTY]
-    return summary.of_ingest(ingested.tables), faults
-
-
-def predict(out: Path, points: Path, output: Path, *, progress: Silent | None = None) -> dict:
-    """Write the answers to `points` (CSV) to `output` (CSV) and return how many rows were answered.
-
-    Raises
-    ------
-    StaleError
-        If the loop has not been closed on the campaign as it stands.
-    RequestError
-        If the points cannot be read, lack a column that the model needs, or the answers cannot be written.
-    """
-    from sealfit.closure.predict import predict as answer
-    from sealfit.points import read_points, write_answers
-
-    store = Store.open(existing_out(out))
-    for warning in store.warnings:
-        (progress or Silent()).warn(warning)
-    store.require("close-loop")
-    asked = read_points(points)
-    answers = answer(store.read_json("model"), asked.values)
-    return {"out": str(store.out), "output": str(output), **write_answers(asked, answers, output)}
-
-
-def effects(out: Path | None = None) -> dict:
-    """Return the catalogue; with OUT, in its units, with the users' own effects and those that its loop added."""
-    from sealfit import summary
-    from sealfit.effects import EFFECTS
-
-    if out is None:
-        return {"effects": summary.of_effects(EFFECTS.values(), Units())}
-    store = Store.open(existing_out(out))
-    known = dict(EFFECTS)
-    if store.config.loop.effects_folder is not None:
-        from sealfit.effects.user import load_user_effects
-
-        known |= load_user_effects(Path(store.config.loop.effects_folder))
-    closed = not store.why_stale("close-loop")
-    added = [effect["id"] for effect in store.read_json("closure")["effects"]] if closed else None
-    return {"effects": summary.of_effects(known.values(), store.config.units), "added": added}
-
-
-def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:
-    """Write a campaign with known truth to `out`, and the truth beside it, both whole or not at all.
-
-    Raises
-    ------
-    OutError
-        If `out` is there already and `force` is not given, or as `sealfit.simulate.simulate`.
-    """
-    from sealfit.simulate import load_spec, truth_path
-    from sealfit.simulate import simulate as make
-
-    loaded = load_spec(existing_file(spec, "spec"))
-    if not force and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
-        raise OutError("is there already.", file=out, mend="Choose another --out, or replace it with --force.")
-    make(loaded, out)
-    files = sum(1 for path in out.rglob("*") if path.is_file() and path.name != RUNS)
-    return {"campaign": str(out), "truth": str(truth_path(out)), "files": files}

@@ -153,7 +153,7 @@ def lines(summary: Mapping) -> list[str]:
         "fit_aging": lambda part: _fit_lines("aging", part),
         "fit_dynamic": dynamic_lines,
         "close_loop": closure_lines,
-        "report": lambda part: [_line("report", part["file"])],
+        "report": lambda part: [line("report", part["file"])],
     }
     return [line for name, write in writers.items() if name in summary for line in write(summary[name])]
 
@@ -164,26 +164,26 @@ def ingest_lines(part: Mapping) -> list[str]:
     text = f"{files['used']} used, {files['left_out']} left out"
     if files["not_matched"]:
         text += f", {files['not_matched']} not matched by the file-name pattern"
-    found = [_line("files", text)]
+    found = [line("files", text)]
     left_out = [_count(part[f"{what}s_left_out"], what) for what in ("stroke", "row") if part[f"{what}s_left_out"]]
     if sum(faults.values()):
         text = f"{_count(faults['error'], 'error')}, {_count(faults['warning'], 'warning')}"
         more = f"; left out: {', '.join(left_out)}" if left_out else ""
-        found.append(_line("faults", f"{text}{more} (table quality)"))
-    found.append(_line("conditions", f"{part['conditions']} in {_count(part['runs'], 'run')}"))
+        found.append(line("faults", f"{text}{more} (table quality)"))
+    found.append(line("conditions", f"{part['conditions']} in {_count(part['runs'], 'run')}"))
     return found
 
 
 def _fit_lines(title: str, part: Mapping) -> list[str]:
     ranges = part["parameters"]
     if not ranges:
-        return [_line(title, "nothing to fit")]
+        return [line(title, "nothing to fit")]
     quantities = list(dict.fromkeys(entry["quantity"] for entry in ranges))
     found = []
     for quantity in quantities:
         texts = [_range(entry) for entry in ranges if entry["quantity"] == quantity]
         name = "" if len(quantities) == 1 else f"{quantity}: "
-        found.append(_line(title if not found else "", name + ", ".join(texts)))
+        found.append(line(title if not found else "", name + ", ".join(texts)))
     lacking = [entry for entry in ranges if entry["identified"] < entry["of"]]
     if lacking:
         names = [f"{e['quantity']} {e['parameter']}" if len(quantities) > 1 else e["parameter"] for e in lacking]
@@ -192,7 +192,7 @@ def _fit_lines(title: str, part: Mapping) -> list[str]:
             for name, entry in zip(names, lacking, strict=True)
         ]
         reason = next((entry["reason"] for entry in lacking if entry["reason"]), "")
-        found.append(_line("", f"not identified: {', '.join(texts)}. {reason}".rstrip()))
+        found.append(line("", f"not identified: {', '.join(texts)}. {reason}".rstrip()))
     return found
 
 
@@ -202,7 +202,7 @@ def dynamic_lines(part: Mapping) -> list[str]:
     if part["above_sliding"]:
         more = f"{part['largest_ratio'] - 1:.1%} at most, {part['largest_at']}"
         text = f"above the sliding force at {part['above_sliding']} of {part['break_aways']} speeds, both ways ({more})"
-        found.append(_line("break-away", text))
+        found.append(line("break-away", text))
     return found
 
 
@@ -218,21 +218,21 @@ def _range(entry: Mapping) -> str:
 def closure_lines(part: Mapping) -> list[str]:
     """Return the lines of a closed loop."""
     unit, before, after = part["units"]["force_N"], part["before"], part["after"]
-    found = [_line("verdict", f"{part['verdict']}: {part['sentence']}")]
+    found = [line("verdict", f"{part['verdict']}: {part['sentence']}")]
     for effect in part["effects"]:
         status = "candidate, not applied: " if effect["candidate"] else "+ "
         known = [p for p in effect["parameters"] if p["value"] is not None or p["name"] != "phi"]
         values = ", ".join(_value(p) for p in known) if effect["named"] else "no form does as well"
-        found.append(_line("", f"{status}{effect['label']}: {values}"))
+        found.append(line("", f"{status}{effect['label']}: {values}"))
     rows = (("rmse", "rmse_N"), ("held out", "heldout_rmse_N"), ("run means", "rmse_runs_N"), ("largest", "max_abs_N"))
     texts = [f"{name} {_number(before[key])} -> {_number(after[key])}" for name, key in rows]
-    found.append(_line(f"error ({unit})", "; ".join(texts)))
+    found.append(line(f"error ({unit})", "; ".join(texts)))
     if part["noise_floor_N"] is not None:
-        found.append(_line("noise floor", f"{_number(part['noise_floor_N'])} {unit}"))
+        found.append(line("noise floor", f"{_number(part['noise_floor_N'])} {unit}"))
     if part["left"]["channel"] is not None:
-        found.append(_line("left", _left(part["left"], part["verdict"], unit)))
+        found.append(line("left", _left(part["left"], part["verdict"], unit)))
     for run in part["next_runs"][:3]:
-        found.append(_line("next runs", run["why"]))
+        found.append(line("next runs", run["why"]))
     return found
 
 
@@ -275,10 +275,11 @@ def predict_lines(part: Mapping) -> list[str]:
     refused = part["rows"] - part["answered"]
     if refused:
         text += f"; {_count(refused, 'row')} could not be, and the column note says why"
-    return [_line("points", text), _line("answers", part["output"])]
+    return [line("points", text), line("answers", part["output"])]
 
 
-def _line(title: str, text: str) -> str:
+def line(title: str, text: str) -> str:
+    """Return a line of a summary under its title."""
     return f"{title:<11} {text}"
 
 

@@ -355,6 +355,43 @@ CURVES = Schema(
     ),
     open_=True,
 )
+AGING_LAWS = Schema(
+    "aging_laws",
+    (
+        RUBBER,
+        Column("quantity", "", TEXT, "mu_s, mu_c, F_s or F_c"),
+        Column("law", "", TEXT, "log | stretched | power | induction, for all series; or separate laws"),
+        Column("way", "", TEXT, "what temperature and compression change: rate | loss; empty where neither varies"),
+        Column("form", "", TEXT, "equation"),
+        Column("rank", "", INT, "1: likeliest by Schwarz's criterion"),
+        Column("rival", "", BOOL, "true where these data cannot tell it from the likeliest"),
+        Column("criterion", "", FLOAT, "Schwarz's criterion above the likeliest's"),
+        Column("scatter_rel", "", FLOAT, "relative scatter between specimens that it leaves"),
+        Column("heldout_series", "", FLOAT, "RMS error at whole series it was not fitted to, in the quantity's unit"),
+        Column("heldout_last_day", "", FLOAT, "RMS error at the last days of all series, not fitted to"),
+        Column("parameter", "", TEXT, "parameter; null for separate laws"),
+        Column("value", "", FLOAT, "estimate"),
+        Column("lo95", "", FLOAT, "lower end of the 95 % interval"),
+        Column("hi95", "", FLOAT, "upper end of the 95 % interval"),
+        Column("unit", "", TEXT, "unit of value, lo95 and hi95"),
+        Column("identified", "", BOOL, "false where these data do not determine it"),
+    ),
+)
+MASTER_CURVE = Schema(
+    "master_curve",
+    (
+        RUBBER,
+        Column("quantity", "", TEXT, "mu_s, mu_c, F_s or F_c"),
+        Column("kind", "", TEXT, "value | law"),
+        Column("scaled_days", "d", FLOAT, "aging time by the rate at the reference temperature and compression"),
+        Column("value", "", FLOAT, "fitted value of a condition, or the law"),
+        Column("lo95", "", FLOAT, "lower end of the law's 95 % band"),
+        Column("hi95", "", FLOAT, "upper end of the law's 95 % band"),
+        Column("temperature_C", "°C", FLOAT, "aging temperature; null for unaged rubber and for the law"),
+        Column("compression_ratio_pct", "%", FLOAT, "height while aging; null for unaged rubber and for the law"),
+        Column("aging_days", "d", FLOAT, "aging time; null for the law"),
+    ),
+)
 DYNAMIC_CURVES = Schema(
     "dynamic_curves",
     (
@@ -400,6 +437,8 @@ SCHEMAS = {
         SHAPES,
         CURVES,
         AGING_CURVES,
+        AGING_LAWS,
+        MASTER_CURVE,
         DYNAMIC_FIT,
         DYNAMIC_CURVES,
     )

@@ -98,6 +98,9 @@ class Parts:
         )
         return SimpleNamespace(fit=fit, curves=small("dynamic_curves"))
 
+    def joint_laws(self, steady_fit, config):
+        return small("aging_laws"), small("master_curve")
+
     def close_loop(self, bins, traces, config, *, workers=1, on_progress=None):
         self._called("close-loop", config)
         self.workers = workers
@@ -135,6 +138,7 @@ def put_in(monkeypatch):
         "sealfit.ingest.campaign": ["ingest_campaign"],
         "sealfit.fit.steady": ["fit_conditions"],
         "sealfit.fit.aging": ["fit_series", "aging_curves"],
+        "sealfit.fit.all_series": ["joint_laws"],
         "sealfit.fit.dynamic": ["fit_dynamic"],
         "sealfit.closure.loop": ["close_loop"],
         "sealfit.closure.predict": ["predict"],

@@ -1,0 +1,183 @@
+"""Joint laws of aging for the tables of OUT: every law with its evidence, against separate laws of the series."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pandas as pd
+
+from sealfit.config import Config
+from sealfit.errors import FitError, RequestError
+from sealfit.fit.joint_law import Aged, JointLaw, fit_laws, left_out, reference_of, rivals_of
+from sealfit.fit.law import Values, fit_law, law_model
+from sealfit.fit.polish import central_jacobian
+from sealfit.tables import AGING_LAWS, MASTER_CURVE
+
+TEMPERATURE, COMPRESSION = "temperature_C", "compression_ratio_pct"
+SEPARATE = "separate"  # Eq. 15 with a and b of its own for every series
+LIKELY = 3  # laws held against data they were not fitted to
+CURVE_POINTS = 61
+
+
+def aged_values(steady_fit: pd.DataFrame, rubber: str, quantity: str) -> Aged:
+    """Return the fitted values of one quantity of a rubber over its conditions, those that are identified.
+
+    Parameters
+    ----------
+    steady_fit : DataFrame
+        Table `steady_fit`.
+    rubber, quantity : str
+        Which; "mu_s", "mu_c", "F_s" or "F_c".
+    """
+    rows = steady_fit[(steady_fit["quantity"] == "steady") & (steady_fit["parameter"] == quantity)]
+    rows = rows[(rows["rubber"] == rubber) & rows["identified"].astype(bool) & rows["aging_days"].notna()]
+
+    def column(name):
+        return rows[name].to_numpy(float) if name in rows and rows[name].notna().any() else None
+
+    return Aged(
+        rows["aging_days"].to_numpy(float),
+        rows["value"].to_numpy(float),
+        column(TEMPERATURE),
+        column(COMPRESSION),
+        np.nan_to_num(rows["se"].to_numpy(float)) ** 2,
+    )
+
+
+def quantities_of(steady_fit: pd.DataFrame) -> Iterator[tuple[str, str, str]]:
+    """Yield rubber, quantity and unit of every quantity that a law may be fitted to."""
+    rows = steady_fit[steady_fit["parameter"].isin(["mu_s", "mu_c", "F_s", "F_c"])]
+    for (rubber, quantity), own in rows[rows["quantity"] == "steady"].groupby(["rubber", "parameter"], sort=True):
+        yield rubber, quantity, str(own["unit"].iloc[0] or "")
+
+
+def joint_laws(steady_fit: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return tables `aging_laws` and `master_curve`; empty without aging or with too few conditions.
+
+    Parameters
+    ----------
+    steady_fit : DataFrame
+        Table `steady_fit` with the condition columns.
+    config : Config
+        Says whether rubber is aged.
+    """
+    rows, curves = [], []
+    if config.aging and "aging_days" in steady_fit.columns:
+        for rubber, quantity, unit in quantities_of(steady_fit):
+            try:
+                laws = fit_laws(aged_values(steady_fit, rubber, quantity))
+            except FitError:
+                continue
+            at = {"rubber": rubber, "quantity": quantity}
+            rows += [{**at, **row} for row in _law_rows(laws, unit)]
+            curves.append(_master_curve(laws[0]).assign(**at))
+    curves = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
+    return (
+        pd.DataFrame(rows).reindex(columns=AGING_LAWS.names()),
+        curves.reindex(columns=MASTER_CURVE.names()),
+    )
+
+
+def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
+    best = laws[0]
+    rivals = rivals_of(laws)
+    for number, law in enumerate(laws):
+        held = left_out(law) if number < LIKELY else {}
+        head = {
+            "law": law.loss.name,
+            "way": law.way if best.aged.drivers() else "",
+            "form": law.loss.form,
+            "rank": number + 1,
+            "rival": law in rivals,
+            "criterion": law.criterion - best.criterion,
+            "scatter_rel": law.scatter,
+            "heldout_series": held.get("series", np.nan),
+            "heldout_last_day": held.get("last_day", np.nan),
+        }
+        units = {"mu_0": unit, "a": unit, "E": "kJ/mol", "kappa": "1/%"}
+        units |= dict(zip(law.loss.parameters, law.loss.units, strict=True))
+        for name, value, low, high, known in law.parameters():
+            yield {
+                **head, "parameter": name, "value": value, "lo95": low, "hi95": high, "unit": units[name],
+                "identified": known,
+            }  # fmt: skip
+    apart = _separate(best)
+    if apart is not None:
+        yield {
+            "law": SEPARATE, "way": "", "form": "mu_0 - a ln(1 + t/b), a and b of each series", "rank": len(laws) + 1,
+            "rival": False, "criterion": apart[0] - best.criterion, "heldout_last_day": apart[1], "identified": True,
+        }  # fmt: skip
+
+
+def _separate(law: JointLaw) -> tuple[float, float] | None:
+    """Return Schwarz's criterion of separate laws under the joint law's scatter, and their error at last days.
+
+    None where the series have too few values for laws of their own.
+    """
+    aged, series = law.aged, law.aged.series()
+    days = [np.unique(aged.days[series == k]).size for k in np.unique(series[series >= 0])]
+    if len(days) < 2 or min(days) < 3:
+        return None
+    measured = np.zeros(aged.value.size) if aged.variance is None else aged.variance
+    variance = measured + (law.scatter * aged.value) ** 2 + 1e-300
+    values = Values(aged.days, aged.value, np.zeros(aged.value.size, int), series, np.diag(variance))
+    fitted = fit_law(values)
+    criterion = fitted.chi2 + float(np.log(variance).sum()) + fitted.x.size * np.log(aged.value.size)
+    ends = [(series == k) & (aged.days == aged.days[series == k].max()) for k in np.unique(series[series >= 0])]
+    squares = []
+    for out in ends if min(days) > 3 else []:
+        part = fit_law(values.part(~out))
+        squares += list((law_model(values, part.x)[0][out] - aged.value[out]) ** 2)
+    return criterion, float(np.sqrt(np.mean(squares))) if squares else np.nan
+
+
+def _master_curve(law: JointLaw) -> pd.DataFrame:
+    """Return the values over the master curve's time k t, and the law there with its 95 % band.
+
+    Where temperature and compression change the loss and not the rate there is no such time, and no band.
+    """
+    aged = law.aged
+    tested = (aged.temperature_C, aged.compression_pct)
+    scaled = aged.days * (np.exp(law.log_rate(aged)) if law.way == "rate" else 1.0)
+    points = {"kind": "value", "scaled_days": scaled, "value": aged.value, "aging_days": aged.days}
+    for name, column in zip((TEMPERATURE, COMPRESSION), tested, strict=True):
+        points[name] = np.nan if column is None else np.where(aged.days > 0, column, np.nan)
+    if law.way != "rate":
+        return pd.DataFrame(points)
+    days = np.r_[0.0, np.geomspace(scaled[scaled > 0].min() / 3, scaled.max() * 1.5, CURVE_POINTS)]
+    middle = (None if c is None else np.full(days.size, reference_of(c[aged.days > 0])) for c in tested)
+    at = Aged(days, np.zeros(days.size), *middle)
+    slope = central_jacobian(lambda x: law.at(at, x), law.x)
+    half = law.t * np.sqrt(np.einsum("ni,ij,nj->n", slope, law.covariance, slope))
+    value = law.at(at)
+    curve = {"kind": "law", "scaled_days": days, "value": value, "lo95": value - half, "hi95": value + half}
+    return pd.concat([pd.DataFrame(points), pd.DataFrame(curve)], ignore_index=True)
+
+
+def law_of(steady_fit: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
+    """Return the laws of one quantity, likeliest first; or a named one alone.
+
+    Raises
+    ------
+    RequestError
+        If the quantity was not fitted, there are several rubbers, or no law of that name can be fitted.
+    """
+    known = list(quantities_of(steady_fit))
+    rubbers = sorted({rubber for rubber, own, _ in known if own == quantity})
+    if not rubbers:
+        there = ", ".join(sorted({own for _, own, _ in known})) or "none"
+        raise RequestError(f"there is no '{quantity}' to follow.", mend=f"Choose one of: {there}.")
+    if len(rubbers) > 1:
+        raise RequestError(f"there are several rubbers: {', '.join(rubbers)}.", mend="Analyse them one by one.")
+    try:
+        laws = fit_laws(aged_values(steady_fit, rubbers[0], quantity))
+    except FitError as error:
+        raise RequestError(error.message, mend=error.mend) from error
+    chosen = laws if name is None else [law for law in laws if law.loss.name == name]
+    if not chosen:
+        raise RequestError(
+            f"there is no law '{name}' for these conditions.",
+            mend=f"Choose one of: {', '.join(dict.fromkeys(law.loss.name for law in laws))}.",
+        )
+    return chosen

@@ -1,0 +1,241 @@
+r"""Days until aging has carried a quantity to a threshold, and the temperature at which it lasts so many years.
+
+From a joint law, :math:`a\, k^w \varphi(k^{1-w} t) = \mu_0 - \mu^*` solved for t. The interval is that of ln t by the
+delta method, with the law's whole covariance; `resampled` draws the values anew instead and checks it. In the spirit of
+ISO 11346 (rubber, estimation of life-time and maximum temperature of use), whose threshold is a share of the start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import brentq
+
+from sealfit.errors import RequestError
+from sealfit.fit.joint_law import Aged, JointLaw, refitted
+from sealfit.fit.polish import central_jacobian
+
+DAYS_PER_YEAR = 365.25
+SPAN_C = (-80.0, 300.0)  # in which a temperature of use is sought
+FOREVER = 1e9  # days: beyond, the law is asked for more than it can say
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What ends a life: the value itself, or a loss as a share of the start (0.2: a fifth is lost)."""
+
+    value: float | None = None
+    loss: float | None = None
+
+    def reached(self, start: float) -> float:
+        """Return the value at which life ends, for rubber that starts at `start`."""
+        return self.value if self.loss is None else start * (1 - self.loss)
+
+
+@dataclass(frozen=True)
+class Lifetime:
+    """Days to a threshold, ends of the 95 % interval (inf where open), and how far that lies beyond the tests.
+
+    Attributes
+    ----------
+    days, low, high : float
+        Estimate and interval; `days` is inf where the law never comes there, 0 where rubber starts beyond it.
+    threshold : float
+        The value at which life ends.
+    beyond : float
+        days over the longest test, in the master curve's time where there is one: above 1 it is extrapolated.
+    outside : tuple of str
+        What lies outside the tested range: "temperature", "compression".
+    """
+
+    days: float
+    low: float
+    high: float
+    threshold: float
+    beyond: float
+    outside: tuple[str, ...]
+
+    @property
+    def extrapolated(self) -> bool:
+        """Whether the answer goes beyond the tests."""
+        return self.beyond > 1.0 or bool(self.outside)
+
+
+def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, compression_pct: float | None = None):
+    """Return the `Lifetime` of rubber aged at a temperature and compression.
+
+    Parameters
+    ----------
+    law : JointLaw
+        Fitted.
+    goal : Goal
+        What ends a life.
+    temperature_C, compression_pct : float, optional
+        Of use; needed where the tests varied them.
+
+    Raises
+    ------
+    RequestError
+        If one is missing that the law needs.
+    """
+    place = _place(law, temperature_C, compression_pct)
+    days = _days(law, law.x, goal, place)
+    low, high = days, days
+    if 0 < days < FOREVER:
+        slope = central_jacobian(lambda x: np.log(np.array([_days(law, x, goal, place)])), law.x)[0]
+        half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if np.isfinite(slope).all() else np.inf
+        low, high = (float(days * np.exp(np.clip(s * half, -700, 700))) for s in (-1, 1))
+        high = np.inf if high > FOREVER else high
+    aged = law.aged.days > 0
+    tested = law.aged.days[aged] * (np.exp(law.log_rate(law.aged)[aged]) if law.way == "rate" else 1.0)
+    asked = days * (float(np.exp(law.log_rate(place)[0])) if law.way == "rate" else 1.0)
+    threshold = float(goal.reached(law.x[0]))
+    return Lifetime(days, low, high, threshold, asked / tested.max(), _outside(law, temperature_C, compression_pct))
+
+
+def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
+    """Return the goal of a request.
+
+    Raises
+    ------
+    RequestError
+        If not exactly one of both is given, or the loss is no share of the start.
+    """
+    if (threshold is None) == (loss_pct is None):
+        raise RequestError(
+            "what ends a life is not said." if threshold is None else "two ends of life were given.",
+            mend="Give --threshold VALUE or --loss PERCENT.",
+        )
+    if loss_pct is not None and not 0 < loss_pct < 100:
+        raise RequestError(f"--loss {loss_pct:g} is no share of the start.", mend="Give percent between 0 and 100.")
+    return Goal(threshold) if loss_pct is None else Goal(loss=loss_pct / 100)
+
+
+def answer(
+    law: JointLaw,
+    goal: Goal,
+    years: float | None = None,
+    *,
+    temperature_C: float | None = None,
+    compression_pct: float | None = None,
+    resample: bool = False,
+) -> dict:
+    """Return a law's answer as plain values: days with interval, how far beyond the tests, the temperature for years.
+
+    Parameters
+    ----------
+    law : JointLaw
+        Fitted.
+    goal : Goal
+        What ends a life.
+    years : float, optional
+        Asks for the temperature at which life is so long, in place of the days.
+    temperature_C, compression_pct : float, optional
+        Of use.
+    resample : bool
+        Whether the interval is checked by drawing the values anew.
+    """
+    found = {"law": law.loss.name, "way": law.way, "form": law.loss.form, "criterion": law.criterion}
+    found |= {"parameters": {name: value for name, value, *_ in law.parameters()}}
+    if years is not None:
+        celsius = temperature_for(law, goal, years, compression_pct)
+        tested = law.aged.temperature_C[law.aged.days > 0]
+        outside = celsius is None or not tested.min() <= celsius <= tested.max()
+        return {**found, "years": years, "temperature_C": celsius, "extrapolated": outside, "tested_C": _ends(tested)}
+    life = lifetime(law, goal, temperature_C, compression_pct)
+    found |= {"threshold": life.threshold, "days": _finite(life.days), "ci95": [_finite(life.low), _finite(life.high)]}
+    found |= {"extrapolated": life.extrapolated, "beyond_tests": _finite(life.beyond), "outside": list(life.outside)}
+    if resample and 0 < life.days < FOREVER:
+        found["ci95_resampled"] = [_finite(x) for x in resampled(law, goal, temperature_C, compression_pct)]
+    return found
+
+
+def _ends(values: np.ndarray) -> list[float]:
+    return [float(values.min()), float(values.max())]
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> Aged:
+    given = {"E": ("temperature", temperature_C), "kappa": ("compression", compression_pct)}
+    for name, (what, value) in given.items():
+        if name in law.names and value is None:
+            raise RequestError(f"the rubber was aged at more than one {what}.", mend=f"Say which with --{what}.")
+    at = (None if value is None else np.array([float(value)]) for value in (temperature_C, compression_pct))
+    return Aged(np.ones(1), np.zeros(1), *at)
+
+
+def _days(law: JointLaw, x: np.ndarray, goal: Goal, place: Aged) -> float:
+    """Return the days to the goal for parameters x; inf where it is never reached."""
+    own = np.exp(x[2 : 2 + len(law.loss.parameters)])
+    k = float(np.exp(np.clip(law.log_rate(place, x)[0], -50, 50)))
+    a = x[1] * (k if law.way == "loss" else 1.0)
+    phi = (x[0] - goal.reached(x[0])) / a if a != 0 else np.inf
+    if phi <= 0:
+        return 0.0 if a > 0 else np.inf
+    with np.errstate(over="ignore"):
+        days = float(law.loss.time(phi, *own)) / (k if law.way == "rate" else 1.0)
+    return days if days < FOREVER else np.inf
+
+
+def _outside(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> tuple[str, ...]:
+    aged, found = law.aged.days > 0, []
+    for name, value, tested in (
+        ("temperature", temperature_C, law.aged.temperature_C),
+        ("compression", compression_pct, law.aged.compression_pct),
+    ):
+        if value is not None and tested is not None and not tested[aged].min() <= value <= tested[aged].max():
+            found.append(name)
+    return tuple(found)
+
+
+def resampled(
+    law: JointLaw,
+    goal: Goal,
+    temperature_C: float | None = None,
+    compression_pct: float | None = None,
+    *,
+    draws: int = 500,
+    seed: int = 1,
+) -> tuple[float, float]:
+    """Return the ends of the 95 % interval of the lifetime from values drawn anew around the law, refitted each time.
+
+    Parameters
+    ----------
+    draws, seed : int
+        How many, and of which stream.
+    """
+    rng, place = np.random.default_rng(seed), _place(law, temperature_C, compression_pct)
+    measured = np.zeros(law.aged.value.size) if law.aged.variance is None else law.aged.variance
+    mean = law.at(law.aged)
+    sd = np.sqrt(measured + (law.scatter * mean) ** 2)
+    found = []
+    for _ in range(draws):
+        drawn = replace(law.aged, value=mean + sd * rng.standard_normal(mean.size))
+        again = refitted(law, drawn, sd)
+        found.append(_days(again, again.x, goal, place))
+    low, high = np.quantile(found, [0.025, 0.975], method="inverted_cdf")
+    return float(low), float(high)
+
+
+def temperature_for(law: JointLaw, goal: Goal, years: float, compression_pct: float | None = None) -> float | None:
+    """Return the temperature of use in degrees Celsius at which life is so many years; None where none is.
+
+    Raises
+    ------
+    RequestError
+        If the rubber was aged at one temperature only.
+    """
+    if "E" not in law.names:
+        raise RequestError("the rubber was aged at one temperature only.", mend="Test at two or more temperatures.")
+
+    def excess(celsius):
+        days = _days(law, law.x, goal, _place(law, celsius, compression_pct))
+        return np.log(min(max(days, 1e-12), 1e12) / (years * DAYS_PER_YEAR))
+
+    if excess(SPAN_C[0]) * excess(SPAN_C[1]) > 0:
+        return None
+    return float(brentq(excess, *SPAN_C, xtol=1e-6))

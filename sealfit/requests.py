@@ -1,0 +1,130 @@
+"""Commands that keep nothing in OUT: check, predict, lifetime, effects and simulate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sealfit.errors import CampaignError, Fault, OutError
+from sealfit.places import RUNS, campaign_folder, existing_file, existing_out, refuse_effects_in
+from sealfit.progress import Silent
+from sealfit.state import ConfigCopy
+from sealfit.steps import FAULTY
+from sealfit.store import Store
+from sealfit.tables import Units
+
+
+def check(
+    campaign: Path, config: Path | None = None, *, workers: int = 1, progress: Silent | None = None
+) -> tuple[dict, list[Fault]]:
+    """Read everything, write nothing, and return what was found and every fault.
+
+    Raises
+    ------
+    ConfigError
+        If the config cannot be used.
+    """
+    from sealfit import summary
+    from sealfit.ingest.campaign import ingest_campaign
+
+    checked = ConfigCopy.at(config).parse()
+    refuse_effects_in(campaign, checked)
+    try:
+        with (progress or Silent()).counting("reading trace files") as on_file:
+            ingested = ingest_campaign(campaign_folder(campaign, checked), checked, workers=workers, on_file=on_file)
+    except CampaignError as error:
+        return {"files": None}, list(error.faults)
+    faults = [fault for fault in ingested.faults if fault.severity in FAULTY]
+    return summary.of_ingest(ingested.tables), faults
+
+
+def predict(out: Path, points: Path, output: Path, *, progress: Silent | None = None) -> dict:
+    """Write the answers to `points` (CSV) to `output` (CSV) and return how many rows were answered.
+
+    Raises
+    ------
+    StaleError
+        If the loop has not been closed on the campaign as it stands.
+    RequestError
+        If the points cannot be read, lack a column that the model needs, or the answers cannot be written.
+    """
+    from sealfit.closure.predict import predict as answer
+    from sealfit.points import read_points, write_answers
+
+    store = Store.open(existing_out(out))
+    for warning in store.warnings:
+        (progress or Silent()).warn(warning)
+    store.require("close-loop")
+    asked = read_points(points)
+    answers = answer(store.read_json("model"), asked.values)
+    return {"out": str(store.out), "output": str(output), **write_answers(asked, answers, output)}
+
+
+def lifetime(
+    out: Path,
+    *,
+    quantity: str,
+    threshold: float | None,
+    loss_pct: float | None,
+    temperature_C: float | None,
+    compression_pct: float | None,
+    years: float | None,
+    law: str | None,
+) -> dict:
+    """Return the days until a quantity reaches a threshold by the likeliest law and by its rivals, with intervals.
+
+    Raises
+    ------
+    StaleError
+        If the conditions are not fitted, or stale.
+    RequestError
+        If the request does not fit the campaign.
+    """
+    from sealfit.fit.all_series import law_of
+    from sealfit.fit.joint_law import rivals_of
+    from sealfit.fit.lifetime import answer, goal_of
+
+    store = Store.open(existing_out(out))
+    store.require("fit-steady")
+    goal = goal_of(threshold, loss_pct)
+    laws = law_of(store.read("steady_fit"), quantity, law)
+    place = {"temperature_C": temperature_C, "compression_pct": compression_pct}
+    chosen = answer(laws[0], goal, years, resample=True, **place)
+    rivals = [answer(rival, goal, years, **place) for rival in rivals_of(laws)] if law is None else []
+    return {"out": str(store.out), "quantity": quantity, **chosen, "rivals": rivals}
+
+
+def effects(out: Path | None = None) -> dict:
+    """Return the catalogue; with OUT, in its units, with the users' own effects and those that its loop added."""
+    from sealfit import summary
+    from sealfit.effects import EFFECTS
+
+    if out is None:
+        return {"effects": summary.of_effects(EFFECTS.values(), Units())}
+    store = Store.open(existing_out(out))
+    known = dict(EFFECTS)
+    if store.config.loop.effects_folder is not None:
+        from sealfit.effects.user import load_user_effects
+
+        known |= load_user_effects(Path(store.config.loop.effects_folder))
+    closed = not store.why_stale("close-loop")
+    added = [effect["id"] for effect in store.read_json("closure")["effects"]] if closed else None
+    return {"effects": summary.of_effects(known.values(), store.config.units), "added": added}
+
+
+def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:
+    """Write a campaign with known truth to `out`, and the truth beside it, both whole or not at all.
+
+    Raises
+    ------
+    OutError
+        If `out` is there already and `force` is not given, or as `sealfit.simulate.simulate`.
+    """
+    from sealfit.simulate import load_spec, truth_path
+    from sealfit.simulate import simulate as make
+
+    loaded = load_spec(existing_file(spec, "spec"))
+    if not force and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
+        raise OutError("is there already.", file=out, mend="Choose another --out, or replace it with --force.")
+    make(loaded, out)
+    files = sum(1 for path in out.rglob("*") if path.is_file() and path.name != RUNS)
+    return {"campaign": str(out), "truth": str(truth_path(out)), "files": files}

@@ -1,0 +1,51 @@
+"""What `lifetime` ends with, in lines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from sealfit.summary import line
+
+
+def lifetime_lines(part: Mapping) -> list[str]:
+    """Return the lines of a lifetime, the rivals' answers below it."""
+    found = [line("law", f"{part['quantity']} = {part['form']}, {_change(part)}")]
+    found.append(line("life" if "days" in part else "use", _life(part)))
+    if part.get("ci95_resampled"):
+        found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
+    for rival in part["rivals"]:
+        found.append(line("rival", f"{rival['form']}, {_change(rival)}: {_life(rival)}"))
+    return found
+
+
+def _change(part: Mapping) -> str:
+    names = [name for name in ("E", "kappa") if name in part["parameters"]]
+    if not names:
+        return "one temperature and compression"
+    driven = f"temperature and compression change the {part['way']}"
+    energy = f", E = {part['parameters']['E']:.3g} kJ/mol" if "E" in names else ""
+    return driven + energy
+
+
+def _life(part: Mapping) -> str:
+    if "days" not in part:
+        if part["temperature_C"] is None:
+            return f"at no temperature does it last {part['years']:g} years"
+        low, high = part["tested_C"]
+        beyond = f" (extrapolated: tested from {low:g} to {high:g} degC)" if part["extrapolated"] else ""
+        return f"it lasts {part['years']:g} years at {part['temperature_C']:.1f} degC{beyond}"
+    if part["days"] is None:
+        return f"{part['threshold']:.4g} is never reached"
+    if part["days"] == 0:
+        return f"unaged rubber is beyond {part['threshold']:.4g} already"
+    text = f"{part['days']:.3g} d to {part['threshold']:.4g}, 95 % {_days_between(part['ci95'])}"
+    if part["beyond_tests"] is not None and part["beyond_tests"] > 1:
+        text += f" (extrapolated: {part['beyond_tests']:.2g} times the longest test)"
+    if part["outside"]:
+        text += f" (extrapolated: {' and '.join(part['outside'])} outside what was tested)"
+    return text
+
+
+def _days_between(ends: list) -> str:
+    low, high = ends
+    return f"{low:.3g} d or more" if high is None else f"{low:.3g} to {high:.3g} d"
