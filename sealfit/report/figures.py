@@ -9,6 +9,7 @@ import pandas as pd
 from sealfit.config import Config
 from sealfit.report.figures_curves import aging, traces_mean
 from sealfit.report.figures_dynamic import starts
+from sealfit.report.figures_laws import master_curve
 from sealfit.report.figures_loop import before_after, variance_levels
 from sealfit.report.figures_residual import effect_shapes, residual_channels
 from sealfit.report.figures_speed import force_speed
@@ -34,6 +35,7 @@ def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config
         residual_channels(tables, config),
         force_speed(tables, config),
         aging(tables, config),
+        master_curve(tables, config),
         starts(tables, config),
         traces_mean(tables, config),
     )

@@ -15,6 +15,7 @@ from sealfit.config import Config
 from sealfit.report import facts
 from sealfit.report.figures import draw_all
 from sealfit.report.figures_residual import MOST_CHANNELS
+from sealfit.report.law_tables import law_rows
 from sealfit.report.loop_tables import channel_tests, effect_cards, error_rows, next_runs, scatter_rows
 from sealfit.report.numbers import count, given, number
 from sealfit.report.parameters import break_away_rows, parameter_tables
@@ -24,7 +25,7 @@ from sealfit.report.words import left_over, verdict, with_left_channels
 
 TABLES = (
     "inputs", "runs", "quality", "traces_mean", "steady", "steady_fit", "aging_fit", "aging_curves",
-    "dynamic_fit", "dynamic_curves", "effects",
+    "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves", "effects",
     "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves",
 )  # fmt: skip
 VERDICTS = {
@@ -101,6 +102,7 @@ def _content(
         "parameter_tables": sorted(fitted, key=lambda table: table.single),  # how well the fits do comes last
         "aging_fitted": len(tables["aging_fit"]) > 0,
         "aging": config.aging,
+        "laws": law_rows(tables["aging_laws"]),
         "break_aways": break_away_rows(dynamic, config),
         "condition_key": ConditionNames.of(config).key,
         "sensor": config.sensor,

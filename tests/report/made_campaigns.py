@@ -28,6 +28,7 @@ from report.made_tables import (
 
 from sealfit.conditions import add_keys
 from sealfit.config import Config
+from sealfit.fit.all_series import joint_laws
 
 NAMES = (
     "inputs",
@@ -39,6 +40,8 @@ NAMES = (
     "steady_fit",
     "aging_fit",
     "aging_curves",
+    "aging_laws",
+    "master_curve",
     "dynamic_fit",
     "dynamic_curves",
     "effects",
@@ -178,6 +181,7 @@ def aging_campaign(
         "aging_fit": aging_fit(fits),
         "aging_curves": aging_curves(fits, max(days)),
         **starts(conditions, speeds, config),
+        **(_laws(fits, config) if len(conditions) < 20 else {}),
         "residuals_before": found["before"],
         "residuals_after": found["after"],
         "levels": levels(found),
@@ -188,6 +192,12 @@ def aging_campaign(
         tables["shapes"] = shapes()
         tables["effects"] = effects(closure)
     return Made(tables, closure, {**PROVENANCE, "inputs": inputs(steady["file"])}, config)
+
+
+def _laws(fits, config):
+    """Return the tables of the laws for all series; those of 73 conditions would take the tests half a minute."""
+    laws, curve = joint_laws(table("steady_fit", fits), config)
+    return {"aging_laws": table("aging_laws", laws), "master_curve": table("master_curve", curve)}
 
 
 def paper_sized():

@@ -102,7 +102,7 @@ def test_nothing_unavailable_is_printed_raw(name, pages):
 def test_figures_are_named_for_the_store(reports):
     assert set(reports["closed"].figures) == {
         "before_after", "effect_shapes", "variance_levels", "residual_channels", "force_speed", "aging",
-        "starts", "traces_mean",
+        "master_curve", "starts", "traces_mean",
     }  # fmt: skip
     assert set(reports["torque"].figures) == {"before_after", "force_speed"}
 
