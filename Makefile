@@ -33,6 +33,7 @@ bench-effects: .venv/.installed-test
 
 bench-coverage: .venv/.installed-test
 	$(BIN)/python benchmarks/coverage_steady.py 400
+	$(BIN)/python benchmarks/coverage_dynamic.py 100
 
 # In an environment of its own, as pygam holds scipy back. What is in out/loop.jsonl already is not run again.
 bench-loop: .venv/.installed-bench ## close the loop on some 700 campaigns beside what people would use instead (90 minutes)
