@@ -34,7 +34,7 @@ def peaks(starts: Sequence[Start], steady: pd.DataFrame) -> pd.DataFrame:
     """
     unit = steady["file"].to_numpy() if steady["file"].nunique() > 1 else np.arange(len(starts))
     peak = _peaks(starts, unit)
-    sliding = (steady["force_N"] * steady["direction"]).to_numpy(float)
+    sliding = np.array([s.sliding_N for s in starts])
     return pd.DataFrame({FORCE: peak, RATIO: peak / sliding}).groupby(unit, sort=False).mean().dropna()
 
 

@@ -15,6 +15,7 @@ ROUGH = 0.1  # wanted noise of the local speed, as a share of the steady speed
 RAMPS = np.geomspace(0.5, 200.0, 12)  # steps in time that a ramp may take, to begin with
 AS_NOISE = 1.2  # times the noise: what a ramp may leave that is that of the platform
 MOST_CELLS = 200  # of the distance over which starts are averaged
+JUST_BEGUN = 0.1  # of the steady window: what sliding is like at its beginning
 LEAST = 4  # rows below which a beginning shows nothing
 
 
@@ -28,12 +29,15 @@ class Start:
         Its row in table `steady`.
     distance_mm, speed_mm_s, force_N : ndarray, shape (n,)
         Distance slid, smoothed over the noise of the displacement, its rate, and the force.
+    sliding_N : float
+        Mean force where steady sliding has just begun: further on, warming or wear may have changed it.
     """
 
     row: int
     distance_mm: np.ndarray
     speed_mm_s: np.ndarray
     force_N: np.ndarray
+    sliding_N: float
 
 
 def starts_of(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]:
@@ -60,10 +64,12 @@ def starts_of(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]:
             continue
         part = slice(begin, end)
         until = int(np.argmax(sliding[part]))
+        after = np.flatnonzero(sliding[part])[: max(LEAST, int(JUST_BEGUN * sliding[part].sum()))]
         found = _begun(time[part], sign[row] * along[part], pace[row], until)
         if found is not None:
             since, distance, speed = found
-            yield Start(row, distance, speed, sign[row] * force[part][since:until])
+            along_it = sign[row] * force[part]
+            yield Start(row, distance, speed, along_it[since:until], float(along_it[after].mean()))
 
 
 def cell_means(starts: Sequence[Start], values: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
