@@ -105,7 +105,7 @@ def main() -> None:
         files = len(list((place / "traces").iterdir()))
         workers = ["--workers", str(given.workers)]
         subprocess.run([*sealfit, "ingest", str(place), "--out", str(out)], check=True, stdout=subprocess.DEVNULL)
-        for step in ("fit-steady", "fit-aging"):  # close-loop wants them to be there
+        for step in ("fit-steady", "fit-aging", "fit-dynamic"):  # close-loop wants them to be there
             subprocess.run([*sealfit, step, str(out)], check=True, stdout=subprocess.DEVNULL)
         seconds, resident, proportional = watched([*sealfit, "close-loop", str(out), *workers])
     print(
