@@ -19,6 +19,7 @@ from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
 
 NO_START = "no stroke begins at rest or at a reversal within its rows: the rise of the force is not in these traces"
 TOO_FAST = "the force comes up within a few samples: sample faster, or start more slowly"
+MISSED = "the force does not come up as the model's does: {share:.0%} of the sliding force is left"
 NO_CURVE = "the Stribeck curve is not known: what it does along the ramp looks like damping"
 ONE_START = "one start alone: no scatter is known; measure repeats"
 WIDE = "the starts disagree: only that it lies between {low:.3g} and {high:.3g} {unit} is known"
@@ -170,7 +171,8 @@ def _stiffness_row(found: Stiffness, curve: Curve, unit: str, config: Config) ->
     low, high = (value * np.exp(np.clip(sign * half, -50, 50)) for sign in (-1.0, 1.0))
     row |= {"se": value * np.sqrt(found.covariance[0, 0]), "lo95": low, "hi95": high}
     row["u_sys"] = value * config.sensor.u / abs(curve.coulomb_N)
-    reason = "" if found.stiffness_known else WIDE.format(low=low, high=high, unit=unit)
+    remark = MISSED.format(share=found.rmse_N / curve.coulomb_N) if found.misses(curve.coulomb_N) else ""
+    reason = remark if found.stiffness_known else WIDE.format(low=low, high=high, unit=unit)
     return table_row(**row, identified=found.stiffness_known, reason=reason)
 
 

@@ -144,6 +144,11 @@ class Rises:
         """Return measured minus model of every sample at (log sigma_0, tau), shape (samples,)."""
         return self._solved(np.exp(at[:1]), at[1:])[2][..., 0][self.there]
 
+    def noise_N(self) -> float:
+        """Return the noise of a sample, from how neighbours bend."""
+        bend = np.diff(self.force, 2, axis=0)[self.there[2:]]
+        return 1.4826 * float(np.median(np.abs(bend - np.median(bend)))) / np.sqrt(6.0) if bend.size else 0.0
+
     def gain_of(self, rss: float) -> float:
         """Return how much better a fit is than a force that is there after one row, in its own residual variances."""
         force = np.where(self.there, self.force, np.nan)[1:]

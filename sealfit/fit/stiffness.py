@@ -27,6 +27,7 @@ from sealfit.fit.rises import Curve, Rises, Stroke
 
 LEAST = 3  # such samples below which nothing can be said
 RISES = 30.0  # residual variances by which a rise must do better than none
+MISSED_NOISE, MISSED_LEVEL = 2.0, 0.03  # of the noise and of the sliding force: what a fit leaves that has missed
 OPEN = np.log(3.0)  # of log sigma_0: an interval that reaches further each way is no estimate
 
 
@@ -50,8 +51,8 @@ class Stiffness:
         Files.
     forces_N : tuple of ndarray, shape (n,) each
         Fitted force of every stroke.
-    rmse_N : float
-        Of what the fit leaves.
+    rmse_N, noise_N : float
+        RMS of what the fit leaves, and the noise of a sample as its neighbours tell it.
     """
 
     sigma_0: float
@@ -63,11 +64,16 @@ class Stiffness:
     files: int
     forces_N: tuple[np.ndarray, ...]
     rmse_N: float
+    noise_N: float
 
     @property
     def seen(self) -> bool:
         """Whether the samples show the rise: some lie within it, and a force that is there at once does worse."""
         return self.within >= LEAST and self.gain > RISES
+
+    def misses(self, level_N: float) -> bool:
+        """Whether the force comes up otherwise than the model's, by more than noise and than matters at this level."""
+        return self.rmse_N > MISSED_NOISE * self.noise_N and self.rmse_N > MISSED_LEVEL * level_N
 
     def log_half_width(self) -> float:
         """Return half of the 95 % interval of log sigma_0."""
@@ -127,6 +133,7 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
         within=rises.inside(float(np.exp(found.x[0])), levels, start_N),
         files=rises.files,
         forces_N=rises.forces(found.residual),
+        noise_N=rises.noise_N(),
         rmse_N=float(np.sqrt(found.rss / found.residual.size)),
     )
 

@@ -94,6 +94,7 @@ def test_noise_of_the_displacement_does_not_hide_the_damping(tmp_path, jitter_mm
     assert found["identified"].all()
     assert found.loc["sigma_0", "lo95"] < found.loc["sigma_0", "value"] < found.loc["sigma_0", "hi95"]
     assert list(found["unit"]) == ["N/mm", "N s/mm"]
+    assert (found["reason"] == "").all()
 
 
 def test_strokes_both_ways_begin_with_bristles_bent_the_other_way(tmp_path):
@@ -174,5 +175,6 @@ def test_micro_tribometer(tmp_path):
     found = fit_dynamic(tables["traces"], steady, fit_conditions(steady, config), config)
     table = dynamic(found.fit)
     assert 33 < table.loc["sigma_0", "value"] < 47
+    assert "does not come up as the model's does" in table.loc["sigma_0", "reason"]
     assert not table.loc["sigma_1", "identified"]
     assert "Stribeck" in table.loc["sigma_1", "reason"]
