@@ -156,7 +156,8 @@ def test_the_search_works_on_few_rows_but_not_on_too_few_of_a_stroke(bins, repea
     assert len(left) <= max(ROWS, min(PER_STROKE * strokes, MOST_ROWS)) + rest
     assert len(left) == len(table) or len(left) > 0.4 * min(ROWS, PER_STROKE * strokes)
     assert left["n"].sum() == table["n"].sum()
-    assert left["force_N"].mean() == pytest.approx(table["force_N"].mean(), rel=1e-6)
+    whole, merged = (np.average(rows["force_N"], weights=rows["n"]) for rows in (table, left))
+    assert merged == pytest.approx(whole, rel=1e-12)
 
 
 def test_an_effect_of_sliding_power_is_found_and_predicted_from_load_and_speed():
