@@ -17,7 +17,8 @@ from sealfit.fit.joint_law import Aged, JointLaw, refitted
 from sealfit.fit.polish import central_jacobian
 
 DAYS_PER_YEAR = 365.25
-SPAN_C = (-80.0, 300.0)  # in which a temperature of use is sought
+SPAN_C = (-80.0, 300.0)  # of temperatures of use
+SPAN_PCT = (1.0, 200.0)  # of the original height in use; above 100 it is stretched
 FOREVER = 1e9  # days: beyond, the law is asked for more than it can say
 
 
@@ -77,7 +78,7 @@ def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, comp
     Raises
     ------
     RequestError
-        If one is missing that the law needs.
+        If one is missing that the law needs, given though the tests did not vary it, or out of any range of use.
     """
     place = _place(law, temperature_C, compression_pct)
     days = _days(law, law.x, goal, place)
@@ -100,13 +101,15 @@ def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
     Raises
     ------
     RequestError
-        If not exactly one of both is given, or the loss is no share of the start.
+        If not exactly one of both is given, the threshold is no number, or the loss is no share of the start.
     """
     if (threshold is None) == (loss_pct is None):
         raise RequestError(
             "what ends a life is not said." if threshold is None else "two ends of life were given.",
             mend="Give --threshold VALUE or --loss PERCENT.",
         )
+    if threshold is not None and not np.isfinite(threshold):
+        raise RequestError(f"--threshold {threshold:g} is no value to reach.", mend="Give a number.")
     if loss_pct is not None and not 0 < loss_pct < 100:
         raise RequestError(f"--loss {loss_pct:g} is no share of the start.", mend="Give percent between 0 and 100.")
     return Goal(threshold) if loss_pct is None else Goal(loss=loss_pct / 100)
@@ -135,7 +138,14 @@ def answer(
         Of use.
     resample : bool
         Whether the interval is checked by drawing the values anew.
+
+    Raises
+    ------
+    RequestError
+        If the request cannot be answered: see `lifetime` and `temperature_for`.
     """
+    if years is not None and temperature_C is not None:
+        raise RequestError("--years asks for the temperature, and --temperature gives it.", mend="Give one of the two.")
     found = {"law": law.loss.name, "way": law.way, "form": law.loss.form, "criterion": law.criterion}
     found |= {"parameters": {name: value for name, value, *_ in law.parameters()}}
     if years is not None:
@@ -160,10 +170,21 @@ def _finite(value: float) -> float | None:
 
 
 def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> Aged:
-    given = {"E": ("temperature", temperature_C), "kappa": ("compression", compression_pct)}
-    for name, (what, value) in given.items():
+    """Return where the rubber is used, checked."""
+    for name, what, value, tested, (least, most), unit in (
+        ("E", "temperature", temperature_C, law.aged.temperature_C, SPAN_C, "degC"),
+        ("kappa", "compression", compression_pct, law.aged.compression_pct, SPAN_PCT, "percent"),
+    ):
         if name in law.names and value is None:
             raise RequestError(f"the rubber was aged at more than one {what}.", mend=f"Say which with --{what}.")
+        if value is not None and not least <= value <= most:
+            raise RequestError(
+                f"--{what} {value:g} is no {what} of use.", mend=f"Give {unit} between {least:g} and {most:g}."
+            )
+        only = np.unique(tested[law.aged.days > 0]) if tested is not None else np.array([])
+        if value is not None and name not in law.names and not (only.size and np.allclose(value, only)):
+            where = f"at {only[0]:g} {unit} only" if only.size else f"at one {what}, which is not on record"
+            raise RequestError(f"the rubber was aged {where}.", mend=f"Leave --{what} away, or test at another {what}.")
     at = (None if value is None else np.array([float(value)]) for value in (temperature_C, compression_pct))
     return Aged(np.ones(1), np.zeros(1), *at)
 
@@ -227,8 +248,10 @@ def temperature_for(law: JointLaw, goal: Goal, years: float, compression_pct: fl
     Raises
     ------
     RequestError
-        If the rubber was aged at one temperature only.
+        If the rubber was aged at one temperature only, or the years are no time.
     """
+    if not 0 < years < np.inf:
+        raise RequestError(f"--years {years:g} is no time to last.", mend="Give a number above 0.")
     if "E" not in law.names:
         raise RequestError("the rubber was aged at one temperature only.", mend="Test at two or more temperatures.")
 

@@ -9,7 +9,7 @@ import pytest
 
 from sealfit.errors import FitError, RequestError
 from sealfit.fit.joint_law import Aged, fit_joint_law, fit_laws, left_out, rivals_of
-from sealfit.fit.lifetime import DAYS_PER_YEAR, Goal, goal_of, lifetime, resampled, temperature_for
+from sealfit.fit.lifetime import DAYS_PER_YEAR, Goal, answer, goal_of, lifetime, resampled, temperature_for
 from sealfit.physics.losses import LOSSES
 
 MEASURED = os.environ.get("SEALFIT_MEASURED")
@@ -139,6 +139,35 @@ def test_what_a_request_lacks_is_said():
         goal_of(None, None)
     with pytest.raises(RequestError, match="no share"):
         goal_of(None, 120.0)
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        ({"years": 0.0}, "no time to last"),
+        ({"years": -5.0}, "no time to last"),
+        ({"years": np.nan}, "no time to last"),
+        ({"years": 10.0, "temperature_C": 40.0}, "asks for the temperature"),
+        ({"temperature_C": -400.0}, "no temperature of use"),
+        ({"temperature_C": np.nan}, "no temperature of use"),
+        ({"temperature_C": 40.0, "compression_pct": 0.0}, "no compression of use"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(asked, why):
+    law = fit_joint_law(campaign(), "log", "rate")
+    with pytest.raises(RequestError, match=why):
+        answer(law, Goal(0.7), **({"compression_pct": 80.0} | asked))
+
+
+def test_a_temperature_is_refused_where_the_tests_had_one():
+    days = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 12.0, 16.0])
+    law = fit_laws(Aged(days, 0.93 - 0.05 * np.log1p(days / 0.1), np.full(7, 60.0), np.full(7, 80.0)))[0]
+    with pytest.raises(RequestError, match="at 60 degC only"):
+        lifetime(law, Goal(0.75), 40.0)
+    assert lifetime(law, Goal(0.75), 60.0, 80.0).days > 0
+    for threshold in (np.nan, np.inf):
+        with pytest.raises(RequestError, match="no value to reach"):
+            goal_of(threshold, None)
 
 
 # ---------------------------------------------------------------- measured: strength of an adhesive and a polymer
