@@ -24,6 +24,7 @@ from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import Rows
+from sealfit.samples import strokes_of
 
 DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at: a far surer one may show in it
 
@@ -217,12 +218,8 @@ def steady_samples(traces: pd.DataFrame, rows: Rows) -> pd.DataFrame:
     first = rows.groups.starts["stroke"]
     strokes = rows.table.iloc[first]
     steady = traces[traces["steady"].to_numpy(dtype=bool)]
-    file, stroke = steady["file"].to_numpy(), steady["stroke"].to_numpy()
-    change = np.flatnonzero(np.r_[True, (file[1:] != file[:-1]) | (stroke[1:] != stroke[:-1])])
-    own = pd.MultiIndex.from_frame(strokes[["file", "stroke"]]).get_indexer(
-        pd.MultiIndex.from_arrays([file[change], stroke[change]])
-    )
-    place = np.repeat(own, np.diff(np.r_[change, file.size]))
+    edges, own = strokes_of(steady, strokes)
+    place = np.repeat(own, np.diff(edges))
     known = place >= 0
     place = place[known]
     table = {name: steady[name].to_numpy()[known] for name in ("displacement_mm", "time_s", "force_N")}

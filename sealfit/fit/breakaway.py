@@ -9,7 +9,6 @@ import pandas as pd
 from scipy import stats
 
 from sealfit.config import Config
-from sealfit.fit.starts import Start, cell_means
 from sealfit.fit.steady import table_row
 
 NEAR = 1  # cells to either side of the peak that count as it
@@ -19,7 +18,7 @@ FEW = "no repeats: no scatter is known"
 FAMILY = 0.01  # chance of a peak anywhere in a campaign where there is none
 
 
-def peaks(starts: Sequence[Start], steady: pd.DataFrame) -> pd.DataFrame:
+def peaks(force: np.ndarray, sliding: Sequence[float], steady: pd.DataFrame) -> pd.DataFrame:
     """Return the break-away force F_ba and its share of the sliding force, per file, or per stroke of a single file.
 
     Where the peak lies is read from the mean of the other units, and a start's own force is then taken there: the
@@ -27,15 +26,17 @@ def peaks(starts: Sequence[Start], steady: pd.DataFrame) -> pd.DataFrame:
 
     Parameters
     ----------
-    starts : sequence of Start
-        At one condition, commanded speed and direction.
+    force : ndarray, shape (starts, cells)
+        Mean force in cells of distance, in N, as `cell_means` gives it: the starts at one condition, commanded speed
+        and direction; NaN where there is no sample.
+    sliding : sequence of float, length starts
+        Their force in steady sliding, in N.
     steady : DataFrame
         Rows of table `steady`, one per start, in the same order.
     """
-    unit = steady["file"].to_numpy() if steady["file"].nunique() > 1 else np.arange(len(starts))
-    peak = _peaks(starts, unit)
-    sliding = np.array([s.sliding_N for s in starts])
-    return pd.DataFrame({FORCE: peak, RATIO: peak / sliding}).groupby(unit, sort=False).mean().dropna()
+    unit = steady["file"].to_numpy() if steady["file"].nunique() > 1 else np.arange(len(force))
+    peak = _peaks(force, unit)
+    return pd.DataFrame({FORCE: peak, RATIO: peak / np.asarray(sliding)}).groupby(unit, sort=False).mean().dropna()
 
 
 def break_away_rows(found: Sequence[tuple[Mapping, pd.DataFrame]], config: Config) -> Iterator[dict]:
@@ -79,12 +80,11 @@ def _pooled(groups: Sequence[np.ndarray]) -> tuple[float, int]:
     return float(np.sqrt(squares / df)) if df else np.nan, df
 
 
-def _peaks(starts: Sequence[Start], unit: np.ndarray) -> np.ndarray:
+def _peaks(force: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """Return each start's force where the mean of the other units is largest, shape (starts,); NaN without a sample."""
-    _, force = cell_means(starts, [s.force_N for s in starts])
     hits, total = np.isfinite(force), np.nan_to_num(force)
-    found = np.full(len(starts), np.nan)
-    for k in range(len(starts)):
+    found = np.full(len(force), np.nan)
+    for k in range(len(force)):
         others = unit != unit[k] if (unit != unit[k]).any() else unit == unit[k]
         count = hits[others].sum(axis=0)
         mean = np.where(count > 0, total[others].sum(axis=0) / np.maximum(count, 1), -np.inf)

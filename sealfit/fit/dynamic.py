@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from sealfit.config import Config
 from sealfit.fit.breakaway import break_away_rows, peaks
@@ -73,8 +72,10 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
             at = {"condition": name, "speed_set_mm_s": speed, "direction": direction}
             places = of.index.to_numpy()
             alike = [starts[k] for k in places]
-            broken.append((at, peaks(alike, of)))
-            curves.append(_mean_curve(alike, None if models is None else [models[k] for k in places]).assign(**at))
+            distance, force = cell_means(alike, [s.force_N for s in alike])
+            broken.append((at, peaks(force, [s.sliding_N for s in alike], of)))
+            model = None if models is None else cell_means(alike, [models[k] for k in places])[1]
+            curves.append(_mean_curve(distance, force, model).assign(**at))
     rows += break_away_rows([(at, own) for at, own in broken if len(own)], config)
     keys = condition_keys(steady, config)
     table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
@@ -103,12 +104,11 @@ def _numbered(names: pd.Series) -> np.ndarray:
     return pd.factorize(names)[0] if names.nunique() > 1 else np.arange(len(names))
 
 
-def _mean_curve(starts: Sequence[Start], models: Sequence[np.ndarray] | None) -> pd.DataFrame:
+def _mean_curve(distance: np.ndarray, force: np.ndarray, model: np.ndarray | None) -> pd.DataFrame:
     """Return the mean start at one speed and direction, and the fitted model's, as table `dynamic_curves`."""
-    distance, force = cell_means(starts, [s.force_N for s in starts])
     cells = pd.DataFrame(force)
     table = {"distance_mm": distance, "force_N": cells.mean(), "force_se_N": cells.sem(), "n": cells.count()}
-    table["model_N"] = np.nan if models is None else pd.DataFrame(cell_means(starts, models)[1]).mean()
+    table["model_N"] = np.nan if model is None else pd.DataFrame(model).mean()
     return pd.DataFrame(table).query("n > 0")
 
 
@@ -185,7 +185,7 @@ def _damping_row(found: Stiffness, curve: Curve, unit: str) -> dict:
         return table_row(**row, identified=False, reason=NO_CURVE)
     half = found.damping_half_width()
     low, high = max(found.sigma_1 - half, 0.0), found.sigma_1 + half
-    row |= {"lo95": low, "hi95": high, "se": half / stats.t.ppf(0.975, max(found.df[1], 1.0))}
+    row |= {"lo95": low, "hi95": high, "se": found.damping_se}
     if low > 0.0:
         return table_row(**row, identified=True)
     return table_row(**row, identified=False, reason=f"no damping of the bristles is seen: at most {high:.2g} {unit}")

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sealfit.physics.stribeck import stribeck_decay
+from sealfit.physics import bristle_limit
+from sealfit.samples import noise_from_bends
 
 STIFFNESSES = 40  # of the grid: the rise's length from a third of a step to the whole stroke
 DAMPINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the grid: tau as a share of the time that the rise takes
@@ -70,7 +71,7 @@ class Curve:
         """Return G, the bristles' force in steady sliding, of the shape of the speed."""
         if not self.known:
             return np.full(np.shape(speed_mm_s), self.coulomb_N)
-        return self.coulomb_N + (self.static_N - self.coulomb_N) * stribeck_decay(speed_mm_s, self.v_s)
+        return bristle_limit(speed_mm_s, 1.0, mu_s=self.static_N, mu_c=self.coulomb_N, v_s=self.v_s, sigma_0=1.0)
 
 
 class Rises:
@@ -146,8 +147,7 @@ class Rises:
 
     def noise_N(self) -> float:
         """Return the noise of a sample, from how neighbours bend."""
-        bend = np.diff(self.force, 2, axis=0)[self.there[2:]]
-        return 1.4826 * float(np.median(np.abs(bend - np.median(bend)))) / np.sqrt(6.0) if bend.size else 0.0
+        return noise_from_bends(np.diff(self.force, 2, axis=0)[self.there[2:]])
 
     def gain_of(self, rss: float) -> float:
         """Return how much better a fit is than a force that is there after one row, in its own residual variances."""

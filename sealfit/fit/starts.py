@@ -10,6 +10,8 @@ import pandas as pd
 from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
 
+from sealfit.samples import noise_from_bends, strokes_of
+
 STANDSTILL = 0.05  # slower than this share of the steady speed: not moving yet
 ROUGH = 0.1  # wanted noise of the local speed, as a share of the steady speed
 RAMPS = np.geomspace(0.5, 200.0, 12)  # steps in time that a ramp may take, to begin with
@@ -50,16 +52,11 @@ def starts_of(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]:
     steady : DataFrame
         Table `steady`: the strokes.
     """
-    file, stroke = pd.factorize(traces["file"])[0], traces["stroke"].to_numpy()
-    edges = np.flatnonzero(np.r_[True, (np.diff(file) != 0) | (np.diff(stroke) != 0), True])
-    first, last = edges[:-1], edges[1:]
-    own = pd.MultiIndex.from_frame(steady[["file", "stroke"]]).get_indexer(
-        pd.MultiIndex.from_arrays([traces["file"].to_numpy()[first], stroke[first]])
-    )
+    edges, own = strokes_of(traces, steady)
     time, along, force = (traces[name].to_numpy(float) for name in ("time_s", "displacement_mm", "force_N"))
     sliding, sign = traces["steady"].to_numpy(bool), steady["direction"].to_numpy()
     pace = np.abs(steady["speed_mm_s"].to_numpy(float))
-    for begin, end, row in zip(first.tolist(), last.tolist(), own.tolist(), strict=True):
+    for begin, end, row in zip(edges[:-1].tolist(), edges[1:].tolist(), own.tolist(), strict=True):
         if row < 0 or not sliding[begin:end].any():
             continue
         part = slice(begin, end)
@@ -122,16 +119,24 @@ def _motion(time_s: np.ndarray, along_mm: np.ndarray, pace: float, until: int) -
     fits = []
     for shape, lag in ((_straight, 0.5), (_lagging, 1.0)):
 
-        def left(at, shape=shape):
-            return along - _linear(along, shape(time - at[0], np.exp(at[1]))[0])[1]
+        def motion(at, shape=shape):
+            return shape(time - at[0], np.exp(np.clip(at[1], -50.0, 50.0)))
+
+        def left(at, motion=motion):
+            return along - _linear(along, motion(at)[0])[1]
+
+        def slope(at, motion=motion):  # of variable projection: Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995
+            distance, rate, by_ramp = motion(at)
+            speed = _linear(along, distance)[0]
+            return np.column_stack([_linear(own, distance)[1] - own for own in (-speed * rate, speed * by_ramp)])
 
         grid = [(lagged - lag * ramp, np.log(ramp)) for ramp in step * RAMPS]
         start = min(grid, key=lambda at: float((left(at) ** 2).sum()))
-        fits.append((least_squares(left, start, x_scale=[step, 1.0], max_nfev=30), shape))
+        fits.append((least_squares(left, start, slope, method="lm", x_scale=[step, 1.0], max_nfev=100), shape))
     found, shape = min(fits, key=lambda fit: fit[0].cost)
-    distance, rate = shape(time_s - found.x[0], np.exp(found.x[1]))
+    distance, rate, _ = shape(time_s - found.x[0], np.exp(found.x[1]))
     speed = _linear(along, distance[rows])[0]
-    if np.sqrt(2 * found.cost / time.size) > AS_NOISE * _noise(along_mm) or not speed > 0.0:
+    if np.sqrt(2 * found.cost / time.size) > AS_NOISE * noise_from_bends(np.diff(along_mm, 2)) or not speed > 0.0:
         return None
     return speed * distance, speed * rate
 
@@ -143,17 +148,18 @@ def _linear(along_mm: np.ndarray, shape: np.ndarray) -> tuple[float, np.ndarray]
     return slope, along_mm.mean() + slope * centred
 
 
-def _straight(since: np.ndarray, ramp: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance and speed for a final speed of 1 to which the speed rises along a straight line."""
+def _straight(since: np.ndarray, ramp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return distance, speed and d distance / d log ramp, for a speed that rises to 1 along a straight line."""
     share = np.clip(since / ramp, 0.0, 1.0)
-    return np.where(since < ramp, 0.5 * ramp * share**2, since - 0.5 * ramp), share
+    lag = 0.5 * ramp * share**2
+    return np.where(since < ramp, lag, since - 0.5 * ramp), share, -lag
 
 
-def _lagging(since: np.ndarray, ramp: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance and speed for a final speed of 1 that is approached as by a first-order lag."""
+def _lagging(since: np.ndarray, ramp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return distance, speed and d distance / d log ramp, for a speed of 1 approached as by a first-order lag."""
     since = np.maximum(since, 0.0)
     left = np.exp(-since / ramp)
-    return since - ramp * (1 - left), 1 - left
+    return since - ramp * (1 - left), 1 - left, since * left - ramp * (1 - left)
 
 
 def _smoothed(time_s: np.ndarray, along_mm: np.ndarray, pace: float) -> tuple[np.ndarray, np.ndarray]:
@@ -168,14 +174,8 @@ def _smoothed(time_s: np.ndarray, along_mm: np.ndarray, pace: float) -> tuple[np
 
 def _half_width(time_s: np.ndarray, along_mm: np.ndarray, pace: float) -> int:
     """Return the rows to either side over which a parabola gives the local speed to `ROUGH` of the steady one."""
-    noise, step = _noise(along_mm), pace * float(np.median(np.diff(time_s)))
+    noise, step = noise_from_bends(np.diff(along_mm, 2)), pace * float(np.median(np.diff(time_s)))
     for half in range(1, max(2, len(time_s) // 16)):
         if noise * np.sqrt(3.0 / (half * (half + 1) * (2 * half + 1))) <= ROUGH * step:
             break
     return half
-
-
-def _noise(along_mm: np.ndarray) -> float:
-    """Return the standard deviation of a sample of the displacement, from how neighbours bend."""
-    bend = np.diff(along_mm, 2)
-    return 1.4826 * float(np.median(np.abs(bend - np.median(bend)))) / np.sqrt(6.0)

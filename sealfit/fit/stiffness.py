@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from sealfit.fit.polish import central_jacobian, polish
+from sealfit.fit.polish import polish
 from sealfit.fit.rises import Curve, Rises, Stroke
 
 LEAST = 3  # such samples below which nothing can be said
@@ -75,9 +75,14 @@ class Stiffness:
         """Whether the force comes up otherwise than the model's, by more than noise and than matters at this level."""
         return self.rmse_N > MISSED_NOISE * self.noise_N and self.rmse_N > MISSED_LEVEL * level_N
 
+    @property
+    def quantile(self) -> np.ndarray:
+        """Student's quantile of the 95 % intervals of the two, shape (2,)."""
+        return stats.t.ppf(0.975, np.maximum(self.df, 1.0))
+
     def log_half_width(self) -> float:
         """Return half of the 95 % interval of log sigma_0."""
-        return float(stats.t.ppf(0.975, max(self.df[0], 1.0)) * np.sqrt(self.covariance[0, 0]))
+        return float(self.quantile[0] * np.sqrt(self.covariance[0, 0]))
 
     @property
     def stiffness_known(self) -> bool:
@@ -89,10 +94,15 @@ class Stiffness:
         """sigma_0 tau, in N s/mm."""
         return self.sigma_0 * self.tau_s
 
-    def damping_half_width(self) -> float:
-        """Return half of the 95 % interval of sigma_1, by the delta method, in N s/mm."""
+    @property
+    def damping_se(self) -> float:
+        """Standard error of sigma_1 by the delta method, in N s/mm."""
         slope = np.array([self.sigma_1, self.sigma_0])
-        return float(stats.t.ppf(0.975, max(self.df[1], 1.0)) * np.sqrt(slope @ self.covariance @ slope))
+        return float(np.sqrt(slope @ self.covariance @ slope))
+
+    def damping_half_width(self) -> float:
+        """Return half of the 95 % interval of sigma_1, in N s/mm."""
+        return float(self.quantile[1] * self.damping_se)
 
 
 def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
@@ -115,12 +125,11 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
     found = polish(rises.residual, None, np.array([np.log(stiffness[best]), tau[best]]), (low, high))
     levels, start_N = rises.amplitudes(found.x)
     level = rises.run_levels(levels)
-    shifts = [
-        at - found.x + [other.run_levels(other.amplitudes(at)[0]).mean() - level.mean(), 0.0]
-        for other in (Rises(strokes, moved) for moved in curve.moved())
-        for at in (polish(other.residual, None, found.x, (low, high)).x,)
-    ]
-    by_files, df = _between_files(central_jacobian(rises.residual, found.x), found.residual, rises.file)
+    shifts = []
+    for other in (Rises(strokes, moved) for moved in curve.moved()):
+        at = _one_step(found.jacobian, other.residual(found.x), found.x, low, high)
+        shifts.append(at - found.x + [other.run_levels(other.amplitudes(at)[0]).mean() - level.mean(), 0.0])
+    by_files, df = _between_files(found.jacobian, found.residual, rises.file)
     by_level = float(level.var(ddof=1) / level.size) if level.size > 1 else np.nan
     by_curve = np.array(shifts).T @ np.array(shifts) if shifts else np.zeros((2, 2))
     parts = ((np.diag(by_files), df), (np.array([by_level, 0.0]), level.size - 1), (np.diag(by_curve), curve.df))
@@ -136,6 +145,20 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
         noise_N=rises.noise_N(),
         rmse_N=float(np.sqrt(found.rss / found.residual.size)),
     )
+
+
+def _one_step(jacobian: np.ndarray, residual: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray):
+    """Return where one Gauss-Newton step leads, shape (p,); what it would carry over a bound is held there."""
+    step, free = np.zeros(x.size), np.ones(x.size, bool)
+    for _ in range(x.size):
+        step[free] = np.linalg.lstsq(jacobian[:, free], -residual - jacobian @ np.where(free, 0.0, step), rcond=1e-12)[
+            0
+        ]
+        over = free & ((x + step < low) | (x + step > high))
+        if not over.any():
+            break
+        step[over], free = (np.clip(x + step, low, high) - x)[over], free & ~over
+    return x + step
 
 
 def _together(parts: Sequence[tuple[np.ndarray, np.ndarray | int]]) -> np.ndarray:
