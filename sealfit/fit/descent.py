@@ -100,11 +100,12 @@ def search_bent(model: Model, rows: Rows, scatter: Scatter) -> Model:
 def _best_on_grid(model: Model, rows: Rows, whitening: Whitening, group: list[int]) -> Model:
     """Return the model with the numbers of a group, equal to one another, at the best of a few values or as it is."""
     low, high = bounds_of(model, rows)
-    best, chosen = _linear_solved(model, model, rows, whitening)
+    prior = _linear_prior(model)
+    best, chosen = _linear_solved(model, *prior, rows, whitening)
     for value in np.linspace(low[group[0]], high[group[0]], GRID):
         vector = model.vector()
         vector[group] = value
-        cost, solved = _linear_solved(model.at(vector), model, rows, whitening)
+        cost, solved = _linear_solved(model.at(vector), *prior, rows, whitening)
         if cost < best - 1e-9:
             best, chosen = cost, solved
     return model.at(np.clip(chosen.vector(), low, high))
@@ -117,26 +118,30 @@ def linear_solved(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarr
     descent throws the rest anywhere.
     """
     low, high = bounds_of(model, rows)
-    solved = _linear_solved(model, model, rows, Whitening(scatter, friction, rows.groups))[1]
+    solved = _linear_solved(model, *_linear_prior(model), rows, Whitening(scatter, friction, rows.groups))[1]
     return model.at(np.clip(solved.vector(), low, high))
 
 
-def _linear_solved(model: Model, centre: Model, rows: Rows, whitening: Whitening) -> tuple[float, Model]:
-    """Return the whitened sum of squares left by, and the model with, its linear numbers solved for at once.
+def _linear_prior(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Return the prior's precision of the numbers that act linearly, and where it lies."""
+    linear = ~model.bent
+    return precision_of(model)[np.ix_(linear, linear)], centre_of(model)[linear]
 
-    The priors lie about `centre`.
-    """
-    held = model.bent  # one step far from the optimum would throw these anywhere
+
+def _linear_solved(
+    model: Model, precision: np.ndarray, centre: np.ndarray, rows: Rows, whitening: Whitening
+) -> tuple[float, Model]:
+    """Return the whitened sum of squares left by, and the model with, its linear numbers solved for at once."""
+    linear = ~model.bent  # one step far from the optimum would throw the others anywhere
     vector = model.vector()
     force, jacobian = evaluate(model, rows)
     residual = whitening((rows.force - force)[:, None])[:, 0]
-    normal, gradient = whitening.normal(jacobian[:, ~held], residual)
-    prior = precision_of(model)[np.ix_(~held, ~held)]
-    away = (vector - centre_of(centre))[~held]
-    gradient = gradient - prior @ away
-    step, *_ = np.linalg.lstsq(normal + prior, gradient, rcond=1e-10)
-    vector[~held] += step
-    return float(residual @ residual + away @ prior @ away - step @ gradient), model.at(vector)
+    normal, gradient = whitening.normal(jacobian[:, linear], residual)
+    away = vector[linear] - centre
+    gradient = gradient - precision @ away
+    step, *_ = np.linalg.lstsq(normal + precision, gradient, rcond=1e-10)
+    vector[linear] += step
+    return float(residual @ residual + away @ precision @ away - step @ gradient), model.at(vector)
 
 
 def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
