@@ -25,7 +25,7 @@ from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.rows import Rows, make_rows, thin
 
 ROWS = 4_000  # that the search works on; more are merged along their strokes,
-PER_STROKE = 8  # to no fewer than these of each stroke,
+PER_STROKE = 8  # to about so many of each stroke,
 MOST_ROWS = 8_000  # unless there are more than so many then
 
 

@@ -155,6 +155,8 @@ def test_the_search_works_on_few_rows_but_not_on_too_few_of_a_stroke(bins, repea
     rest = strokes  # what is over in each stroke when whole numbers of bins are merged makes a row of its own
     assert len(left) <= max(ROWS, min(PER_STROKE * strokes, MOST_ROWS)) + rest
     assert len(left) == len(table) or len(left) > 0.4 * min(ROWS, PER_STROKE * strokes)
+    together = np.ceil(len(table) / np.clip(PER_STROKE * strokes, ROWS, MOST_ROWS))  # bins merged into one row
+    assert len(left) == np.ceil(table.groupby("stroke_id").size() / together).sum()
     assert left["n"].sum() == table["n"].sum()
     whole, merged = (np.average(rows["force_N"], weights=rows["n"]) for rows in (table, left))
     assert merged == pytest.approx(whole, rel=1e-12)
