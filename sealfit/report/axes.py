@@ -88,3 +88,8 @@ def natural(entry: tuple[str, object]) -> list[tuple[int, float, str]]:
 def capital(text: str) -> str:
     """Return text with its first letter large."""
     return text[:1].upper() + text[1:]
+
+
+def evenly(count: int, wanted: int) -> list[int]:
+    """Return `wanted` places of `count`, spread evenly from the first to the last; some twice where there are fewer."""
+    return [round(k * (count - 1) / max(wanted - 1, 1)) for k in range(wanted)]

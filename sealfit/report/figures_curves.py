@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sealfit.config import Config
-from sealfit.report.axes import natural, padded, round_ticks
+from sealfit.report.axes import evenly, natural, padded, round_ticks
 from sealfit.report.numbers import count, given, number
 from sealfit.report.style import AFTER, CYCLE, FLOOR, QUIET, SKY, Key, Panel, Plot
 from sealfit.report.symbols import ConditionNames, is_unaged, joined, plain, short, symbol_plain
@@ -198,9 +198,9 @@ def _examples(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     groups = [g.sort_values("speed") for _, g in known.groupby("condition", sort=False)]
     n = min(MOST_TRACES, len(known))
     picked = []
-    for k in range(n):
-        group = groups[round(k * (len(groups) - 1) / max(n - 1, 1))]
+    for k, place in enumerate(evenly(len(groups), n)):
+        group = groups[place]
         left = group[~group["run_id"].isin([row["run_id"] for row in picked])]
         if len(left):
-            picked.append(left.iloc[round(k * (len(left) - 1) / max(n - 1, 1))])
+            picked.append(left.iloc[evenly(len(left), n)[k]])
     return pd.DataFrame(picked)

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sealfit.config import Config
-from sealfit.report.axes import natural, padded
+from sealfit.report.axes import evenly, natural, padded
 from sealfit.report.numbers import given, number
 from sealfit.report.style import BLACK, FLOOR, Key, Panel, Plot, shades
 from sealfit.report.symbols import ConditionNames, is_unaged, plain, short
@@ -70,9 +70,9 @@ def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         return None
     names, units = ConditionNames.of(config), config.units
     ordered = sorted(curves["condition"].unique(), key=lambda c: (not is_unaged(c), natural((names(c), None))))
-    picked = [ordered[k] for k in _spread(len(ordered), MOST_PANELS)]
+    picked = [ordered[k] for k in evenly(len(ordered), min(len(ordered), MOST_PANELS))]
     speeds = np.sort(curves["speed_set_mm_s"].dropna().unique())
-    speeds = speeds[_spread(len(speeds), MOST_SPEEDS)] if len(speeds) else speeds
+    speeds = speeds[evenly(len(speeds), min(len(speeds), MOST_SPEEDS))]
     colours = dict(zip(speeds.tolist(), shades(len(speeds)), strict=True))
     shown = curves[curves["condition"].isin(picked)]
     shown = shown[shown["speed_set_mm_s"].isin(speeds) | shown["speed_set_mm_s"].isna()]
@@ -98,8 +98,3 @@ def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     if shown["model_N"].notna().any():
         legend.append(Key("dynamic model", FLOOR, "line"))
     return Plot("starts", "Starts", tuple(panels), tuple(legend))
-
-
-def _spread(count: int, most: int) -> list[int]:
-    """Return up to `most` places of `count`, spread evenly, the first and the last among them."""
-    return sorted({round(k * (count - 1) / max(min(count, most) - 1, 1)) for k in range(min(count, most))})
