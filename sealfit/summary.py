@@ -201,7 +201,8 @@ def dynamic_lines(part: Mapping) -> list[str]:
     found = _fit_lines("pre-sliding", part)
     if part["above_sliding"]:
         more = f"{part['largest_ratio'] - 1:.1%} at most, {part['largest_at']}"
-        text = f"above the sliding force at {part['above_sliding']} of {part['break_aways']} speeds, both ways ({more})"
+        text = f"above the sliding force in {part['above_sliding']} of {part['break_aways']} cases of condition, speed "
+        text += f"and direction ({more})"
         found.append(line("break-away", text))
     return found
 
