@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from sealfit.config import load_config
+from sealfit.fit.aged import Aged
 from sealfit.fit.dynamic import fit_dynamic
-from sealfit.fit.joint_law import Aged, fit_joint_law
+from sealfit.fit.joint_law import fit_joint_law
 from sealfit.fit.lifetime import Goal, lifetime
 from sealfit.fit.steady import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign

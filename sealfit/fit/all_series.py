@@ -9,9 +9,10 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import FitError, RequestError
-from sealfit.fit.joint_law import Aged, JointLaw, fit_laws, left_out, reference_of, rivals_of
+from sealfit.fit.aged import Aged, reference_of
+from sealfit.fit.joint_law import JointLaw, fit_laws, left_out, rivals_of
 from sealfit.fit.law import Values, fit_law, law_model
-from sealfit.fit.polish import central_jacobian
+from sealfit.physics.losses import LOSSES
 from sealfit.tables import AGING_LAWS, MASTER_CURVE
 
 TEMPERATURE, COMPRESSION = "temperature_C", "compression_ratio_pct"
@@ -116,19 +117,16 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
     None where the series have too few values for laws of their own.
     """
     aged, series = law.aged, law.aged.series()
-    days = [np.unique(aged.days[series == k]).size for k in np.unique(series[series >= 0])]
+    days = [np.unique(aged.days[own]).size for own in aged.whole_series()]
     if len(days) < 2 or min(days) < 3:
         return None
-    measured = np.zeros(aged.value.size) if aged.variance is None else aged.variance
-    variance = measured + (law.scatter * aged.value) ** 2 + 1e-300
-    values = Values(aged.days, aged.value, np.zeros(aged.value.size, int), series, np.diag(variance))
-    fitted = fit_law(values)
-    criterion = fitted.chi2 + float(np.log(variance).sum()) + fitted.x.size * np.log(aged.value.size)
-    ends = [(series == k) & (aged.days == aged.days[series == k].max()) for k in np.unique(series[series >= 0])]
+    covariance = aged.covariance(law.scatter)
+    fitted = fit_law(Values(aged.days, aged.value, np.zeros(aged.value.size, int), series, covariance))
+    criterion = fitted.chi2 + float(np.linalg.slogdet(covariance)[1]) + fitted.x.size * np.log(aged.value.size)
     squares = []
-    for out in ends if min(days) > 3 else []:
-        part = fit_law(values.part(~out))
-        squares += list((law_model(values, part.x)[0][out] - aged.value[out]) ** 2)
+    for out in aged.last_days() if min(days) > 3 else []:
+        part = fit_law(fitted.values.part(~out))
+        squares += list((law_model(fitted.values, part.x)[0][out] - aged.value[out]) ** 2)
     return criterion, float(np.sqrt(np.mean(squares))) if squares else np.nan
 
 
@@ -139,7 +137,7 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
     """
     aged = law.aged
     tested = (aged.temperature_C, aged.compression_pct)
-    scaled = aged.days * (np.exp(law.log_rate(aged)) if law.way == "rate" else 1.0)
+    scaled = law.tested_days()
     points = {"kind": "value", "scaled_days": scaled, "value": aged.value, "aging_days": aged.days}
     for name, column in zip((TEMPERATURE, COMPRESSION), tested, strict=True):
         points[name] = np.nan if column is None else np.where(aged.days > 0, column, np.nan)
@@ -148,7 +146,7 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
     days = np.r_[0.0, np.geomspace(scaled[scaled > 0].min() / 3, scaled.max() * 1.5, CURVE_POINTS)]
     middle = (None if c is None else np.full(days.size, reference_of(c[aged.days > 0])) for c in tested)
     at = Aged(days, np.zeros(days.size), *middle)
-    slope = central_jacobian(lambda x: law.at(at, x), law.x)
+    slope = law.slope(at)
     half = law.t * np.sqrt(np.einsum("ni,ij,nj->n", slope, law.covariance, slope))
     value = law.at(at)
     curve = {"kind": "law", "scaled_days": days, "value": value, "lo95": value - half, "hi95": value + half}
@@ -170,14 +168,10 @@ def law_of(steady_fit: pd.DataFrame, quantity: str, name: str | None = None) -> 
         raise RequestError(f"there is no '{quantity}' to follow.", mend=f"Choose one of: {there}.")
     if len(rubbers) > 1:
         raise RequestError(f"there are several rubbers: {', '.join(rubbers)}.", mend="Analyse them one by one.")
+    aged = aged_values(steady_fit, rubbers[0], quantity)
+    if name is not None and name not in LOSSES:
+        raise RequestError(f"there is no law '{name}'.", mend=f"Choose one of: {', '.join(LOSSES)}.")
     try:
-        laws = fit_laws(aged_values(steady_fit, rubbers[0], quantity))
+        return fit_laws(aged) if name is None else fit_laws(aged, (name,))
     except FitError as error:
         raise RequestError(error.message, mend=error.mend) from error
-    chosen = laws if name is None else [law for law in laws if law.loss.name == name]
-    if not chosen:
-        raise RequestError(
-            f"there is no law '{name}' for these conditions.",
-            mend=f"Choose one of: {', '.join(dict.fromkeys(law.loss.name for law in laws))}.",
-        )
-    return chosen

@@ -15,84 +15,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 from scipy import stats
 from scipy.optimize import brentq
 
 from sealfit.errors import FitError
-from sealfit.fit.polish import central_jacobian, polish
+from sealfit.fit.aged import Aged
+from sealfit.fit.joint_solve import solved
+from sealfit.fit.polish import central_jacobian
+from sealfit.fit.prior import covariance_of
 from sealfit.physics.losses import LOSSES, Loss
 
-GAS_CONSTANT = 8.314462618e-3  # kJ/(mol K), CODATA 2018
-ZERO_C = 273.15
 WAYS = ("rate", "loss")  # what temperature and compression change
-ENERGIES = (0.0, 50.0, 100.0)  # kJ/mol, to begin with
-SHAPES = {"b": (0.01, 0.3, 10.0), "tau": (0.5, 5.0, 50.0), "beta": (0.5, 1.0), "n": (0.2, 0.5, 1.0), "t_i": (0.3, 3.0)}
-LIMITS = {"b": (1e-9, 1e4), "tau": (1e-6, 1e6), "beta": (0.05, 5.0), "n": (0.01, 5.0), "t_i": (1e-3, 1e3)}
 TURNS, SETTLED = 4, 0.02  # of the fit and the scatter, at most; relative change of the scatter that ends them
 RIVAL = 6.0  # of the criterion: a rival law is less likely than the chosen one by less than exp(3)
 KNOWN = np.log(100.0)  # a positive number whose 95 % interval spans more than this is not determined
-
-
-@dataclass(frozen=True)
-class Aged:
-    """Values of one quantity: a specimen, or the mean of those of one condition, each.
-
-    Attributes
-    ----------
-    days, value : ndarray, shape (n,)
-        Aging time in days, and the value measured.
-    temperature_C, compression_pct : ndarray, shape (n,), or None
-        Of aging; whatever stands there for unaged specimens is not read. None where no such thing was varied.
-    variance : ndarray, shape (n,)
-        Of each value as measured; the scatter between specimens is estimated and added. 0 where it is all there is.
-    """
-
-    days: np.ndarray
-    value: np.ndarray
-    temperature_C: np.ndarray | None = None
-    compression_pct: np.ndarray | None = None
-    variance: np.ndarray | None = None
-
-    def part(self, keep: np.ndarray) -> Aged:
-        """Return some of the values."""
-        taken = {
-            name: None if getattr(self, name) is None else getattr(self, name)[keep]
-            for name in ("temperature_C", "compression_pct", "variance")
-        }
-        return replace(self, days=self.days[keep], value=self.value[keep], **taken)
-
-    def drivers(self) -> dict[str, np.ndarray]:
-        """Return what multiplies E (kJ/mol) and kappa (per percent) in ln k, for those that vary, shape (n,) each."""
-        aged, found = self.days > 0, {}
-        for name, at, column in (("E", self.temperature_C, _inverse), ("kappa", self.compression_pct, _plain)):
-            if at is not None and np.unique(at[aged]).size > 1:
-                found[name] = np.where(aged, column(reference_of(at[aged])) - column(at), 0.0)
-        return found
-
-    def series(self) -> np.ndarray:
-        """Return the number of each value's series, shape (n,); -1 for unaged specimens."""
-        keys = [at for at in (self.temperature_C, self.compression_pct) if at is not None]
-        number, aged = np.full(self.days.size, -1), self.days > 0
-        number[aged] = 0
-        if keys:
-            number[aged] = np.unique(np.column_stack(keys)[aged], axis=0, return_inverse=True)[1].ravel()
-        return number
-
-
-def _inverse(celsius):
-    return 1 / (GAS_CONSTANT * (np.asarray(celsius, float) + ZERO_C))
-
-
-def _plain(percent):
-    return np.asarray(percent, float)
-
-
-def reference_of(tested: np.ndarray) -> float:
-    """Return the middle of the tested temperatures or compressions, at which k is 1."""
-    return float(np.median(np.unique(tested)))
 
 
 @dataclass(frozen=True)
@@ -137,21 +75,34 @@ class JointLaw:
         return float(stats.t.ppf(0.975, max(self.df, 1)))
 
     def at(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
-        """Return the law at other conditions, shape (n,); their references are those of the fit."""
-        return _law(self, self.x if x is None else x, aged.days, self.log_rate(aged, x))
+        """Return the law at other conditions, shape (n,), or (..., n) for x of shape (..., p).
 
-    def log_rate(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
-        """Return ln k at some conditions, shape (n,)."""
-        x, total = self.x if x is None else x, np.zeros(aged.days.size)
-        tested = self.aged.days > 0
-        for name, at, there, column in (
-            ("E", aged.temperature_C, self.aged.temperature_C, _inverse),
-            ("kappa", aged.compression_pct, self.aged.compression_pct, _plain),
-        ):
-            if name in self.names:
-                away = column(reference_of(there[tested])) - column(at)
-                total = total + x[self.names.index(name)] * np.where(aged.days > 0, away, 0.0)
-        return total
+        The references of temperature and compression are those of the fit.
+        """
+        x = self.x if x is None else x
+        k, own = self.rate(aged, x), self.own(x)
+        lost = self.loss.value(aged.days * k, *own) if self.way == "rate" else k * self.loss.value(aged.days, *own)
+        return x[..., :1] - x[..., 1:2] * lost
+
+    def own(self, x: np.ndarray | None = None) -> list[np.ndarray]:
+        """Return the shape's own numbers, shape (..., 1) each."""
+        x = self.x if x is None else x
+        return [np.exp(x[..., 2 + k, None]) for k in range(len(self.loss.parameters))]
+
+    def rate(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
+        """Return k at some conditions, shape (..., n)."""
+        x, logarithm = self.x if x is None else x, np.zeros(aged.days.size)
+        for name in (name for name in self.names if name in ("E", "kappa")):
+            logarithm = logarithm + x[..., self.names.index(name), None] * aged.away(name, self.aged)
+        return np.exp(np.clip(logarithm, -50, 50))
+
+    def slope(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
+        """Return the derivative of the law along its parameters, shape (n, p), or (..., n, p) for many x."""
+        return central_jacobian(lambda many: self.at(aged, many), self.x if x is None else x, together=True)
+
+    def tested_days(self) -> np.ndarray:
+        """Return the days of the tests, in the master curve's time where there is one, shape (n,)."""
+        return self.aged.days * (self.rate(self.aged) if self.way == "rate" else 1.0)
 
     def parameters(self) -> Iterator[tuple[str, float, float, float, bool]]:
         """Yield name, value, ends of the 95 % interval, and whether the values determine it."""
@@ -163,14 +114,6 @@ class JointLaw:
             else:
                 known = np.isfinite(half) and (name != "a" or abs(self.x[k]) > half)
                 yield name, float(self.x[k]), float(self.x[k] - half), float(self.x[k] + half), bool(known)
-
-
-def _law(law: JointLaw, x: np.ndarray, days: np.ndarray, log_rate: np.ndarray) -> np.ndarray:
-    own = np.exp(x[2 : 2 + len(law.loss.parameters)])
-    k = np.exp(np.clip(log_rate, -50, 50))
-    if law.way == "rate":
-        return x[0] - x[1] * law.loss.value(days * k, *own)
-    return x[0] - x[1] * k * law.loss.value(days, *own)
 
 
 def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
@@ -199,54 +142,21 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
             mend="Test more days, or choose a law with fewer numbers.",
         )
     empty = JointLaw(aged, shape, way, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf)
-    measured = np.zeros(aged.value.size) if aged.variance is None else aged.variance
     x, scatter, before = None, 0.05, np.inf
     for _ in range(TURNS):
-        sd = np.sqrt(measured + (scatter * aged.value) ** 2 + 1e-300)
-        x = _solved(empty, sd, x)
-        residual = aged.value - empty.at(aged, x)
-        before, scatter = scatter, _scatter(residual, measured, aged.value, aged.value.size - len(names))
+        x = solved(empty, aged.covariance(scatter), x)
+        before, scatter = scatter, _scatter(aged, aged.value - empty.at(aged, x), aged.value.size - len(names))
         if abs(scatter - before) <= SETTLED * before:
             break
-    sd = np.sqrt(measured + (scatter * aged.value) ** 2 + 1e-300)
-    white = central_jacobian(lambda at: empty.at(aged, at), x) / sd[:, None]
-    size = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
-    inverse = np.linalg.pinv((white / size).T @ (white / size), rcond=1e-12, hermitian=True)
-    chi2 = float(((aged.value - empty.at(aged, x)) ** 2 / sd**2).sum())
-    criterion = chi2 + float(2 * np.log(sd).sum()) + len(names) * np.log(aged.value.size)
-    return replace(empty, x=x, covariance=inverse / np.outer(size, size), scatter=scatter, criterion=criterion)
+    root = np.linalg.cholesky(aged.covariance(scatter))
+    white = np.linalg.solve(root, np.column_stack([aged.value - empty.at(aged, x), empty.slope(aged, x)]))
+    criterion = float(white[:, 0] @ white[:, 0] + 2 * np.log(np.diag(root)).sum())
+    criterion += len(names) * np.log(aged.value.size)
+    covariance = covariance_of(white[:, 1:], np.zeros((len(names),) * 2))
+    return replace(empty, x=x, covariance=covariance, scatter=scatter, criterion=criterion)
 
 
-def _solved(law: JointLaw, sd: np.ndarray, start: np.ndarray | None, aged: Aged | None = None) -> np.ndarray:
-    """Return the parameters of least weighted squares: from a start, or from the best few of a grid."""
-    aged, own = aged or law.aged, law.loss.parameters
-    low = np.array([np.log(LIMITS[n][0]) if n in own else -np.inf for n in law.names])
-    high = np.array([np.log(LIMITS[n][1]) if n in own else np.inf for n in law.names])
-
-    def residual(x):
-        return (law.at(aged, x) - aged.value) / sd
-
-    if start is not None:
-        return polish(residual, None, start, (low, high)).x
-    grids = [[np.log(v) for v in SHAPES[name]] for name in own]
-    grids += [ENERGIES if name == "E" else (0.0,) for name in law.names[2 + len(own) :]]
-    tried = []
-    for point in product(*grids):
-        x = np.r_[0.0, 1.0, point]
-        basis = np.column_stack([np.ones(aged.value.size), law.at(aged, x)]) / sd[:, None]
-        x[:2], *_ = np.linalg.lstsq(basis, aged.value / sd, rcond=1e-10)
-        tried.append((float((residual(x) ** 2).sum()), x))
-    tried.sort(key=lambda entry: entry[0])
-    found = [polish(residual, None, x, (low, high)) for _, x in tried[:4]]
-    return min(found, key=lambda f: f.rss).x
-
-
-def refitted(law: JointLaw, aged: Aged, sd: np.ndarray) -> JointLaw:
-    """Return a law fitted to other values, their standard deviations given, shape (n,); references stay the law's."""
-    return replace(law, x=_solved(law, sd, law.x, aged))
-
-
-def _scatter(residual: np.ndarray, measured: np.ndarray, size: np.ndarray, df: int) -> float:
+def _scatter(aged: Aged, residual: np.ndarray, df: int) -> float:
     """Return the relative scatter beyond the measured variance at which chi-square is its degrees of freedom.
 
     Paule & Mandel 1982, J. Res. NBS 87(5), 377-385, doi:10.6028/jres.087.022.
@@ -255,11 +165,11 @@ def _scatter(residual: np.ndarray, measured: np.ndarray, size: np.ndarray, df: i
         return 0.0
 
     def excess(tau):
-        return float((residual**2 / (measured + (tau * size) ** 2 + 1e-300)).sum()) - df
+        return float(residual @ np.linalg.solve(aged.covariance(tau), residual)) - df
 
     if excess(0.0) <= 0:
         return 0.0
-    high = float(np.sqrt(np.mean((residual / size) ** 2))) + 1e-9
+    high = float(np.sqrt(np.mean((residual / aged.value) ** 2))) + 1e-9
     while excess(high) > 0:
         high *= 2
     return float(brentq(excess, 0.0, high, xtol=1e-6 * high))
@@ -293,19 +203,14 @@ def rivals_of(laws: Sequence[JointLaw]) -> list[JointLaw]:
 
 def left_out(law: JointLaw) -> dict[str, float]:
     """Return the RMS error of a law at whole series, and at last days, that it was not fitted to; NaN without any."""
-    aged, series = law.aged, law.aged.series()
-    measured = np.zeros(aged.value.size) if aged.variance is None else aged.variance
-    sd = np.sqrt(measured + (law.scatter * aged.value) ** 2 + 1e-300)
-    numbers = np.unique(series[series >= 0])
-    whole = [series == k for k in numbers]
-    ends = [(series == k) & (aged.days == aged.days[series == k].max()) for k in numbers]
-    found = {}
-    for name, masks in (("series", whole if len(whole) > 2 else []), ("last_day", ends)):
+    aged, covariance = law.aged, law.aged.covariance(law.scatter)
+    whole, found = aged.whole_series(), {}
+    for name, masks in (("series", whole if len(whole) > 2 else []), ("last_day", aged.last_days())):
         squares = []
         for out in masks:
             part = aged.part(~out)
-            if part.drivers().keys() == aged.drivers().keys():
-                x = refitted(law, part, sd[~out]).x
+            if part.drivers() == aged.drivers():
+                x = solved(law, covariance[np.ix_(~out, ~out)], law.x, part)
                 squares += list((law.at(aged.part(out), x) - aged.value[out]) ** 2)
         found[name] = float(np.sqrt(np.mean(squares))) if squares else np.nan
     return found

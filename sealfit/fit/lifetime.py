@@ -7,13 +7,16 @@ ISO 11346 (rubber, estimation of life-time and maximum temperature of use), whos
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
 
 from sealfit.errors import RequestError
-from sealfit.fit.joint_law import Aged, JointLaw, refitted
+from sealfit.fit.aged import DRIVERS, Aged
+from sealfit.fit.joint_law import JointLaw
+from sealfit.fit.joint_solve import solved_many
 from sealfit.fit.polish import central_jacobian
 
 DAYS_PER_YEAR = 365.25
@@ -88,11 +91,9 @@ def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, comp
         half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if np.isfinite(slope).all() else np.inf
         low, high = (float(days * np.exp(np.clip(s * half, -700, 700))) for s in (-1, 1))
         high = np.inf if high > FOREVER else high
-    aged = law.aged.days > 0
-    tested = law.aged.days[aged] * (np.exp(law.log_rate(law.aged)[aged]) if law.way == "rate" else 1.0)
-    asked = days * (float(np.exp(law.log_rate(place)[0])) if law.way == "rate" else 1.0)
-    threshold = float(goal.reached(law.x[0]))
-    return Lifetime(days, low, high, threshold, asked / tested.max(), _outside(law, temperature_C, compression_pct))
+    asked = days * (float(law.rate(place)[0]) if law.way == "rate" else 1.0)
+    threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
+    return Lifetime(days, low, high, threshold, beyond, _outside(law, temperature_C, compression_pct))
 
 
 def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
@@ -169,12 +170,17 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
+def _asked(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> Iterator[tuple]:
+    """Yield per driver of aging its name, in words, what is asked, what was tested, what may be asked, and its unit."""
+    asked = (temperature_C, compression_pct)
+    spans = (("temperature", SPAN_C, "degC"), ("compression", SPAN_PCT, "percent"))
+    for (name, column, _), value, (what, span, unit) in zip(DRIVERS, asked, spans, strict=True):
+        yield name, what, value, getattr(law.aged, column), span, unit
+
+
 def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> Aged:
     """Return where the rubber is used, checked."""
-    for name, what, value, tested, (least, most), unit in (
-        ("E", "temperature", temperature_C, law.aged.temperature_C, SPAN_C, "degC"),
-        ("kappa", "compression", compression_pct, law.aged.compression_pct, SPAN_PCT, "percent"),
-    ):
+    for name, what, value, tested, (least, most), unit in _asked(law, temperature_C, compression_pct):
         if name in law.names and value is None:
             raise RequestError(f"the rubber was aged at more than one {what}.", mend=f"Say which with --{what}.")
         if value is not None and not least <= value <= most:
@@ -191,8 +197,7 @@ def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | 
 
 def _days(law: JointLaw, x: np.ndarray, goal: Goal, place: Aged) -> float:
     """Return the days to the goal for parameters x; inf where it is never reached."""
-    own = np.exp(x[2 : 2 + len(law.loss.parameters)])
-    k = float(np.exp(np.clip(law.log_rate(place, x)[0], -50, 50)))
+    k, own = float(law.rate(place, x)[0]), [float(value[0]) for value in law.own(x)]
     a = x[1] * (k if law.way == "loss" else 1.0)
     phi = (x[0] - goal.reached(x[0])) / a if a != 0 else np.inf
     if phi <= 0:
@@ -203,13 +208,11 @@ def _days(law: JointLaw, x: np.ndarray, goal: Goal, place: Aged) -> float:
 
 
 def _outside(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> tuple[str, ...]:
-    aged, found = law.aged.days > 0, []
-    for name, value, tested in (
-        ("temperature", temperature_C, law.aged.temperature_C),
-        ("compression", compression_pct, law.aged.compression_pct),
-    ):
-        if value is not None and tested is not None and not tested[aged].min() <= value <= tested[aged].max():
-            found.append(name)
+    found = []
+    for _, what, value, tested, *_ in _asked(law, temperature_C, compression_pct):
+        low, high = (np.nan, np.nan) if tested is None else _ends(tested[law.aged.days > 0])
+        if value is not None and (value < low or value > high):
+            found.append(what)
     return tuple(found)
 
 
@@ -230,14 +233,10 @@ def resampled(
         How many, and of which stream.
     """
     rng, place = np.random.default_rng(seed), _place(law, temperature_C, compression_pct)
-    measured = np.zeros(law.aged.value.size) if law.aged.variance is None else law.aged.variance
     mean = law.at(law.aged)
-    sd = np.sqrt(measured + (law.scatter * mean) ** 2)
-    found = []
-    for _ in range(draws):
-        drawn = replace(law.aged, value=mean + sd * rng.standard_normal(mean.size))
-        again = refitted(law, drawn, sd)
-        found.append(_days(again, again.x, goal, place))
+    covariance = law.aged.covariance(law.scatter, mean)
+    drawn = mean + rng.standard_normal((draws, mean.size)) @ np.linalg.cholesky(covariance).T
+    found = [_days(law, x, goal, place) for x in solved_many(law, covariance, drawn)]
     low, high = np.quantile(found, [0.025, 0.975], method="inverted_cdf")
     return float(low), float(high)
 

@@ -1,6 +1,7 @@
 """One law of aging for all series: truth comes back, evidence chooses the shape, and intervals hold."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,9 @@ import pandas as pd
 import pytest
 
 from sealfit.errors import FitError, RequestError
-from sealfit.fit.joint_law import Aged, fit_joint_law, fit_laws, left_out, rivals_of
+from sealfit.fit.aged import Aged
+from sealfit.fit.joint_law import fit_joint_law, fit_laws, left_out, rivals_of
+from sealfit.fit.joint_solve import solved, solved_many
 from sealfit.fit.lifetime import DAYS_PER_YEAR, Goal, answer, goal_of, lifetime, resampled, temperature_for
 from sealfit.physics.losses import LOSSES
 
@@ -113,6 +116,29 @@ def test_the_delta_interval_agrees_with_values_drawn_anew():
     low, high = resampled(law, Goal(0.75), 50.0, 85.0, draws=120)
     assert np.log(high / low) == pytest.approx(np.log(found.high / found.low), rel=0.25)
     assert low < found.days < high
+
+
+def test_many_draws_at_once_are_fitted_as_each_alone():
+    law = fit_joint_law(campaign(scatter=0.01), "log", "rate")
+    covariance = law.aged.covariance(law.scatter)
+    drawn = np.random.default_rng(2).multivariate_normal(law.at(law.aged), covariance, 6)
+    together = solved_many(law, covariance, drawn)
+    for values, x in zip(drawn, together, strict=True):
+        alone = solved(law, covariance, law.x, replace(law.aged, value=values))
+        assert x == pytest.approx(alone, rel=1e-4, abs=1e-6)
+
+
+def test_correlated_values_weigh_as_their_covariance_says():
+    """Half of the values measured with a common error: the same law as on their differences and the other half."""
+    law = fit_joint_law(campaign(scatter=0.0), "log", "rate")
+    known = law.aged
+    spread = np.diag(np.full(known.days.size, 1e-8))
+    common = (known.temperature_C == 80.0) & (known.days > 0)
+    spread += 1e-4 * np.outer(common, common)
+    shifted = replace(known, value=known.value + 0.02 * common, variance=spread)
+    assert fit_joint_law(shifted, "log", "rate").x == pytest.approx(law.x, rel=0.02, abs=2e-3)
+    blind = replace(shifted, variance=np.diag(spread))
+    assert abs(fit_joint_law(blind, "log", "rate").x[3] - law.x[3]) > 3.0  # E takes the common error up
 
 
 def test_lifetimes_hold_the_truth():

@@ -1,0 +1,109 @@
+"""Values of one quantity over aging time, temperature and compression: what a joint law is fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sealfit.effects import arrhenius_aging
+
+GAS_CONSTANT = arrhenius_aging.GAS_CONSTANT / 1000  # kJ/(mol K)
+TINY = 1e-300  # of a variance: values without any scatter
+
+
+def _inverse(celsius):
+    return 1 / (GAS_CONSTANT * (np.asarray(celsius, float) + arrhenius_aging.ZERO_C))
+
+
+def _plain(percent):
+    return np.asarray(percent, float)
+
+
+DRIVERS = (("E", "temperature_C", _inverse), ("kappa", "compression_pct", _plain))
+"""What changes the pace of aging: its coefficient in ln k (kJ/mol, 1/%), where it stands, what it is multiplied by."""
+
+
+@dataclass(frozen=True)
+class Aged:
+    """Values of one quantity: a specimen, or the mean of those of one condition, each.
+
+    Attributes
+    ----------
+    days, value : ndarray, shape (n,)
+        Aging time in days, and the value measured.
+    temperature_C, compression_pct : ndarray, shape (n,), or None
+        Of aging; whatever stands there for unaged specimens is not read. None where no such thing was varied.
+    variance : ndarray, shape (n,) or (n, n), or None
+        Variance or covariance of the values as measured; the scatter between specimens is estimated and added. None
+        where it is all there is.
+    """
+
+    days: np.ndarray
+    value: np.ndarray
+    temperature_C: np.ndarray | None = None
+    compression_pct: np.ndarray | None = None
+    variance: np.ndarray | None = None
+
+    def part(self, keep: np.ndarray) -> Aged:
+        """Return some of the values; `keep` is a mask, shape (n,)."""
+        taken = {
+            name: None if getattr(self, name) is None else getattr(self, name)[keep]
+            for name in ("temperature_C", "compression_pct")
+        }
+        variance = self.variance
+        if variance is not None:
+            variance = variance[keep] if variance.ndim == 1 else variance[np.ix_(keep, keep)]
+        return replace(self, days=self.days[keep], value=self.value[keep], variance=variance, **taken)
+
+    def covariance(self, scatter: float, about: np.ndarray | None = None) -> np.ndarray:
+        """Return the covariance of the values, shape (n, n).
+
+        Parameters
+        ----------
+        scatter : float
+            Relative standard deviation between specimens, beyond the measured variance.
+        about : ndarray, shape (n,), optional
+            What it is relative to; default the values.
+        """
+        measured = np.zeros(self.value.size) if self.variance is None else self.variance
+        own = (scatter * (self.value if about is None else about)) ** 2 + TINY
+        return (np.diag(measured) if measured.ndim == 1 else measured) + np.diag(own)
+
+    def drivers(self) -> tuple[str, ...]:
+        """Return the names of the coefficients in ln k of what was varied."""
+        aged, found = self.days > 0, []
+        for name, column, _ in DRIVERS:
+            at = getattr(self, column)
+            if at is not None and np.unique(at[aged]).size > 1:
+                found.append(name)
+        return tuple(found)
+
+    def away(self, name: str, tested: Aged) -> np.ndarray:
+        """Return what a coefficient multiplies in ln k, counted from the middle of what was tested, shape (n,)."""
+        column, of = next((column, of) for own, column, of in DRIVERS if own == name)
+        middle = reference_of(getattr(tested, column)[tested.days > 0])
+        return np.where(self.days > 0, of(middle) - of(getattr(self, column)), 0.0)
+
+    def series(self) -> np.ndarray:
+        """Return the number of each value's series, shape (n,); -1 for unaged specimens."""
+        keys = [at for at in (self.temperature_C, self.compression_pct) if at is not None]
+        number, aged = np.full(self.days.size, -1), self.days > 0
+        number[aged] = 0
+        if keys:
+            number[aged] = np.unique(np.column_stack(keys)[aged], axis=0, return_inverse=True)[1].ravel()
+        return number
+
+    def whole_series(self) -> list[np.ndarray]:
+        """Return the mask of each series, shape (n,) each."""
+        series = self.series()
+        return [series == k for k in np.unique(series[series >= 0])]
+
+    def last_days(self) -> list[np.ndarray]:
+        """Return the mask of each series' last day, shape (n,) each."""
+        return [own & (self.days == self.days[own].max()) for own in self.whole_series()]
+
+
+def reference_of(tested: np.ndarray) -> float:
+    """Return the middle of the tested temperatures or compressions, at which k is 1."""
+    return float(np.median(np.unique(tested)))
