@@ -86,7 +86,7 @@ def lifetime(
     store = Store.open(existing_out(out))
     store.require("fit-steady")
     goal = goal_of(threshold, loss_pct)
-    laws = law_of(store.read("steady_fit"), quantity, law)
+    laws = law_of(store.read("steady"), store.read("steady_fit"), quantity, law)
     place = {"temperature_C": temperature_C, "compression_pct": compression_pct}
     chosen = answer(laws[0], goal, years, resample=True, **place)
     rivals = [answer(rival, goal, years, **place) for rival in rivals_of(laws)] if law is None else []

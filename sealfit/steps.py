@@ -160,7 +160,9 @@ def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> 
         progress.say("no aging_days in the condition: there is no aging law to fit")
     steady_fit = store.read("steady_fit")
     fitted = fit_series(steady_fit, config)
-    for name, table in zip(("aging_laws", "master_curve"), joint_laws(steady_fit, config), strict=True):
+    for name, table in zip(
+        ("aging_laws", "master_curve"), joint_laws(store.read("steady"), steady_fit, config), strict=True
+    ):
         staged.table(name, table)
     staged.table("aging_fit", fitted)
     staged.table("aging_curves", aging_curves(fitted))

@@ -98,7 +98,7 @@ class Parts:
         )
         return SimpleNamespace(fit=fit, curves=small("dynamic_curves"))
 
-    def joint_laws(self, steady_fit, config):
+    def joint_laws(self, steady, steady_fit, config):
         return small("aging_laws"), small("master_curve")
 
     def close_loop(self, bins, traces, config, *, workers=1, on_progress=None):

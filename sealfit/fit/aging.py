@@ -97,7 +97,7 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
         used["value"].to_numpy(float),
         np.array([fitted.index(name) for name in used["quantity"]], int),
         number,
-        _covariance(used, own),
+        steady_covariance(used, own),
     )
     return list(_rubber_rows(values, curves, fitted, used, own, unit, found))
 
@@ -118,8 +118,16 @@ def _has_unaged(found: pd.DataFrame, quantity: str) -> bool:
     return bool(((found["quantity"] == quantity) & (found["aging_days"] == 0)).any())
 
 
-def _covariance(used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:
-    """Covariance of the steady values: full within a condition, none between conditions."""
+def steady_covariance(used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:
+    """Return the covariance of steady values, shape (n, n): full within a condition, none between conditions.
+
+    Parameters
+    ----------
+    used : DataFrame
+        The values: `condition`, `quantity` (mu_s, ...) and `value`.
+    own : DataFrame
+        Table `steady_fit`.
+    """
     rows = own[own["quantity"] == "covariance"]
     known = dict(zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"], strict=True))
     condition, quantity = used["condition"].to_numpy(object), used["quantity"].to_numpy(object)

@@ -12,27 +12,29 @@ from sealfit.errors import FitError, RequestError
 from sealfit.fit.aged import Aged, reference_of
 from sealfit.fit.joint_law import JointLaw, fit_laws, left_out, rivals_of
 from sealfit.fit.law import Values, fit_law, law_model
+from sealfit.fit.shared_curve import Levels, shared_levels
 from sealfit.physics.losses import LOSSES
 from sealfit.tables import AGING_LAWS, MASTER_CURVE
 
+MU = ("mu_s", "mu_c")
 TEMPERATURE, COMPRESSION = "temperature_C", "compression_ratio_pct"
 SEPARATE = "separate"  # Eq. 15 with a and b of its own for every series
 LIKELY = 3  # laws held against data they were not fitted to
 CURVE_POINTS = 61
 
 
-def aged_values(steady_fit: pd.DataFrame, rubber: str, quantity: str) -> Aged:
-    """Return the fitted values of one quantity of a rubber over its conditions, those that are identified.
+def aged_values(levels: Levels, rubber: str, quantity: str) -> Aged:
+    """Return the values of one quantity of a rubber over its conditions, those that the forces determine.
 
     Parameters
     ----------
-    steady_fit : DataFrame
-        Table `steady_fit`.
+    levels : Levels
+        As `shared_levels` gives them.
     rubber, quantity : str
         Which; "mu_s", "mu_c", "F_s" or "F_c".
     """
-    rows = steady_fit[(steady_fit["quantity"] == "steady") & (steady_fit["parameter"] == quantity)]
-    rows = rows[(rows["rubber"] == rubber) & rows["identified"].astype(bool) & rows["aging_days"].notna()]
+    of = (levels.table["rubber"] == rubber) & (levels.table["quantity"] == quantity)
+    rows, here = levels.table[of], of.to_numpy()
 
     def column(name):
         return rows[name].to_numpy(float) if name in rows and rows[name].notna().any() else None
@@ -42,34 +44,31 @@ def aged_values(steady_fit: pd.DataFrame, rubber: str, quantity: str) -> Aged:
         rows["value"].to_numpy(float),
         column(TEMPERATURE),
         column(COMPRESSION),
-        np.nan_to_num(rows["se"].to_numpy(float)) ** 2,
+        levels.covariance[np.ix_(here, here)],
     )
 
 
-def quantities_of(steady_fit: pd.DataFrame) -> Iterator[tuple[str, str, str]]:
-    """Yield rubber, quantity and unit of every quantity that a law may be fitted to."""
-    rows = steady_fit[steady_fit["parameter"].isin(["mu_s", "mu_c", "F_s", "F_c"])]
-    for (rubber, quantity), own in rows[rows["quantity"] == "steady"].groupby(["rubber", "parameter"], sort=True):
-        yield rubber, quantity, str(own["unit"].iloc[0] or "")
-
-
-def joint_laws(steady_fit: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
+def joint_laws(steady: pd.DataFrame, steady_fit: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return tables `aging_laws` and `master_curve`; empty without aging or with too few conditions.
 
     Parameters
     ----------
+    steady : DataFrame
+        Table `steady`: the forces.
     steady_fit : DataFrame
         Table `steady_fit` with the condition columns.
     config : Config
-        Says whether rubber is aged.
+        Says whether rubber is aged, and gives the units.
     """
     rows, curves = [], []
     if config.aging and "aging_days" in steady_fit.columns:
-        for rubber, quantity, unit in quantities_of(steady_fit):
+        levels = shared_levels(steady, steady_fit)
+        for rubber, quantity in _quantities(levels):
             try:
-                laws = fit_laws(aged_values(steady_fit, rubber, quantity))
+                laws = fit_laws(aged_values(levels, rubber, quantity))
             except FitError:
                 continue
+            unit = "" if quantity in MU else config.units.unit("force")
             at = {"rubber": rubber, "quantity": quantity}
             rows += [{**at, **row} for row in _law_rows(laws, unit)]
             curves.append(_master_curve(laws[0]).assign(**at))
@@ -78,6 +77,12 @@ def joint_laws(steady_fit: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
         pd.DataFrame(rows).reindex(columns=AGING_LAWS.names()),
         curves.reindex(columns=MASTER_CURVE.names()),
     )
+
+
+def _quantities(levels: Levels) -> list[tuple[str, str]]:
+    """Return rubber and quantity of all values, in order."""
+    pairs = levels.table[["rubber", "quantity"]].drop_duplicates()
+    return sorted(pairs.itertuples(index=False, name=None))
 
 
 def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
@@ -153,24 +158,36 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
     return pd.concat([pd.DataFrame(points), pd.DataFrame(curve)], ignore_index=True)
 
 
-def law_of(steady_fit: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
+def law_of(steady: pd.DataFrame, steady_fit: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
     """Return the laws of one quantity, likeliest first; or a named one alone.
+
+    Parameters
+    ----------
+    steady, steady_fit : DataFrame
+        The tables of these names.
+    quantity : str
+        "mu_s", "mu_c", "F_s" or "F_c".
+    name : str, optional
+        Of the law.
 
     Raises
     ------
     RequestError
-        If the quantity was not fitted, there are several rubbers, or no law of that name can be fitted.
+        If rubber is not aged, the quantity was not fitted, there are several rubbers, or no such law can be fitted.
     """
-    known = list(quantities_of(steady_fit))
-    rubbers = sorted({rubber for rubber, own, _ in known if own == quantity})
+    if "aging_days" not in steady_fit.columns:
+        raise RequestError("this rig ages no rubber.", mend="Name aging_days in the config's condition.")
+    levels = shared_levels(steady, steady_fit)
+    known = _quantities(levels)
+    rubbers = [rubber for rubber, own in known if own == quantity]
     if not rubbers:
-        there = ", ".join(sorted({own for _, own, _ in known})) or "none"
+        there = ", ".join(dict.fromkeys(own for _, own in known)) or "none"
         raise RequestError(f"there is no '{quantity}' to follow.", mend=f"Choose one of: {there}.")
     if len(rubbers) > 1:
         raise RequestError(f"there are several rubbers: {', '.join(rubbers)}.", mend="Analyse them one by one.")
-    aged = aged_values(steady_fit, rubbers[0], quantity)
     if name is not None and name not in LOSSES:
         raise RequestError(f"there is no law '{name}'.", mend=f"Choose one of: {', '.join(LOSSES)}.")
+    aged = aged_values(levels, rubbers[0], quantity)
     try:
         return fit_laws(aged) if name is None else fit_laws(aged, (name,))
     except FitError as error:

@@ -94,7 +94,7 @@ def make_condition(name: str, runs: pd.DataFrame) -> Condition:
     return Condition(str(name), kept.reset_index(drop=True), levels, has_load, len(runs) - len(kept), model)
 
 
-def _stacked(conditions: list[Condition]) -> tuple[np.ndarray, ...]:
+def stacked(conditions: list[Condition]) -> tuple[np.ndarray, ...]:
     """Arrays of several conditions padded to one length; padding has weight 0."""
     longest = max(len(c.runs) for c in conditions)
     filled = [np.ones((len(conditions), longest)) for _ in range(3)] + [np.zeros((len(conditions), longest))]
@@ -108,7 +108,7 @@ def solve(conditions: list[Condition]) -> None:
     """Fit every condition's model, those with a Stribeck curve all at once."""
     full = [c for c in conditions if c.model == FULL]
     if full:
-        fit = solve_stribeck(*_stacked(full))
+        fit = solve_stribeck(*stacked(full))
         for condition, values, rss, grid in zip(full, fit.values(), fit.rss, fit.grid, strict=True):
             condition.values, condition.chi2, condition.grid = values, float(rss), grid
     for condition in conditions:
@@ -141,7 +141,7 @@ def bound(conditions: list[Condition], rise: np.ndarray) -> None:
     """Set the ends of the intervals; `rise` is how much chi-square may grow, shape (conditions,)."""
     full = [k for k, c in enumerate(conditions) if c.model == FULL and np.isfinite(rise[k])]
     if full:
-        arrays = _stacked([conditions[k] for k in full])
+        arrays = stacked([conditions[k] for k in full])
         fit = solve_stribeck(*arrays)
         lows, highs = stribeck_intervals(*arrays, fit, rise[full])
         for k, low, high in zip(full, lows, highs, strict=True):

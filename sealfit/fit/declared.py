@@ -51,7 +51,7 @@ def declare(rows: Rows) -> Declared:
     conditions = rows.conditions
     names = tuple(conditions["condition"])
     aging = rows.has_aging
-    series_of = _fit_series(conditions, aging)
+    series_of = series_of_curve(conditions, aging)
     stribeck = {s: _speed_form(rows, series_of == s) for s in dict.fromkeys(series_of)}
     law = {}
     for s in stribeck:
@@ -84,8 +84,16 @@ def declare(rows: Rows) -> Declared:
     return Declared(tuple(parameters), index, names, rows.has_load, stribeck, law)
 
 
-def _fit_series(conditions, aging: bool) -> np.ndarray:
-    """Return the series whose v_s and sigma_2 a condition uses: a lone series takes its unaged rubber in."""
+def series_of_curve(conditions, aging: bool) -> np.ndarray:
+    """Return the series whose v_s and sigma_2 each condition uses: a lone series takes its unaged rubber in.
+
+    Parameters
+    ----------
+    conditions : DataFrame
+        A row per condition with `series`, `rubber` and, where rubber is aged, `aging_days`.
+    aging : bool
+        Whether it is.
+    """
     series = conditions["series"].to_numpy(dtype=object).copy()
     if aging:
         for rubber in conditions["rubber"].unique():

@@ -52,6 +52,32 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     unknown error of the force's size, the same for all samples, so nothing averages it down. A zero offset of the
     sensor has opposite signs in the two directions and does at most the same; it is what the loop looks for.
     """
+    conditions, scatter, variance = solve_conditions(steady)
+    bound(conditions, variance.rise())
+    keys = condition_keys(steady, config)
+    rows = [
+        {"condition": c.name, **row} for k, c in enumerate(conditions) for row in _rows(c, k, variance, scatter, config)
+    ]
+    table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
+    fixed = STEADY_FIT.names()
+    return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
+
+
+def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, UnitVariance]:
+    """Return every condition with its model solved, the scatter of repeats, and how far their variances are widened.
+
+    Curves that are not told from flat ones are dropped; there are no intervals yet.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`; rows with `used` false are left out.
+
+    Raises
+    ------
+    FitError
+        If nothing is left to fit.
+    """
     runs = run_means(steady)
     scatter = repeat_scatter(steady)
     choices = run_weights(runs, scatter)
@@ -62,15 +88,7 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     for condition, value, df in zip(conditions, first.value, first.df, strict=True):
         if condition.model == FULL:
             drop_flat_curve(condition, value, df)
-    variance = _unit_variance(conditions, scatter)
-    bound(conditions, variance.rise())
-    keys = condition_keys(steady, config)
-    rows = [
-        {"condition": c.name, **row} for k, c in enumerate(conditions) for row in _rows(c, k, variance, scatter, config)
-    ]
-    table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
-    fixed = STEADY_FIT.names()
-    return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
+    return conditions, scatter, _unit_variance(conditions, scatter)
 
 
 def _solved(runs: pd.DataFrame) -> list[Condition]:

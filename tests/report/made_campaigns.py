@@ -181,7 +181,7 @@ def aging_campaign(
         "aging_fit": aging_fit(fits),
         "aging_curves": aging_curves(fits, max(days)),
         **starts(conditions, speeds, config),
-        **(_laws(fits, config) if len(conditions) < 20 else {}),
+        **(_laws(table("steady", steady), fits, config) if len(conditions) < 20 else {}),
         "residuals_before": found["before"],
         "residuals_after": found["after"],
         "levels": levels(found),
@@ -194,9 +194,9 @@ def aging_campaign(
     return Made(tables, closure, {**PROVENANCE, "inputs": inputs(steady["file"])}, config)
 
 
-def _laws(fits, config):
+def _laws(steady, fits, config):
     """Return the tables of the laws for all series; those of 73 conditions would take the tests half a minute."""
-    laws, curve = joint_laws(table("steady_fit", fits), config)
+    laws, curve = joint_laws(steady, table("steady_fit", fits), config)
     return {"aging_laws": table("aging_laws", laws), "master_curve": table("master_curve", curve)}
 
 

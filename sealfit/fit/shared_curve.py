@@ -1,0 +1,167 @@
+r"""mu_s and mu_c of all conditions from the forces, one v_s and one sigma_2 for all days of a series.
+
+The declared model (Eq. 14 with Eq. 15) holds v_s and sigma_2 of a series through its days, and only mu_s and mu_c age.
+Given v_s the force is linear in all else,
+
+.. math:: F\,\mathrm{sgn}\,v = N [\mu_c^{(i)} + (\mu_s^{(i)} - \mu_c^{(i)}) e^{-(v/v_s)^2}] + \sigma_2 |v|,
+
+so mu_s and mu_c of the conditions i, with their covariance, hold all that the forces say of any law of aging: a law
+fitted to them by generalised least squares is fitted to the forces. What the days share makes the values surer than
+free fits do, and determines conditions that have too few speeds for a fit of their own. Where the days of a series do
+not agree on v_s and sigma_2 (F test), its conditions keep their free fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+from scipy.linalg import block_diag
+from scipy.optimize import minimize_scalar
+
+from sealfit.fit.aging import PAIRS, steady_covariance
+from sealfit.fit.condition import FULL, Condition, stacked
+from sealfit.fit.declared import series_of_curve
+from sealfit.fit.polish import covariance_of
+from sealfit.fit.steady import FORCES, solve_conditions
+from sealfit.fit.stribeck import search_grid
+from sealfit.fit.uncertainty import UnitVariance
+
+SHARED_P = 0.01  # below, the days of a series do not share v_s and sigma_2
+RANK = 1e-8  # of the columns of a condition: with one speed mu_s and mu_c are one number
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Values of mu_s and mu_c (F_s and F_c) and the covariance of their measurement.
+
+    Attributes
+    ----------
+    table : DataFrame
+        `condition`, `quantity` and `value`, and the condition's columns of `steady_fit`.
+    covariance : ndarray, shape (n, n)
+        Of the values.
+    """
+
+    table: pd.DataFrame
+    covariance: np.ndarray
+
+
+def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
+    """Return what the forces say of mu_s and mu_c at every aged condition and the unaged rubber.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`; rows with `used` false are left out.
+    steady_fit : DataFrame
+        Table `steady_fit` with `aging_days`: the free fits, of which only what is identified is used.
+
+    Raises
+    ------
+    FitError
+        If nothing is left to fit.
+    """
+    rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["aging_days"].notna()]
+    about = rows.drop(columns=["quantity", "parameter", "value"]).drop_duplicates("condition")
+    known = rows[rows["identified"].to_numpy(bool) & rows["value"].notna()]
+    curved = set(known.loc[known["parameter"] == "v_s", "condition"])
+    free = known[known["parameter"].isin([name for pair in PAIRS for name in pair])]
+    free = free.assign(quantity=free["parameter"])[["condition", "quantity", "value"]]
+    conditions, _, variance = solve_conditions(steady)
+    place = {c.name: k for k, c in enumerate(conditions)}
+    series = series_of_curve(about.reset_index(drop=True), aging=True)
+    tables, covariances = [], []
+    for names in (about["condition"].to_numpy(object)[series == s] for s in dict.fromkeys(series)):
+        places = [place[name] for name in names]
+        table, covariance = _shared([conditions[k] for k in places], variance, places, curved) or (None, None)
+        if table is None:
+            table = free[free["condition"].isin(names)]
+            covariance = steady_covariance(table, steady_fit)
+        tables.append(table)
+        covariances.append(covariance)
+    table = pd.concat(tables, ignore_index=True) if tables else free
+    return Levels(table.merge(about, on="condition", how="left", validate="many_to_one"), block_diag(*covariances))
+
+
+def _shared(
+    own: Sequence[Condition], variance: UnitVariance, places: Sequence[int], curved: set[str]
+) -> tuple[pd.DataFrame, np.ndarray] | None:
+    """Return the values of a series and their covariance; None where its days share no curve."""
+    full = [c for c in own if c.model == FULL]
+    if len(full) < 2 or not curved & {c.name for c in own} or len({c.has_load for c in own}) > 1:
+        return None
+    unit, df = _usual(variance)
+    tested = _Curve(full)
+    more = tested.df - sum(c.df for c in full)
+    rise = (tested.rss - sum(c.chi2 for c in full)) / unit
+    if not np.isfinite(unit) or (more > 0 and stats.f.sf(rise / more, more, df) < SHARED_P):
+        return None
+    curve = _Curve(own)
+    widened = float(np.nanmean(variance.value[list(places)]))
+    covariance, _ = covariance_of(curve.tangent())
+    covariance = covariance * widened
+    names = list(curve.names())
+    count = len(names)
+    keep = np.isfinite(np.diag(covariance)[:count]) & (np.diag(covariance)[:count] > 0)
+    table = pd.DataFrame(names, columns=["condition", "quantity"]).assign(value=curve.levels.ravel())
+    return table[keep].reset_index(drop=True), covariance[:count, :count][np.ix_(keep, keep)]
+
+
+def _usual(variance: UnitVariance) -> tuple[float, float]:
+    """Return the factor on the stated variances of conditions that are not worse than the others, and its df."""
+    usual = np.flatnonzero(np.isfinite(variance.value) & ~variance.own)
+    return (float(variance.value[usual[0]]), float(variance.df[usual[0]])) if usual.size else (np.nan, np.nan)
+
+
+class _Curve:
+    """Eq. 14 with one v_s and one sigma_2 on several conditions, at the least sum of squares."""
+
+    def __init__(self, own: Sequence[Condition]) -> None:
+        self.own = own
+        self.speed, self.load, self.force, weight = stacked(own)
+        self.root = np.sqrt(weight)
+        grid = search_grid(self.speed.reshape(1, -1), weight.reshape(1, -1))[0]
+        rss = [self._solve(u)[0] for u in grid]
+        best = int(np.argmin(rss))
+        ends = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
+        found = minimize_scalar(lambda u: self._solve(u)[0], bounds=ends, method="bounded", options={"xatol": 1e-9})
+        self.log_v_s = float(found.x) if found.fun <= rss[best] else float(grid[best])
+        self.rss, self.levels, self.sigma_2, rank = self._solve(self.log_v_s)
+        self.df = int((weight > 0).sum()) - rank - 1 - (self.sigma_2 > 0)
+
+    def _columns(self, log_v_s: float) -> np.ndarray:
+        """Return the weighted columns of mu_s and mu_c, shape (conditions, runs, 2)."""
+        decay = np.exp(-((self.speed / np.exp(log_v_s)) ** 2))
+        return np.stack([decay, 1 - decay], axis=-1) * (self.load * self.root)[..., None]
+
+    def _solve(self, log_v_s: float) -> tuple[float, np.ndarray, float, int]:
+        """Return the sum of squares, mu_s and mu_c, shape (conditions, 2), sigma_2, and the rank of the levels."""
+        columns = self._columns(log_v_s)
+        inverse = np.linalg.pinv(columns, rcond=RANK)
+        both = np.stack([self.force * self.root, self.speed * self.root], axis=-1)  # F and |v|
+        fitted = inverse @ both
+        rest = both - columns @ fitted
+        size = float((rest[..., 1] ** 2).sum())
+        sigma_2 = max(float((rest[..., 0] * rest[..., 1]).sum()) / size, 0.0) if size > 0 else 0.0
+        left = rest[..., 0] - sigma_2 * rest[..., 1]
+        rank = round(float(np.einsum("knp,kpn->", columns, inverse)))
+        return float((left**2).sum()), fitted[..., 0] - sigma_2 * fitted[..., 1], sigma_2, rank
+
+    def names(self) -> Iterator[tuple[str, str]]:
+        """Yield condition and quantity of every level, in the order of the tangent's columns."""
+        for condition in self.own:
+            for name in ("mu_s", "mu_c"):
+                yield condition.name, name if condition.has_load else FORCES[name]
+
+    def tangent(self) -> np.ndarray:
+        """Return the weighted derivatives along the levels, ln v_s and sigma_2 where it is not 0, shape (runs, p)."""
+        columns = self._columns(self.log_v_s)
+        square = (self.speed / np.exp(self.log_v_s)) ** 2
+        bend = np.diff(self.levels[:, ::-1], axis=1) * self.load * np.exp(-square) * 2 * square * self.root
+        shared = [bend.ravel()] + ([(self.speed * self.root).ravel()] if self.sigma_2 > 0 else [])
+        there = (self.root > 0).ravel()
+        return np.column_stack([block_diag(*columns), *shared])[there]

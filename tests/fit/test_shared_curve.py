@@ -1,0 +1,130 @@
+"""mu_s and mu_c from the forces with what the days of a series share: exact, surer, and free where days disagree."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from sealfit.config import Config
+from sealfit.fit.all_series import aged_values
+from sealfit.fit.joint_law import fit_joint_law
+from sealfit.fit.shared_curve import shared_levels
+from sealfit.fit.steady import fit_conditions
+from sealfit.fit.uncertainty import run_means
+from sealfit.physics import aging_law, stribeck_force
+
+MU_S = {"mu_0": 0.93513, "a": 0.04448, "b": 0.0804}  # as `campaign` has them
+MU_C = {"mu_0": 0.609, "a": 0.03307, "b": 0.1324}
+R = 8.314462618e-3
+DAYS = (0, 1, 2, 4, 8, 16)
+SERIES = tuple((celsius, percent) for celsius in (40.0, 60.0, 80.0) for percent in (80.0, 90.0))
+
+
+def levels(table):
+    return shared_levels(table, fit_conditions(table, Config()))
+
+
+def arrhenius(energy=80.0, kappa=0.02):
+    """Laws of every series under time-temperature superposition, as `campaign` takes them."""
+    laws = {}
+    for celsius, percent in SERIES:
+        k = np.exp(energy / R * (1 / 333.15 - 1 / (celsius + 273.15)) + kappa * (85.0 - percent))
+        laws[celsius, percent] = tuple({**law, "b": law["b"] / k} for law in (MU_S, MU_C))
+    return laws
+
+
+def run_table(table):
+    """Run means with the condition's columns."""
+    about = table[["condition", "temperature_C", "compression_ratio_pct", "aging_days"]].drop_duplicates()
+    return run_means(table).merge(about, on="condition")
+
+
+def test_exact_forces_give_the_coefficients_back(campaign):
+    found = levels(campaign(noise=1e-9, setup=1e-9)).table
+    assert len(found) == 12
+    for row in found.itertuples():
+        law = {"mu_s": MU_S, "mu_c": MU_C}[row.quantity]
+        assert row.value == pytest.approx(float(aging_law(row.aging_days, **law)), rel=1e-6)
+
+
+def test_values_and_covariance_are_those_of_one_fit_to_all_forces(campaign):
+    table = campaign(noise=0.01, days=(0, 2, 8), repeats=40, ways=(1,))
+    found, runs = levels(table), run_table(table)
+    k = np.searchsorted((0, 2, 8), runs["aging_days"])
+    speed, force = runs["speed"].to_numpy(), runs["force"].to_numpy()
+
+    def residual(x):
+        model = stribeck_force(speed, 49.03, mu_s=x[:3][k], mu_c=x[3:6][k], v_s=x[6], sigma_2=x[7])
+        return (model - force) / (0.01 * force / np.sqrt(40))
+
+    direct = least_squares(residual, [0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 5.0, 0.02], x_scale="jac", xtol=1e-14)
+    covariance = np.linalg.inv(direct.jac.T @ direct.jac)
+    order = [(0, 2, 8).index(row.aging_days) + 3 * (row.quantity == "mu_c") for row in found.table.itertuples()]
+    se, own = np.sqrt(np.diag(covariance))[order], np.sqrt(np.diag(found.covariance))
+    assert np.abs(found.table["value"].to_numpy() - direct.x[order]).max() < 0.15 * se.min()
+    assert own == pytest.approx(se, rel=0.15)
+    correlation = covariance[np.ix_(order, order)] / np.outer(se, se)
+    assert np.abs(found.covariance / np.outer(own, own) - correlation).max() < 0.1
+
+
+def test_what_the_days_share_makes_the_values_surer_than_free_fits(campaign):
+    table = campaign(noise=0.01)
+    fits = fit_conditions(table, Config())
+    found = shared_levels(table, fits)
+    free = fits[fits["quantity"] == "steady"].set_index(["condition", "parameter"])["se"]
+    own = np.array([free[row.condition, row.quantity] for row in found.table.itertuples()])
+    assert np.median(np.sqrt(np.diag(found.covariance)) / own) < 0.8
+
+
+def test_a_day_with_two_speeds_is_known_through_the_others(campaign):
+    table = campaign(noise=0.003)
+    few = (table["aging_days"] == 8) & ~table["speed_set_mm_s"].isin([1, 32])
+    fits = fit_conditions(table[~few], Config())
+    alone = fits[(fits["aging_days"] == 8) & (fits["parameter"] == "mu_s")]
+    assert not alone["identified"].any()
+    found = shared_levels(table[~few], fits).table
+    value = found[(found["aging_days"] == 8) & (found["quantity"] == "mu_s")]["value"]
+    assert float(value.iloc[0]) == pytest.approx(0.93513 - 0.04448 * np.log1p(8 / 0.0804), rel=0.01)
+
+
+def test_days_that_do_not_agree_on_the_stribeck_speed_keep_their_free_fits(campaign):
+    table = campaign(noise=0.003, days=(0, 2, 4))
+    late = table["aging_days"] == 4
+    other = stribeck_force(table["speed_mm_s"], 49.03, mu_s=0.76, mu_c=0.49, v_s=15.0, sigma_2=0.02)
+    table.loc[late, "force_N"] = other[late] * (1 + 0.003 * np.random.default_rng(3).standard_normal(int(late.sum())))
+    fits = fit_conditions(table, Config())
+    found = shared_levels(table, fits)
+    free = fits[fits["quantity"] == "steady"].set_index(["condition", "parameter"])["value"]
+    for row in found.table.itertuples():
+        assert row.value == free[row.condition, row.quantity]
+
+
+@pytest.mark.parametrize("quantity", ["mu_s", "mu_c"])
+def test_a_law_of_the_levels_is_the_law_of_the_forces(campaign, quantity):
+    """Against one fit of both laws, v_s and sigma_2 of every series to all run means, by another solver."""
+    table = campaign(noise=0.01, series=SERIES, laws=arrhenius(), days=DAYS, ways=(1,))
+    law = fit_joint_law(aged_values(levels(table), "rubber", quantity), "log", "rate")
+    runs = run_means(table).merge(
+        table[["run_id", "temperature_C", "compression_ratio_pct", "aging_days"]].drop_duplicates(), on="run_id"
+    )
+    aged = runs["aging_days"].to_numpy() > 0
+    place = np.array(
+        [SERIES.index(pair) for pair in zip(runs["temperature_C"], runs["compression_ratio_pct"], strict=True)]
+    )
+    place = np.where(aged, place, len(SERIES))
+    inverse = np.where(aged, 1 / R * (1 / 333.15 - 1 / (runs["temperature_C"] + 273.15)), 0.0)
+    percent = np.where(aged, 85.0 - runs["compression_ratio_pct"], 0.0)
+    speed, force, days = (runs[name].to_numpy() for name in ("speed", "force", "aging_days"))
+
+    def residual(x):
+        mu = [
+            p[0] - p[1] * np.log1p(np.exp(p[3] * inverse + p[4] * percent) * days / np.exp(p[2]))
+            for p in (x[:5], x[5:10])
+        ]
+        decay = np.exp(-((speed / x[10:17][place]) ** 2))
+        return (49.03 * (mu[1] + (mu[0] - mu[1]) * decay) + x[17:24][place] * speed - force) / (0.01 * force)
+
+    start = [0.9, 0.04, np.log(0.1), 70.0, 0.0, 0.6, 0.03, np.log(0.1), 70.0, 0.0, *[5.0] * 7, *[0.02] * 7]
+    direct = least_squares(residual, start, x_scale="jac").x
+    direct = direct[:5] if quantity == "mu_s" else direct[5:10]
+    assert np.abs(law.x - direct).max() > 0  # another way, so never the same to the last digit
+    assert (np.abs(law.x - direct) < 0.35 * np.sqrt(np.diag(law.covariance))).all()
