@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from steady_tables import MU_C, MU_S
 
 from sealfit.config import Config
 from sealfit.fit.all_series import aged_values
@@ -12,8 +13,6 @@ from sealfit.fit.steady import fit_conditions
 from sealfit.fit.uncertainty import run_means
 from sealfit.physics import aging_law, stribeck_force
 
-MU_S = {"mu_0": 0.93513, "a": 0.04448, "b": 0.0804}  # as `campaign` has them
-MU_C = {"mu_0": 0.609, "a": 0.03307, "b": 0.1324}
 R = 8.314462618e-3
 DAYS = (0, 1, 2, 4, 8, 16)
 SERIES = tuple((celsius, percent) for celsius in (40.0, 60.0, 80.0) for percent in (80.0, 90.0))

@@ -1,0 +1,76 @@
+"""Tables `steady` with known truth, made from the equations without any traces: for counts of many campaigns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from sealfit.physics import aging_law, stribeck_force
+
+MU_S = {"mu_0": 0.93513, "a": 0.04448, "b": 0.0804}  # the source's laws, 80 degC and 80 %
+MU_C = {"mu_0": 0.609, "a": 0.03307, "b": 0.1324}
+SPEEDS = (0.5, 1, 2, 4, 8, 16, 32, 64)
+
+
+def steady_rows(
+    *,
+    seed=1,
+    speeds=SPEEDS,
+    days=(0, 1, 2, 4, 8, 16),
+    series=((60.0, 80.0),),
+    repeats=3,
+    noise=0.004,
+    setup=0.0,
+    specimen=0.0,
+    constant=0.0,
+    load=49.03,
+    ways=(1, -1),
+    commanded=True,
+    model=None,
+    laws=None,
+):
+    """Table `steady` of a campaign with known truth; noise, setup and specimen are relative, constant in N."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for place, (temperature, compression) in enumerate(series):
+        law_s, law_c = (laws or {}).get((temperature, compression), (MU_S, MU_C))
+        for day in days:
+            if day == 0 and place > 0:
+                continue
+            truth = model or {
+                "mu_s": aging_law(day, **law_s),
+                "mu_c": aging_law(day, **law_c),
+                "v_s": 5.0,
+                "sigma_2": 0.02,
+            }
+            name = f"temperature_C={temperature:g}, compression_ratio_pct={compression:g}"
+            condition = "unaged" if day == 0 else f"{name}, aging_days={day:g}"
+            piece = 1 + specimen * rng.normal()
+            for speed in speeds:
+                for way in ways:
+                    force = stribeck_force(way * speed, load if load else 1.0, **truth) * piece
+                    force = force * (1 + setup * rng.normal())
+                    for repeat in range(1, repeats + 1):
+                        rows.append(
+                            {
+                                "file": f"{condition} {way * speed:g} {repeat}.csv",
+                                "run_id": f"{condition} {way * speed:g}",
+                                "repeat": repeat,
+                                "stroke": 1,
+                                "direction": way,
+                                "specimen_id": condition,
+                                "condition": condition,
+                                "series": "unaged" if day == 0 else name,
+                                "rubber": "rubber",
+                                "speed_mm_s": way * speed,
+                                "speed_set_mm_s": speed if commanded else np.nan,
+                                "load_N": load if load else np.nan,
+                                "force_N": float(force) * (1 + noise * rng.normal())
+                                + (constant * rng.normal() if constant else 0.0),
+                                "used": True,
+                                "temperature_C": temperature,
+                                "compression_ratio_pct": compression,
+                                "aging_days": float(day),
+                            }
+                        )
+    return pd.DataFrame(rows)
