@@ -12,7 +12,7 @@ from sealfit.config import Config
 from sealfit.fit.steady import table_row
 
 NEAR = 1  # cells to either side of the peak that count as it
-FORCE, RATIO = "F_ba", "F_ba/F"
+FORCE, RATIO, SLIDING = "F_ba", "F_ba/F", "F"
 NO_PEAK = "the force comes up to its sliding value without passing above it"
 FEW = "no repeats: no scatter is known"
 FAMILY = 0.01  # chance of a peak anywhere in a campaign where there is none
@@ -39,41 +39,55 @@ def peaks(force: np.ndarray, sliding: Sequence[float], steady: pd.DataFrame) -> 
     return pd.DataFrame({FORCE: peak, RATIO: peak / np.asarray(sliding)}).groupby(unit, sort=False).mean().dropna()
 
 
-def break_away_rows(found: Sequence[tuple[Mapping, pd.DataFrame]], config: Config) -> Iterator[dict]:
+def break_away_rows(
+    found: Sequence[tuple[Mapping, pd.DataFrame]], birge: Mapping[str, float], config: Config
+) -> Iterator[dict]:
     """Yield rows of table `dynamic_fit` for all break-aways of a campaign.
 
-    The scatter of repeats is pooled within a condition (in log force and log ratio). A peak is one where the ratio
-    stands above 1 by a t-test at 1 % for the whole campaign (Bonferroni); elsewhere `reason` says that there is none.
+    The scatter of repeats is pooled within a condition (in log force and log ratio). The force is also widened by the
+    scatter of set-ups, which all repeats of a run share; in the ratio it cancels. A peak is one where the ratio stands
+    above 1 by a t-test at 1 % for the whole campaign (Bonferroni); elsewhere `reason` says that there is none.
 
     Parameters
     ----------
     found : sequence of (keys, DataFrame)
         The condition, commanded speed and direction as columns of the table, and what `peaks` gave there.
+    birge : mapping
+        Condition -> by how much run means scatter more than repeats would have them, from the steady fit.
     config : Config
         Gives the units and the sensor's accuracy.
     """
-    pooled = {
-        (condition, name): _pooled([np.log(own[name].to_numpy()) for at, own in found if at["condition"] == condition])
-        for condition in dict.fromkeys(at["condition"] for at, _ in found)
-        for name in (FORCE, RATIO)
-    }
+    pooled = {}
+    for condition in dict.fromkeys(at["condition"] for at, _ in found):
+        alike = [own for at, own in found if at["condition"] == condition]
+        for name, logarithm in (
+            (FORCE, [np.log(own[FORCE]) for own in alike]),
+            (RATIO, [np.log(own[RATIO]) for own in alike]),
+            (SLIDING, [np.log(own[FORCE] / own[RATIO]) for own in alike]),
+        ):
+            pooled[condition, name] = _pooled(logarithm)
     for at, own in found:
-        for name, unit, u_sys in ((FORCE, config.units.unit("force"), config.sensor.u), (RATIO, "", None)):
-            spread, df = pooled[at["condition"], name]
+        condition = at["condition"]
+        setup = max(birge.get(condition, 1.0) ** 2 - 1, 0.0) * pooled[condition, SLIDING][0] ** 2
+        for name, unit, u_sys, shared in (
+            (FORCE, config.units.unit("force"), config.sensor.u, setup),
+            (RATIO, "", None, 0.0),
+        ):
+            spread, df = pooled[condition, name]
             value = float(np.exp(np.log(own[name]).mean()))
             row = {"quantity": "break_away", "parameter": name, "value": value, "unit": unit, "u_sys": u_sys}
             if df < 1:
                 yield {**table_row(**row, identified=False, reason=FEW), **at}
                 continue
-            error = spread / np.sqrt(len(own))
+            error = np.sqrt((spread**2 + shared) / len(own))
             half = stats.t.ppf(0.975, df) * error
             row |= {"se": value * error, "lo95": value * np.exp(-half), "hi95": value * np.exp(half)}
-            ratio_error = pooled[at["condition"], RATIO][0] / np.sqrt(len(own))
+            ratio_error = pooled[condition, RATIO][0] / np.sqrt(len(own))
             above = float(np.log(own[RATIO]).mean()) > stats.t.isf(FAMILY / len(found), df) * ratio_error
             yield {**table_row(**row, identified=True, reason="" if above else NO_PEAK), **at}
 
 
-def _pooled(groups: Sequence[np.ndarray]) -> tuple[float, int]:
+def _pooled(groups: Sequence[pd.Series]) -> tuple[float, int]:
     """Return the standard deviation within groups, and its degrees of freedom."""
     df = sum(values.size - 1 for values in groups)
     squares = sum(float(((values - values.mean()) ** 2).sum()) for values in groups)

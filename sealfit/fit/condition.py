@@ -71,10 +71,14 @@ class Condition:
         """
         rest, way = self.runs["force"].to_numpy(float) - self.model_force(), self.runs["direction"].to_numpy()
         one, other = rest[way > 0], rest[way < 0]
-        if min(len(one), len(other)) < 3:
+        halves = self.runs["half"].dropna().to_numpy(float)
+        if min(len(one), len(other)) >= 3:
+            half = (one.mean() - other.mean()) / 2
+            error = np.sqrt(one.var(ddof=1) / len(one) + other.var(ddof=1) / len(other)) / 2
+        elif len(halves) >= 3:
+            half, error = halves.mean(), halves.std(ddof=1) / np.sqrt(len(halves))
+        else:
             return 0.0
-        half = (one.mean() - other.mean()) / 2
-        error = np.sqrt(one.var(ddof=1) / len(one) + other.var(ddof=1) / len(other)) / 2
         return float(half) if abs(half) > 4 * error else 0.0
 
     def columns(self) -> np.ndarray:

@@ -76,7 +76,8 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
             broken.append((at, peaks(force, [s.sliding_N for s in alike], of)))
             model = None if models is None else cell_means(alike, [models[k] for k in places])[1]
             curves.append(_mean_curve(distance, force, model).assign(**at))
-    rows += break_away_rows([(at, own) for at, own in broken if len(own)], config)
+    birge = steady_fit[steady_fit["parameter"] == "birge_ratio"].dropna(subset="value").set_index("condition")["value"]
+    rows += break_away_rows([(at, own) for at, own in broken if len(own)], birge.to_dict(), config)
     keys = condition_keys(steady, config)
     table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
     fixed = DYNAMIC_FIT.names()

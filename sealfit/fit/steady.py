@@ -9,6 +9,7 @@ import pandas as pd
 
 from sealfit.conditions import condition_columns
 from sealfit.config import Config
+from sealfit.fit.both_ways import both_ways_together
 from sealfit.fit.condition import FULL, Condition, bound, drop_flat_curve, judge, make_condition, solve
 from sealfit.fit.stribeck import NAMES, linearised
 from sealfit.fit.uncertainty import UnitVariance, likelier, run_means, run_weights, unit_variance
@@ -79,7 +80,7 @@ def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, Un
         If nothing is left to fit.
     """
     runs = run_means(steady)
-    scatter = repeat_scatter(steady)
+    scatter = repeat_scatter(both_ways_together(steady[steady["used"].to_numpy(bool)]))
     choices = run_weights(runs, scatter)
     solved = [_solved(runs.assign(weight=weight)) for weight in choices]
     chi2 = [sum(c.chi2 for c in conditions) for conditions in solved]

@@ -16,6 +16,7 @@ import pandas as pd
 from scipy import stats
 
 from sealfit.errors import FitError
+from sealfit.fit.both_ways import BOTH, SAME_SPEED, both_ways_together
 from sealfit.ingest.scatter import Scatter
 
 POOLING_P = 0.25  # Bancroft's level for "is there set-up scatter at all": at 5 % it would too often be missed
@@ -31,13 +32,14 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     Parameters
     ----------
     steady : DataFrame
-        Table `steady`; rows with `used` false are left out.
+        Table `steady`; rows with `used` false are left out. The two ways of a file are taken together.
 
     Returns
     -------
     DataFrame
         `condition`, `run_id`, `direction`, `speed` (|v|), `set` (commanded |v|, NaN where unknown), `load` (NaN where
-        unknown), `force` (F sgn v) and `files`, sorted by the first three.
+        unknown), `force` (F sgn v), `half` (half of the difference between the two ways, where a row stands for both)
+        and `files`, sorted by the first three.
 
     Raises
     ------
@@ -50,6 +52,7 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     rows = steady[steady["used"].to_numpy(bool) & steady["condition"].notna().to_numpy()]
     if rows.empty:
         raise FitError("no steady window is left to fit.", mend="Look in table quality why each was left out.")
+    rows = both_ways_together(rows)
     commanded = rows["speed_set_mm_s"] if "speed_set_mm_s" in rows.columns else pd.Series(np.nan, rows.index)
     numbers = pd.DataFrame(
         {
@@ -60,7 +63,8 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
             "speed": rows["speed_mm_s"].astype(float).abs(),
             "set": commanded.astype(float).abs(),
             "load": rows["load_N"].astype(float),
-            "force": rows["force_N"].astype(float) * rows["direction"].astype(int),
+            "force": rows["force_N"].astype(float) * rows["direction"].astype(int).replace(BOTH, 1),
+            "half": rows["half_N"],
         }
     )
     keys = ["condition", "run_id", "direction"]
@@ -171,9 +175,6 @@ def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
     )
 
 
-SAME_SPEED = 1.25  # measured speeds within 25 % of the slowest are one level: rigs without speed control wander so
-
-
 def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
     """Return the distinct speed levels of one condition, rising, per direction: {+1: (k,), -1: (m,)}.
 
@@ -181,7 +182,10 @@ def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
     kept apart: a direction offset between a slow way out and a fast way back would be taken for a Stribeck curve.
     """
     levels = {}
-    for direction, rows in runs.groupby("direction"):
+    for direction in (1, -1):
+        rows = runs[runs["direction"].isin([direction, BOTH])]
+        if rows.empty:
+            continue
         commanded = rows["set"].to_numpy(float)
         if np.all(np.isfinite(commanded)) and np.all(commanded > 0):
             codes = np.array([float(f"{speed:.6g}") for speed in commanded])
@@ -192,5 +196,5 @@ def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
                 start = value if value > SAME_SPEED * start or start < 0 else start
                 codes.append(start)
             codes = np.array(codes)
-        levels[int(direction)] = np.unique(codes)
+        levels[direction] = np.unique(codes)
     return levels
