@@ -6,7 +6,7 @@ NO_NETWORK = echo "make: the packages that sealfit needs could not be installed;
 CODE := $(wildcard sealfit tests benchmarks)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost clean
+.PHONY: help demo test lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost paper clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -32,8 +32,7 @@ bench-effects: .venv/.installed-test
 	$(BIN)/python benchmarks/false_alarms.py --seeds 1 --strength strong --effects
 
 bench-coverage: .venv/.installed-test
-	$(BIN)/python benchmarks/coverage_steady.py 400
-	$(BIN)/python benchmarks/coverage_dynamic.py 100
+	$(BIN)/python benchmarks/coverage.py --campaigns 100
 
 # In an environment of its own, as pygam holds scipy back. What is in out/loop.jsonl already is not run again.
 bench-loop: .venv/.installed-bench ## close the loop on some 700 campaigns beside what people would use instead (90 minutes)
@@ -41,6 +40,9 @@ bench-loop: .venv/.installed-bench ## close the loop on some 700 campaigns besid
 
 bench-loop-cost: .venv/.installed-test
 	$(BIN)/python benchmarks/loop_cost.py
+
+paper: .venv/.installed-test ## simulate and analyse the source paper's campaign, and write docs/paper
+	$(BIN)/python benchmarks/paper.py
 
 clean: ## remove everything that make made, .venv too
 	rm -rf .venv demo-out build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -10,6 +10,7 @@ from scipy import stats
 
 from sealfit.config import Config
 from sealfit.fit.steady import table_row
+from sealfit.fit.stiffness import together
 
 NEAR = 1  # cells to either side of the peak that count as it
 FORCE, RATIO, SLIDING = "F_ba", "F_ba/F", "F"
@@ -40,51 +41,58 @@ def peaks(force: np.ndarray, sliding: Sequence[float], steady: pd.DataFrame) -> 
 
 
 def break_away_rows(
-    found: Sequence[tuple[Mapping, pd.DataFrame]], birge: Mapping[str, float], config: Config
+    found: Sequence[tuple[Mapping, pd.DataFrame]], widened: Mapping[str, tuple[float, float]], config: Config
 ) -> Iterator[dict]:
     """Yield rows of table `dynamic_fit` for all break-aways of a campaign.
 
-    The scatter of repeats is pooled within a condition (in log force and log ratio). The force is also widened by the
-    scatter of set-ups, which all repeats of a run share; in the ratio it cancels. A peak is one where the ratio stands
-    above 1 by a t-test at 1 % for the whole campaign (Bonferroni); elsewhere `reason` says that there is none.
+    The scatter of repeats is pooled within a condition: that of the force as a share of it, that of the ratio as the
+    force above the sliding force in N, since what does not cancel in it is the noise of the samples. The force is also
+    widened by the scatter of set-ups, which all repeats of a run share. A peak is one where the force stands above the
+    sliding force by a t-test at 1 % for the whole campaign (Bonferroni); elsewhere `reason` says that there is none.
 
     Parameters
     ----------
     found : sequence of (keys, DataFrame)
         The condition, commanded speed and direction as columns of the table, and what `peaks` gave there.
-    birge : mapping
-        Condition -> by how much run means scatter more than repeats would have them, from the steady fit.
+    widened : mapping
+        Condition -> by how much run means scatter more than repeats would have them (Birge's ratio), and on how many
+        degrees of freedom that rests: from the steady fit.
     config : Config
         Gives the units and the sensor's accuracy.
     """
     pooled = {}
     for condition in dict.fromkeys(at["condition"] for at, _ in found):
         alike = [own for at, own in found if at["condition"] == condition]
-        for name, logarithm in (
-            (FORCE, [np.log(own[FORCE]) for own in alike]),
-            (RATIO, [np.log(own[RATIO]) for own in alike]),
-            (SLIDING, [np.log(own[FORCE] / own[RATIO]) for own in alike]),
-        ):
-            pooled[condition, name] = _pooled(logarithm)
+        pooled[condition, FORCE] = _pooled([np.log(own[FORCE]) for own in alike])
+        pooled[condition, SLIDING] = _pooled([np.log(own[FORCE] / own[RATIO]) for own in alike])
+        pooled[condition, RATIO] = _pooled([_above(own) for own in alike])
     for at, own in found:
         condition = at["condition"]
-        setup = max(birge.get(condition, 1.0) ** 2 - 1, 0.0) * pooled[condition, SLIDING][0] ** 2
-        for name, unit, u_sys, shared in (
-            (FORCE, config.units.unit("force"), config.sensor.u, setup),
-            (RATIO, "", None, 0.0),
+        birge, birge_df = widened.get(condition, (1.0, 1.0))
+        setup = max(birge**2 - 1, 0.0) * pooled[condition, SLIDING][0] ** 2
+        rise, rise_df = pooled[condition, RATIO]
+        rise_error = rise / np.sqrt(len(own))
+        peak = rise_df >= 1 and float(_above(own).mean()) > stats.t.isf(FAMILY / len(found), rise_df) * rise_error
+        spread, df = pooled[condition, FORCE]
+        force_df = together(((spread**2, df), (setup, birge_df)))
+        for name, unit, u_sys, variance, error_df in (
+            (FORCE, config.units.unit("force"), config.sensor.u, spread**2 + setup, force_df),
+            (RATIO, "", None, (rise / own[FORCE].mean()) ** 2, rise_df),
         ):
-            spread, df = pooled[condition, name]
             value = float(np.exp(np.log(own[name]).mean()))
             row = {"quantity": "break_away", "parameter": name, "value": value, "unit": unit, "u_sys": u_sys}
-            if df < 1:
+            if rise_df < 1:
                 yield {**table_row(**row, identified=False, reason=FEW), **at}
                 continue
-            error = np.sqrt((spread**2 + shared) / len(own))
-            half = stats.t.ppf(0.975, df) * error
+            error = np.sqrt(variance / len(own))
+            half = stats.t.ppf(0.975, error_df) * error
             row |= {"se": value * error, "lo95": value * np.exp(-half), "hi95": value * np.exp(half)}
-            ratio_error = pooled[condition, RATIO][0] / np.sqrt(len(own))
-            above = float(np.log(own[RATIO]).mean()) > stats.t.isf(FAMILY / len(found), df) * ratio_error
-            yield {**table_row(**row, identified=True, reason="" if above else NO_PEAK), **at}
+            yield {**table_row(**row, identified=True, reason="" if peak else NO_PEAK), **at}
+
+
+def _above(own: pd.DataFrame) -> pd.Series:
+    """Return the force above the sliding force, in N."""
+    return own[FORCE] * (1 - 1 / own[RATIO])
 
 
 def _pooled(groups: Sequence[pd.Series]) -> tuple[float, int]:

@@ -11,6 +11,7 @@ import pandas as pd
 from sealfit.config import Config
 from sealfit.fit.breakaway import break_away_rows, peaks
 from sealfit.fit.rises import Curve, Stroke
+from sealfit.fit.rows import nesting_run
 from sealfit.fit.starts import Start, cell_means, starts_of
 from sealfit.fit.steady import condition_keys, parameter_units, table_row
 from sealfit.fit.stiffness import Stiffness, fit_stiffness
@@ -76,14 +77,21 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
             broken.append((at, peaks(force, [s.sliding_N for s in alike], of)))
             model = None if models is None else cell_means(alike, [models[k] for k in places])[1]
             curves.append(_mean_curve(distance, force, model).assign(**at))
-    birge = steady_fit[steady_fit["parameter"] == "birge_ratio"].dropna(subset="value").set_index("condition")["value"]
-    rows += break_away_rows([(at, own) for at, own in broken if len(own)], birge.to_dict(), config)
+    rows += break_away_rows([(at, own) for at, own in broken if len(own)], _widened(steady_fit), config)
     keys = condition_keys(steady, config)
     table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
     fixed = DYNAMIC_FIT.names()
     table = table.reindex(columns=[*fixed, *(name for name in keys.columns if name not in fixed)])
     curves = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
     return Dynamic(table.astype({"direction": "Int64"}), curves.reindex(columns=DYNAMIC_CURVES.names()))
+
+
+def _widened(steady_fit: pd.DataFrame) -> dict[str, tuple[float, float]]:
+    """Return by how much the run means of each condition scatter more than repeats, and the degrees of freedom."""
+    rows = steady_fit[steady_fit["quantity"] == "statistics"]
+    both = [rows[rows["parameter"] == name].set_index("condition")["value"] for name in ("birge_ratio", "error_df")]
+    table = pd.concat(both, axis=1).dropna()
+    return dict(zip(table.index, table.itertuples(index=False, name=None), strict=True))
 
 
 def _strokes(starts: Sequence[Start], own: pd.DataFrame, curve: Curve) -> list[Stroke]:
@@ -93,7 +101,7 @@ def _strokes(starts: Sequence[Start], own: pd.DataFrame, curve: Curve) -> list[S
     """
     size = own["load_N"] if curve.known else own["force_N"] * own["direction"]
     ratio = (size / (size.mean() if curve.known else curve.coulomb_N)).fillna(1.0).to_numpy(float)
-    units = (_numbered(own[name]) for name in ("file", "run_id"))
+    units = (_numbered(names) for names in (own["file"], nesting_run(own)))
     return [
         Stroke(file, run, part, s.distance_mm, s.speed_mm_s, s.force_N)
         for file, run, part, s in zip(*units, ratio, starts, strict=True)

@@ -137,7 +137,7 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
         sigma_0=float(np.exp(found.x[0] + level.mean())),
         tau_s=float(found.x[1]),
         covariance=by_files + np.diag([by_level, 0.0]) + by_curve,
-        df=_together(parts),
+        df=together(parts),
         gain=rises.gain_of(found.rss),
         within=rises.inside(float(np.exp(found.x[0])), levels, start_N),
         files=rises.files,
@@ -161,7 +161,7 @@ def _one_step(jacobian: np.ndarray, residual: np.ndarray, x: np.ndarray, low: np
     return x + step
 
 
-def _together(parts: Sequence[tuple[np.ndarray, np.ndarray | int]]) -> np.ndarray:
+def together(parts: Sequence[tuple[np.ndarray, np.ndarray | int]]) -> np.ndarray:
     """Return the degrees of freedom of sums of variances (Welch and Satterthwaite), shape (p,)."""
     total = sum(variance for variance, _ in parts)
     spread = sum(variance**2 / np.maximum(df, 1) for variance, df in parts)

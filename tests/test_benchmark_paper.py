@@ -1,0 +1,54 @@
+"""What the source paper printed agrees with itself as far as it does, and is looked up where our tables have it."""
+
+import pandas as pd
+import pytest
+from paper_numbers import MEASURED, as_printed, compared, condition, printed_errors
+
+from sealfit.conditions import add_keys
+from sealfit.config import Config
+
+
+def test_the_printed_prediction_of_mu_c_needs_another_start():
+    found = printed_errors()
+    assert found["start"] == pytest.approx(0.639, abs=5e-5)
+    assert found["gap"] == pytest.approx(0.030, abs=5e-5)
+    assert (found["needed_4"], found["needed_16"]) == pytest.approx((8.6, 7.4), abs=0.05)
+    assert (found["own_4"], found["own_16"]) == pytest.approx((2.4, 0.7), abs=0.05)
+    assert found["spare"] < 0.0007
+
+
+def test_eq_15_as_printed_gives_the_printed_mu_s():
+    assert as_printed("mu_s", 0.0) == pytest.approx(0.93566, abs=5e-6)
+    assert as_printed("mu_s", 16.0) == pytest.approx(0.7, abs=5e-5)
+
+
+def test_conditions_are_spelled_as_the_tables_spell_them():
+    columns = ["temperature_C", "compression_ratio_pct", "aging_days"]
+    places = [at for _, _, at, _ in MEASURED]
+    runs = pd.DataFrame([at or (23.0, 100.0, 0.0) for at in places], columns=columns)
+    assert list(add_keys(runs, Config())["condition"]) == [condition(at) for at in places]
+
+
+def test_every_published_number_stands_beside_ours():
+    series = "temperature_C=60, compression_ratio_pct=80"
+    steady = pd.DataFrame(
+        [(condition(at), q, "steady", value, value - 0.01, value + 0.01) for _, q, at, value in MEASURED],
+        columns=["condition", "parameter", "quantity", "value", "lo95", "hi95"],
+    )
+    law = pd.DataFrame(
+        [(series, q, name, 1.0, 0.5, 2.0) for q in ("mu_s", "mu_c") for name in "abc"],
+        columns=["series", "quantity", "parameter", "value", "lo95", "hi95"],
+    )
+    curves = pd.DataFrame(
+        [(series, q, day, 0.7, 0.6, 0.8) for q in ("mu_s", "mu_c") for day in (0.0, 16.0)],
+        columns=["series", "quantity", "aging_days", "value", "lo95", "hi95"],
+    )
+    runs = pd.DataFrame(
+        [("unaged", "r1", 40.0), ("unaged", "r2", 49.0), (condition((80, 80, 16)), "r3", 35.0)],
+        columns=["condition", "run_id", "force_N"],
+    )
+    tables = {"steady": runs, "steady_fit": steady, "aging_fit": law, "aging_curves": curves}
+    lines = compared(tables)
+    assert len(lines) == len(MEASURED) + 6 + 2 + 2
+    assert all(line.ours == line.published for line in lines[: len(MEASURED)])
+    assert [line.ours for line in lines[-2:]] == [49.0, 35.0]
