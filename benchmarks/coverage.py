@@ -4,9 +4,9 @@
 
 Prints, per design and number, the share of the intervals that hold the truth, the share called identified and the
 median half-width relative to the truth; and per part all of them pooled, with a standard error that takes campaigns as
-clusters. "laws" counts the law for all series fitted to the forces, the law that evidence chooses, and lifetimes by
-both; "dynamic" starts from traces and also counts break-aways found where there is none. Intervals of `predict` are
-counted by loop.py.
+clusters. "laws" counts the law for all series fitted to the forces, what evidence chooses, and lifetimes by the true
+law and over all laws; "dynamic" starts from traces and also counts break-aways found where there is none. Intervals of
+`predict` are counted by loop.py.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from sealfit.fit.aging import fit_series
 from sealfit.fit.all_series import aged_values
 from sealfit.fit.dynamic import fit_dynamic
 from sealfit.fit.joint_law import JointLaw, fit_joint_law, fit_laws, rivals_of
-from sealfit.fit.lifetime import Goal, lifetime, resampled
+from sealfit.fit.lifetime import Goal, lifetime, over_laws, resampled
 from sealfit.fit.shared_curve import shared_levels
 from sealfit.fit.steady import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
@@ -136,11 +136,11 @@ def laws(settings: dict, seed: int) -> Iterator[Entry]:
         likely = [(one.loss.name, one.way) for one in (chosen[0], *rivals_of(chosen))]
         yield Entry(f"{quantity}: the true law is the likeliest", likely[0] == ("log", "rate"), None, None)
         yield Entry(f"{quantity}: the true law is the likeliest or a rival", ("log", "rate") in likely, None, None)
-        yield from _lives(quantity, law, fitted, chosen[0], middle, seed)
+        yield from _lives(quantity, law, fitted, chosen, middle, seed)
 
 
 def _lives(
-    quantity: str, law: dict, fitted: JointLaw, likeliest: JointLaw, middle: tuple, seed: int
+    quantity: str, law: dict, fitted: JointLaw, chosen: Sequence[JointLaw], middle: tuple, seed: int
 ) -> Iterator[Entry]:
     """Yield lifetimes within and beyond the tests: a loss that takes 10 days in the middle, and 100 days."""
     celsius, percent = middle[0] - 5.0, middle[1]
@@ -148,10 +148,9 @@ def _lives(
     for title, days in (("life", 10.0), ("life beyond the tests", 100.0)):
         goal = Goal(law["mu_0"] - law["a"] * np.log1p(days / law["b"]))
         truth = days / _rate(celsius, percent, middle)
-        for by, one in (("", fitted), (", likeliest law", likeliest)):
-            found = lifetime(one, goal, *place)
-            if found.days > 0:
-                yield Entry(f"{quantity} {title}{by}", truth, found.low, found.high)
+        found = lifetime(fitted, goal, *place)
+        yield Entry(f"{quantity} {title}", truth, found.low, found.high)
+        yield Entry(f"{quantity} {title}, over all laws", truth, *over_laws(chosen, goal, *place))
         yield Entry(f"{quantity} {title}, resampled", truth, *resampled(fitted, goal, *place, seed=seed))
 
 

@@ -81,7 +81,8 @@ def lifetime(
     """
     from sealfit.fit.all_series import law_of
     from sealfit.fit.joint_law import rivals_of
-    from sealfit.fit.lifetime import answer, goal_of
+    from sealfit.fit.lifetime import over_laws
+    from sealfit.fit.lifetime_answer import answer, finite_ends, goal_of
 
     store = Store.open(existing_out(out))
     store.require("fit-steady")
@@ -90,6 +91,8 @@ def lifetime(
     place = {"temperature_C": temperature_C, "compression_pct": compression_pct}
     chosen = answer(laws[0], goal, years, resample=True, **place)
     rivals = [answer(rival, goal, years, **place) for rival in rivals_of(laws)] if law is None else []
+    if law is None and years is None:
+        chosen["ci95_over_laws"] = finite_ends(over_laws(laws, goal, **place))
     return {"out": str(store.out), "quantity": quantity, **chosen, "rivals": rivals}
 
 

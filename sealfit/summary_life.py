@@ -13,6 +13,8 @@ def lifetime_lines(part: Mapping) -> list[str]:
     found.append(line("life" if "days" in part else "use", _life(part)))
     if part.get("ci95_resampled"):
         found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
+    if part.get("ci95_over_laws") and part["rivals"]:
+        found.append(line("", f"95 % interval over all laws by their weight: {_days_between(part['ci95_over_laws'])}"))
     for rival in part["rivals"]:
         found.append(line("rival", f"{rival['form']}, {_change(rival)}: {_life(rival)}"))
     return found

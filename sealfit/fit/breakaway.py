@@ -103,15 +103,23 @@ def _pooled(groups: Sequence[pd.Series]) -> tuple[float, int]:
 
 
 def _peaks(force: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return each start's force where the mean of the other units is largest, shape (starts,); NaN without a sample."""
-    hits, total = np.isfinite(force), np.nan_to_num(force)
+    """Return each start's force where the mean of the other units is largest, shape (starts,); NaN without a sample.
+
+    Mean and force are those of the cell and its neighbours: the largest of single cells is mostly noise.
+    """
+    hits, total = (_with_neighbours(x) for x in (np.isfinite(force).astype(float), np.nan_to_num(force)))
     found = np.full(len(force), np.nan)
     for k in range(len(force)):
         others = unit != unit[k] if (unit != unit[k]).any() else unit == unit[k]
         count = hits[others].sum(axis=0)
         mean = np.where(count > 0, total[others].sum(axis=0) / np.maximum(count, 1), -np.inf)
         at = int(np.argmax(mean))
-        near = slice(max(at - NEAR, 0), at + NEAR + 1)
-        if hits[k, near].any() and (here := total[k, near].sum() / hits[k, near].sum()) > 0.0:
+        if hits[k, at] and (here := total[k, at] / hits[k, at]) > 0.0:
             found[k] = here
     return found
+
+
+def _with_neighbours(values: np.ndarray) -> np.ndarray:
+    """Return the sum over each cell and `NEAR` to either side, shape of `values`."""
+    padded = np.pad(values, ((0, 0), (NEAR, NEAR)))
+    return sum(padded[:, k : k + values.shape[1]] for k in range(2 * NEAR + 1))

@@ -12,7 +12,8 @@ from sealfit.errors import FitError, RequestError
 from sealfit.fit.aged import Aged
 from sealfit.fit.joint_law import fit_joint_law, fit_laws, left_out, rivals_of
 from sealfit.fit.joint_solve import solved, solved_many
-from sealfit.fit.lifetime import DAYS_PER_YEAR, Goal, answer, goal_of, lifetime, resampled, temperature_for
+from sealfit.fit.lifetime import DAYS_PER_YEAR, Goal, lifetime, over_laws, resampled, temperature_for
+from sealfit.fit.lifetime_answer import answer, goal_of
 from sealfit.physics.losses import LOSSES
 
 MEASURED = os.environ.get("SEALFIT_MEASURED")
@@ -116,6 +117,27 @@ def test_the_delta_interval_agrees_with_values_drawn_anew():
     low, high = resampled(law, Goal(0.75), 50.0, 85.0, draws=120)
     assert np.log(high / low) == pytest.approx(np.log(found.high / found.low), rel=0.25)
     assert low < found.days < high
+
+
+def test_the_interval_over_one_law_is_its_own():
+    laws = fit_laws(campaign(scatter=0.003))
+    own = lifetime(laws[0], Goal(0.75), 50.0, 85.0)
+    assert over_laws(laws[:1], Goal(0.75), 50.0, 85.0) == pytest.approx((own.low, own.high), rel=1e-6)
+
+
+def test_the_interval_over_laws_reaches_over_rivals_that_cannot_be_told_apart():
+    series = campaign(scatter=0.02, seed=3)
+    laws = fit_laws(series.part((series.days == 0) | ((series.temperature_C > 50) & (series.compression_pct == 80))))
+    goal = Goal(0.55)  # beyond the tests, where the laws part
+    own = lifetime(laws[0], goal, 60.0)
+    low, high = over_laws(laws, goal, 60.0)
+    assert np.log(high / low) > np.log(own.high / own.low)
+    assert low < own.days < high
+
+
+def test_an_end_that_a_likely_law_leaves_open_stays_open():
+    laws = fit_laws(campaign("stretched", (4.0, 0.6), a=0.3, scatter=0.0005))
+    assert over_laws(laws, Goal(0.3), 60.0, 80.0)[1] == np.inf
 
 
 def test_many_draws_at_once_are_fitted_as_each_alone():
