@@ -83,6 +83,9 @@ DESIGNS = {
             "speeds_mm_s": (0.5, 2.0, 4.0, 8.0, 20.0, 40.0),
         }),
         "6 speeds one way": (BRISTLES, {"speeds_mm_s": (0.5, 2.0, 5.0, 10.0, 25.0, 50.0)}),
+        "6 speeds one way, slow ramps": (BRISTLES, {
+            "speeds_mm_s": (0.5, 2.0, 5.0, 8.0, 10.0, 12.0), "ramp_s": 2.0, "sampling_Hz": 400.0, "max_rows": 4000,
+        }),
         "no break-away, 8 speeds one way": (FLAT, {}),
     },
 }  # fmt: skip

@@ -14,6 +14,7 @@ from sealfit.fit.stiffness import together
 
 NEAR = 1  # cells to either side of the peak that count as it
 FORCE, RATIO, SLIDING = "F_ba", "F_ba/F", "F"
+TOP, PLACES = "top", "places"  # the force where the mean of all units is largest, and of how many places that is one
 NO_PEAK = "the force comes up to its sliding value without passing above it"
 FEW = "no repeats: no scatter is known"
 FAMILY = 0.01  # chance of a peak anywhere in a campaign where there is none
@@ -23,7 +24,8 @@ def peaks(force: np.ndarray, sliding: Sequence[float], steady: pd.DataFrame) -> 
     """Return the break-away force F_ba and its share of the sliding force, per file, or per stroke of a single file.
 
     Where the peak lies is read from the mean of the other units, and a start's own force is then taken there: the
-    largest of noisy samples is always too high.
+    largest of noisy samples is always too high. `top` is its force above sliding where the mean of all is largest, and
+    `places` how many places apart there are: what a test needs of whether there is a peak at all.
 
     Parameters
     ----------
@@ -36,8 +38,10 @@ def peaks(force: np.ndarray, sliding: Sequence[float], steady: pd.DataFrame) -> 
         Rows of table `steady`, one per start, in the same order.
     """
     unit = steady["file"].to_numpy() if steady["file"].nunique() > 1 else np.arange(len(force))
-    peak = _peaks(force, unit)
-    return pd.DataFrame({FORCE: peak, RATIO: peak / np.asarray(sliding)}).groupby(unit, sort=False).mean().dropna()
+    peak, top = _peaks(force, unit)
+    places = max(force.shape[1] // (2 * NEAR + 1), 1)
+    table = {FORCE: peak, RATIO: peak / np.asarray(sliding), TOP: top - np.asarray(sliding), PLACES: places}
+    return pd.DataFrame(table).groupby(unit, sort=False).mean().dropna()
 
 
 def break_away_rows(
@@ -47,8 +51,9 @@ def break_away_rows(
 
     The scatter of repeats is pooled within a condition: that of the force as a share of it, that of the ratio as the
     force above the sliding force in N, since what does not cancel in it is the noise of the samples. The force is also
-    widened by the scatter of set-ups, which all repeats of a run share. A peak is one where the force stands above the
-    sliding force by a t-test at 1 % for the whole campaign (Bonferroni); elsewhere `reason` says that there is none.
+    widened by the scatter of set-ups, which all repeats of a run share. A peak is one where the largest mean stands
+    above the sliding force by a t-test at 1 % for all places of all starts of the campaign (Bonferroni); elsewhere
+    `reason` says that there is none, and there is no interval.
 
     Parameters
     ----------
@@ -65,34 +70,31 @@ def break_away_rows(
         alike = [own for at, own in found if at["condition"] == condition]
         pooled[condition, FORCE] = _pooled([np.log(own[FORCE]) for own in alike])
         pooled[condition, SLIDING] = _pooled([np.log(own[FORCE] / own[RATIO]) for own in alike])
-        pooled[condition, RATIO] = _pooled([_above(own) for own in alike])
+        pooled[condition, RATIO] = _pooled([own[FORCE] * (1 - 1 / own[RATIO]) for own in alike])
+        pooled[condition, TOP] = _pooled([own[TOP] for own in alike])
+    places = sum(float(own[PLACES].max()) for _, own in found)
     for at, own in found:
         condition = at["condition"]
         birge, birge_df = widened.get(condition, (1.0, 1.0))
         setup = max(birge**2 - 1, 0.0) * pooled[condition, SLIDING][0] ** 2
-        rise, rise_df = pooled[condition, RATIO]
-        rise_error = rise / np.sqrt(len(own))
-        peak = rise_df >= 1 and float(_above(own).mean()) > stats.t.isf(FAMILY / len(found), rise_df) * rise_error
         spread, df = pooled[condition, FORCE]
+        above = pooled[condition, RATIO][0] / own[FORCE].mean()
+        critical = (
+            stats.t.isf(FAMILY / places, df) * pooled[condition, TOP][0] / np.sqrt(len(own)) if df >= 1 else np.inf
+        )
+        reason = FEW if df < 1 else "" if own[TOP].mean() > critical else NO_PEAK
         force_df = together(((spread**2, df), (setup, birge_df)))
         for name, unit, u_sys, variance, error_df in (
             (FORCE, config.units.unit("force"), config.sensor.u, spread**2 + setup, force_df),
-            (RATIO, "", None, (rise / own[FORCE].mean()) ** 2, rise_df),
+            (RATIO, "", None, above**2, df),
         ):
             value = float(np.exp(np.log(own[name]).mean()))
             row = {"quantity": "break_away", "parameter": name, "value": value, "unit": unit, "u_sys": u_sys}
-            if rise_df < 1:
-                yield {**table_row(**row, identified=False, reason=FEW), **at}
-                continue
-            error = np.sqrt(variance / len(own))
-            half = stats.t.ppf(0.975, error_df) * error
-            row |= {"se": value * error, "lo95": value * np.exp(-half), "hi95": value * np.exp(half)}
-            yield {**table_row(**row, identified=True, reason="" if peak else NO_PEAK), **at}
-
-
-def _above(own: pd.DataFrame) -> pd.Series:
-    """Return the force above the sliding force, in N."""
-    return own[FORCE] * (1 - 1 / own[RATIO])
+            if not reason:
+                error = np.sqrt(variance / len(own))
+                half = stats.t.ppf(0.975, error_df) * error
+                row |= {"se": value * error, "lo95": value * np.exp(-half), "hi95": value * np.exp(half)}
+            yield {**table_row(**row, identified=not reason, reason=reason), **at}
 
 
 def _pooled(groups: Sequence[pd.Series]) -> tuple[float, int]:
@@ -102,21 +104,29 @@ def _pooled(groups: Sequence[pd.Series]) -> tuple[float, int]:
     return float(np.sqrt(squares / df)) if df else np.nan, df
 
 
-def _peaks(force: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return each start's force where the mean of the other units is largest, shape (starts,); NaN without a sample.
+def _peaks(force: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return each start's force where the mean of the other units is largest, and of all units, shape (starts,) each.
 
-    Mean and force are those of the cell and its neighbours: the largest of single cells is mostly noise.
+    NaN without a sample there. Mean and force are those of the cell and its neighbours: the largest of single cells is
+    mostly noise.
     """
     hits, total = (_with_neighbours(x) for x in (np.isfinite(force).astype(float), np.nan_to_num(force)))
-    found = np.full(len(force), np.nan)
-    for k in range(len(force)):
-        others = unit != unit[k] if (unit != unit[k]).any() else unit == unit[k]
-        count = hits[others].sum(axis=0)
-        mean = np.where(count > 0, total[others].sum(axis=0) / np.maximum(count, 1), -np.inf)
-        at = int(np.argmax(mean))
-        if hits[k, at] and (here := total[k, at] / hits[k, at]) > 0.0:
-            found[k] = here
-    return found
+
+    def highest(starts: np.ndarray) -> int:
+        count = hits[starts].sum(axis=0)
+        return int(np.argmax(np.where(count > 0, total[starts].sum(axis=0) / np.maximum(count, 1), -np.inf)))
+
+    def at(start: int, cell: int) -> float:
+        here = total[start, cell] / hits[start, cell] if hits[start, cell] else 0.0
+        return here if here > 0.0 else np.nan
+
+    everywhere = np.ones(len(force), bool)
+    others = [unit != own if (unit != own).any() else everywhere for own in unit]
+    whole = highest(everywhere)
+    return (
+        np.array([at(k, highest(mask)) for k, mask in enumerate(others)]),
+        np.array([at(k, whole) for k in range(len(force))]),
+    )
 
 
 def _with_neighbours(values: np.ndarray) -> np.ndarray:
