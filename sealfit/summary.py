@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sealfit.tables import Units
+from sealfit.verdict import predicts_worse
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -104,6 +105,10 @@ def verdict_sentence(closure: Mapping, units: Units) -> str:
         return "the declared model explains these measurements down to their own scatter"
     if closure["verdict"] == "closed":
         return f"{added}; no significant structure is left"
+    if predicts_worse(closure):
+        after, before = (closure[name]["heldout_rmse_N"] for name in ("after", "before"))
+        them, change = "it" if count == 1 else "them", f"{before:.3g} -> {after:.3g} {units.unit('force')}"
+        return f"{added}, but what is held out is predicted worse with {them} ({change}): do not predict with {them}"
     return f"{added}, and something is left that could not be named{_where(closure['left'], units)}"
 
 

@@ -23,6 +23,7 @@ from sealfit.effects.contract import Effect
 from sealfit.engine import begin_map
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.rows import Rows, make_rows, thin
+from sealfit.verdict import predicts_worse
 
 ROWS = 4_000  # that the search works on; more are merged along their strokes,
 PER_STROKE = 8  # to about so many of each stroke,
@@ -222,7 +223,8 @@ def _document(
             "mean_abs_pct": found["mean_abs_pct"],
             "lack_of_fit_p": lack_of_fit(fitted),
         }
-    verdict = "unexplained" if grown.left is not None else "closed" if grown.added else "nothing_missing"
+    worse = predicts_worse({**numbers, "effects": entries})
+    verdict = "unexplained" if grown.left is not None or worse else "closed" if grown.added else "nothing_missing"
     units = config.units
     slots = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
     return {

@@ -11,6 +11,7 @@ from markupsafe import Markup
 from sealfit.config import Config
 from sealfit.report.numbers import NOTHING, known, measured, number, of_unit, p_value, together
 from sealfit.report.symbols import channel_label, channel_words, effect_label, joined, split_channels, symbol_html
+from sealfit.verdict import predicts_worse
 
 FLAT = 0.02  # of its span: a shape that crosses zero by less is of one sign
 STARTS = (
@@ -52,6 +53,12 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
             return _sentence(errors)
         them = "them" if len(added) > 1 else "it"
         return Markup("The declared model missed {}; with {} {}.").format(lead, them, errors)
+    if predicts_worse(closure):
+        them = "them" if len(added) > 1 else "it"
+        return Markup(
+            "{} would explain what the declared model leaves over, but {}: do not predict with {}. "
+            "Somewhere in these data one {} alone shows what it does there."
+        ).format(lead[:1].upper() + lead[1:], errors, them, closure.get("heldout_unit") or "run")
     where = _where(closure["left"], config)
     if missed:
         return Markup(
@@ -186,7 +193,7 @@ def left_over(closure: Mapping, config: Config) -> Markup:
                 f"; {of_unit(number(left['rmse_N'], 2), unit)} of it lies above the floor (roots of sums of squares)"
             )
         said[0] += "."
-    if closure["verdict"] == "unexplained":
+    if closure["verdict"] == "unexplained" and not predicts_worse(closure):
         said.append(f"It is not only noise: {_where(left, config)}.")
     elif left.get("channels"):
         said.append(f"No channel orders it more surely than chance would; where to look first: {_where(left, config)}.")

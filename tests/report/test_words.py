@@ -5,6 +5,7 @@ from report.made_tables import empty, shapes
 
 from sealfit.config import Config
 from sealfit.report.words import acts, does, left_over, verdict, with_left_channels
+from sealfit.verdict import predicts_worse
 
 NUMBERS = {
     "rmse_N": 1.3,
@@ -60,6 +61,19 @@ def test_closed_says_what_was_missed_and_what_it_brings():
         "The declared model missed warming by sliding (μ falls by 6.1 % [5.5, 6.7], time constant of warming τ = 4.0 s "
         "[3.6, 4.5]); with it the error on runs the fit did not see falls from 1.42 N to 0.31 N; noise floor 0.29 N."
     )
+
+
+def test_effects_that_predict_worse_are_not_called_a_closed_loop():
+    closure = document("unexplained")
+    closure["after"] = {**closure["after"], "heldout_rmse_N": 7.4}
+    assert predicts_worse(closure)
+    text = said(closure)
+    assert text.startswith("Warming by sliding (")
+    assert "rises from 1.42 N to 7.4" in text
+    assert "do not predict with it" in text
+    assert "It is not only noise" not in left_over(closure, Config())
+    assert not predicts_worse(document())
+    assert not predicts_worse({**closure, "effects": []})
 
 
 def test_several_effects_are_counted_and_candidates_are_not():
