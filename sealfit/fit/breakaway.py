@@ -9,10 +9,11 @@ import pandas as pd
 from scipy import stats
 
 from sealfit.config import Config
+from sealfit.fit.starts import Start
 from sealfit.fit.steady import table_row
 from sealfit.fit.stiffness import together
 
-NEAR = 1  # cells to either side of the peak that count as it
+SAMPLES, SHARE = 8, 1 / 40  # of the window over which a peak is averaged: samples of a start, share of the distance
 FORCE, RATIO, SLIDING = "F_ba", "F_ba/F", "F"
 TOP, PLACES = "top", "places"  # the force where the mean of all units is largest, and of how many places that is one
 NO_PEAK = "the force comes up to its sliding value without passing above it"
@@ -20,27 +21,29 @@ FEW = "no repeats: no scatter is known"
 FAMILY = 0.01  # chance of a peak anywhere in a campaign where there is none
 
 
-def peaks(force: np.ndarray, sliding: Sequence[float], steady: pd.DataFrame) -> pd.DataFrame:
+def peaks(starts: Sequence[Start], force: np.ndarray, steady: pd.DataFrame) -> pd.DataFrame:
     """Return the break-away force F_ba and its share of the sliding force, per file, or per stroke of a single file.
 
     Where the peak lies is read from the mean of the other units, and a start's own force is then taken there: the
     largest of noisy samples is always too high. `top` is its force above sliding where the mean of all is largest, and
-    `places` how many places apart there are: what a test needs of whether there is a peak at all.
+    `places` how many places there are: what a test needs of whether there is a peak at all.
 
     Parameters
     ----------
+    starts : sequence of Start
+        At one condition, commanded speed and direction.
     force : ndarray, shape (starts, cells)
-        Mean force in cells of distance, in N, as `cell_means` gives it: the starts at one condition, commanded speed
-        and direction; NaN where there is no sample.
-    sliding : sequence of float, length starts
-        Their force in steady sliding, in N.
+        Their mean force in cells of distance, in N, as `cell_means` gives it.
     steady : DataFrame
         Rows of table `steady`, one per start, in the same order.
     """
+    samples = float(np.median([s.force_N.size for s in starts]))
+    half = int(np.ceil(force.shape[1] * max(SAMPLES / samples, SHARE) / 2))  # of the window, in cells
+    sliding = np.array([s.sliding_N for s in starts])
     unit = steady["file"].to_numpy() if steady["file"].nunique() > 1 else np.arange(len(force))
-    peak, top = _peaks(force, unit)
-    places = max(force.shape[1] // (2 * NEAR + 1), 1)
-    table = {FORCE: peak, RATIO: peak / np.asarray(sliding), TOP: top - np.asarray(sliding), PLACES: places}
+    peak, top = _peaks(*(_window(x, half) for x in (np.nan_to_num(force), np.isfinite(force))), unit)
+    places = max(force.shape[1] / (2 * half + 1), 1.0)
+    table = {FORCE: peak, RATIO: peak / sliding, TOP: top - sliding, PLACES: places}
     return pd.DataFrame(table).groupby(unit, sort=False).mean().dropna()
 
 
@@ -104,32 +107,30 @@ def _pooled(groups: Sequence[pd.Series]) -> tuple[float, int]:
     return float(np.sqrt(squares / df)) if df else np.nan, df
 
 
-def _peaks(force: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _peaks(total: np.ndarray, hits: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return each start's force where the mean of the other units is largest, and of all units, shape (starts,) each.
 
-    NaN without a sample there. Mean and force are those of the cell and its neighbours: the largest of single cells is
-    mostly noise.
+    Parameters
+    ----------
+    total, hits : ndarray, shape (starts, cells)
+        Sum of the force over a window about each cell, and of how many cells.
+    unit : ndarray, shape (starts,)
+        Of evidence.
     """
-    hits, total = (_with_neighbours(x) for x in (np.isfinite(force).astype(float), np.nan_to_num(force)))
 
     def highest(starts: np.ndarray) -> int:
         count = hits[starts].sum(axis=0)
-        return int(np.argmax(np.where(count > 0, total[starts].sum(axis=0) / np.maximum(count, 1), -np.inf)))
+        sure = count > count.max() / 2  # a mean of few is mostly noise
+        return int(np.argmax(np.where(sure, total[starts].sum(axis=0) / np.maximum(count, 1), -np.inf)))
 
-    def at(start: int, cell: int) -> float:
-        here = total[start, cell] / hits[start, cell] if hits[start, cell] else 0.0
-        return here if here > 0.0 else np.nan
-
-    everywhere = np.ones(len(force), bool)
+    everywhere, each = np.ones(len(total), bool), np.arange(len(total))
     others = [unit != own if (unit != own).any() else everywhere for own in unit]
-    whole = highest(everywhere)
-    return (
-        np.array([at(k, highest(mask)) for k, mask in enumerate(others)]),
-        np.array([at(k, whole) for k in range(len(force))]),
-    )
+    force = np.where(hits > 0, total / np.maximum(hits, 1), np.nan)
+    found = (force[each, [highest(mask) for mask in others]], force[:, highest(everywhere)])
+    return tuple(np.where(values > 0.0, values, np.nan) for values in found)
 
 
-def _with_neighbours(values: np.ndarray) -> np.ndarray:
-    """Return the sum over each cell and `NEAR` to either side, shape of `values`."""
-    padded = np.pad(values, ((0, 0), (NEAR, NEAR)))
-    return sum(padded[:, k : k + values.shape[1]] for k in range(2 * NEAR + 1))
+def _window(values: np.ndarray, half: int) -> np.ndarray:
+    """Return the sum over each cell and `half` cells to either side, shape of `values`."""
+    padded = np.pad(values.astype(float), ((0, 0), (half, half)))
+    return sum(padded[:, k : k + values.shape[1]] for k in range(2 * half + 1))

@@ -74,7 +74,7 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
             places = of.index.to_numpy()
             alike = [starts[k] for k in places]
             distance, force = cell_means(alike, [s.force_N for s in alike])
-            broken.append((at, peaks(force, [s.sliding_N for s in alike], of)))
+            broken.append((at, peaks(alike, force, of)))
             model = None if models is None else cell_means(alike, [models[k] for k in places])[1]
             curves.append(_mean_curve(distance, force, model).assign(**at))
     rows += break_away_rows([(at, own) for at, own in broken if len(own)], _widened(steady_fit), config)

@@ -88,7 +88,8 @@ def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, comp
     days = _days(law, law.x, goal, place)
     low, high = days, days
     if 0 < days < FOREVER:
-        slope = central_jacobian(lambda x: np.log(np.array([_days(law, x, goal, place)])), law.x)[0]
+        with np.errstate(invalid="ignore"):  # near where it is never reached
+            slope = central_jacobian(lambda x: np.log(np.array([_days(law, x, goal, place)])), law.x)[0]
         half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if np.isfinite(slope).all() else np.inf
         low, high = (float(days * np.exp(np.clip(s * half, -700, 700))) for s in (-1, 1))
         high = np.inf if high > FOREVER else high
