@@ -60,6 +60,8 @@ DESIGNS = {
         "6 speeds one way, set-up 1 %": {"noise": 0.01, "setup": 0.01, "speeds": SIX, "ways": (1,)},
         "6 speeds one way, no repeats": {"noise": 0.01, "speeds": SIX, "ways": (1,), "repeats": 1},
         "8 speeds one way, no repeats, noise in N": {"noise": 0.0, "constant": 0.3, "ways": (1,), "repeats": 1},
+        "6 speeds both ways in one file": {"noise": 0.01, "speeds": SIX, "together": True},
+        "6 speeds both ways in one file, set-up 1 %": {"noise": 0.01, "setup": 0.01, "speeds": SIX, "together": True},
         "5 speeds one way, noise 4 %": {"noise": 0.04, "speeds": FIVE, "ways": (1,)},
     },
     "aging": {

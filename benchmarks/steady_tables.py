@@ -25,13 +25,24 @@ def steady_rows(
     constant=0.0,
     load=49.03,
     ways=(1, -1),
+    together=False,
     commanded=True,
     model=None,
     laws=None,
 ):
-    """Table `steady` of a campaign with known truth; noise, setup and specimen are relative, constant in N."""
+    """Table `steady` of a campaign with known truth; noise, setup and specimen are relative, constant in N.
+
+    With `together` the two ways stand in one file, and its set-up and noise are those of both.
+    """
     rng = np.random.default_rng(seed)
-    rows = []
+    rows, drawn = [], {}
+
+    def once(*key):
+        """A standard normal number, the same both ways where they stand in one file."""
+        if key not in drawn:
+            drawn[key] = rng.normal()
+        return drawn[key]
+
     for place, (temperature, compression) in enumerate(series):
         law_s, law_c = (laws or {}).get((temperature, compression), (MU_S, MU_C))
         for day in days:
@@ -49,12 +60,14 @@ def steady_rows(
             for speed in speeds:
                 for way in ways:
                     force = stribeck_force(way * speed, load if load else 1.0, **truth) * piece
-                    force = force * (1 + setup * rng.normal())
+                    own = speed if together else way * speed
+                    sign = ("+" if way > 0 else "-") if together else ""
+                    force = force * (1 + setup * once(condition, own))
                     for repeat in range(1, repeats + 1):
                         rows.append(
                             {
-                                "file": f"{condition} {way * speed:g} {repeat}.csv",
-                                "run_id": f"{condition} {way * speed:g}",
+                                "file": f"{condition} {own:g} {repeat}.csv",
+                                "run_id": f"{condition} {own:g}{sign}",
                                 "repeat": repeat,
                                 "stroke": 1,
                                 "direction": way,
@@ -65,7 +78,7 @@ def steady_rows(
                                 "speed_mm_s": way * speed,
                                 "speed_set_mm_s": speed if commanded else np.nan,
                                 "load_N": load if load else np.nan,
-                                "force_N": float(force) * (1 + noise * rng.normal())
+                                "force_N": float(force) * (1 + noise * once(condition, own, repeat))
                                 + (constant * rng.normal() if constant else 0.0),
                                 "used": True,
                                 "temperature_C": temperature,
