@@ -74,7 +74,7 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
             places = of.index.to_numpy()
             alike = [starts[k] for k in places]
             distance, force = cell_means(alike, [s.force_N for s in alike])
-            broken.append((at, peaks(alike, force, of)))
+            broken.append((at, peaks(alike, distance, force, of)))
             model = None if models is None else cell_means(alike, [models[k] for k in places])[1]
             curves.append(_mean_curve(distance, force, model).assign(**at))
     rows += break_away_rows([(at, own) for at, own in broken if len(own)], _widened(steady_fit), config)
@@ -86,12 +86,13 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
     return Dynamic(table.astype({"direction": "Int64"}), curves.reindex(columns=DYNAMIC_CURVES.names()))
 
 
-def _widened(steady_fit: pd.DataFrame) -> dict[str, tuple[float, float]]:
-    """Return by how much the run means of each condition scatter more than repeats, and the degrees of freedom."""
+def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
+    """Return the reduced chi-square of run means under the repeats' scatter, all conditions pooled, and its df."""
     rows = steady_fit[steady_fit["quantity"] == "statistics"]
-    both = [rows[rows["parameter"] == name].set_index("condition")["value"] for name in ("birge_ratio", "error_df")]
-    table = pd.concat(both, axis=1).dropna()
-    return dict(zip(table.index, table.itertuples(index=False, name=None), strict=True))
+    table = rows[rows["parameter"].isin(["chi2", "df"])].pivot(index="condition", columns="parameter", values="value")
+    table = table.reindex(columns=["chi2", "df"]).dropna()
+    df = float(table["df"].sum())
+    return (float(table["chi2"].sum()) / df, df) if df > 0 else (1.0, 1.0)
 
 
 def _strokes(starts: Sequence[Start], own: pd.DataFrame, curve: Curve) -> list[Stroke]:

@@ -22,6 +22,44 @@ LEAST = 4  # rows below which a beginning shows nothing
 
 
 @dataclass(frozen=True)
+class Sliding:
+    """The force where steady sliding has just begun, as a line: further on, warming or wear may change it otherwise.
+
+    Attributes
+    ----------
+    force_N, distance_mm, slope_N_mm : float
+        Mean force, the distance slid there, and how the force changes along it.
+    rows : int
+        Samples that it rests on.
+    extent_mm : float
+        Root of the sum of their squared distances from `distance_mm`.
+    """
+
+    force_N: float
+    distance_mm: float
+    slope_N_mm: float
+    rows: int
+    extent_mm: float
+
+    @classmethod
+    def of(cls, distance_mm: np.ndarray, force_N: np.ndarray) -> Sliding:
+        """Return the line through samples, shape (n,) each."""
+        away = distance_mm - distance_mm.mean()
+        slope = float(away @ force_N / max(away @ away, 1e-300))
+        extent = float(np.sqrt(away @ away))
+        return cls(float(force_N.mean()), float(distance_mm.mean()), slope, len(force_N), extent)
+
+    def at(self, distance_mm: np.ndarray) -> np.ndarray:
+        """Return the force that sliding would have had at a distance, in N."""
+        return self.force_N + self.slope_N_mm * (distance_mm - self.distance_mm)
+
+    def error(self, distance_mm: np.ndarray) -> np.ndarray:
+        """Return the standard error of that, in standard deviations of a sample."""
+        away = (distance_mm - self.distance_mm) / max(self.extent_mm, 1e-300)
+        return np.sqrt(1 / self.rows + away**2)
+
+
+@dataclass(frozen=True)
 class Start:
     """The beginning of one stroke, its motion and force positive along it.
 
@@ -31,15 +69,15 @@ class Start:
         Its row in table `steady`.
     distance_mm, speed_mm_s, force_N : ndarray, shape (n,)
         Distance slid, smoothed over the noise of the displacement, its rate, and the force.
-    sliding_N : float
-        Mean force where steady sliding has just begun: further on, warming or wear may have changed it.
+    sliding : Sliding
+        What it comes to.
     """
 
     row: int
     distance_mm: np.ndarray
     speed_mm_s: np.ndarray
     force_N: np.ndarray
-    sliding_N: float
+    sliding: Sliding
 
 
 def starts_of(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]:
@@ -66,7 +104,8 @@ def starts_of(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]:
         if found is not None:
             since, distance, speed = found
             along_it = sign[row] * force[part]
-            yield Start(row, distance, speed, along_it[since:until], float(along_it[after].mean()))
+            slid = sign[row] * (along[part][after] - along[part][since])
+            yield Start(row, distance, speed, along_it[since:until], Sliding.of(slid, along_it[after]))
 
 
 def cell_means(starts: Sequence[Start], values: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -69,13 +69,13 @@ def test_a_rise_within_a_sample_is_not_seen():
     assert not found.stiffness_known
 
 
-def made(tmp_path, *, physics=(), noise=NOISE, seed=1, **design):
+def made(tmp_path, *, physics=(), noise=NOISE, seed=1, effects=(), **design):
     physics = {
         "mu_s": {"mu_0": 0.9, "a": 0.04, "b": 0.1}, "mu_c": {"mu_0": 0.6, "a": 0.03, "b": 0.1},
         **{name: MODEL[name] for name in ("v_s", "sigma_2", "sigma_0", "sigma_1")}, **dict(physics),
     }  # fmt: skip
     design = {"days": (), "temperatures_C": (), "compressions_pct": (), **design}
-    simulate(Spec(seed=seed, physics=physics, design=design, noise=noise), tmp_path / "c")
+    simulate(Spec(seed=seed, physics=physics, design=design, noise=noise, effects=effects), tmp_path / "c")
     config = load_config()
     tables = ingest_campaign(tmp_path / "c", config, workers=1).tables
     return tables, fit_dynamic(tables["traces"], tables["steady"], fit_conditions(tables["steady"], config), config)
@@ -180,3 +180,12 @@ def test_micro_tribometer(tmp_path):
     assert "does not come up as the model's does" in table.loc["sigma_0", "reason"]
     assert not table.loc["sigma_1", "identified"]
     assert "Stribeck" in table.loc["sigma_1", "reason"]
+
+
+def test_warming_along_the_stroke_is_no_break_away(tmp_path):
+    warm = {"id": "warming_distance", "acts_on": "mu", "operation": "multiply", "parameters": {"A": 0.06, "s_0": 10.0}}
+    _, found = made(tmp_path, effects=(warm,))
+    ratio = found.fit[found.fit["parameter"] == "F_ba/F"]
+    assert len(ratio) > 3
+    assert (ratio["value"] - 1).abs().max() < 0.01
+    assert not ratio["identified"].any()
