@@ -383,8 +383,10 @@ MASTER_CURVE = Schema(
         RUBBER,
         Column("quantity", "", TEXT, "mu_s, mu_c, F_s or F_c"),
         Column("kind", "", TEXT, "value | law"),
-        Column("scaled_days", "d", FLOAT, "aging time by the rate at the reference temperature and compression"),
-        Column("value", "", FLOAT, "fitted value of a condition, or the law"),
+        Column("scaled_days", "d", FLOAT, "aging time, by the rate where temperature and compression change that"),
+        Column(
+            "value", "", FLOAT, "value of a condition, brought to the reference where that changes the loss; or law"
+        ),
         Column("lo95", "", FLOAT, "lower end of the law's 95 % band"),
         Column("hi95", "", FLOAT, "upper end of the law's 95 % band"),
         Column("temperature_C", "°C", FLOAT, "aging temperature; null for unaged rubber and for the law"),

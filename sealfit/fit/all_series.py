@@ -136,18 +136,17 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
 
 
 def _master_curve(law: JointLaw) -> pd.DataFrame:
-    """Return the values over the master curve's time k t, and the law there with its 95 % band.
+    """Return the values on the master curve, and the law at the reference temperature and compression with its band.
 
-    Where temperature and compression change the loss and not the rate there is no such time, and no band.
+    Where these change the rate of aging the values stand over k t; where they change the loss, a loss is divided by k.
     """
     aged = law.aged
     tested = (aged.temperature_C, aged.compression_pct)
-    scaled = law.tested_days()
-    points = {"kind": "value", "scaled_days": scaled, "value": aged.value, "aging_days": aged.days}
+    scaled, start = law.tested_days(), law.x[0]
+    value = aged.value if law.way == "rate" else start + (aged.value - start) / law.rate(aged)
+    points = {"kind": "value", "scaled_days": scaled, "value": value, "aging_days": aged.days}
     for name, column in zip((TEMPERATURE, COMPRESSION), tested, strict=True):
         points[name] = np.nan if column is None else np.where(aged.days > 0, column, np.nan)
-    if law.way != "rate":
-        return pd.DataFrame(points)
     days = np.r_[0.0, np.geomspace(scaled[scaled > 0].min() / 3, scaled.max() * 1.5, CURVE_POINTS)]
     middle = (None if c is None else np.full(days.size, reference_of(c[aged.days > 0])) for c in tested)
     at = Aged(days, np.zeros(days.size), *middle)

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from steady_tables import MU_C, MU_S
 
 from sealfit.config import Config
-from sealfit.fit.all_series import aged_values
+from sealfit.fit.all_series import aged_values, joint_laws
 from sealfit.fit.joint_law import fit_joint_law
 from sealfit.fit.shared_curve import shared_levels
 from sealfit.fit.steady import fit_conditions
@@ -22,12 +22,17 @@ def levels(table):
     return shared_levels(table, fit_conditions(table, Config()))
 
 
-def arrhenius(energy=80.0, kappa=0.02):
-    """Laws of every series under time-temperature superposition, as `campaign` takes them."""
+def pace(celsius, percent, energy, kappa=0.02):
+    return np.exp(energy / R * (1 / 333.15 - 1 / (celsius + 273.15)) + kappa * (85.0 - percent))
+
+
+def arrhenius(energy=80.0, what="rate"):
+    """Laws of every series, the rate or the loss by Arrhenius and compression, as `campaign` takes them."""
     laws = {}
-    for celsius, percent in SERIES:
-        k = np.exp(energy / R * (1 / 333.15 - 1 / (celsius + 273.15)) + kappa * (85.0 - percent))
-        laws[celsius, percent] = tuple({**law, "b": law["b"] / k} for law in (MU_S, MU_C))
+    for place in SERIES:
+        k = pace(*place, energy)
+        own = {"b": 1 / k, "a": 1.0} if what == "rate" else {"b": 1.0, "a": k}
+        laws[place] = tuple({**law, "a": law["a"] * own["a"], "b": law["b"] * own["b"]} for law in (MU_S, MU_C))
     return laws
 
 
@@ -127,3 +132,15 @@ def test_a_law_of_the_levels_is_the_law_of_the_forces(campaign, quantity):
     direct = direct[:5] if quantity == "mu_s" else direct[5:10]
     assert np.abs(law.x - direct).max() > 0  # another way, so never the same to the last digit
     assert (np.abs(law.x - direct) < 0.35 * np.sqrt(np.diag(law.covariance))).all()
+
+
+def test_every_condition_lies_on_the_master_curve_whichever_way_temperature_acts(campaign):
+    for laws in (arrhenius(), arrhenius(15.0, "loss")):
+        table = campaign(noise=1e-4, series=SERIES, laws=laws, days=DAYS, ways=(1,))
+        _, curves = joint_laws(table, fit_conditions(table, Config()), Config())
+        own = curves[curves["quantity"] == "mu_s"]
+        law = own[own["kind"] == "law"].sort_values("scaled_days")
+        values = own[own["kind"] == "value"]
+        assert len(values) == len(SERIES) * 5 + 1
+        expected = np.interp(values["scaled_days"], law["scaled_days"], law["value"])
+        assert values["value"].to_numpy() == pytest.approx(expected, abs=2e-3)
