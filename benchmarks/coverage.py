@@ -30,7 +30,7 @@ from sealfit.fit.aging import fit_series
 from sealfit.fit.all_series import aged_values
 from sealfit.fit.dynamic import fit_dynamic
 from sealfit.fit.joint_law import JointLaw, fit_joint_law, fit_laws, rivals_of
-from sealfit.fit.lifetime import Goal, lifetime, over_laws, resampled
+from sealfit.fit.lifetime import DAYS_PER_YEAR, Goal, lifetime, over_laws, resampled, temperature_for
 from sealfit.fit.shared_curve import shared_levels
 from sealfit.fit.steady import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
@@ -157,6 +157,8 @@ def _lives(
         yield Entry(f"{quantity} {title}", truth, found.low, found.high)
         yield Entry(f"{quantity} {title}, over all laws", truth, *over_laws(chosen, goal, *place))
         yield Entry(f"{quantity} {title}, resampled", truth, *resampled(fitted, goal, *place, seed=seed))
+        _, low, high = temperature_for(fitted, goal, truth / DAYS_PER_YEAR, place[1])
+        yield Entry(f"{quantity} temperature, {title}", celsius, low, high)
 
 
 def _rate(celsius: float, percent: float, middle: tuple[float, float]) -> float:

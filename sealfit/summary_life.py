@@ -35,7 +35,9 @@ def _life(part: Mapping) -> str:
             return f"at no temperature does it last {part['years']:g} years"
         low, high = part["tested_C"]
         beyond = f" (extrapolated: tested from {low:g} to {high:g} degC)" if part["extrapolated"] else ""
-        return f"it lasts {part['years']:g} years at {part['temperature_C']:.1f} degC{beyond}"
+        ends = part["temperature_ci95"]
+        interval = f", 95 % {ends[0]:.1f} to {ends[1]:.1f} degC" if None not in ends else ""
+        return f"it lasts {part['years']:g} years at {part['temperature_C']:.1f} degC{interval}{beyond}"
     if part["days"] is None:
         return f"{part['threshold']:.4g} is never reached"
     if part["days"] == 0:

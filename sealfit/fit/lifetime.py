@@ -22,6 +22,7 @@ from sealfit.fit.polish import central_jacobian
 
 DAYS_PER_YEAR = 365.25
 SPAN_C = (-80.0, 300.0)  # of temperatures of use
+NUDGE_C = 0.01  # of the temperature, for a slope along it
 SPAN_PCT = (1.0, 200.0)  # of the original height in use; above 100 it is stretched
 FOREVER = 1e9  # days: beyond, the law is asked for more than it can say
 
@@ -223,8 +224,15 @@ def resampled(
     return float(low), float(high) if high < FOREVER else np.inf
 
 
-def temperature_for(law: JointLaw, goal: Goal, years: float, compression_pct: float | None = None) -> float | None:
-    """Return the temperature of use in degrees Celsius at which life is so many years; None where none is.
+def temperature_for(
+    law: JointLaw, goal: Goal, years: float, compression_pct: float | None = None
+) -> tuple[float, float, float] | None:
+    """Return the temperature of use at which life is so many years, and its 95 % interval; None where none is.
+
+    Returns
+    -------
+    celsius, low, high : float
+        In degrees Celsius; the ends by the delta method.
 
     Raises
     ------
@@ -236,10 +244,15 @@ def temperature_for(law: JointLaw, goal: Goal, years: float, compression_pct: fl
     if "E" not in law.names:
         raise RequestError("the rubber was aged at one temperature only.", mend="Test at two or more temperatures.")
 
-    def excess(celsius):
-        days = _days(law, law.x, goal, _place(law, celsius, compression_pct))
-        return np.log(min(max(days, 1e-12), 1e12) / (years * DAYS_PER_YEAR))
+    def log_days(celsius: float, x: np.ndarray) -> float:
+        days = _days(law, x, goal, _place(law, celsius, compression_pct))
+        return float(np.log(np.clip(days, 1e-12, 1e12)))
 
-    if excess(SPAN_C[0]) * excess(SPAN_C[1]) > 0:
+    wanted = np.log(years * DAYS_PER_YEAR)
+    if (log_days(SPAN_C[0], law.x) - wanted) * (log_days(SPAN_C[1], law.x) - wanted) > 0:
         return None
-    return float(brentq(excess, *SPAN_C, xtol=1e-6))
+    celsius = float(brentq(lambda at: log_days(at, law.x) - wanted, *SPAN_C, xtol=1e-6))
+    along = (log_days(celsius + NUDGE_C, law.x) - log_days(celsius - NUDGE_C, law.x)) / (2 * NUDGE_C)
+    slope = central_jacobian(lambda x: np.array([log_days(celsius, x)]), law.x)[0]
+    half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) / abs(along) if along else np.inf
+    return celsius, celsius - half, celsius + half

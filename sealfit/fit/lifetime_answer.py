@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sealfit.errors import RequestError
@@ -63,16 +65,10 @@ def answer(
     found = {"law": law.loss.name, "way": law.way, "form": law.loss.form, "criterion": law.criterion}
     found |= {"parameters": {name: value for name, value, *_ in law.parameters()}}
     if years is not None:
-        celsius = temperature_for(law, goal, years, compression_pct)
-        tested = law.aged.temperature_C[law.aged.days > 0]
-        outside = celsius is None or not tested.min() <= celsius <= tested.max()
-        return {
-            **found,
-            "years": years,
-            "temperature_C": celsius,
-            "extrapolated": outside,
-            "tested_C": list(ends_of(tested)),
-        }
+        celsius, *ends = temperature_for(law, goal, years, compression_pct) or (None, np.inf, np.inf)
+        low, high = ends_of(law.aged.temperature_C[law.aged.days > 0])
+        found |= {"years": years, "temperature_C": celsius, "temperature_ci95": finite_ends(ends)}
+        return {**found, "extrapolated": celsius is None or not low <= celsius <= high, "tested_C": [low, high]}
     life = lifetime(law, goal, temperature_C, compression_pct)
     found |= {"threshold": life.threshold, "days": _finite(life.days), "ci95": finite_ends((life.low, life.high))}
     found |= {"extrapolated": life.extrapolated, "beyond_tests": _finite(life.beyond), "outside": list(life.outside)}
@@ -81,7 +77,7 @@ def answer(
     return found
 
 
-def finite_ends(interval: tuple[float, float]) -> list[float | None]:
+def finite_ends(interval: Sequence[float]) -> list[float | None]:
     """Return the ends of an interval, None where it is open."""
     return [_finite(end) for end in interval]
 

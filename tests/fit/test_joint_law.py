@@ -175,8 +175,21 @@ def test_lifetimes_hold_the_truth():
 
 def test_the_temperature_for_ten_years_gives_ten_years():
     law = fit_joint_law(campaign(scatter=0.002), "log", "rate")
-    celsius = temperature_for(law, Goal(0.6), 10.0, 80.0)
+    celsius, low, high = temperature_for(law, Goal(0.6), 10.0, 80.0)
+    assert low < celsius < high
     assert lifetime(law, Goal(0.6), celsius, 80.0).days == pytest.approx(10 * DAYS_PER_YEAR, rel=1e-4)
+
+
+def test_intervals_of_the_temperature_hold_the_truth():
+    days = 0.1 * np.expm1(0.33 / 0.05)  # to 0.6 at k = 1, at 85 %
+    k = days / (1.0 * DAYS_PER_YEAR)
+    truth = 1 / (1 / 333.15 - np.log(k) * R / 80.0) - 273.15
+    found = [
+        temperature_for(fit_joint_law(campaign(scatter=0.01, seed=s), "log", "rate"), Goal(0.6), 1.0, 85.0)
+        for s in range(40)
+    ]
+    assert 0.86 <= np.mean([low <= truth <= high for _, low, high in found]) <= 1.0
+    assert np.median([celsius for celsius, *_ in found]) == pytest.approx(truth, abs=1.0)
 
 
 def test_what_a_request_lacks_is_said():
