@@ -13,7 +13,7 @@ def lifetime_lines(part: Mapping) -> list[str]:
     found.append(line("life" if "days" in part else "use", _life(part)))
     if part.get("ci95_resampled"):
         found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
-    if part.get("ci95_over_laws") and part["rivals"]:
+    if part.get("ci95_over_laws") and part["rivals"] and part["days"]:
         found.append(line("", f"95 % interval over all laws by their weight: {_days_between(part['ci95_over_laws'])}"))
     for rival in part["rivals"]:
         found.append(line("rival", f"{rival['form']}, {_change(rival)}: {_life(rival)}"))
@@ -39,7 +39,7 @@ def _life(part: Mapping) -> str:
         interval = f", 95 % {ends[0]:.1f} to {ends[1]:.1f} degC" if None not in ends else ""
         return f"it lasts {part['years']:g} years at {part['temperature_C']:.1f} degC{interval}{beyond}"
     if part["days"] is None:
-        return f"{part['threshold']:.4g} is never reached"
+        return f"{part['threshold']:.4g} is not reached, not in 1e9 d"
     if part["days"] == 0:
         return f"unaged rubber is beyond {part['threshold']:.4g} already"
     text = f"{part['days']:.3g} d to {part['threshold']:.4g}, 95 % {_days_between(part['ci95'])}"
@@ -52,4 +52,6 @@ def _life(part: Mapping) -> str:
 
 def _days_between(ends: list) -> str:
     low, high = ends
+    if low is None:
+        return "not in 1e9 d"
     return f"{low:.3g} d or more" if high is None else f"{low:.3g} to {high:.3g} d"

@@ -1,0 +1,52 @@
+"""What `lifetime` ends with, for every kind of answer."""
+
+import numpy as np
+import pytest
+
+from sealfit.fit.aged import Aged
+from sealfit.fit.joint_law import fit_laws, rivals_of
+from sealfit.fit.lifetime import Goal, over_laws
+from sealfit.fit.lifetime_answer import answer, finite_ends
+from sealfit.summary_life import lifetime_lines
+
+DAYS = np.array([0.0, *[1.0, 2.0, 4.0, 8.0, 12.0, 16.0] * 3])
+CELSIUS = np.array([23.0, *[40.0] * 6, *[60.0] * 6, *[80.0] * 6])
+
+
+@pytest.fixture(scope="module")
+def laws():
+    rate = np.exp(80.0 / 8.314462618e-3 * (1 / 333.15 - 1 / (CELSIUS + 273.15)))
+    value = 0.93 - 0.05 * np.log1p(rate * DAYS / 0.1)
+    return fit_laws(Aged(DAYS, value * (1 + 0.01 * np.random.default_rng(1).standard_normal(19)), CELSIUS))
+
+
+def said(laws, goal, years=None, **place):
+    part = {"quantity": "mu_s", **answer(laws[0], goal, years, resample=True, **place)}
+    part["rivals"] = [answer(rival, goal, years, **place) for rival in rivals_of(laws)]
+    if years is None:
+        part["ci95_over_laws"] = finite_ends(over_laws(laws, goal, **place))
+    return "\n".join(lifetime_lines(part))
+
+
+def test_days_have_their_intervals_and_the_rivals_answer(laws):
+    text = said(laws, Goal(0.75), temperature_C=50.0)
+    assert " d to 0.75, 95 % " in text
+    assert "by resampling" in text
+    assert ("over all laws" in text) == bool(rivals_of(laws))
+
+
+@pytest.mark.parametrize(
+    ("value", "words"), [(-1.0, "-1 is not reached, not in 1e9 d"), (0.99, "unaged rubber is beyond 0.99 already")]
+)
+def test_what_is_never_or_already_reached_is_said(laws, value, words):
+    text = said(laws, Goal(value), temperature_C=20.0)
+    assert words in text
+    assert "None" not in text
+    assert "nan" not in text
+
+
+def test_the_temperature_for_years_has_an_interval_and_is_marked_beyond_the_tests(laws):
+    text = said(laws, Goal(loss=0.3), 10.0)
+    assert "it lasts 10 years at " in text
+    assert " degC, 95 % " in text
+    assert "extrapolated" in text
