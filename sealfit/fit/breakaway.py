@@ -9,13 +9,15 @@ import pandas as pd
 from scipy import stats
 
 from sealfit.config import Config
-from sealfit.fit.starts import Start
+from sealfit.fit.starts import Start, cell_means
 from sealfit.fit.steady import table_row
 from sealfit.fit.stiffness import together
 
 SAMPLES, SHARE = 8, 1 / 40  # of the window over which a peak is averaged: samples of a start, share of the distance
 FORCE, RATIO, SLIDING = "F_ba", "F_ba/F", "F"
-TOP, NOISE, PLACES = "top", "noise", "places"
+TOP, NOISE, PLACES, WHERE = "top", "noise", "places", "where"
+LARGEST = "F_max/F"
+INTO = "{where:.3g} {unit} into strokes of {reach:.3g} {unit}"
 NO_PEAK = "the force comes up to its sliding value without passing above it"
 FEW = "no repeats: no scatter is known"
 FAMILY = 0.01  # chance of a peak anywhere in a campaign where there is none
@@ -57,6 +59,7 @@ def peaks(starts: Sequence[Start], distance: np.ndarray, force: np.ndarray, stea
         TOP: mean[:, whole] - sliding[:, whole],
         NOISE: np.hypot(line_error, 1 / np.sqrt(np.maximum(hits[:, whole] * per_cell, 1.0))),
         PLACES: max(force.shape[1] / (2 * half + 1), 1.0),
+        WHERE: distance[whole],
     }
     return pd.DataFrame(table).groupby(unit, sort=False).mean().dropna()
 
@@ -110,6 +113,31 @@ def break_away_rows(
                 half = stats.t.ppf(0.975, error_df) * error
                 row |= {"se": value * error, "lo95": value * np.exp(-half), "hi95": value * np.exp(half)}
             yield {**table_row(**row, identified=bool(peak), reason=reason), **at}
+
+
+def largest_row(strokes: Sequence[Start], steady: pd.DataFrame, config: Config) -> dict | None:
+    """Return the row of table `dynamic_fit` for the largest force anywhere in strokes, over their sliding force.
+
+    It may come at the end as well as at the start, so it describes strokes and is no break-away; where it lies stands
+    in `reason`. None where the force never opposes the motion.
+
+    Parameters
+    ----------
+    strokes : sequence of Start
+        Whole strokes at one condition, commanded speed and direction.
+    steady : DataFrame
+        Rows of table `steady`, one per stroke, in the same order.
+    config : Config
+        Gives the units.
+    """
+    distance, force = cell_means(strokes, [s.force_N for s in strokes])
+    own = peaks(strokes, distance, force, steady)
+    if own.empty:
+        return None
+    reach = float(np.median([s.distance_mm[-1] for s in strokes]))
+    where = INTO.format(where=own[WHERE].iloc[0], reach=reach, unit=config.units.unit("displacement"))
+    value = float(np.exp(np.log(own[RATIO]).mean()))
+    return table_row(quantity="largest", parameter=LARGEST, value=value, unit="", identified=True, reason=where)
 
 
 def _pooled(groups: Sequence[pd.Series]) -> tuple[float, int]:

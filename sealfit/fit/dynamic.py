@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.fit.breakaway import break_away_rows, peaks
+from sealfit.fit.breakaway import break_away_rows, largest_row, peaks
 from sealfit.fit.rises import Curve, Stroke
 from sealfit.fit.rows import nesting_run
-from sealfit.fit.starts import Start, cell_means, starts_of
+from sealfit.fit.starts import Start, cell_means, starts_of, whole_strokes
 from sealfit.fit.steady import condition_keys, parameter_units, table_row
 from sealfit.fit.stiffness import Stiffness, fit_stiffness
 from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
@@ -51,7 +51,8 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
     -------
     Dynamic
         In its fit `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (rows per commanded speed and direction: the
-        force, and its share of the sliding force) or "statistics". Its curves are the mean starts and the model's.
+        force, and its share of the sliding force), "largest" (the same rows: the largest force anywhere in the strokes
+        over the sliding force) or "statistics". Its curves are the mean starts and the model's.
 
     Notes
     -----
@@ -77,6 +78,7 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
             broken.append((at, peaks(alike, distance, force, of)))
             model = None if models is None else cell_means(alike, [models[k] for k in places])[1]
             curves.append(_mean_curve(distance, force, model).assign(**at))
+    rows += _largest(traces, steady, config)
     rows += break_away_rows([(at, own) for at, own in broken if len(own)], _widened(steady_fit), config)
     keys = condition_keys(steady, config)
     table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
@@ -84,6 +86,16 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
     table = table.reindex(columns=[*fixed, *(name for name in keys.columns if name not in fixed)])
     curves = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
     return Dynamic(table.astype({"direction": "Int64"}), curves.reindex(columns=DYNAMIC_CURVES.names()))
+
+
+def _largest(traces: pd.DataFrame, steady: pd.DataFrame, config: Config) -> Iterator[dict]:
+    """Yield a row for the largest force of strokes at each condition, commanded speed and direction."""
+    by_row = {stroke.row: stroke for stroke in whole_strokes(traces, steady)}
+    own = steady[steady.index.isin(list(by_row))]
+    for at, of in own.groupby(["condition", "speed_set_mm_s", "direction"], dropna=False, sort=True):
+        row = largest_row([by_row[k] for k in of.index], of, config)
+        if row is not None:
+            yield {**row, **dict(zip(("condition", "speed_set_mm_s", "direction"), at, strict=True))}
 
 
 def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:

@@ -108,6 +108,30 @@ def starts_of(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]:
             yield Start(row, distance, speed, along_it[since:until], Sliding.of(slid, along_it[after]))
 
 
+def whole_strokes(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]:
+    """Yield every stroke from its first row to its last, the sliding force being the mean of its steady window.
+
+    Parameters
+    ----------
+    traces, steady : DataFrame
+        As for `starts_of`.
+    """
+    edges, own = strokes_of(traces, steady)
+    time, along, force = (traces[name].to_numpy(float) for name in ("time_s", "displacement_mm", "force_N"))
+    sliding, sign = traces["steady"].to_numpy(bool), steady["direction"].to_numpy()
+    for begin, end, row in zip(edges[:-1].tolist(), edges[1:].tolist(), own.tolist(), strict=True):
+        window = sliding[begin:end]
+        if row < 0 or not window.any() or end - begin < LEAST:
+            continue
+        distance = np.maximum.accumulate(sign[row] * (along[begin:end] - along[begin]))
+        if distance[-1] > 0.0:
+            along_it = sign[row] * force[begin:end]
+            mean = Sliding(
+                float(along_it[window].mean()), float(distance[window].mean()), 0.0, int(window.sum()), np.inf
+            )
+            yield Start(row, distance, np.gradient(distance, time[begin:end]), along_it, mean)
+
+
 def cell_means(starts: Sequence[Start], values: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the middles of cells of distance, shape (cells,), and each start's mean in each, shape (starts, cells).
 

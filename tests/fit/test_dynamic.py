@@ -180,6 +180,11 @@ def test_micro_tribometer(tmp_path):
     assert "does not come up as the model's does" in table.loc["sigma_0", "reason"]
     assert not table.loc["sigma_1", "identified"]
     assert "Stribeck" in table.loc["sigma_1", "reason"]
+    largest = found.fit[found.fit["parameter"] == "F_max/F"].set_index("direction")
+    assert largest.loc[1, "value"] == pytest.approx(1.081, abs=0.01)
+    assert largest.loc[-1, "value"] == pytest.approx(1.013, abs=0.005)
+    assert largest.loc[1, "reason"] == "0.227 mm into strokes of 0.227 mm"  # at the end forward: no break-away
+    assert not found.fit.loc[found.fit["quantity"] == "break_away", "identified"].any()
 
 
 def test_warming_along_the_stroke_is_no_break_away(tmp_path):
