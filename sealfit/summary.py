@@ -105,7 +105,7 @@ def verdict_sentence(closure: Mapping, units: Units) -> str:
         return "the declared model explains these measurements down to their own scatter"
     if closure["verdict"] == "closed":
         return f"{added}; no significant structure is left"
-    if predicts_worse(closure):
+    if predicts_worse(closure) and not closure["left"]["channel"]:
         after, before = (closure[name]["heldout_rmse_N"] for name in ("after", "before"))
         them, change = "it" if count == 1 else "them", f"{before:.3g} -> {after:.3g} {units.unit('force')}"
         return f"{added}, but what is held out is predicted worse with {them} ({change}): do not predict with {them}"

@@ -31,13 +31,14 @@ def _change(part: Mapping) -> str:
 
 def _life(part: Mapping) -> str:
     if "days" not in part:
-        if part["temperature_C"] is None:
-            return f"at no temperature does it last {part['years']:g} years"
+        years, span = f"{part['years']:g} years", "from {:g} to {:g} degC".format(*part["sought_C"])
+        if part["always"] == "longer":
+            return f"it lasts longer than {years} at every temperature {span}"
+        if part["always"] == "shorter":
+            return f"at no temperature {span} does it last {years}"
         low, high = part["tested_C"]
         beyond = f" (extrapolated: tested from {low:g} to {high:g} degC)" if part["extrapolated"] else ""
-        ends = part["temperature_ci95"]
-        interval = f", 95 % {ends[0]:.1f} to {ends[1]:.1f} degC" if None not in ends else ""
-        return f"it lasts {part['years']:g} years at {part['temperature_C']:.1f} degC{interval}{beyond}"
+        return f"it lasts {years} at {part['temperature_C']:.1f} degC{_degrees(part['temperature_ci95'])}{beyond}"
     if part["days"] is None:
         return f"{part['threshold']:.4g} is not reached, not in 1e9 d"
     if part["days"] == 0:
@@ -48,6 +49,15 @@ def _life(part: Mapping) -> str:
     if part["outside"]:
         text += f" (extrapolated: {' and '.join(part['outside'])} outside what was tested)"
     return text
+
+
+def _degrees(ends: list) -> str:
+    low, high = ends
+    if low is None and high is None:
+        return ", these tests set no limits to it"
+    if low is None or high is None:
+        return f", 95 % below {high:.1f} degC" if low is None else f", 95 % above {low:.1f} degC"
+    return f", 95 % {low:.1f} to {high:.1f} degC"
 
 
 def _days_between(ends: list) -> str:

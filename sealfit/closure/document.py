@@ -148,15 +148,15 @@ def effect_table(entries: Sequence[dict], added: Sequence[Added]) -> pd.DataFram
     return pd.DataFrame(records, columns=names)
 
 
-def left_entry(grown: Grown, rmse_N: float, floor_N: float | None) -> dict:
+def left_entry(grown: Grown, rmse_N: float, floor_N: float | None, *, look: bool = True) -> dict:
     """Return closure.json's `left`: the error above the floor, and the strongest structure that is still there.
 
     Where nothing is significant any more but effects were added, the channel that orders most of what is left is named
-    with its p-value, as a place to look: it is no claim.
+    with its p-value, as a place to look: it is no claim. Without `look` it is not: what is named is then significant.
     """
     above = float(np.sqrt(max(rmse_N**2 - floor_N**2, 0.0))) if floor_N is not None else None
     left = grown.left
-    if left is None and grown.added:
+    if left is None and grown.added and look:
         left = _unsteady_offset(grown) or _largest(
             grown.after, [c for c in grown.last if c.judgement.log_p <= np.log(WORTH_A_LOOK) and c.p_value < EVEN]
         )

@@ -236,7 +236,7 @@ def _document(
         "heldout_unit": level,
         "effects": entries,
         "scatter": scatter_list(after),
-        "left": left_entry(grown, numbers["after"]["rmse_N"], floor),
+        "left": left_entry(grown, numbers["after"]["rmse_N"], floor, look=not worse),
         "next_runs": next_runs(grown, config, effects),
     }
 

@@ -136,7 +136,9 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
     shape, drivers = LOSSES[loss], aged.drivers()
     names = ("mu_0", "a", *shape.parameters, *drivers)
     conditions = len(set(zip(aged.series().tolist(), aged.days.tolist(), strict=True)))
-    if conditions < len(names) or not (aged.days > 0).any():
+    if not (aged.days > 0).any():
+        raise FitError("no aged rubber was tested.", mend="Test at least two aged conditions.")
+    if conditions < len(names):
         raise FitError(
             f"{conditions} conditions do not determine the {len(names)} numbers of the law '{loss}'.",
             mend="Test more days, or choose a law with fewer numbers.",
@@ -183,16 +185,16 @@ def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw
     FitError
         If they determine none.
     """
-    found, last = [], None
+    found, first = [], None
     for loss in losses:
         both = aged.drivers() and loss != "power"  # a power of k t is a power of k times one of t
         for way in WAYS if both else WAYS[:1]:
             try:
                 found.append(fit_joint_law(aged, loss, way))
             except FitError as error:
-                last = error
+                first = first or error  # of the law with the fewest numbers
     if not found:
-        raise last
+        raise first
     return sorted(found, key=lambda law: law.criterion)
 
 

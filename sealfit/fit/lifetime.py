@@ -7,7 +7,7 @@ ISO 11346 (rubber, estimation of life-time and maximum temperature of use), whos
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +22,9 @@ from sealfit.fit.polish import central_jacobian
 
 DAYS_PER_YEAR = 365.25
 SPAN_C = (-80.0, 300.0)  # of temperatures of use
-NUDGE_C = 0.01  # of the temperature, for a slope along it
+STRIDE_C, HALVINGS = 2.0, 12  # in which the ends of the interval of a temperature are sought, and then halved
 SPAN_PCT = (1.0, 200.0)  # of the original height in use; above 100 it is stretched
-FOREVER = 1e9  # days: beyond, the law is asked for more than it can say
+AT_ONCE, FOREVER = 1e-9, 1e9  # days: beyond, the law is asked for more than it can say
 
 
 @dataclass(frozen=True)
@@ -89,11 +89,11 @@ def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, comp
     days = _days(law, law.x, goal, place)
     low, high = days, days
     if 0 < days < FOREVER:
-        with np.errstate(invalid="ignore"):  # near where it is never reached
+        with np.errstate(divide="ignore", invalid="ignore"):  # near where it is never reached, or at once
             slope = central_jacobian(lambda x: np.log(np.array([_days(law, x, goal, place)])), law.x)[0]
         half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if np.isfinite(slope).all() else np.inf
         low, high = (float(days * np.exp(np.clip(s * half, -700, 700))) for s in (-1, 1))
-        high = np.inf if high > FOREVER else high
+        low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
     asked = days * (float(law.rate(place)[0]) if law.way == "rate" else 1.0)
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
     return Lifetime(days, low, high, threshold, beyond, _outside(law, temperature_C, compression_pct))
@@ -221,18 +221,20 @@ def resampled(
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.log(np.quantile(found, [0.025, 0.975], method="inverted_cdf") / days)
     low, high = days * np.exp(np.clip(ends * wider, -700, 700))
-    return float(low), float(high) if high < FOREVER else np.inf
+    return float(low) if low > AT_ONCE else 0.0, float(high) if high < FOREVER else np.inf
 
 
 def temperature_for(
     law: JointLaw, goal: Goal, years: float, compression_pct: float | None = None
-) -> tuple[float, float, float] | None:
-    """Return the temperature of use at which life is so many years, and its 95 % interval; None where none is.
+) -> tuple[float, float, float]:
+    """Return the temperature of use at which life is so many years, and its 95 % interval.
 
     Returns
     -------
     celsius, low, high : float
-        In degrees Celsius; the ends by the delta method.
+        In degrees Celsius; celsius is inf where life is longer at every temperature sought, -inf where it is shorter.
+        The interval are the temperatures at which so many years lie in the interval of the life (Fieller's way); an end
+        that was not found is infinite.
 
     Raises
     ------
@@ -243,16 +245,33 @@ def temperature_for(
         raise RequestError(f"--years {years:g} is no time to last.", mend="Give a number above 0.")
     if "E" not in law.names:
         raise RequestError("the rubber was aged at one temperature only.", mend="Test at two or more temperatures.")
+    wanted = years * DAYS_PER_YEAR
 
-    def log_days(celsius: float, x: np.ndarray) -> float:
-        days = _days(law, x, goal, _place(law, celsius, compression_pct))
-        return float(np.log(np.clip(days, 1e-12, 1e12)))
+    def longer(celsius: float) -> float:
+        days = _days(law, law.x, goal, _place(law, celsius, compression_pct))
+        return float(np.log(np.clip(days, 1e-12, 1e12) / wanted))
 
-    wanted = np.log(years * DAYS_PER_YEAR)
-    if (log_days(SPAN_C[0], law.x) - wanted) * (log_days(SPAN_C[1], law.x) - wanted) > 0:
-        return None
-    celsius = float(brentq(lambda at: log_days(at, law.x) - wanted, *SPAN_C, xtol=1e-6))
-    along = (log_days(celsius + NUDGE_C, law.x) - log_days(celsius - NUDGE_C, law.x)) / (2 * NUDGE_C)
-    slope = central_jacobian(lambda x: np.array([log_days(celsius, x)]), law.x)[0]
-    half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) / abs(along) if along else np.inf
-    return celsius, celsius - half, celsius + half
+    def held(celsius: float) -> bool:
+        life = lifetime(law, goal, celsius, compression_pct)
+        return life.low <= wanted <= life.high
+
+    ends = [longer(celsius) for celsius in SPAN_C]
+    if ends[0] * ends[1] > 0:
+        always = np.inf if ends[0] > 0 else -np.inf
+        return always, -np.inf, np.inf
+    celsius = float(brentq(longer, *SPAN_C, xtol=1e-6))
+    return celsius, _last(held, celsius, SPAN_C[0]), _last(held, celsius, SPAN_C[1])
+
+
+def _last(held: Callable[[float], bool], inside: float, limit: float) -> float:
+    """Return where, from a place inside towards a limit, something ceases to hold; infinite where it never does."""
+    direction = np.sign(limit - inside)
+    outside = inside
+    while (limit - outside) * direction > 0:
+        inside, outside = outside, outside + direction * min(STRIDE_C, abs(limit - outside))
+        if not held(outside):
+            for _ in range(HALVINGS):
+                middle = (inside + outside) / 2
+                inside, outside = (middle, outside) if held(middle) else (inside, middle)
+            return float(inside)
+    return float(direction * np.inf)

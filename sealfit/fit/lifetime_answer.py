@@ -8,7 +8,7 @@ import numpy as np
 
 from sealfit.errors import RequestError
 from sealfit.fit.joint_law import JointLaw
-from sealfit.fit.lifetime import FOREVER, Goal, ends_of, lifetime, resampled, temperature_for
+from sealfit.fit.lifetime import FOREVER, SPAN_C, Goal, ends_of, lifetime, resampled, temperature_for
 
 
 def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
@@ -62,13 +62,19 @@ def answer(
     """
     if years is not None and temperature_C is not None:
         raise RequestError("--years asks for the temperature, and --temperature gives it.", mend="Give one of the two.")
+    if goal.loss is not None and (law.aged.days > 0).all():
+        raise RequestError(
+            "no unaged rubber was tested: there is no start of which a share could be lost.",
+            mend="Give --threshold VALUE, or test unaged rubber.",
+        )
     found = {"law": law.loss.name, "way": law.way, "form": law.loss.form, "criterion": law.criterion}
     found |= {"parameters": {name: value for name, value, *_ in law.parameters()}}
     if years is not None:
-        celsius, *ends = temperature_for(law, goal, years, compression_pct) or (None, np.inf, np.inf)
+        celsius, *ends = temperature_for(law, goal, years, compression_pct)
         low, high = ends_of(law.aged.temperature_C[law.aged.days > 0])
-        found |= {"years": years, "temperature_C": celsius, "temperature_ci95": finite_ends(ends)}
-        return {**found, "extrapolated": celsius is None or not low <= celsius <= high, "tested_C": [low, high]}
+        found |= {"years": years, "temperature_C": _finite(celsius), "temperature_ci95": finite_ends(ends)}
+        found |= {"always": None if np.isfinite(celsius) else "longer" if celsius > 0 else "shorter"}
+        return {**found, "extrapolated": not low <= celsius <= high, "tested_C": [low, high], "sought_C": list(SPAN_C)}
     life = lifetime(law, goal, temperature_C, compression_pct)
     found |= {"threshold": life.threshold, "days": _finite(life.days), "ci95": finite_ends((life.low, life.high))}
     found |= {"extrapolated": life.extrapolated, "beyond_tests": _finite(life.beyond), "outside": list(life.outside)}

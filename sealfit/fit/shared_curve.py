@@ -8,7 +8,7 @@ Given v_s the force is linear in all else,
 so mu_s and mu_c of the conditions i, with their covariance, hold all that the forces say of any law of aging: a law
 fitted to them by generalised least squares is fitted to the forces. What the days share makes the values surer than
 free fits do, and determines conditions that have too few speeds for a fit of their own. Where the days of a series do
-not agree on v_s and sigma_2 (F test), its conditions keep their free fits.
+not agree on v_s and sigma_2 (F test), its conditions keep their free fits; so do days that disagree with the others.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from sealfit.fit.stribeck import search_grid
 from sealfit.fit.uncertainty import UnitVariance
 
 SHARED_P = 0.01  # below, the days of a series do not share v_s and sigma_2
+DETERMINED = 0.3  # standard error over value: above, the forces do not tell it
 RANK = 1e-8  # of the columns of a condition: with one speed mu_s and mu_c are one number
 
 
@@ -77,53 +78,68 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
     tables, covariances = [], []
     for names in (about["condition"].to_numpy(object)[series == s] for s in dict.fromkeys(series)):
         places = [place[name] for name in names]
-        table, covariance = _shared([conditions[k] for k in places], variance, places, curved) or (None, None)
-        if table is None:
-            table = free[free["condition"].isin(names)]
-            covariance = steady_covariance(table, steady_fit)
-        tables.append(table)
-        covariances.append(covariance)
+        found = _shared([conditions[k] for k in places], variance, variance.value[places], curved)
+        covered = set()
+        if found is not None:
+            tables.append(found[0])
+            covariances.append(found[1])
+            covered = found[2]
+        own = free[free["condition"].isin(set(names) - covered)]
+        tables.append(own)
+        covariances.append(steady_covariance(own, steady_fit))
     table = pd.concat(tables, ignore_index=True) if tables else free
     return Levels(table.merge(about, on="condition", how="left", validate="many_to_one"), block_diag(*covariances))
 
 
 def _shared(
-    own: Sequence[Condition], variance: UnitVariance, places: Sequence[int], curved: set[str]
-) -> tuple[pd.DataFrame, np.ndarray] | None:
-    """Return the values of a series and their covariance; None where its days share no curve."""
+    own: Sequence[Condition], variance: UnitVariance, widened: np.ndarray, curved: set[str]
+) -> tuple[pd.DataFrame, np.ndarray, set[str]] | None:
+    """Return the values of a series, their covariance and the conditions that it speaks for; None for no shared curve.
+
+    `widened`, shape (conditions,), is each condition's factor on the stated variances.
+    """
+    is_full = np.array([c.model == FULL for c in own])
     full = [c for c in own if c.model == FULL]
-    if len(full) < 2 or not curved & {c.name for c in own} or len({c.has_load for c in own}) > 1:
+    df = _usual_df(variance)
+    if is_full.sum() < 2 or not curved & {c.name for c in own} or len({c.has_load for c in own}) > 1:
         return None
-    unit, df = _usual(variance)
-    tested = _Curve(full)
-    more = tested.df - sum(c.df for c in full)
-    rise = (tested.rss - sum(c.chi2 for c in full)) / unit
-    if not np.isfinite(unit) or (more > 0 and stats.f.sf(rise / more, more, df) < SHARED_P):
+    if not np.isfinite(widened).all() or not np.isfinite(df):
         return None
-    curve = _Curve(own)
-    widened = float(np.nanmean(variance.value[list(places)]))
+    curve = _Curve(full, widened[is_full])
+    free = sum(c.chi2 / w for c, w in zip(full, widened[is_full], strict=True))
+    if _worse(curve.rss - free, curve.df - sum(c.df for c in full), df):
+        return None
+    if len(full) < len(own):  # days with too few speeds for a fit of their own, if they lie on it too
+        every = _Curve(own, widened)
+        if not _worse(every.rss - curve.rss, every.df - curve.df, df):
+            curve = every
     covariance, _ = covariance_of(curve.tangent())
-    covariance = covariance * widened
     names = list(curve.names())
-    count = len(names)
-    keep = np.isfinite(np.diag(covariance)[:count]) & (np.diag(covariance)[:count] > 0)
-    table = pd.DataFrame(names, columns=["condition", "quantity"]).assign(value=curve.levels.ravel())
-    return table[keep].reset_index(drop=True), covariance[:count, :count][np.ix_(keep, keep)]
+    value, variances = curve.levels.ravel(), np.diag(covariance)[: len(names)]
+    keep = np.isfinite(variances) & (variances > 0) & (value > 0) & (variances < (DETERMINED * value) ** 2)
+    table = pd.DataFrame(names, columns=["condition", "quantity"]).assign(value=value)
+    places = np.flatnonzero(keep)
+    return table[keep].reset_index(drop=True), covariance[np.ix_(places, places)], {c.name for c in curve.own}
 
 
-def _usual(variance: UnitVariance) -> tuple[float, float]:
-    """Return the factor on the stated variances of conditions that are not worse than the others, and its df."""
-    usual = np.flatnonzero(np.isfinite(variance.value) & ~variance.own)
-    return (float(variance.value[usual[0]]), float(variance.df[usual[0]])) if usual.size else (np.nan, np.nan)
+def _worse(rise: float, more: int, df: float) -> bool:
+    """Return whether a sum of squares rises by more than its degrees of freedom explain."""
+    return more > 0 and bool(stats.f.sf(rise / more, more, df) < SHARED_P)
+
+
+def _usual_df(variance: UnitVariance) -> float:
+    """Return the degrees of freedom of conditions that are not worse than the others."""
+    usual = variance.df[np.isfinite(variance.value) & ~variance.own]
+    return float(usual[0]) if usual.size else np.nan
 
 
 class _Curve:
     """Eq. 14 with one v_s and one sigma_2 on several conditions, at the least sum of squares."""
 
-    def __init__(self, own: Sequence[Condition]) -> None:
+    def __init__(self, own: Sequence[Condition], widened: np.ndarray) -> None:
         self.own = own
         self.speed, self.load, self.force, weight = stacked(own)
-        self.root = np.sqrt(weight)
+        self.root = np.sqrt(weight / widened[:, None])
         grid = search_grid(self.speed.reshape(1, -1), weight.reshape(1, -1))[0]
         rss = [self._solve(u)[0] for u in grid]
         best = int(np.argmin(rss))
@@ -131,7 +147,7 @@ class _Curve:
         found = minimize_scalar(lambda u: self._solve(u)[0], bounds=ends, method="bounded", options={"xatol": 1e-9})
         self.log_v_s = float(found.x) if found.fun <= rss[best] else float(grid[best])
         self.rss, self.levels, self.sigma_2, rank = self._solve(self.log_v_s)
-        self.df = int((weight > 0).sum()) - rank - 1 - (self.sigma_2 > 0)
+        self.df = int((weight > 0).sum()) - rank - 2
 
     def _columns(self, log_v_s: float) -> np.ndarray:
         """Return the weighted columns of mu_s and mu_c, shape (conditions, runs, 2)."""

@@ -53,12 +53,11 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
             return _sentence(errors)
         them = "them" if len(added) > 1 else "it"
         return Markup("The declared model missed {}; with {} {}.").format(lead, them, errors)
-    if predicts_worse(closure):
+    if predicts_worse(closure) and not closure["left"].get("channels"):
         them = "them" if len(added) > 1 else "it"
-        return Markup(
-            "{} would explain what the declared model leaves over, but {}: do not predict with {}. "
-            "Somewhere in these data one {} alone shows what it does there."
-        ).format(lead[:1].upper() + lead[1:], errors, them, closure.get("heldout_unit") or "run")
+        return Markup("{} would explain what the declared model leaves over, but {}: do not predict with {}.").format(
+            lead[:1].upper() + lead[1:], errors, them
+        )
     where = _where(closure["left"], config)
     if missed:
         return Markup(
@@ -193,7 +192,7 @@ def left_over(closure: Mapping, config: Config) -> Markup:
                 f"; {of_unit(number(left['rmse_N'], 2), unit)} of it lies above the floor (roots of sums of squares)"
             )
         said[0] += "."
-    if closure["verdict"] == "unexplained" and not predicts_worse(closure):
+    if closure["verdict"] == "unexplained" and (left.get("channels") or not predicts_worse(closure)):
         said.append(f"It is not only noise: {_where(left, config)}.")
     elif left.get("channels"):
         said.append(f"No channel orders it more surely than chance would; where to look first: {_where(left, config)}.")

@@ -192,6 +192,26 @@ def test_intervals_of_the_temperature_hold_the_truth():
     assert np.median([celsius for celsius, *_ in found]) == pytest.approx(truth, abs=1.0)
 
 
+def test_a_life_that_no_temperature_shortens_enough_is_not_called_short():
+    law = fit_joint_law(campaign("stretched", (4.0, 0.6), a=0.3, scatter=0.001), "stretched", "rate")
+    assert temperature_for(law, Goal(0.5), 20.0, 80.0)[0] == np.inf  # its floor lies above
+    assert temperature_for(law, Goal(0.99), 20.0, 80.0)[0] == -np.inf
+
+
+def test_without_unaged_rubber_there_is_no_share_of_the_start():
+    series = campaign(scatter=0.005)
+    law = fit_joint_law(series.part(series.days > 0), "log", "rate")
+    with pytest.raises(RequestError, match="no unaged rubber"):
+        answer(law, Goal(loss=0.2), temperature_C=50.0, compression_pct=85.0)
+
+
+def test_limits_of_the_temperature_that_the_tests_do_not_set_are_open():
+    law = fit_joint_law(campaign(energy=3.0, scatter=0.01), "log", "rate")
+    celsius, low, high = temperature_for(law, Goal(0.75), 10.0 / 365.25, 85.0)
+    assert -80 <= celsius <= 300 or not np.isfinite(celsius)
+    assert not np.isfinite(low) or not np.isfinite(high)
+
+
 def test_what_a_request_lacks_is_said():
     law = fit_joint_law(campaign(), "log", "rate")
     with pytest.raises(RequestError, match="more than one temperature"):

@@ -144,3 +144,27 @@ def test_every_condition_lies_on_the_master_curve_whichever_way_temperature_acts
         assert len(values) == len(SERIES) * 5 + 1
         expected = np.interp(values["scaled_days"], law["scaled_days"], law["value"])
         assert values["value"].to_numpy() == pytest.approx(expected, abs=2e-3)
+
+
+@pytest.mark.parametrize("speeds", [(32, 64), (16, 32, 64)])
+def test_a_day_with_fast_speeds_only_has_no_static_coefficient(campaign, speeds):
+    table = campaign(noise=0.004, series=((60.0, 80.0), (80.0, 80.0)), specimen=0.01)
+    late = (table["temperature_C"] == 80.0) & (table["aging_days"] == 16)
+    table = table[~late | table["speed_set_mm_s"].isin(speeds)]
+    found = levels(table)
+    own = found.table[(found.table["temperature_C"] == 80.0) & (found.table["aging_days"] == 16)]
+    assert set(own["quantity"]) == {"mu_c"}
+    laws, _ = joint_laws(table, fit_conditions(table, Config()), Config())
+    assert laws["scatter_rel"].max() < 0.05
+
+
+def test_a_day_that_scatters_more_weighs_less(campaign):
+    table = campaign(noise=0.004, seed=5)
+    late = table["aging_days"] == 16
+    rng = np.random.default_rng(1)
+    gain = dict.fromkeys(table.loc[late, "run_id"].unique())
+    gain = {run: 1 + 0.04 * rng.standard_normal() for run in gain}
+    table.loc[late, "force_N"] *= table.loc[late, "run_id"].map(gain)
+    found = levels(table)
+    se = dict(zip(found.table["aging_days"], np.sqrt(np.diag(found.covariance)), strict=False))
+    assert se[16.0] > 1.5 * se[8.0]  # was 1.0
