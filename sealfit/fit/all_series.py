@@ -13,10 +13,10 @@ from sealfit.fit.aged import Aged, reference_of
 from sealfit.fit.joint_law import JointLaw, fit_laws, left_out, rivals_of
 from sealfit.fit.law import Values, fit_law, law_model
 from sealfit.fit.shared_curve import Levels, shared_levels
+from sealfit.fit.steady import FORCES, parameter_units
 from sealfit.physics.losses import LOSSES
 from sealfit.tables import AGING_LAWS, MASTER_CURVE
 
-MU = ("mu_s", "mu_c")
 TEMPERATURE, COMPRESSION = "temperature_C", "compression_ratio_pct"
 SEPARATE = "separate"  # Eq. 15 with a and b of its own for every series
 LIKELY = 3  # laws held against data they were not fitted to
@@ -68,7 +68,7 @@ def joint_laws(steady: pd.DataFrame, steady_fit: pd.DataFrame, config: Config) -
                 laws = fit_laws(aged_values(levels, rubber, quantity))
             except FitError:
                 continue
-            unit = "" if quantity in MU else config.units.unit("force")
+            unit = parameter_units(config.units, quantity in FORCES)["mu_s"]
             at = {"rubber": rubber, "quantity": quantity}
             rows += [{**at, **row} for row in _law_rows(laws, unit)]
             curves.append(_master_curve(laws[0]).assign(**at))

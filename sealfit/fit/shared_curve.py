@@ -29,6 +29,7 @@ from sealfit.fit.polish import covariance_of
 from sealfit.fit.steady import FORCES, solve_conditions
 from sealfit.fit.stribeck import search_grid
 from sealfit.fit.uncertainty import UnitVariance
+from sealfit.tables import STEADY_FIT
 
 SHARED_P = 0.01  # below, the days of a series do not share v_s and sigma_2
 DETERMINED = 0.3  # standard error over value: above, the forces do not tell it
@@ -67,7 +68,8 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
         If nothing is left to fit.
     """
     rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["aging_days"].notna()]
-    about = rows.drop(columns=["quantity", "parameter", "value"]).drop_duplicates("condition")
+    of_parameters = [name for name in STEADY_FIT.names() if name not in ("condition", "series", "rubber")]
+    about = rows.drop(columns=of_parameters).drop_duplicates("condition")
     known = rows[rows["identified"].to_numpy(bool) & rows["value"].notna()]
     curved = set(known.loc[known["parameter"] == "v_s", "condition"])
     free = known[known["parameter"].isin([name for pair in PAIRS for name in pair])]

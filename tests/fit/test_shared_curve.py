@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 from steady_tables import MU_C, MU_S
 
-from sealfit.config import Config
+from sealfit.config import Config, Quantity
 from sealfit.fit.all_series import aged_values, joint_laws
 from sealfit.fit.joint_law import fit_joint_law
 from sealfit.fit.shared_curve import shared_levels
@@ -168,3 +168,10 @@ def test_a_day_that_scatters_more_weighs_less(campaign):
     found = levels(table)
     se = dict(zip(found.table["aging_days"], np.sqrt(np.diag(found.covariance)), strict=False))
     assert se[16.0] > 1.5 * se[8.0]  # was 1.0
+
+
+def test_coefficients_of_a_rig_that_reads_torque_have_their_true_unit(campaign):
+    config = Config(quantities={"force": Quantity(quantity="torque", unit="mN m")})
+    table = campaign(noise=0.004)
+    laws, _ = joint_laws(table, fit_conditions(table, config), config)
+    assert set(laws.loc[laws["parameter"].isin(["mu_0", "a"]), "unit"]) == {"mN m/N"}
