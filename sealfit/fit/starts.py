@@ -44,9 +44,8 @@ class Sliding:
     @classmethod
     def of(cls, distance_mm: np.ndarray, force_N: np.ndarray) -> Sliding:
         """Return the line through samples, shape (n,) each."""
-        away = distance_mm - distance_mm.mean()
-        slope = float(away @ force_N / max(away @ away, 1e-300))
-        extent = float(np.sqrt(away @ away))
+        slope, _ = _linear(force_N, distance_mm)
+        extent = float(np.linalg.norm(distance_mm - distance_mm.mean()))
         return cls(float(force_N.mean()), float(distance_mm.mean()), slope, len(force_N), extent)
 
     def at(self, distance_mm: np.ndarray) -> np.ndarray:
@@ -90,22 +89,15 @@ def starts_of(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]:
     steady : DataFrame
         Table `steady`: the strokes.
     """
-    edges, own = strokes_of(traces, steady)
-    time, along, force = (traces[name].to_numpy(float) for name in ("time_s", "displacement_mm", "force_N"))
-    sliding, sign = traces["steady"].to_numpy(bool), steady["direction"].to_numpy()
     pace = np.abs(steady["speed_mm_s"].to_numpy(float))
-    for begin, end, row in zip(edges[:-1].tolist(), edges[1:].tolist(), own.tolist(), strict=True):
-        if row < 0 or not sliding[begin:end].any():
-            continue
-        part = slice(begin, end)
-        until = int(np.argmax(sliding[part]))
-        after = np.flatnonzero(sliding[part])[: max(LEAST, int(JUST_BEGUN * sliding[part].sum()))]
-        found = _begun(time[part], sign[row] * along[part], pace[row], until)
+    for row, time, along, force, sliding in _along_motion(traces, steady):
+        until = int(np.argmax(sliding))
+        after = np.flatnonzero(sliding)[: max(LEAST, int(JUST_BEGUN * sliding.sum()))]
+        found = _begun(time, along, pace[row], until)
         if found is not None:
             since, distance, speed = found
-            along_it = sign[row] * force[part]
-            slid = sign[row] * (along[part][after] - along[part][since])
-            yield Start(row, distance, speed, along_it[since:until], Sliding.of(slid, along_it[after]))
+            line = Sliding.of(along[after] - along[since], force[after])
+            yield Start(row, distance, speed, force[since:until], line)
 
 
 def whole_strokes(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]:
@@ -116,20 +108,24 @@ def whole_strokes(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[Start]
     traces, steady : DataFrame
         As for `starts_of`.
     """
+    for row, time, along, force, sliding in _along_motion(traces, steady):
+        distance = np.maximum.accumulate(along - along[0])
+        if len(along) >= LEAST and distance[-1] > 0.0:
+            middle = float(distance[sliding].mean())
+            level = Sliding(float(force[sliding].mean()), middle, 0.0, int(sliding.sum()), np.inf)
+            yield Start(row, distance, np.gradient(distance, time), force, level)
+
+
+def _along_motion(traces: pd.DataFrame, steady: pd.DataFrame) -> Iterator[tuple[int, np.ndarray, ...]]:
+    """Yield each stroke that slides steadily somewhere: its row in `steady`, and shape (n,) each the time, displacement
+    and force counted along its motion, and whether it slides steadily."""
     edges, own = strokes_of(traces, steady)
     time, along, force = (traces[name].to_numpy(float) for name in ("time_s", "displacement_mm", "force_N"))
     sliding, sign = traces["steady"].to_numpy(bool), steady["direction"].to_numpy()
     for begin, end, row in zip(edges[:-1].tolist(), edges[1:].tolist(), own.tolist(), strict=True):
-        window = sliding[begin:end]
-        if row < 0 or not window.any() or end - begin < LEAST:
-            continue
-        distance = np.maximum.accumulate(sign[row] * (along[begin:end] - along[begin]))
-        if distance[-1] > 0.0:
-            along_it = sign[row] * force[begin:end]
-            mean = Sliding(
-                float(along_it[window].mean()), float(distance[window].mean()), 0.0, int(window.sum()), np.inf
-            )
-            yield Start(row, distance, np.gradient(distance, time[begin:end]), along_it, mean)
+        part = slice(begin, end)
+        if row >= 0 and sliding[part].any():
+            yield row, time[part], sign[row] * along[part], sign[row] * force[part], sliding[part]
 
 
 def cell_means(starts: Sequence[Start], values: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -204,11 +200,11 @@ def _motion(time_s: np.ndarray, along_mm: np.ndarray, pace: float, until: int) -
     return speed * distance, speed * rate
 
 
-def _linear(along_mm: np.ndarray, shape: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the slope of a displacement on a shape, and the straight line through it, shape (n,)."""
+def _linear(values: np.ndarray, shape: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the slope of values on a shape, and the straight line through them, shape (n,)."""
     centred = shape - shape.mean()
-    slope = float(centred @ along_mm / max(centred @ centred, 1e-300))
-    return slope, along_mm.mean() + slope * centred
+    slope = float(centred @ values / max(centred @ centred, 1e-300))
+    return slope, values.mean() + slope * centred
 
 
 def _straight(since: np.ndarray, ramp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
