@@ -8,7 +8,7 @@ import pandas as pd
 from sealfit.fit.rows import nesting_run
 
 BOTH = 0  # `direction` of a row that stands for both
-SAME_SPEED = 1.25  # measured speeds of the two ways within 25 % are one setting
+SAME_SPEED = 1.25  # measured speeds within 25 % are one setting: rigs without speed control wander that much
 KEYS = ["file", "run_id"]
 
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sealfit.fit.both_ways import SAME_SPEED
 from sealfit.fit.rows import Rows
 
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
 SPEEDS_FOR_STRIBECK = 4  # mu_s, mu_c, v_s and sigma_2 are four numbers
 SPEEDS_FOR_VISCOUS = 2
 DAYS_FOR_LAW = 3  # mu_0, a and b are three numbers
-SAME_SPEED = 1.25  # measured speeds within 25 % are one setting: rigs without speed control wander that much
 
 
 @dataclass(frozen=True, slots=True)
