@@ -37,7 +37,12 @@ def cores() -> int:
 
 
 def run_map(
-    function: Callable[[Given], Made], items: Iterable[Given], *, workers: int = 1, trial_s: float = 0.0
+    function: Callable[[Given], Made],
+    items: Iterable[Given],
+    *,
+    workers: int = 1,
+    trial_s: float = 0.0,
+    together: int | None = None,
 ) -> Iterator[Made]:
     """Yield `function(item)` for every item, in the order of the items.
 
@@ -56,6 +61,8 @@ def run_map(
     trial_s : float
         Work here for this many seconds first, and start processes only if what is left would take longer than they
         take to start. For items that are usually quick; leave it out where a single item may take long.
+    together : int, optional
+        Items that are sent to a process at once; by default as many as keep the cost of sending low.
 
     Raises
     ------
@@ -73,11 +80,11 @@ def run_map(
     if waiting and done and (time.monotonic() - began) / done * len(waiting) < PROCESSES_START_S:
         yield from map(function, waiting)
     elif waiting:
-        yield from begin_map(function, list(waiting), workers=workers)
+        yield from begin_map(function, list(waiting), workers=workers, together=together)
 
 
 def begin_map(
-    function: Callable[[Given], Made], items: Sequence[Given], *, workers: int = 1
+    function: Callable[[Given], Made], items: Sequence[Given], *, workers: int = 1, together: int | None = None
 ) -> Generator[Made, None, None]:
     """Return `run_map`, its processes already at work while the caller does something else.
 
@@ -85,19 +92,20 @@ def begin_map(
 
     Parameters
     ----------
-    function, items, workers
+    function, items, workers, together
         As for `run_map`; with one worker nothing is done before the first result is asked for.
     """
     if workers <= 1 or len(items) <= 1 or multiprocessing.parent_process() is not None:
         return (function(item) for item in items)
-    made = _in_processes(function, items, min(workers, len(items)))
+    workers = min(workers, len(items))
+    size = together or max(1, min(MAX_CHUNK, len(items) // (workers * CHUNKS_PER_WORKER)))
+    made = _in_processes(function, items, workers, size)
     next(made)
     return made
 
 
-def _in_processes(function: Callable[[Given], Made], items: Sequence[Given], workers: int) -> Iterator[Made]:
-    """Yield once when the first items are sent, then the results."""
-    size = max(1, min(MAX_CHUNK, len(items) // (workers * CHUNKS_PER_WORKER)))
+def _in_processes(function: Callable[[Given], Made], items: Sequence[Given], workers: int, size: int) -> Iterator[Made]:
+    """Yield once when the first items are sent, `size` at a time, then the results."""
     chunks = (items[start : start + size] for start in range(0, len(items), size))
     # Spawn, not fork: a fork copies the locks of pyarrow's and BLAS's threads without the threads that free them.
     executor = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)

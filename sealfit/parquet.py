@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -11,6 +13,8 @@ import pyarrow.parquet as pq
 
 from sealfit import __version__
 from sealfit.tables import TEXT, Column, Schema, Units
+
+CHANNEL = "channel of the campaign"
 
 
 def to_arrow(frame: pd.DataFrame, schema: Schema, units: Units) -> pa.Table:
@@ -34,28 +38,63 @@ def to_arrow(frame: pd.DataFrame, schema: Schema, units: Units) -> pa.Table:
         raise ValueError(f"table {schema.name}: missing columns {missing}, columns that it does not know {others}")
 
     arrays, fields = [], []
-    for column in (*schema.columns, *(Column(name, "", None, "channel of the campaign") for name in others)):
+    for column in (*schema.columns, *(Column(name, "", None, CHANNEL) for name in others)):
         array = _array(frame[column.name], column, schema.name)
-        about = {"unit": units.of(column.name) or column.unit, "meaning": column.meaning}
         arrays.append(array)
-        fields.append(pa.field(column.name, array.type, metadata=about))
-    about = {
-        "sealfit": json.dumps({"version": __version__, "table": schema.name}),
-        "units": json.dumps({field.name: field.metadata[b"unit"].decode() for field in fields}, ensure_ascii=False),
-    }
-    return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=about))
+        fields.append(_field(column, array.type, units))
+    return _table(arrays, fields, json.dumps({"version": __version__, "table": schema.name}))
+
+
+def _table(arrays: list, fields: list[pa.Field], about: str | bytes) -> pa.Table:
+    units = {field.name: field.metadata[b"unit"].decode() for field in fields}
+    metadata = {"sealfit": about, "units": json.dumps(units, ensure_ascii=False)}
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=metadata))
+
+
+def with_columns(table: pa.Table, columns: Mapping[str, str], units: Units) -> pa.Table:
+    """Return a table of `to_arrow` with these columns, in this order: name and type, as Arrow spells it.
+
+    A column that it lacks is null throughout; numbers become words where words are asked for.
+    """
+    arrays, fields = [], []
+    for name, kind in columns.items():
+        wanted = pa.type_for_alias(kind)
+        at = table.schema.get_field_index(name)
+        if at < 0:
+            arrays.append(pa.nulls(table.num_rows, wanted))
+            fields.append(_field(Column(name, "", None, CHANNEL), wanted, units))
+            continue
+        values = table.column(at)
+        if wanted == TEXT and values.type != TEXT:
+            values = pa.array(values.to_pandas().map(str, na_action="ignore").astype(object), TEXT, from_pandas=True)
+        arrays.append(values.cast(wanted))
+        fields.append(table.schema.field(at).with_type(wanted))
+    return _table(arrays, fields, table.schema.metadata[b"sealfit"])
+
+
+def _field(column: Column, dtype: pa.DataType, units: Units) -> pa.Field:
+    about = {"unit": units.of(column.name) or column.unit, "meaning": column.meaning}
+    return pa.field(column.name, dtype, metadata=about)
 
 
 def write(frame: pd.DataFrame, schema: Schema, units: Units, path: Path) -> None:
     """Write `frame` to `path`. Raises OSError if the disk refuses, ValueError as `to_arrow`."""
-    table = to_arrow(frame, schema, units)
+    write_arrow(to_arrow(frame, schema, units), path)
+
+
+def write_arrow(table: pa.Table, path: Path) -> None:
+    """Write a table as it is, and wait until it is on the disk itself. Raises OSError if the disk refuses."""
     with path.open("wb") as file:  # a file of Python's, so that a full disk is an OSError with its number
         pq.write_table(table, file, compression="zstd")
+        file.flush()
+        os.fsync(file.fileno())
 
 
-def read(path: Path, columns: list[str] | None = None) -> pd.DataFrame:
-    """Return the table at `path`, a file or a partitioned folder, or those columns of it."""
-    return pq.read_table(path, columns=columns).to_pandas(self_destruct=True)
+def read(path: Path | Sequence[Path], columns: list[str] | None = None) -> pd.DataFrame:
+    """Return the table at `path`, a file or its parts in their order, or those columns of it."""
+    paths = [path] if isinstance(path, Path) else path
+    parts = [pq.read_table(one, columns=columns, partitioning=None) for one in paths]
+    return pa.concat_tables(parts).to_pandas(self_destruct=True)
 
 
 def _array(values: pd.Series, column: Column, table: str) -> pa.Array:

@@ -56,6 +56,16 @@ class Staged:
             figure.savefig(drawn, format=kind, dpi=PLOT_DPI, metadata=about)
             self._write(f"plots/{name}.{kind}", lambda path, drawn=drawn: path.write_bytes(drawn.getbuffer()))
 
+    def folder(self) -> Path:
+        """Return the folder in which other processes may write files of this step, told with `adopt`."""
+        with disk(self._out):
+            self._folder.mkdir(exist_ok=True)
+        return self._folder
+
+    def adopt(self, files: Mapping[str, int]) -> None:
+        """Take files, with their sizes, for this step's: some that others wrote into `folder`, and some in OUT."""
+        self.files |= files
+
     def _write(self, name: str, write: Callable[[Path], object]) -> None:
         path = self._folder / name
         with disk(self._out):
@@ -65,10 +75,15 @@ class Staged:
             self.files[name] = path.stat().st_size
 
     def move(self, name: str, to: str | None = None) -> None:
-        """Move a staged file to its final place in one step of the file system."""
+        """Move a staged file to its final place in one step of the file system; one that is in OUT already stays."""
         target = self._out / (to or name)
+        source = self._folder / name
+        if name in self.files and not source.exists():
+            return
+        if target.parent.is_file():  # a table that was one file
+            target.parent.unlink()
         target.parent.mkdir(exist_ok=True)
-        os.replace(self._folder / name, target)
+        os.replace(source, target)
 
     def clear(self) -> None:
         """Remove what is staged."""

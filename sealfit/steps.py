@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
 FITTED = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
+UNREPORTED = ("traces", "bins")  # as many rows as samples, and nothing in the report needs them
 FAULTY = ("warning", "error")  # severities that count as a fault
 
 
@@ -87,6 +88,7 @@ def _do_steps(
 
     for warning in store.warnings:
         progress.warn(warning)
+    store.anew = force
     done = []
     for step in steps:
         why = store.why_stale(step)
@@ -119,15 +121,17 @@ def faults_of(quality: pd.DataFrame) -> list[Fault]:
 
 # ---------------------------------------------------------------- the work of each step
 def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
-    from sealfit.ingest.campaign import ingest_campaign
+    from sealfit.ingest.campaign import Place, ingest_campaign
 
     campaign, config = store.state.campaign, store.seen_config("ingest")
     runs_before = fingerprint(campaign / RUNS)  # as it was when the reading began
+    place = Place(staged.folder(), store.parts(), store.marks)
     with progress.counting("reading trace files") as on_file:
-        ingested = ingest_campaign(campaign, config, workers=workers, on_file=on_file)
+        ingested = ingest_campaign(campaign, config, workers=workers, on_file=on_file, place=place)
     progress.faults(ingested.faults)
-    for name in INGESTED:
-        staged.table(name, ingested.tables[name])
+    for name, table in ingested.tables.items():
+        staged.table(name, table)
+    staged.adopt(ingested.stored)
     marks = _as_read(ingested.tables["inputs"])
     named = {fault.file for fault in ingested.faults if fault.file} | set(glob_names(campaign, config.files))
     for name in sorted(named - marks.keys()):  # missing or unreadable: if that changes, the campaign has changed
@@ -199,7 +203,7 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Non
     from sealfit.report.page import build_report
 
     progress.say("drawing the report")
-    tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED)}
+    tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED) if name not in UNREPORTED}
     report = build_report(tables, store.read_json("closure"), store.provenance(), store.seen_config("report"))
     for name, figure in report.figures.items():
         staged.figure(name, figure)

@@ -6,7 +6,7 @@ import contextlib
 import shlex
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from sealfit import __version__
 from sealfit.config import Config
 from sealfit.errors import ConfigError, OutError, StaleError
-from sealfit.fingerprint import STEPS, fingerprint, fingerprints, seen_config, step_keys
+from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, fingerprints, seen_config, step_keys
 from sealfit.lock import LOCK, only_writer
 from sealfit.provenance import provenance
 from sealfit.staging import STAGING, Staged, disk, sync, undisturbed
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PROVENANCE = "provenance.json"
+PARQUET = ".parquet"
 
 
 class Store:
@@ -34,6 +35,7 @@ class Store:
         self.out, self.state = out, state
         self.config: Config = state.config.parse()
         self.warnings: list[str] = []
+        self.anew = False  # whether what is stored already is to be made again
         if state.campaign.is_dir():
             self._now = fingerprints(state.campaign, state.inputs, self.config)
         else:
@@ -173,7 +175,10 @@ class Store:
         """Return a table, or those columns of it."""
         from sealfit import parquet
 
-        return parquet.read(self.out / f"{table}.parquet", columns)
+        name = f"{table}{PARQUET}"
+        files = (file for done in self.state.steps.values() for file in done.files)
+        parts = [self.out / file for file in files if file.startswith(f"{name}/")]
+        return parquet.read(parts or self.out / name, columns)
 
     def read_json(self, name: str) -> dict:
         """Return `<name>.json`."""
@@ -231,7 +236,7 @@ class Store:
             sync(self.out)
             for file in files:
                 staged.move(file)
-            for file in old.keys() - files.keys():
+            for file in self._left_over(old, files):
                 (self.out / file).unlink(missing_ok=True)
             staged.move(PROVENANCE)
             sync(self.out)
@@ -240,6 +245,28 @@ class Store:
             self.state = ended
         if staged.inputs is not None:
             self._now = dict(inputs)
+
+    def _left_over(self, old: Mapping[str, int], files: Mapping[str, int]) -> set[str]:
+        """Return the files of an earlier time of the step that are not its any more.
+
+        In the folder of a table nothing else may lie, whoever left it there: readers take all of it.
+        """
+        folders = {file.split("/")[0] for file in files if file.endswith(PARQUET) and "/" in file}
+        lying = {f"{folder}/{path.name}" for folder in folders for path in (self.out / folder).iterdir()}
+        return (old.keys() | lying) - files.keys()
+
+    # ------------------------------------------------------------ parts of a table
+    def parts(self) -> dict[str, Path]:
+        """Return the stored parts of the campaign that may be taken as they are, by their keys."""
+        from sealfit.ingest.stored import known_parts
+
+        done = self.state.steps.get("ingest")
+        return known_parts(self.out, done.files) if done and not self.anew else {}
+
+    @property
+    def marks(self) -> Mapping[str, Fingerprint]:
+        """The campaign's files as they are now."""
+        return self._now
 
 
 def _make_folder(out: Path) -> bool:

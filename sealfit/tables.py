@@ -188,6 +188,7 @@ TRACES = Schema(
     "traces",
     (
         FILE,
+        CONDITION,
         STROKE,
         TIME,
         DISPLACEMENT,

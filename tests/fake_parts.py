@@ -63,7 +63,9 @@ class Parts:
         if name in self.raises:
             raise self.raises[name]
 
-    def ingest_campaign(self, campaign, config, *, workers=1, on_file=None):
+    Place = staticmethod(lambda folder, known, marks: folder)
+
+    def ingest_campaign(self, campaign, config, *, workers=1, on_file=None, place=None):
         self._called("ingest", config)
         marks = {path.name: fingerprint(path) for path in sorted(campaign.glob("*.csv")) if path.name != "runs.csv"}
         on_file(len(marks), len(marks))
@@ -77,7 +79,8 @@ class Parts:
         )
         good = Fault("read", "was read.", "a.csv", severity="info", action="kept")
         quality = pd.DataFrame([fault.as_dict() for fault in (good, *self.faults)])
-        return SimpleNamespace(tables={**tables, "inputs": inputs, "quality": quality}, faults=[good, *self.faults])
+        tables |= {"inputs": inputs, "quality": quality}
+        return SimpleNamespace(tables=tables, faults=[good, *self.faults], stored={})
 
     def fit_conditions(self, steady, config):
         self._called("fit-steady", config)
@@ -112,7 +115,7 @@ class Parts:
 
     def build_report(self, tables, closure, provenance, config):
         self._called("report", config)
-        assert set(tables) >= {"bins", "steady_fit", "aging_curves", "curves"}
+        assert set(tables) >= {"steady", "steady_fit", "aging_curves", "curves"}
         return SimpleNamespace(html=f"<p>{closure['verdict']}</p>", figures={"one": Figure()})
 
     def predict(self, model, points):
@@ -135,7 +138,7 @@ def put_in(monkeypatch):
     """Put the stand-ins in the place of the computing parts, and return them."""
     parts = Parts()
     places = {
-        "sealfit.ingest.campaign": ["ingest_campaign"],
+        "sealfit.ingest.campaign": ["ingest_campaign", "Place"],
         "sealfit.fit.steady": ["fit_conditions"],
         "sealfit.fit.aging": ["fit_series", "aging_curves"],
         "sealfit.fit.all_series": ["joint_laws"],

@@ -1,44 +1,67 @@
-"""A campaign folder to tables: every file read, split and judged, repeats averaged. Writes nothing."""
+"""A campaign folder to tables: every file read, split and judged, repeats averaged; part by part, on any number of
+processes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
-from sealfit.conditions import add_keys
 from sealfit.config import Config
 from sealfit.engine import run_map
 from sealfit.errors import CampaignError, Fault
-from sealfit.fingerprint import fingerprint
-from sealfit.ingest.average import bin_table, mean_traces
+from sealfit.fingerprint import Fingerprint, fingerprint
+from sealfit.ingest.derive import condition_keys
+from sealfit.ingest.part import SAMPLED, Asked
+from sealfit.ingest.parts import plan_parts
 from sealfit.ingest.peers import constant_strokes, outlying_files, reversed_strokes
 from sealfit.ingest.quality import quality_table
+from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.runs import list_traces
-from sealfit.ingest.trace_file import FileStrokes, read_strokes
-from sealfit.tables import BINS, FLOAT, INT, RUNS, STEADY, TEXT, Schema
+from sealfit.ingest.shaped import STEADY_ONLY, shaped
+from sealfit.ingest.stored import Made, agrees, common_columns, load_part, make_part, part_key
+from sealfit.tables import RUNS, STEADY
 
-INNER = ("several", "equal", "extreme", "run", "sliding", "row")  # columns that serve the ingest only
 OF_SAMPLES = ("time_s", "displacement_mm", "distance_mm", "force_N", "force_sd_N", "n")  # their means are in `steady`
 FAULTY = ("warning", "error")
 SHOWN = 20  # faults that a campaign without a single usable stroke lists
 
 
 @dataclass(frozen=True)
+class Place:
+    """Where parts are stored, those that are there already, by their keys, and the campaign's files as they are now."""
+
+    folder: Path
+    known: Mapping[str, Path] = field(default_factory=dict)
+    marks: Mapping[str, Fingerprint] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Ingested:
-    """Tables inputs, runs, quality, traces, traces_mean, steady and bins; `faults` are the warnings and errors among
-    the findings of `quality`."""
+    """Tables inputs, runs, quality and steady, and traces, traces_mean and bins where they are not stored by parts.
+
+    `faults` are the warnings and errors among the findings of `quality`; `stored` the files of the parts, by their
+    names below OUT, with their sizes; `reread` the number of trace files that were read.
+    """
 
     tables: dict[str, pd.DataFrame]
     faults: list[Fault]
+    stored: dict[str, int] = field(default_factory=dict)
+    reread: int = 0
 
 
 def ingest_campaign(
-    campaign: Path, config: Config, *, workers: int = 1, on_file: Callable[[int, int], None] | None = None
+    campaign: Path,
+    config: Config,
+    *,
+    workers: int = 1,
+    on_file: Callable[[int, int], None] | None = None,
+    place: Place | None = None,
 ) -> Ingested:
     """Return the tables of a campaign.
 
@@ -51,7 +74,10 @@ def ingest_campaign(
     workers : int
         Processes; the tables do not depend on it.
     on_file : callable, optional
-        Called after each file with its number, from 1, and the number of files.
+        Called as files have been read with their number so far, and the number of files to be read.
+    place : Place, optional
+        Where the tables of samples are to be stored, so that they need not fit into memory; only what is not there yet
+        is read.
 
     Raises
     ------
@@ -60,55 +86,143 @@ def ingest_campaign(
     """
     campaign = Path(campaign)
     refs, faults = list_traces(campaign, config)
-    files: list[FileStrokes] = []
-    for made in run_map(partial(read_strokes, campaign=campaign, config=config), refs, workers=workers, trial_s=1.0):
-        files.append(made)
-        if on_file is not None:
-            on_file(len(files), len(refs))
-    faults = [*faults, *(fault for made in files for fault in made.faults)]
-    strokes, found = judged(stroke_table(files, config))
+    make = _Maker(campaign, config, workers, on_file, place)
+    parts = make.parts(_planned(campaign, refs, config))
+    order = {ref.file: i for i, ref in enumerate(refs)}
+    faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: order[fault.file])
+    strokes = _in_order(strokes_of([part.strokes for part in parts]), order)
+    strokes, found = judged(strokes)
     faults += found
     if not strokes["used"].any():
-        raise CampaignError(_nothing_left(faults, len(files)))
-    steady, found = outlying_files(_steady(strokes), config)
+        raise CampaignError(_nothing_left(faults, len(refs)))
+    steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
     strokes = strokes.assign(used=_still_used(strokes, steady))
-    samples = sample_table(files, strokes)
-    inputs = _inputs(campaign, files, strokes, faults)
+    parts = make.settled(parts, strokes)
+    inputs = _inputs(campaign, parts, order, strokes, faults)
     tables = {
         "inputs": inputs,
-        "runs": _shaped(strokes, RUNS, drop=(*_steady_only(), *OF_SAMPLES)),
+        "runs": shaped(strokes, RUNS, drop=(*STEADY_ONLY, *OF_SAMPLES)),
         "quality": quality_table(faults, inputs["file"].tolist()),
-        "traces": samples.drop(columns=["row", "sliding"]),
-        "traces_mean": mean_traces(*_sliding(samples, strokes)),
-        "steady": _shaped(steady, STEADY),
-        "bins": _bins(samples, strokes, config),
+        "steady": shaped(steady, STEADY),
     }
-    return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY])
+    if place is None:
+        tables |= {name: _stacked([part.tables[name] for part in parts if name in part.tables]) for name in SAMPLED}
+    stored = {name: size for part in parts for name, size in part.stored.items()}
+    return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY], stored, make.reread)
 
 
-def stroke_table(files: Sequence[FileStrokes], config: Config) -> pd.DataFrame:
-    """Return one row per stroke with everything that is known of it, the keys included; run_id with its direction.
-
-    A run with strokes both ways is two: `<run_id>+` and `<run_id>-`.
-    """
-    table = pd.DataFrame([row for made in files for row in made.strokes])
-    if not len(table):
-        return pd.DataFrame({"used": np.array([], bool)})
-    table = table.infer_objects()
-    for name in (*config.condition, *config.rubber):
-        if name not in table.columns:  # every file is unaged, and none says the rest
-            table[name] = np.nan
-    return _two_runs(add_keys(table, config))
+def _planned(campaign: Path, refs: Sequence[TraceRef], config: Config) -> list[Asked]:
+    conditions = condition_keys([ref.channels for ref in refs], config)
+    sizes = [_size(campaign / ref.file) for ref in refs]
+    plan = plan_parts(conditions, [str(ref.channels["run_id"]) for ref in refs], sizes)
+    return [Asked(tuple(refs[i] for i in files)) for files in plan]
 
 
-def _two_runs(table: pd.DataFrame) -> pd.DataFrame:
-    ways = table.groupby(["run_id", "file"])["direction"].transform("nunique")
-    used = table["direction"].where(table["used"]).groupby(table["run_id"]).transform("nunique")
-    both = (ways.groupby(table["run_id"]).transform("max") > 1) | (used > 1)
-    sign = np.where(table["direction"] > 0, "+", "-")
-    names = table["run_id"].astype(str)
-    return table.assign(run_id=names.where(~both, names + sign), run=names)
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:  # reading it will say why
+        return 0
+
+
+class _Maker:
+    """Makes parts: takes those that are stored, reads the others."""
+
+    def __init__(
+        self,
+        campaign: Path,
+        config: Config,
+        workers: int,
+        on_file: Callable[[int, int], None] | None,
+        place: Place | None,
+    ) -> None:
+        self._make = partial(make_part, campaign=campaign, config=config, folder=place.folder if place else None)
+        self._config, self._workers, self._on_file = config, workers, on_file or (lambda done, total: None)
+        self._place = place
+        self.reread = 0
+
+    def parts(self, planned: Sequence[Asked]) -> list[Made]:
+        """Return every part, by what its own files say."""
+        made: list[Made | None] = [self._known(asked) for asked in planned]
+        fresh = [i for i, part in enumerate(made) if part is None]
+        for i, part in zip(fresh, self._read([planned[i] for i in fresh]), strict=True):
+            made[i] = part
+        return made
+
+    def settled(self, parts: Sequence[Made], strokes: pd.DataFrame) -> list[Made]:
+        """Return the parts, made again where the whole campaign leaves out other strokes or has other columns."""
+        unused = _ruled_out(parts, strokes)
+        columns = common_columns(parts)
+        wanted = [
+            part.asked
+            if part.asked.unused == out and agrees(part, columns)
+            else Asked(part.asked.refs, out, columns if part.columns else None)
+            for part, out in zip(parts, unused, strict=True)
+        ]
+        again = [i for i, (part, asked) in enumerate(zip(parts, wanted, strict=True)) if asked != part.asked]
+        settled = list(parts)
+        for i, part in zip(again, self._read([wanted[i] for i in again]), strict=True):
+            settled[i] = part
+        return settled
+
+    def _known(self, asked: Asked) -> Made | None:
+        if self._place is None or not self._place.known:
+            return None
+        path = self._place.known.get(part_key(asked, self._place.marks, self._config) or "")
+        return load_part(asked, path) if path else None
+
+    def _read(self, asked: Sequence[Asked]) -> list[Made]:
+        total, done, made = sum(len(part.refs) for part in asked), 0, []
+        for part in run_map(self._make, asked, workers=self._workers, together=1):
+            made.append(part)
+            done += len(part.files)
+            self._on_file(done, total)
+        self.reread += total
+        return made
+
+
+def _ruled_out(parts: Sequence[Made], strokes: pd.DataFrame) -> list[frozenset]:
+    """Return, per part, its strokes that are not used although their own file shows nothing wrong with them."""
+    of = {found.file: i for i, part in enumerate(parts) for found in part.files}
+    out: list[set] = [set() for _ in parts]
+    gone = strokes[~strokes["used"].to_numpy(bool) & strokes["by_itself"].to_numpy(bool)]
+    for file, stroke in zip(gone["file"], gone["stroke"].tolist(), strict=True):
+        out[of[file]].add((file, stroke))
+    return [frozenset(strokes) for strokes in out]
+
+
+def strokes_of(parts: Sequence[pa.Table]) -> pd.DataFrame:
+    """Return the strokes of all parts in one table; a column that holds words in one part holds words in all."""
+    whole = [part for part in parts if part.num_rows]
+    if not whole:
+        return pd.DataFrame({"file": pd.array([], "str"), "used": np.array([], bool), "by_itself": np.array([], bool)})
+    words = {
+        f.name for part in whole for f in part.schema if pa.types.is_string(f.type) or pa.types.is_large_string(f.type)
+    }
+    table = pa.concat_tables([_worded(part, words) for part in whole], promote_options="permissive").to_pandas()
+    return table.assign(by_itself=table["used"])
+
+
+def _is_text(dtype: pa.DataType) -> bool:
+    return pa.types.is_string(dtype) or pa.types.is_large_string(dtype)
+
+
+def _worded(part: pa.Table, words: set[str]) -> pa.Table:
+    for i, column in enumerate(part.schema):
+        if column.name in words:
+            values = part.column(i)
+            if not _is_text(column.type):
+                texts = values.to_pandas().map(str, na_action="ignore").astype(object)
+                values = pa.array(texts, pa.string(), from_pandas=True)
+            part = part.set_column(i, column.name, values.cast(pa.string()))
+    return part
+
+
+def _in_order(strokes: pd.DataFrame, order: Mapping[str, int]) -> pd.DataFrame:
+    """Return the strokes in the order of their files in the campaign."""
+    place = np.array([order[file] for file in strokes["file"]], int)
+    return strokes.iloc[np.argsort(place, kind="stable")].reset_index(drop=True)
 
 
 def judged(strokes: pd.DataFrame) -> tuple[pd.DataFrame, list[Fault]]:
@@ -122,94 +236,24 @@ def judged(strokes: pd.DataFrame) -> tuple[pd.DataFrame, list[Fault]]:
     return strokes, faults
 
 
-def sample_table(files: Sequence[FileStrokes], strokes: pd.DataFrame) -> pd.DataFrame:
-    """Return all samples, with `row` (place in `strokes`); `steady` is false throughout a stroke that is not used."""
-    parts = [made for made in files if made.samples is not None]
-    names = list(dict.fromkeys(name for made in parts for name in made.samples))
-    length = [len(made.samples["time_s"]) for made in parts]
-    columns = {name: _stacked([made.samples.get(name) for made in parts], length) for name in names}
-    first = np.concatenate(([0], np.cumsum([len(made.strokes) for made in parts])[:-1]))
-    row = np.repeat(first, length) + columns["stroke"] - 1
-    columns["steady"] = columns["steady"] & strokes["used"].to_numpy(bool)[row]
-    file = np.repeat(np.array([made.file for made in parts], object), length)
-    head = {"file": pd.array(file, dtype="str"), "stroke": columns.pop("stroke").astype(np.int64)}
-    order = ["time_s", "displacement_mm", "force_N", "steady"]
-    return pd.DataFrame({**head, **{name: columns.pop(name) for name in order}, **columns, "row": row})
-
-
-def _stacked(parts: list[np.ndarray | None], length: list[int]) -> np.ndarray:
-    """Return the parts in one array; null where a file lacks the channel."""
-    kinds = {part.dtype.kind for part in parts if part is not None}
-    if kinds <= set("fiub"):
-        return np.concatenate([np.full(n, np.nan) if p is None else p for p, n in zip(parts, length, strict=True)])
-    return np.concatenate([np.full(n, None, object) if p is None else p for p, n in zip(parts, length, strict=True)])
-
-
-def _steady(strokes: pd.DataFrame) -> pd.DataFrame:
-    return strokes[strokes["used"]].reset_index(drop=True)
-
-
 def _still_used(strokes: pd.DataFrame, steady: pd.DataFrame) -> np.ndarray:
     used = strokes["used"].to_numpy(bool).copy()
     used[used] = steady["used"].to_numpy(bool)
     return used
 
 
-def _sliding(samples: pd.DataFrame, strokes: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the samples of sliding of the strokes that are used, and these strokes, with places renewed."""
-    used = strokes["used"].to_numpy(bool)
-    place = np.cumsum(used) - 1
-    row = samples["row"].to_numpy()
-    rows = samples.loc[samples["sliding"].to_numpy(bool) & used[row], ["row", "displacement_mm", "force_N", "steady"]]
-    return rows.assign(row=place[rows["row"].to_numpy()]), strokes[used].reset_index(drop=True)
-
-
-def _bins(samples: pd.DataFrame, strokes: pd.DataFrame, config: Config) -> pd.DataFrame:
-    """Return table `bins`: means of what was measured along the trace, and what is known of the whole stroke."""
-    rows = samples[samples["steady"].to_numpy(bool)].drop(columns=["file", "stroke", "steady", "sliding"])
-    made = bin_table(rows, strokes, config.bins)
-    measured = [name for name in made.columns if name != "row"]
-    whole = strokes.drop(columns=[name for name in measured if name in strokes.columns])
-    if "load_N" in measured and "load_N" in strokes.columns:  # where some files measure it and others declare it
-        made["load_N"] = made["load_N"].fillna(strokes["load_N"].iloc[made["row"]].reset_index(drop=True))
-    known = whole.iloc[made["row"]].reset_index(drop=True)
-    return _shaped(pd.concat([known, made], axis=1), BINS, drop=(*_steady_only(), "used"))
-
-
-def _steady_only() -> tuple[str, ...]:
-    inner = {column.name for column in STEADY.columns} - {column.name for column in RUNS.columns}
-    return tuple(inner - {column.name for column in BINS.columns})
-
-
-def _shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.DataFrame:
-    """Return the schema's columns in order and with their types, then the open ones."""
-    fixed = {}
-    for column in schema.columns:
-        values = (
-            table[column.name] if column.name in table.columns else pd.Series(None, index=table.index, dtype=object)
-        )
-        if column.dtype == FLOAT:
-            fixed[column.name] = pd.to_numeric(values, errors="coerce").astype(float)
-        elif column.dtype == INT:
-            fixed[column.name] = values.astype(np.int64)
-        elif column.dtype == TEXT:
-            fixed[column.name] = values.astype("str")
-        else:
-            fixed[column.name] = values.astype(bool)
-    taken = {*fixed, *INNER, *(name for name in drop if name not in fixed)}
-    return pd.DataFrame({**fixed, **{name: table[name] for name in table.columns if name not in taken}})
+def _stacked(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    return tables[0] if len(tables) == 1 else pd.concat(tables, ignore_index=True)
 
 
 def _inputs(
-    campaign: Path, files: Sequence[FileStrokes], strokes: pd.DataFrame, faults: Sequence[Fault]
+    campaign: Path, parts: Sequence[Made], order: Mapping[str, int], strokes: pd.DataFrame, faults: Sequence[Fault]
 ) -> pd.DataFrame:
     """Return table `inputs`: every trace file of the campaign, and those that are not used."""
     used = set(strokes.loc[strokes["used"], "file"])
-    rows = [
-        (made.file, made.mark, made.rows, len(made.strokes), "used" if made.file in used else "left out")
-        for made in files
-    ]
-    known = {made.file for made in files}
+    files = sorted((found for part in parts for found in part.files), key=lambda found: order[found.file])
+    rows = [(f.file, f.mark, f.rows, f.strokes, "used" if f.file in used else "left out") for f in files]
+    known = {found.file for found in files}
     for fault in faults:
         if fault.file is not None and fault.file not in known and fault.action == "file left out":
             known.add(fault.file)

@@ -66,8 +66,8 @@ def findings(ingested, file):
 def test_a_campaign_becomes_all_tables_with_their_schemas(campaign):
     seen = []
     made = ingest_campaign(campaign, Config(), on_file=lambda done, of: seen.append((done, of)))
-    assert list(made.tables) == TABLES
-    assert seen == [(i, 6) for i in range(1, 7)]
+    assert set(made.tables) == set(TABLES)
+    assert seen == [(6, 6)]
     assert made.faults == []
     for name in TABLES:
         schema, table = SCHEMAS[name], made.tables[name]

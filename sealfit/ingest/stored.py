@@ -1,0 +1,164 @@
+"""Parts of a campaign on the disk: written by whoever reads them, and taken as they are while nothing has changed.
+
+A part's files are named by what it was made from, so a process that does the work a second time (its first answer was
+lost) writes the same names, and a part that is as it was keeps its files. Beside its tables a part has a file of its
+strokes and findings: with it, the whole campaign can be judged anew without reading the samples.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sealfit import __version__, parquet
+from sealfit.config import Config
+from sealfit.errors import Fault
+from sealfit.fingerprint import Fingerprint
+from sealfit.ingest.part import SAMPLED, Asked, FileFound, read_part
+from sealfit.staging import disk
+from sealfit.tables import SCHEMAS
+
+PARTS = "parts"  # folder of OUT with the strokes of each part
+PARQUET = ".parquet"
+_ABOUT = b"part"
+
+Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each column, as Arrow spells it
+
+
+@dataclass(frozen=True)
+class Made:
+    """One part as the campaign needs it.
+
+    `columns` are those of its tables; the tables themselves are in `tables`, or on the disk in `stored`: files by their
+    names below OUT, with their sizes in bytes.
+    """
+
+    asked: Asked
+    files: tuple[FileFound, ...]
+    faults: tuple[Fault, ...]
+    strokes: pa.Table
+    columns: Columns
+    tables: Mapping[str, pd.DataFrame]
+    stored: Mapping[str, int]
+
+
+def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None) -> Made:
+    """Read a part and store it below `folder`, or keep its tables in memory where there is none.
+
+    Raises
+    ------
+    OutError
+        If the disk is full or refuses.
+    """
+    part = read_part(asked, campaign, config)
+    tables = {name: table for name, table in part.tables.items() if len(table)}
+    if folder is None:
+        return Made(asked, part.files, part.faults, part.strokes, {}, tables, {})
+    arrow = {name: parquet.to_arrow(table, SCHEMAS[name], config.units) for name, table in tables.items()}
+    columns = {name: {f.name: str(f.type) for f in table.schema} for name, table in arrow.items()}
+    if asked.columns is not None:
+        arrow = {name: parquet.with_columns(table, asked.columns[name], config.units) for name, table in arrow.items()}
+    name = _file_name(part_key(asked, {found.file: found.mark for found in part.files}, config), asked)
+    with disk(folder.parent):
+        stored = {
+            f"{of}{PARQUET}/{name}": _write(table, folder / f"{of}{PARQUET}" / name) for of, table in arrow.items()
+        }
+        about = {
+            "unused": sorted(asked.unused),
+            "wanted": asked.columns,
+            "columns": columns,
+            "files": [asdict(found) for found in part.files],
+            "faults": [fault.as_dict() for fault in part.faults],
+            "stored": stored,
+        }
+        strokes = part.strokes.replace_schema_metadata(
+            {**(part.strokes.schema.metadata or {}), _ABOUT: json.dumps(about)}
+        )
+        stored[f"{PARTS}/{name}"] = _write(strokes, folder / PARTS / name)
+    return Made(asked, part.files, part.faults, part.strokes, columns, {}, stored)
+
+
+def part_key(asked: Asked, marks: Mapping[str, Fingerprint], config: Config) -> str | None:
+    """Return a hash of what a part is made from, or None where a file's content is not known."""
+    hashes = [marks[ref.file].sha256 if ref.file in marks else None for ref in asked.refs]
+    if None in hashes:
+        return None
+    seen = [__version__, config.model_dump(mode="json"), [(r.file, dict(r.channels)) for r in asked.refs], hashes]
+    return hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()[:20]
+
+
+def _file_name(key: str | None, asked: Asked) -> str:
+    variant = hashlib.sha256(json.dumps([sorted(asked.unused), asked.columns], sort_keys=True).encode()).hexdigest()
+    return f"{key or uuid.uuid4().hex[:20]}-{variant[:8]}{PARQUET}"
+
+
+def known_parts(out: Path, files: Mapping[str, int]) -> dict[str, Path]:
+    """Return the stored parts that are whole, by their keys.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of results.
+    files : dict of str to int
+        Files that the last ingest left there, and their sizes in bytes.
+    """
+    whole = {name.split("/", 1)[1] for name in files if name.startswith(f"{PARTS}/")}
+    for name, size in files.items():
+        path = out / name
+        if name.endswith(PARQUET) and "/" in name and not (path.is_file() and path.stat().st_size == size):
+            whole.discard(name.split("/", 1)[1])
+    return {name.split("-", 1)[0]: out / PARTS / name for name in whole}
+
+
+def load_part(asked: Asked, path: Path) -> Made:
+    """Return a part that was stored before, without its tables."""
+    strokes = pq.read_table(path)
+    about = json.loads(strokes.schema.metadata[_ABOUT])
+    unused = frozenset((file, stroke) for file, stroke in about["unused"])
+    files = tuple(FileFound(**{**found, "mark": Fingerprint(**found["mark"])}) for found in about["files"])
+    stored = {**about["stored"], f"{PARTS}/{path.name}": path.stat().st_size}
+    faults = tuple(Fault(**fault) for fault in about["faults"])
+    asked = replace(asked, unused=unused, columns=about["wanted"])
+    return Made(asked, files, faults, strokes, about["columns"], {}, stored)
+
+
+def common_columns(parts: Sequence[Made]) -> Columns:
+    """Return the columns of each table over all parts; numbers beside words are words.
+
+    Tables of one folder must agree: a reader takes the columns of the first file for those of all.
+    """
+    common: dict[str, dict[str, str]] = {name: {} for name in SAMPLED}
+    for columns in (part.columns for part in parts):
+        for table, types in columns.items():
+            for name, kind in types.items():
+                known = common[table].setdefault(name, kind)
+                if known != kind:
+                    common[table][name] = "string" if "string" in (known, kind) else "double"
+    return common
+
+
+def agrees(part: Made, columns: Columns) -> bool:
+    """Whether the stored tables of a part have these columns, in this order."""
+    has = {table: (part.asked.columns or part.columns)[table] for table in part.columns}
+    return all(list(types.items()) == list(columns[table].items()) for table, types in has.items())
+
+
+def _write(table: pa.Table, path: Path) -> int:
+    """Write a table, whole or not at all, and return its size; two that write the same do not disturb each other."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+    try:
+        parquet.write_arrow(table, draft)
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
+    return path.stat().st_size
