@@ -24,7 +24,6 @@ from loop_summary import coverage
 from steady_tables import MU_C, MU_S, steady_rows
 
 from sealfit.config import Config, load_config
-from sealfit.engine import one_thread
 from sealfit.fit.aged import GAS_CONSTANT
 from sealfit.fit.aging import fit_series
 from sealfit.fit.all_series import aged_values
@@ -35,6 +34,7 @@ from sealfit.fit.shared_curve import shared_levels
 from sealfit.fit.steady import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.simulate import Spec, simulate
+from sealfit.threads import one_thread
 
 LAWS = {"mu_s": MU_S, "mu_c": MU_C}
 CURVE = {"mu_s": 0.7, "mu_c": 0.45, "v_s": 6.0, "sigma_2": 0.03}

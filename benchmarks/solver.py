@@ -18,10 +18,10 @@ import numpy as np
 import scipy
 from scipy.optimize import curve_fit, least_squares
 
-from sealfit.engine import one_thread
 from sealfit.fit.law import solve_law
 from sealfit.fit.stribeck import solve_stribeck
 from sealfit.physics import aging_law, stribeck_force
+from sealfit.threads import one_thread
 
 SPEEDS = np.tile(np.geomspace(0.5, 64.0, 8), 3)
 DAYS = np.array([0.0, 1, 2, 4, 8, 12, 16])

@@ -30,6 +30,10 @@ Results = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results 
 Out = Annotated[Path, typer.Option("--out", help="Folder of results; made if it is not there.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Rig config (TOML); default: as the README's table.")]
 Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Processes to use. [default: all cores]")]
+Scheduler = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on: tcp://host:port, or its file."),
+]
 Force = Annotated[bool, typer.Option("--force", help="Do it again even if it is current.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
@@ -56,36 +60,61 @@ def ingest(
     out: Out,
     config: ConfigFile = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
     force: Force = False,
     strict: Strict = False,
     as_json: Json = False,
 ) -> None:
     """Read a campaign into tables of traces."""
-    _run(("ingest",), campaign, out, config, workers, force, strict, as_json)
+    _run(("ingest",), campaign, out, config, workers, scheduler, force, strict, as_json)
 
 
 @app.command("fit-steady")
-def fit_steady(out: Results, force: Force = False, as_json: Json = False) -> None:
+def fit_steady(
+    out: Results,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
     """Fit steady LuGre to each condition."""
-    _single("fit-steady", out, force, as_json)
+    _single("fit-steady", out, force, as_json, workers, scheduler)
 
 
 @app.command("fit-aging")
-def fit_aging(out: Results, force: Force = False, as_json: Json = False) -> None:
+def fit_aging(
+    out: Results,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
     """Fit the aging law across days."""
-    _single("fit-aging", out, force, as_json)
+    _single("fit-aging", out, force, as_json, workers, scheduler)
 
 
 @app.command("fit-dynamic")
-def fit_dynamic(out: Results, force: Force = False, as_json: Json = False) -> None:
+def fit_dynamic(
+    out: Results,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
     """Fit sigma_0 and sigma_1 to the pre-sliding part."""
-    _single("fit-dynamic", out, force, as_json)
+    _single("fit-dynamic", out, force, as_json, workers, scheduler)
 
 
 @app.command("close-loop")
-def close_loop(out: Results, workers: Workers = None, force: Force = False, as_json: Json = False) -> None:
+def close_loop(
+    out: Results,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
     """Find, name and add what the model lacks."""
-    _single("close-loop", out, force, as_json, workers)
+    _single("close-loop", out, force, as_json, workers, scheduler)
 
 
 @app.command()
@@ -100,6 +129,7 @@ def run(
     out: Out,
     config: ConfigFile = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
     force: Force = False,
     strict: Strict = False,
     as_json: Json = False,
@@ -107,7 +137,7 @@ def run(
     """Do every step that is not current, in order."""
     from sealfit.fingerprint import STEPS
 
-    _run(STEPS, campaign, out, config, workers, force, strict, as_json)
+    _run(STEPS, campaign, out, config, workers, scheduler, force, strict, as_json)
 
 
 @app.command()
@@ -170,11 +200,18 @@ def simulate(
 
 
 @app.command()
-def check(campaign: Campaign, config: ConfigFile = None, workers: Workers = None, as_json: Json = False) -> None:
+def check(
+    campaign: Campaign,
+    config: ConfigFile = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
     """List every fault of a campaign, write nothing."""
-    from sealfit import engine, progress, requests, summary
+    count = _workers(workers, scheduler)
+    from sealfit import progress, requests, summary
 
-    found, faults = requests.check(campaign, config, workers=workers or engine.cores(), progress=progress.to_stderr())
+    found, faults = requests.check(campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr())
     if as_json:
         _print_json({"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]})
     else:
@@ -196,18 +233,21 @@ def _run(
     out: Path,
     config: Path | None,
     workers: int | None,
+    scheduler: str | None,
     force: bool,
     strict: bool,
     as_json: bool,
 ) -> None:
-    from sealfit import engine, progress, steps, summary
+    count = _workers(workers, scheduler)
+    from sealfit import progress, steps, summary
 
     made = steps.run(
         campaign,
         out,
         config,
         steps=names,
-        workers=workers or engine.cores(),
+        workers=count,
+        scheduler=scheduler,
         force=force,
         strict=strict,
         progress=progress.to_stderr(),
@@ -215,11 +255,23 @@ def _run(
     _end("ingest" if len(names) == 1 else "run", made, summary.lines, as_json)
 
 
-def _single(step: str, out: Path, force: bool, as_json: bool, workers: int | None = None) -> None:
-    from sealfit import engine, progress, steps, summary
+def _single(
+    step: str, out: Path, force: bool, as_json: bool, workers: int | None = None, scheduler: str | None = None
+) -> None:
+    count = _workers(workers, scheduler)
+    from sealfit import progress, steps, summary
 
-    made = steps.single(step, out, workers=workers or engine.cores(), force=force, progress=progress.to_stderr())
+    made = steps.single(step, out, workers=count, scheduler=scheduler, force=force, progress=progress.to_stderr())
     _end(step, made, summary.lines, as_json)
+
+
+def _workers(workers: int | None, scheduler: str | None) -> int:
+    """Return how many processes of this computer to use; told apart from a cluster before anything is loaded."""
+    from sealfit import engine
+
+    if workers is not None and scheduler is not None:
+        raise typer.BadParameter("use either --workers (this computer) or --scheduler (a Dask cluster), not both.")
+    return workers or engine.cores()
 
 
 def _end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: bool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sealfit.engine import on_cluster
 from sealfit.errors import CampaignError, Fault, OutError
 from sealfit.places import RUNS, campaign_folder, existing_file, existing_out, refuse_effects_in
 from sealfit.progress import Silent
@@ -14,7 +15,12 @@ from sealfit.tables import Units
 
 
 def check(
-    campaign: Path, config: Path | None = None, *, workers: int = 1, progress: Silent | None = None
+    campaign: Path,
+    config: Path | None = None,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    progress: Silent | None = None,
 ) -> tuple[dict, list[Fault]]:
     """Read everything, write nothing, and return what was found and every fault.
 
@@ -29,8 +35,9 @@ def check(
     checked = ConfigCopy.at(config).parse()
     refuse_effects_in(campaign, checked)
     try:
-        with (progress or Silent()).counting("reading trace files") as on_file:
-            ingested = ingest_campaign(campaign_folder(campaign, checked), checked, workers=workers, on_file=on_file)
+        folder = campaign_folder(campaign, checked)
+        with on_cluster(scheduler, folder), (progress or Silent()).counting("reading trace files") as on_file:
+            ingested = ingest_campaign(folder, checked, workers=workers, on_file=on_file)
     except CampaignError as error:
         return {"files": None}, list(error.faults)
     faults = [fault for fault in ingested.faults if fault.severity in FAULTY]

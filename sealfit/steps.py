@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sealfit.engine import on_cluster
 from sealfit.errors import CampaignError, Fault
 from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, glob_names
 from sealfit.places import RUNS, campaign_folder, existing_out, refuse_effects_in
@@ -31,6 +32,7 @@ def run(
     *,
     steps: tuple[str, ...] = STEPS,
     workers: int = 1,
+    scheduler: str | None = None,
     force: bool = False,
     strict: bool = False,
     progress: Silent | None = None,
@@ -44,7 +46,9 @@ def run(
     config : Path or None
         A rig config, or None for the default.
     workers : int
-        Processes that read trace files and repeat the search.
+        Processes of this computer that read trace files, fit and repeat the search.
+    scheduler : str or None
+        Address or scheduler file of a Dask cluster to do that instead; it has to see both folders.
     force : bool
         Do current steps too.
     strict : bool
@@ -59,7 +63,8 @@ def run(
     source = ConfigCopy.at(config)
     checked = source.parse()
     refuse_effects_in(campaign, checked)
-    with Store.writing(out, campaign_folder(campaign, checked), source) as store:
+    folder = campaign_folder(campaign, checked)
+    with Store.writing(out, folder, source) as store, on_cluster(scheduler, folder, out):
         return _do_steps(store, steps, workers=workers, force=force, strict=strict, progress=progress)
 
 
@@ -68,7 +73,15 @@ def ingest(campaign: Path, out: Path, config: Path | None = None, **options) -> 
     return run(campaign, out, config, steps=("ingest",), **options)
 
 
-def single(step: str, out: Path, *, workers: int = 1, force: bool = False, progress: Silent | None = None) -> dict:
+def single(
+    step: str,
+    out: Path,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    force: bool = False,
+    progress: Silent | None = None,
+) -> dict:
     """Do one step after the first in an OUT whose earlier steps are current, and return its summary.
 
     Raises
@@ -76,7 +89,7 @@ def single(step: str, out: Path, *, workers: int = 1, force: bool = False, progr
     StaleError
         If a step before it is missing or stale; it names the command to run.
     """
-    with Store.writing(existing_out(out)) as store:
+    with Store.writing(existing_out(out)) as store, on_cluster(scheduler, out):
         store.require(STEPS[STEPS.index(step) - 1])
         return _do_steps(store, (step,), workers=workers, force=force, strict=False, progress=progress or Silent())
 

@@ -103,6 +103,13 @@ def test_version(sealfit):
     assert re.fullmatch(r"sealfit \d+\.\d+\.\d+\n", sealfit("--version").stdout)
 
 
+def test_processes_here_and_a_cluster_exclude_each_other(sealfit, campaign, out):
+    ended = sealfit("run", campaign, "--out", out, "--workers", 2, "--scheduler", "tcp://127.0.0.1:1")
+    assert ended.code == 2
+    assert "either --workers (this computer) or --scheduler" in ended.stderr
+    assert not out.exists()
+
+
 # ---------------------------------------------------------------- exit codes
 @pytest.mark.parametrize(
     "arguments", [[], ["rum"], ["run"], ["run", "c"], ["ingest", "c", "--out", "o", "--workers", "0"], ["run", "--bad"]]

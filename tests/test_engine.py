@@ -133,6 +133,11 @@ if __name__ == "__main__":
 """
 
 
+def descendants_of(pid):
+    found = children_of(pid)
+    return found + [one for child in found for one in descendants_of(child)]
+
+
 def children_of(pid):
     found = []
     for entry in Path("/proc").glob("[0-9]*/stat"):
@@ -162,10 +167,10 @@ def test_no_worker_outlives_its_parent(tmp_path, how):
     ) as run:
         assert run.stdout.readline() == "begun\n"
         until = time.monotonic() + 20
-        while len(children_of(run.pid)) < 3 and time.monotonic() < until:  # two workers and the resource tracker
+        while len(descendants_of(run.pid)) < 4 and time.monotonic() < until:
             time.sleep(0.05)
-        children = children_of(run.pid)
-        assert len(children) >= 2
+        children = descendants_of(run.pid)
+        assert len(children) == 4  # two workers, the server that starts them, and the resource tracker
         if how == signal.SIGINT:
             os.killpg(run.pid, how)  # as a terminal does: to the whole group
         else:

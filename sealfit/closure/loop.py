@@ -20,7 +20,7 @@ from sealfit.closure.record import to_record
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
-from sealfit.engine import begin_map
+from sealfit.engine import begin_map, many_workers
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.rows import Rows, make_rows, thin
 from sealfit.verdict import predicts_worse
@@ -135,7 +135,7 @@ class _HeldOut:
 
     def begin(self, before: Fitted) -> None:
         """Set processes to work, on the assumption that something will be added."""
-        if self.workers > 1:
+        if many_workers(self.workers):
             self._begun = begin_map(_held_out, _Folds(self, before, search=True), workers=self.workers)
 
     def close(self) -> None:

@@ -1,0 +1,202 @@
+"""A real Dask scheduler and two workers of this computer: the same results as here, also where a worker is killed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas.testing as pdt
+import pytest
+
+pytest.importorskip("distributed")
+
+from sealfit.cluster import Cluster
+from sealfit.engine import on_cluster, run_map
+from sealfit.errors import RequestError, WorkerError
+from sealfit.ingest import parts
+from sealfit.progress import Silent
+from sealfit.simulate import load_spec, simulate
+from sealfit.steps import CLOSED, FITTED, INGESTED, STEPS, run
+from sealfit.store import Store
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+
+
+class DaskOfTwo:
+    """A scheduler and two workers without nannies: one that is killed stays dead."""
+
+    def __init__(self, folder):
+        self.file = folder / "scheduler.json"
+        self.log = (folder / "log.txt").open("w")
+        scheduler = "--host 127.0.0.1 --port 0 --no-dashboard --scheduler-file"
+        self.scheduler = self._start("dask_scheduler", f"{scheduler} {self.file}")
+        worker = f"--scheduler-file {self.file} --nthreads 1 --no-nanny --no-dashboard --local-directory {folder}"
+        self.workers = [self._start("dask_worker", f"{worker} --name {name}") for name in "ab"]
+
+    def _start(self, what, options):
+        command = [sys.executable, "-m", f"distributed.cli.{what}", *options.split()]
+        paths = os.pathsep.join([str(HERE), str(ROOT)])
+        environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+        return subprocess.Popen(command, stdout=self.log, stderr=self.log, env=environment, cwd=ROOT)
+
+    def wait(self, workers=2):
+        until = time.monotonic() + 60
+        while time.monotonic() < until:
+            if self.file.exists():
+                try:
+                    cluster = Cluster(str(self.file))
+                except RequestError:
+                    continue
+                count = cluster.threads()
+                cluster.close()
+                if count == workers:
+                    return self
+            time.sleep(0.2)
+        raise AssertionError("the workers did not start")
+
+    def stop(self):
+        for process in (*self.workers, self.scheduler):
+            process.kill()
+            process.wait()
+        self.log.close()
+
+
+@pytest.fixture
+def dask(tmp_path):
+    made = DaskOfTwo(tmp_path)
+    try:
+        yield made.wait()
+    finally:
+        made.stop()
+
+
+def square(number):
+    return number * number
+
+
+def slow_square(number):
+    time.sleep(0.2)
+    return number * number
+
+
+def wrong(number):
+    raise RequestError(f"{number} is wrong.", mend="Use another.")
+
+
+def fatal(number):
+    os._exit(1)
+
+
+def test_a_map_runs_on_the_cluster_in_order(dask):
+    with on_cluster(str(dask.file)):
+        assert list(run_map(square, range(50))) == [n * n for n in range(50)]
+        assert set(run_map(process_id, range(20), together=1)) <= {worker.pid for worker in dask.workers}
+        with pytest.raises(RequestError, match="0 is wrong"):
+            list(run_map(wrong, range(3)))
+    assert set(run_map(process_id, range(3))) == {os.getpid()}
+
+
+def process_id(_):
+    return os.getpid()
+
+
+def test_a_map_survives_a_killed_worker(dask):
+    with on_cluster(str(dask.file)):
+        made = run_map(slow_square, range(30), together=1)
+        first = [next(made) for _ in range(5)]
+        dask.workers[0].send_signal(signal.SIGKILL)
+        assert first + list(made) == [n * n for n in range(30)]
+
+
+def test_work_that_kills_every_worker_is_a_clear_error(dask, monkeypatch):
+    monkeypatch.setattr("sealfit.cluster.ALONE_S", 3.0)
+    with on_cluster(str(dask.file)), pytest.raises(WorkerError, match=r"no workers left.*start them again"):
+        list(run_map(fatal, range(1)))
+
+
+def test_a_folder_that_workers_do_not_see_is_refused(dask, tmp_path):
+    with (
+        pytest.raises(RequestError, match=r"does not see the folder.*all workers share"),
+        on_cluster(str(dask.file), tmp_path / "nowhere"),
+    ):
+        pass
+
+
+def test_no_scheduler_is_a_clear_error(monkeypatch):
+    monkeypatch.setattr("sealfit.cluster.CONNECT_S", 0.5)
+    with pytest.raises(RequestError, match=r"no Dask scheduler answers at tcp://127.0.0.1:1\. Start one"):
+        Cluster("tcp://127.0.0.1:1")
+
+
+def test_a_cluster_without_workers_is_a_clear_error(dask):
+    for worker in dask.workers:
+        worker.kill()
+        worker.wait()
+    time.sleep(1.0)
+    with pytest.raises(RequestError, match=r"has no workers\. Start one: dask worker"):
+        Cluster(str(dask.file))
+
+
+# ---------------------------------------------------------------- the whole pipeline
+class KillsAt(Silent):
+    """Kills a worker when the first part has been read, or the first fold is waited for."""
+
+    def __init__(self, victim, at):
+        self.victim, self.at, self.killed = victim, at, ""
+
+    def say(self, text):
+        if self.at in text:
+            self._kill(text)
+
+    def counting(self, what):
+        import contextlib
+
+        def on_file(done, total):
+            if self.at == what and done < total:
+                self._kill(f"{done} of {total}")
+
+        return contextlib.nullcontext(on_file)
+
+    def _kill(self, when):
+        if not self.killed:
+            self.killed = when
+            self.victim.send_signal(signal.SIGKILL)
+
+
+def results(out):
+    store = Store.open(out)
+    tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED)}
+    return tables, json.loads((out / "closure.json").read_text("utf-8"))
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """Some 50 files with an effect that the loop finds, so that the folds search too."""
+    folder = tmp_path_factory.mktemp("cluster")
+    spec = load_spec(ROOT / "sample_data" / "simulated.spec.toml")
+    design = spec.design.model_copy(update={"temperatures_C": (60.0,), "days": (1.0, 4.0), "max_rows": 150})
+    simulate(spec.model_copy(update={"design": design}), folder / "c")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parts, "PART_FILES", 12)
+        run(folder / "c", folder / "here", steps=STEPS[:-1], workers=1)
+    return folder / "c", results(folder / "here")
+
+
+@pytest.mark.parametrize("at", ["reading trace files", "fold 1 of"], ids=["in ingest", "in the folds"])
+def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
+    campaign, tmp_path, dask, monkeypatch, at
+):
+    folder, (here, closure) = campaign
+    monkeypatch.setattr(parts, "PART_FILES", 12)
+    kills = KillsAt(dask.workers[1], at)
+    run(folder, tmp_path / "there", steps=STEPS[:-1], scheduler=str(dask.file), progress=kills)
+    assert kills.killed
+    there, closed = results(tmp_path / "there")
+    for name, table in here.items():
+        pdt.assert_frame_equal(there[name], table, check_exact=True, obj=name)
+    assert closed == closure
+    assert len(there["inputs"]) == there["inputs"]["file"].nunique()
