@@ -6,7 +6,6 @@ Everything here works on what is already known of each file, and reads none.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -33,8 +32,12 @@ def condition_keys(files: Sequence[Channels], config: Config) -> list[str]:
     ['unaged']
     """
     names = condition_columns(config)
-    table = pd.DataFrame({name: pd.Series([c.get(name) for c in files], dtype=object) for name in names})
-    return add_keys(table, config)["condition"].tolist()
+    own = [tuple([channels.get(name) for name in names]) for channels in files]
+    different = dict.fromkeys(own)  # far fewer than there are files
+    columns = zip(*different, strict=True) if different else [()] * len(names)
+    table = pd.DataFrame({name: pd.Series(list(c), dtype=object) for name, c in zip(names, columns, strict=True)})
+    words = dict(zip(different, add_keys(table, config)["condition"].tolist(), strict=True))
+    return [words[key] for key in own]
 
 
 def _text(value: float | str) -> str:
@@ -53,22 +56,29 @@ def add_order(entries: Sequence[Entry], files: Sequence[Channels]) -> tuple[list
             continue
         text = str(channels["started_at"]).strip()
         try:
-            time = datetime.fromisoformat(text)
-            times[i] = time if time.tzinfo else time.replace(tzinfo=UTC)
+            times[i] = datetime.fromisoformat(text)
         except ValueError:
             mend = "Write it as 2024-03-01T09:30:00."
             faults.append(entry.fault("not_a_time", "is no ISO 8601 time.", "started_at", value=text, mend=mend))
+    if any(time.tzinfo for time in times.values()):
+        times = {i: time if time.tzinfo else time.replace(tzinfo=UTC) for i, time in times.items()}
     ordered = sorted(times.values())
-    added = [dict(channels) for channels in files]
+    first: dict[datetime, int] = {}
+    for place, time in enumerate(ordered, start=1):
+        first.setdefault(time, place)
+    added = list(files)
     for i, time in times.items():
-        added[i]["run_order"] = float(bisect_left(ordered, time) + 1)
-        added[i]["elapsed_h"] = (time - ordered[0]).total_seconds() / 3600
+        hours = (time - ordered[0]).total_seconds() / 3600
+        added[i] = {**files[i], "run_order": float(first[time]), "elapsed_h": hours}
     return added, faults
 
 
 def add_specimens(files: Sequence[Channels], conditions: Sequence[str]) -> list[Channels]:
     """Return the files with a `specimen_id`: one per condition where none is named."""
-    return [{"specimen_id": condition, **channels} for channels, condition in zip(files, conditions, strict=True)]
+    return [
+        channels if "specimen_id" in channels else {"specimen_id": condition, **channels}
+        for channels, condition in zip(files, conditions, strict=True)
+    ]
 
 
 def add_runs(
@@ -118,7 +128,7 @@ def add_runs(
                 name = words if math.isnan(middle) else f"{words}, about {middle:.3g} {unit}"
                 run_ids.update(dict.fromkeys(cluster, name))
                 cluster = []
-    added = [{**channels, "run_id": run_ids[i]} for i, channels in enumerate(files)]
+    added = [c if "run_id" in c else {**c, "run_id": run_ids[i]} for i, c in enumerate(files)]
     if not groups:
         return added, []
     reason = "neither run_id nor a commanded speed is given; files of one condition share a run within 5 % of speed."
@@ -128,6 +138,8 @@ def add_runs(
 
 def add_repeats(files: Sequence[Channels]) -> list[Channels]:
     """Return the files with a `repeat`: where missing by `started_at` if the whole run has it, else by file order."""
+    if all("repeat" in channels for channels in files):
+        return list(files)
     runs = defaultdict(list)
     for i, channels in enumerate(files):
         runs[channels["run_id"]].append(i)
@@ -157,13 +169,15 @@ def disagreements(
             faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat, mend=mend))
         seen.setdefault((run, repeat), i)
         j = first.setdefault(run, i)
-        pairs = [
+        if i == j:
+            continue
+        pairs = (
             ("speed_mm_s", speeds[i], speeds[j]),
             ("load_N", channels.get("load_N"), files[j].get("load_N")),
             ("condition", conditions[i], conditions[j]),
-        ]
+        )
         for column, mine, theirs in pairs:
-            if not _same(mine, theirs):
+            if mine != theirs and not _same(mine, theirs):
                 there = "none" if theirs is None else _text(theirs)
                 reason = f"differs from the other repeats of run '{run}', {_place(entries[j])}: {there}."
                 mend = "One run is one condition, speed and load: give it another run_id, or correct the cell."

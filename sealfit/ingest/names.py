@@ -28,6 +28,9 @@ class NameParts:
         return {name: value for name, value in self.values.items() if not name.startswith("_")}
 
 
+SAYS_NOTHING = NameParts(True, {})
+
+
 def name_parts(file: str, settings: Files) -> NameParts:
     """Return what the relative path `file` says under the config's `files`.
 
@@ -46,6 +49,8 @@ def name_parts(file: str, settings: Files) -> NameParts:
     >>> name_parts("n120.csv", rig).channels
     {'speed_mm_s': -120.0, 'run_id': '120 rpm'}
     """
+    if settings.name_pattern is None and not settings.compute and not settings.columns:
+        return SAYS_NOTHING
     texts: dict[str, str] = {}
     values: dict[str, float | str] = {}
     if settings.name_pattern is not None:

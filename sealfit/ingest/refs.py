@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class TraceRef:
     """One trace file and everything that runs.csv, its name, its header or its constant columns say of the whole file.
 

@@ -42,31 +42,37 @@ def to_values(
 def _column(
     name: str, cells: Mapping[int, float | str], entries: Sequence[Entry], config: Config
 ) -> tuple[Mapping[int, float | str], list[Fault]]:
-    labels = {i: cell if isinstance(cell, str) else f"{cell:g}" for i, cell in cells.items()}
+    # Every different cell is looked at once: a campaign has many files of few temperatures.
+    label = {cell: cell if isinstance(cell, str) else f"{cell:g}" for cell in set(cells.values())}
     if name in TEXT_COLUMNS:
-        return labels, []
-    numbers = {i: cell if isinstance(cell, float) else as_number(cell) for i, cell in cells.items()}
-    wrong = [i for i, number in numbers.items() if number is None or not math.isfinite(number)]
+        return {i: label[cell] for i, cell in cells.items()}, []
+    number = {cell: cell if isinstance(cell, float) else as_number(cell) for cell in label}
+    bad = {cell for cell, value in number.items() if value is None or not math.isfinite(value)}
+    wrong = [i for i, cell in cells.items() if cell in bad] if bad else []
     known = name in NUMBERS or name == "repeat"
     if wrong and not known and len(wrong) >= (1 - _MOSTLY) * len(cells):
-        return labels, []
+        return {i: label[cell] for i, cell in cells.items()}, []
     if wrong and not known and name not in config.condition:
         i = wrong[0]
         reason = f"{len(wrong)} of {len(cells)} cells are no numbers; the column is kept as labels."
         mend = "Empty the cell, or put a number there."
-        place = {"severity": "warning", "action": "kept", "value": labels[i], "mend": mend}
+        place = {"severity": "warning", "action": "kept", "value": label[cells[i]], "mend": mend}
+        labels = {i: label[cell] for i, cell in cells.items()}
         return labels, [entries[i].fault("not_a_number", reason, name, **place)]
     mend = "Put a number there."
-    faults = [entries[i].fault("not_a_number", "is not a number.", name, value=labels[i], mend=mend) for i in wrong]
-    values = {i: math.nan if number is None else number for i, number in numbers.items()}  # nan: not missing, but wrong
+    faults = [
+        entries[i].fault("not_a_number", "is not a number.", name, value=label[cells[i]], mend=mend) for i in wrong
+    ]
+    number |= {cell: math.nan for cell, value in number.items() if value is None}  # nan: not missing, but wrong
+    values = {i: number[cell] for i, cell in cells.items()}
     if name != "repeat":
         return values, faults
-    broken = [i for i, number in values.items() if math.isfinite(number) and number != int(number)]
+    broken = [i for i, value in values.items() if math.isfinite(value) and value != int(value)]
     mend = "Number the repeats 1, 2, 3."
     faults += [
         entries[i].fault("not_a_number", "is no whole number.", name, value=values[i], mend=mend) for i in broken
     ]
-    return {i: int(number) if math.isfinite(number) else -i for i, number in values.items()}, faults
+    return {i: int(value) if math.isfinite(value) else -i for i, value in values.items()}, faults
 
 
 def out_of_range(entries: Sequence[Entry], files: Sequence[Channels]) -> list[Fault]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import codecs
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from sealfit.conditions import condition_columns
@@ -67,12 +68,13 @@ def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fa
     ]
     files, found = to_values(entries, files, config)
     faults += found
-    files, measured, left_out, found = _from_traces(campaign, entries, files, config)
+    needed = _Needed.of(config)
+    files, measured, left_out, found = _from_traces(campaign, entries, files, config, needed)
     keep = [i for i in range(len(entries)) if i not in left_out]
     if not keep:
         raise CampaignError([*faults, *found, _nothing_left()])
     entries, files, measured = ([rows[i] for i in keep] for rows in (entries, files, measured))
-    faults += found + _missing(entries, files, config) + out_of_range(entries, files)
+    faults += found + _missing(entries, files, needed) + out_of_range(entries, files)
     files, found = add_order(entries, files)
     faults += found
     _stop_at_errors(faults)
@@ -93,8 +95,11 @@ def _nothing_left() -> Fault:
 
 def _set_speed(channels: Channels) -> Channels:
     """Return the channels with the commanded speed under its own name, as a magnitude."""
-    rest = {name: value for name, value in channels.items() if name != "speed_mm_s"}
-    return {**rest, "speed_set_mm_s": abs(channels["speed_mm_s"])} if "speed_mm_s" in channels else rest
+    if "speed_mm_s" not in channels:
+        return channels
+    renamed = dict(channels)
+    renamed["speed_set_mm_s"] = abs(renamed.pop("speed_mm_s"))
+    return renamed
 
 
 def _stop_at_errors(faults: Sequence[Fault]) -> None:
@@ -178,28 +183,41 @@ def _header(campaign: Path, file: str, config: Config) -> Channels:
 
 
 def _cells(entry: Entry) -> Channels:
+    if MISSING.isdisjoint(map(str.lower, entry.cells.values())):
+        return entry.cells
     return {name: cell for name, cell in entry.cells.items() if cell.lower() not in MISSING}
 
 
-def _wanted(channels: Channels, config: Config) -> list[str]:
-    """Return the condition columns that are missing; of unaged rubber only the days and the rubber are needed."""
-    unaged = config.aging and channels.get("aging_days") == 0
-    needed = ["aging_days", *config.rubber] if unaged else condition_columns(config)
-    return [name for name in needed if name not in channels]
+@dataclass(frozen=True, slots=True)
+class _Needed:
+    """The condition columns that a file must have; of unaged rubber only the days and the rubber are needed."""
+
+    aged: tuple[str, ...]
+    unaged: tuple[str, ...]
+
+    @classmethod
+    def of(cls, config: Config) -> _Needed:
+        aged = tuple(condition_columns(config))
+        return cls(aged, ("aging_days", *config.rubber) if config.aging else aged)
+
+    def missing(self, channels: Channels) -> list[str]:
+        """Return those that a file lacks."""
+        needed = self.unaged if channels.get("aging_days") == 0 else self.aged
+        return [name for name in needed if name not in channels]
 
 
 def _from_traces(
-    campaign: Path, entries: Sequence[Entry], files: Sequence[Channels], config: Config
+    campaign: Path, entries: Sequence[Entry], files: Sequence[Channels], config: Config, needed: _Needed
 ) -> tuple[list[Channels], list[float], set[int], list[Fault]]:
     """Return the files with what constant columns of their traces add, reading only files that lack something.
 
     Also the measured speed of each file read (nan of the others), the files to leave out, and their faults.
     """
-    added, measured = [dict(channels) for channels in files], [math.nan] * len(files)
+    added, measured = list(files), [math.nan] * len(files)
     left_out: set[int] = set()
     faults: list[Fault] = []
     for i, (entry, channels) in enumerate(zip(entries, files, strict=True)):
-        wanted = _wanted(channels, config)
+        wanted = needed.missing(channels)
         if not wanted and ("run_id" in channels or "speed_mm_s" in channels):
             continue
         try:
@@ -220,7 +238,7 @@ def _from_traces(
                 continue
             values = table[column]
             if (values == values.iloc[0]).all():
-                added[i][name] = _constant(name, values.iloc[0])
+                added[i] = {**added[i], name: _constant(name, values.iloc[0])}
             elif name in wanted:
                 reason = f"varies within the file, {values.min()} to {values.max()}; a condition is one value."
                 mend = "Write the value that was set into runs.csv."
@@ -238,13 +256,15 @@ def _constant(name: str, value: float | str) -> float | str:
     return value if isinstance(value, str) else float(value)
 
 
-def _missing(entries: Sequence[Entry], files: Sequence[Channels], config: Config) -> list[Fault]:
+def _missing(entries: Sequence[Entry], files: Sequence[Channels], needed: _Needed) -> list[Fault]:
     """Return faults of condition columns that no source gives: one per column, or one per cell."""
     faults = []
     lacking: dict[str, list[int]] = {}
     for i, channels in enumerate(files):
-        for name in _wanted(channels, config):
+        for name in needed.missing(channels):
             lacking.setdefault(name, []).append(i)
+    if not lacking:
+        return []
     known = list(dict.fromkeys(name for channels in files for name in channels))
     for name, rows in lacking.items():
         if any(name in channels for channels in files):

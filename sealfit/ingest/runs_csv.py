@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from difflib import SequenceMatcher
 from fnmatch import fnmatchcase
@@ -13,7 +12,8 @@ from pathlib import Path, PurePosixPath
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, Fault
 from sealfit.ingest.columns import nearest, suggestion
-from sealfit.ingest.text import as_number, as_utf8, inside, read_bytes, split_line
+from sealfit.ingest.folders import Folders
+from sealfit.ingest.text import as_number, as_utf8, read_bytes, split_line
 
 RUNS_CSV = "runs.csv"
 KNOWN = (
@@ -29,7 +29,7 @@ KNOWN = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Entry:
     """One trace file as it is listed: its place (for messages) and its cells as text, empty ones left out."""
 
@@ -64,7 +64,9 @@ def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], list[Faul
         count = sum(1 for _ in campaign.rglob("*.csv"))
         mend = f"Write one (the folder holds {count} CSV files), or give a config with files.glob."
         raise _stop("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", mend, file=RUNS_CSV)
-    return entries, faults + _paths(campaign, entries) + _unlisted(campaign, entries, config)
+    folders = Folders(campaign)
+    outside = {entry.file for entry in entries if not folders.hold(entry.file)}
+    return entries, faults + _paths(campaign, entries, outside) + _unlisted(folders, entries, outside, config)
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
@@ -89,14 +91,17 @@ def _read_runs(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]
     if "file" not in names:
         mend = suggestion("file", header)
         raise _stop("missing_column", "there is no such column.", mend, file=RUNS_CSV, line=1, column="file")
-    entries = []
+    entries, unnamed = [], "" in names
     for number, line in lines[1:]:
         cells = [cell.strip() for cell in split_line(line, mark)]
         if any(cells[len(names) :]):
             reason = f"the line has {len(cells)} cells where {len(names)} are named."
             faults.append(Fault("too_many_cells", reason, file=RUNS_CSV, line=number, mend="Quote cells with commas."))
             continue
-        named = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
+        if unnamed or "" in cells:
+            named = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
+        else:
+            named = dict(zip(names, cells, strict=False))
         if mark != ",":  # decimal commas are plain here: no cell of a table of ; or tabs can be split by them
             named = {n: c.replace(",", ".") if as_number(c, ",") is not None else c for n, c in named.items()}
         file = named.pop("file", "")
@@ -160,12 +165,11 @@ def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
     return entries, faults
 
 
-def _paths(campaign: Path, entries: Iterable[Entry]) -> list[Fault]:
+def _paths(campaign: Path, entries: list[Entry], outside: set[str]) -> list[Fault]:
     """Return faults of the listed paths: outside the campaign, listed twice, or none of them there."""
     faults, lines = [], {}
-    entries = list(entries)
     for entry in entries:
-        if inside(campaign, entry.file) is None:
+        if entry.file in outside:
             reason = "the trace file lies outside the campaign folder."
             mend = "Copy it into the folder of runs.csv and write its path relative to it."
             faults.append(entry.fault("path_outside", reason, "file", value=entry.file, mend=mend))
@@ -180,17 +184,16 @@ def _paths(campaign: Path, entries: Iterable[Entry]) -> list[Fault]:
     return faults
 
 
-def _unlisted(campaign: Path, entries: list[Entry], config: Config) -> list[Fault]:
+def _unlisted(folders: Folders, entries: list[Entry], outside: set[str], config: Config) -> list[Fault]:
     """Return files that runs.csv does not list: beside the traces and of the same ending, or matched by the glob."""
     if not entries or entries[0].line is None:
         return []
-    listed = {PurePosixPath(entry.file) for entry in entries if inside(campaign, entry.file)}
-    folders, endings = {path.parent for path in listed}, {path.suffix for path in listed}
-    beside = (path for f in folders if (campaign / f).is_dir() for path in (campaign / f).iterdir())
-    there = {p.relative_to(campaign).as_posix() for p in beside if p.suffix in endings and p.is_file()}
+    listed = {entry.file for entry in entries}
+    there = folders.beside(listed - outside)
     if config.files.glob and ".." not in config.files.glob and not config.files.glob.startswith("/"):
-        there |= {p.relative_to(campaign).as_posix() for p in campaign.glob(config.files.glob) if p.is_file()}
-    files = there - {entry.file for entry in entries} - {RUNS_CSV}
+        found = (p for p in folders.campaign.glob(config.files.glob) if p.is_file())
+        there |= {p.relative_to(folders.campaign).as_posix() for p in found}
+    files = there - listed - {RUNS_CSV}
     mend = "Add it to runs.csv if it is a trace."
     return [
         Fault("not_listed", f"is not in {RUNS_CSV}.", file=f, severity="info", action="file left out", mend=mend)

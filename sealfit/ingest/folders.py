@@ -1,0 +1,67 @@
+"""What lies in the folders of a campaign: each folder is looked into once, however many files are listed in it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from sealfit.ingest.text import inside
+
+
+class _Names(NamedTuple):
+    plain: frozenset[str]  # what is no link and lies inside the campaign, as its folder does
+    all: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Folders:
+    """The folders of `campaign` that were asked for; a folder is its path below the campaign, "" for the campaign."""
+
+    campaign: Path
+    _seen: dict[str, _Names] = field(default_factory=dict)
+
+    def hold(self, file: str) -> bool:
+        """Return whether a path, there or not, lies inside the campaign, links followed: as `text.inside`."""
+        if ":" not in file and "\\" not in file:  # these may mean a drive
+            folder, _, name = file.rpartition("/")
+            if name in self._names(folder).plain:
+                return True
+        return inside(self.campaign, file) is not None
+
+    def beside(self, files: Collection[str]) -> set[str]:
+        """Return the files that lie beside `files`, in the same folders and with one of their endings; not `files`."""
+        names: dict[str, set[str]] = {}
+        for file in files:
+            folder, _, name = file.rpartition("/")
+            names.setdefault(folder, set()).add(name)
+        others = {
+            f"{folder}/{name}" if folder else name
+            for folder, own in names.items()
+            for name in self._names(folder).all - own
+        }
+        if not others:
+            return others
+        endings = {_ending(file) for file in files}
+        return {file for file in others if _ending(file) in endings and (self.campaign / file).is_file()}
+
+    def _names(self, folder: str) -> _Names:
+        if folder not in self._seen:
+            try:
+                with os.scandir(self.campaign / folder) as entries:
+                    link = {entry.name: entry.is_symlink() for entry in entries}
+            except OSError:  # no folder, or one that may not be read: its files will say so when they are read
+                link = {}
+            within = not folder or inside(self.campaign, folder) is not None
+            plain = (name for name, is_link in link.items() if within and not is_link)
+            self._seen[folder] = _Names(frozenset(plain), frozenset(link))
+        return self._seen[folder]
+
+
+def _ending(file: str) -> str:
+    """Return the suffix of a path as pathlib has it: none of `.csv` and `name.`."""
+    name = file.rpartition("/")[2]
+    dot = name.rfind(".")
+    return name[dot:] if 0 < dot < len(name) - 1 else ""
