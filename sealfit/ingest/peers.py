@@ -7,8 +7,9 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import Fault
+from sealfit.ingest.outlying import outlying_repeats
 from sealfit.ingest.quality import FINE
-from sealfit.ingest.scatter import outlying_repeats, repeat_means
+from sealfit.ingest.scatter import repeat_means
 
 AGAINST = -0.5  # share of its peers' force by which a force against its motion is of the wrong sign, not an offset
 
@@ -33,16 +34,43 @@ def reversed_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     if not against.any():
         return keep, []
     found = []
-    way, run = strokes["direction"].to_numpy(), strokes["run"].to_numpy()
+    group = strokes.groupby(["direction", "run"], sort=False).ngroup().to_numpy()
+    runs, ways = _Leaving(force, used, group), _Leaving(force, used, strokes["direction"].to_numpy() > 0)
     for i in np.flatnonzero(against):
-        mates = used & (way == way[i]) & (run == run[i])
-        mates[i] = False
-        peers = mates if mates.sum() >= 2 else used & (way == way[i]) & (np.arange(len(force)) != i)
-        usual = float(np.median(force[peers])) if peers.any() else np.nan
+        usual = runs.median(i) if runs.others(i) >= 2 else ways.median(i)
         wrong = usual > 0.0 and force[i] < AGAINST * usual
         keep[i] = not wrong
         found.append(_against(strokes.iloc[i], force[i], bool(wrong)))
     return keep, found
+
+
+class _Leaving:
+    """Medians of the used values of a group, one of them left out."""
+
+    def __init__(self, values: np.ndarray, used: np.ndarray, group: np.ndarray):
+        order = np.lexsort((values, group))
+        self.values, self.group = values, group
+        order = order[used[order]]
+        self.sorted, of = values[order], group[order]
+        names, first, count = np.unique(of, return_index=True, return_counts=True)
+        self.span = {
+            name: (a, a + n) for name, a, n in zip(names.tolist(), first.tolist(), count.tolist(), strict=True)
+        }
+
+    def others(self, i: int) -> int:
+        """Return how many others are in the group of the used row `i`."""
+        first, last = self.span[self.group[i]]
+        return last - first - 1
+
+    def median(self, i: int) -> float:
+        """Return the median of the others in the group of the used row `i`; nan without any."""
+        first, last = self.span[self.group[i]]
+        own = first + int(np.searchsorted(self.sorted[first:last], self.values[i]))
+        n = last - first - 1
+        if n == 0:
+            return float("nan")
+        middle = [first + (n - 1) // 2, first + n // 2]
+        return float(np.mean([self.sorted[k + (k >= own)] for k in middle]))
 
 
 def _against(row: pd.Series, force_N: float, wrong: bool) -> Fault:
@@ -121,11 +149,12 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
     """
     flagged = outlying_repeats(repeat_means(steady), config.quality.outlier_p)
     outlier, dropped, found = np.zeros(len(steady), bool), np.zeros(len(steady), bool), []
+    places = steady.groupby(["file", "run_id"], sort=False).indices
     for row in flagged.itertuples(index=False):
-        rows = (steady["file"] == row.file).to_numpy() & (steady["run_id"] == row.run_id).to_numpy()
+        rows = places[row.file, row.run_id]
         out = config.quality.drop_outliers and not row.alone
-        outlier |= rows
-        dropped |= rows & out
+        outlier[rows] = True
+        dropped[rows] |= out
         found.append(
             Fault(
                 "outlier",

@@ -1,4 +1,4 @@
-"""Type A: how far repeats of a run scatter, as a function of the force, pooled over runs; and repeats that lie outside.
+"""Type A: how far repeats of a run scatter, as a function of the force, pooled over runs.
 
 Three repeats say next to nothing about their own scatter: of a standard deviation with two degrees of freedom, the 95 %
 interval spans a factor of twelve. Scatter is therefore pooled over runs (GUM 4.2.4; ISO 5725-2, 7.5: sr as a function
@@ -14,10 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 PATTERN_RUNS = 3  # fewer runs cannot tell a common pattern of their repeats from the scatter itself
-MAX_OUTLIERS = 0.1  # share of repeats that the search takes out at most: beyond that the bulk is not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,73 +68,11 @@ def repeat_scatter(steady: pd.DataFrame) -> Scatter:
     pattern of the repeats costs one degree of freedom per repeat number but one.
     """
     means = repeat_means(steady)
-    return _fit(_Layout.of(means), means["force_N"].to_numpy(float), np.ones(len(means), bool)).scatter
-
-
-def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
-    """Return the repeats that disagree with their runs beyond the pooled scatter.
-
-    Parameters
-    ----------
-    means : DataFrame
-        As `repeat_means` returns it.
-    level : float
-        Chance that any repeat at all is flagged in a campaign without outliers.
-
-    Returns
-    -------
-    DataFrame
-        Rows of `means` with `run_mean_N` (the run's mean without it), `t`, `p` (adjusted over the campaign) and
-        `alone` (true where two repeats disagree and which of them is wrong cannot be known: both are returned).
-
-    Notes
-    -----
-    The generalized extreme studentized deviate procedure (Rosner 1983, Technometrics 25(2), 165-172,
-    doi:10.1080/00401706.1983.10487848), on residuals within runs: the most extreme repeat is taken out, scatter and
-    pattern are estimated without it, and so on; the outliers are those up to the last one that exceeds its limit. So
-    neither does an outlier widen the scale it is judged by, nor do two hide each other. The limit is Sidak's for
-    the repeats left, on Student's t with the pooled degrees of freedom.
-    """
-    layout = _Layout.of(means)
-    force = means["force_N"].to_numpy(float)
-    kept = np.ones(len(means), bool)
-    tiny = 1e-6 * float(np.max(np.abs(force), initial=0.0)) + 1e-300  # repeats that agree to the last digit
-    found: list[tuple[np.ndarray, float, float, float]] = []
-    last = 0
-    for _ in range(max(1, int(MAX_OUTLIERS * len(means)))):
-        fit = _fit(layout, force, kept)
-        candidates = kept & (fit.share > 1e-9)
-        if fit.scatter.df < 4 or not candidates.any():
-            break
-        size = np.where(candidates, np.abs(fit.t), -1.0)
-        worst = int(np.argmax(size))
-        together = np.flatnonzero(kept & (layout.run == layout.run[worst]))
-        rows = together if len(together) == 2 else np.array([worst])
-        without = kept.copy()
-        without[rows] = False
-        apart = _fit(layout, force, without)
-        if apart.scatter.df < 3:
-            break
-        sd = max(float(apart.scatter.sd_N(fit.mean[worst])), tiny)
-        t = float(fit.residual[worst] / (sd * np.sqrt(fit.share[worst])))
-        tests = int(candidates.sum()) - (len(rows) - 1)
-        p_one = 2.0 * stats.t.sf(abs(t), apart.df_at(float(fit.mean[worst])))
-        p = float(-np.expm1(tests * np.log1p(-min(p_one, 1.0 - 1e-16))))
-        found.append((rows, t, p, float(apart.mean[worst]) if len(rows) == 1 else float(fit.mean[worst])))
-        if p < level:
-            last = len(found)
-        elif abs(t) < 3.0:  # nothing further out remains
-            break
-        kept = without
-    parts = [
-        means.iloc[rows].assign(run_mean_N=mean, t=t, p=p, alone=len(rows) == 2) for rows, t, p, mean in found[:last]
-    ]
-    empty = means.iloc[:0].assign(run_mean_N=0.0, t=0.0, p=0.0, alone=False)
-    return pd.concat(parts) if parts else empty
+    return fit_scatter(Layout.of(means), means["force_N"].to_numpy(float), np.ones(len(means), bool)).scatter
 
 
 @dataclass(frozen=True, slots=True)
-class _Layout:
+class Layout:
     """Run and repeat number of every row, as codes."""
 
     run: np.ndarray
@@ -145,14 +81,17 @@ class _Layout:
     numbers: np.ndarray
 
     @classmethod
-    def of(cls, means: pd.DataFrame) -> _Layout:
+    def of(cls, means: pd.DataFrame) -> Layout:
+        """Return the layout of a table as `repeat_means` returns it."""
         run, names = pd.factorize(means["run_id"])
         repeat, numbers = pd.factorize(means["repeat"], sort=True)
         return cls(run, len(names), repeat, np.asarray(numbers))
 
 
 @dataclass(frozen=True, slots=True)
-class _Fit:
+class ScatterFit:
+    """Scatter of the rows kept, and where every row lies by it; arrays of one length."""
+
     scatter: Scatter
     covariance: np.ndarray  # of s0^2 and g^2, shape (2, 2)
     mean: np.ndarray  # of the run, per row, pattern removed
@@ -171,7 +110,7 @@ class _Fit:
         return min(self.scatter.df, 2.0 * variance**2 / spread) if spread > 0.0 else self.scatter.df
 
 
-def _fit(layout: _Layout, force_N: np.ndarray, kept: np.ndarray) -> _Fit:
+def fit_scatter(layout: Layout, force_N: np.ndarray, kept: np.ndarray) -> ScatterFit:
     """Fit run means, the pattern and the scatter to the rows kept; residuals of every row."""
     count = np.bincount(layout.run[kept], minlength=layout.runs).astype(float)
     pattern, cost = np.zeros(len(layout.numbers)), 0
@@ -193,16 +132,18 @@ def _fit(layout: _Layout, force_N: np.ndarray, kept: np.ndarray) -> _Fit:
     sd = scatter.sd_N(mean)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(share > 0.0, residual / (sd * np.sqrt(np.where(share > 0.0, share, 1.0))), 0.0)
-    return _Fit(scatter, covariance, mean, residual, share, np.nan_to_num(t, nan=0.0, posinf=np.inf, neginf=-np.inf))
+    return ScatterFit(
+        scatter, covariance, mean, residual, share, np.nan_to_num(t, nan=0.0, posinf=np.inf, neginf=-np.inf)
+    )
 
 
-def _run_mean(layout: _Layout, values: np.ndarray, kept: np.ndarray, count: np.ndarray) -> np.ndarray:
+def _run_mean(layout: Layout, values: np.ndarray, kept: np.ndarray, count: np.ndarray) -> np.ndarray:
     total = np.bincount(layout.run[kept], values[kept], minlength=layout.runs)
     return np.divide(total, count, out=np.full(layout.runs, np.nan), where=count > 0)
 
 
 def _pattern(
-    layout: _Layout, force_N: np.ndarray, rows: np.ndarray, present: np.ndarray, s0_2: float, g_2: float
+    layout: Layout, force_N: np.ndarray, rows: np.ndarray, present: np.ndarray, s0_2: float, g_2: float
 ) -> np.ndarray:
     """Return per repeat number the relative change that all runs share, from log F = run + repeat."""
     log_force = np.log(np.maximum(force_N, 1e-300))
@@ -227,7 +168,7 @@ def _pattern(
 
 
 def _variance(
-    layout: _Layout, force_N: np.ndarray, kept: np.ndarray, count: np.ndarray, pattern: np.ndarray, cost: int
+    layout: Layout, force_N: np.ndarray, kept: np.ndarray, count: np.ndarray, pattern: np.ndarray, cost: int
 ) -> tuple[float, float, np.ndarray]:
     """Return s0^2 and g^2 of the rows kept, and their covariance."""
     none = np.zeros((2, 2))

@@ -3,7 +3,8 @@ import numpy.testing as npt
 import pandas as pd
 import pytest
 
-from sealfit.ingest.scatter import outlying_repeats, repeat_means, repeat_scatter
+from sealfit.ingest.outlying import outlying_repeats
+from sealfit.ingest.scatter import repeat_means, repeat_scatter
 
 S0, G = 0.1, 0.01
 

@@ -1,0 +1,147 @@
+"""Work that must grow with the campaign and not with its square, counted; and that less of it gives the same."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from trace_helpers import campaign, config
+
+from sealfit.ingest import folders, outlying, peers, run_values
+from sealfit.ingest.folders import Folders
+from sealfit.ingest.outlying import outlying_repeats
+from sealfit.ingest.runs import list_traces
+from sealfit.ingest.text import inside
+
+HEAD = "file,run_id,repeat,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s,started_at"
+
+
+def counted(monkeypatch, module, name):
+    """Count the calls of a module's function from here on."""
+    calls, function = [], getattr(module, name)
+    monkeypatch.setattr(module, name, lambda *given, **named: (calls.append(given), function(*given, **named))[1])
+    return calls
+
+
+def listed(folder, files):
+    """A campaign of small files in two folders; only their names are looked at."""
+    rows = [
+        f"t{k % 2}/{k}.csv,r{k // 3},{k % 3 + 1},{60 + k // 3 % 2 * 20},80,4,49.03,5,"
+        f"2024-03-01T09:{k // 60:02d}:{k % 60:02d}"
+        for k in range(files)
+    ]
+    for k in range(files):
+        place = folder / f"t{k % 2}" / f"{k}.csv"
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text("")
+    return campaign(folder, "\n".join([HEAD, *rows]))
+
+
+def test_listing_follows_links_per_folder_and_reads_each_different_cell_once(tmp_path, monkeypatch):
+    work = []
+    for files in (30, 300):
+        folder = listed(tmp_path / str(files), files)
+        resolved, parsed = counted(monkeypatch, folders, "inside"), counted(monkeypatch, run_values, "as_number")
+        looked = counted(monkeypatch, os, "scandir")
+        refs, faults = list_traces(folder, config())
+        assert (len(refs), faults) == (files, [])
+        work.append((len(resolved), len(looked), len(parsed)))
+        monkeypatch.undo()
+    assert work[0] == work[1]  # two folders; seven different numbers and three repeats in each
+
+
+def test_what_lies_inside_is_told_from_names_as_from_following_every_link(tmp_path):
+    place, outside = tmp_path / "campaign", tmp_path / "outside"
+    for folder in (place / "traces" / "deep", outside):
+        folder.mkdir(parents=True)
+        (folder / "a.csv").write_text("")
+    (place / "b.csv").write_text("")
+    (place / "C:").mkdir()
+    (place / "C:" / "a.csv").write_text("")
+    (place / "out.csv").symlink_to(outside / "a.csv")
+    (place / "in.csv").symlink_to(place / "b.csv")
+    (place / "out").symlink_to(outside)
+    (place / "in").symlink_to(place / "traces")
+    (place / "self").symlink_to(place)
+    (place / "loop").symlink_to(place / "loop")
+    asked = [
+        "b.csv", "out.csv", "in.csv", "traces/deep/a.csv", "traces/deep/none.csv", "none/a.csv", "out/a.csv",
+        "in/deep/a.csv", "self/b.csv", "self", "loop", "loop/a.csv", "..", "../outside/a.csv", ".", "traces",
+        str(place / "b.csv"), "C:/a.csv", "\\\\host\\a.csv", "b.csv/a.csv", "",
+    ]  # fmt: skip
+    found = Folders(place)
+    for file in asked:
+        assert found.hold(file) == (inside(place, file) is not None), file
+
+
+def test_files_beside_have_an_ending_of_the_listed_and_are_files(tmp_path):
+    for name in ("a.csv", "b.csv", "c.txt", ".csv", "t/d.csv", "t/e.CSV", "other/f.csv"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    (tmp_path / "folder.csv").mkdir()
+    (tmp_path / "link.csv").symlink_to(tmp_path / "c.txt")
+    (tmp_path / "broken.csv").symlink_to(tmp_path / "none")
+    assert Folders(tmp_path).beside({"a.csv", "t/none.csv", "gone/x.csv"}) == {"b.csv", "link.csv", "t/d.csv"}
+
+
+def repeats(runs, seed, far):
+    """Three repeats a run; `far` of them 8 to 20 SDs off, and in some runs two."""
+    rng = np.random.default_rng(seed)
+    level = rng.uniform(5.0, 50.0, runs)[:, None]
+    sd = np.sqrt(0.1**2 + (0.01 * level) ** 2)
+    force = level * np.array([1.02, 1.0, 0.985]) + sd * rng.standard_normal((runs, 3))
+    off = rng.choice(runs, far, replace=False)
+    force[off, 0] += rng.uniform(8, 20, far) * sd[off, 0]
+    force[off[::7], 1] -= 15 * sd[off[::7], 0]
+    names = pd.DataFrame({"file": [f"{r}/{k}" for r in range(runs) for k in range(3)]})
+    return names.assign(run_id=np.repeat(np.arange(runs), 3), repeat=np.tile([1, 2, 3], runs), force_N=force.ravel())
+
+
+def test_fits_of_the_scatter_do_not_grow_with_the_number_of_far_repeats(monkeypatch):
+    fits = []
+    for runs in (2_000, 8_000):
+        calls = counted(monkeypatch, outlying, "fit_scatter")
+        found = outlying_repeats(repeats(runs, 1, runs // 50), 0.001)
+        assert len(found) >= runs // 50
+        fits.append(len(calls))
+        monkeypatch.undo()
+    assert fits[1] < 1.5 * fits[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_taken_together_the_same_repeats_are_found_as_one_by_one(seed, monkeypatch):
+    means = repeats(1_500, seed, 20)
+    together = outlying_repeats(means, 0.001).set_index("file").sort_index()
+    monkeypatch.setattr(outlying, "TOGETHER", 0.0)
+    alone = outlying_repeats(means, 0.001).set_index("file").sort_index()
+    assert together.index.tolist() == alone.index.tolist()
+    np.testing.assert_allclose(together["run_mean_N"], alone["run_mean_N"], rtol=1e-3)
+    np.testing.assert_allclose(together["t"], alone["t"], rtol=0.05)
+
+
+def test_strokes_with_turned_signs_are_not_each_compared_with_all(monkeypatch):
+    looked = counted(monkeypatch, np, "median")
+    strokes = pd.DataFrame(
+        {"file": [f"{k}.csv" for k in range(60)], "run": [f"r{k // 3}" for k in range(60)], "stroke": 1,
+         "several": False, "direction": 1, "force_N": [-20.0] * 59 + [20.0], "used": True}
+    )  # fmt: skip
+    keep, found = peers.reversed_strokes(strokes)
+    assert (keep.all(), len(found), len(looked)) == (True, 59, 0)
+
+
+def test_a_turned_stroke_is_held_against_the_median_of_its_mates():
+    forces = [20.0, 22.0, -21.0, 24.0, 30.0, -9.0]  # of the second run two: held against all others of the direction
+    strokes = pd.DataFrame(
+        {"file": list("abcdef"), "stroke": 1, "several": False, "run": ["x"] * 4 + ["y"] * 2, "direction": 1,
+         "force_N": forces, "used": True}
+    )  # fmt: skip
+    keep, found = peers.reversed_strokes(strokes)
+    # -21 against the median 22 of 20, 22, 24; -9 against the median 22 of 20, 22, -21, 24, 30: not below -11.
+    assert keep.tolist() == [True, True, False, True, True, True]
+    assert [fault.severity for fault in found] == ["error", "warning"]
+
+
+def test_names_of_a_folder_that_may_not_be_read_are_left_to_the_reading(tmp_path):
+    assert Folders(tmp_path).beside({"gone/a.csv"}) == set()
+    assert Folders(Path(tmp_path / "none")).beside({"a.csv"}) == set()
