@@ -2,8 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
+
+from sealfit import parquet
+
+
+@dataclass(frozen=True)
+class StoredTraces:
+    """Where the traces of some conditions lie: all of theirs, and of no others."""
+
+    conditions: frozenset[str]
+    paths: tuple[Path, ...]
+
+    def read(self, columns: list[str] | None = None) -> pd.DataFrame:
+        """Return them, or those columns of table `traces`."""
+        return parquet.read(self.paths, columns)
+
+
+def by_conditions(parts: Mapping[Path, Iterable[str]]) -> list[StoredTraces]:
+    """Return the parts of table `traces` in groups that share no condition.
+
+    Parameters
+    ----------
+    parts : mapping of Path to iterable of str
+        The conditions of each part.
+
+    Examples
+    --------
+    >>> groups = by_conditions({Path("1"): ["a", "b"], Path("2"): ["c"], Path("3"): ["b", "d"]})
+    >>> [sorted(group.conditions) for group in groups]
+    [['a', 'b', 'd'], ['c']]
+    """
+    groups: list[StoredTraces] = []
+    for path, conditions in parts.items():
+        joined = StoredTraces(frozenset(conditions), (path,))
+        for group in [group for group in groups if group.conditions & joined.conditions]:
+            groups.remove(group)
+            joined = StoredTraces(group.conditions | joined.conditions, (*group.paths, *joined.paths))
+        groups.append(joined)
+    return sorted(groups, key=lambda group: min(group.conditions, default=""))
 
 
 def strokes_of(traces: pd.DataFrame, strokes: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:

@@ -189,8 +189,8 @@ def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -
     from sealfit.fit.dynamic import fit_dynamic
 
     progress.say("fitting the pre-sliding part")
-    traces = store.read("traces", ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"])
-    found = fit_dynamic(traces, store.read("steady"), store.read("steady_fit"), store.seen_config("fit-dynamic"))
+    tables, config = (store.read("steady"), store.read("steady_fit")), store.seen_config("fit-dynamic")
+    found = fit_dynamic(store.traces(), *tables, config, workers=workers)
     staged.table("dynamic_fit", found.fit)
     staged.table("dynamic_curves", found.curves)
 

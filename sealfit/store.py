@@ -24,6 +24,8 @@ from sealfit.state import STATE, ConfigCopy, Done, State, to_json
 if TYPE_CHECKING:
     import pandas as pd
 
+    from sealfit.samples import StoredTraces
+
 PROVENANCE = "provenance.json"
 PARQUET = ".parquet"
 
@@ -175,10 +177,20 @@ class Store:
         """Return a table, or those columns of it."""
         from sealfit import parquet
 
-        name = f"{table}{PARQUET}"
+        return parquet.read(self._parts_of(table) or self.out / f"{table}{PARQUET}", columns)
+
+    def _parts_of(self, table: str) -> list[Path]:
         files = (file for done in self.state.steps.values() for file in done.files)
-        parts = [self.out / file for file in files if file.startswith(f"{name}/")]
-        return parquet.read(parts or self.out / name, columns)
+        return [self.out / file for file in files if file.startswith(f"{table}{PARQUET}/")]
+
+    def traces(self) -> list[StoredTraces]:
+        """Return where table `traces` lies, in groups of whole conditions."""
+        from sealfit import parquet
+        from sealfit.ingest.stored import PARTS
+        from sealfit.samples import by_conditions
+
+        parts = {path: parquet.read(self.out / PARTS / path.name, ["condition"]) for path in self._parts_of("traces")}
+        return by_conditions({path: table["condition"].dropna().unique() for path, table in parts.items()})
 
     def read_json(self, name: str) -> dict:
         """Return `<name>.json`."""

@@ -94,7 +94,7 @@ class Parts:
     def aging_curves(self, aging_fit, days=None):
         return small("aging_curves")
 
-    def fit_dynamic(self, traces, steady, steady_fit, config):
+    def fit_dynamic(self, traces, steady, steady_fit, config, *, workers=1):
         self._called("fit-dynamic", config)
         fit = small("dynamic_fit", 2).assign(
             quantity="dynamic", parameter=["sigma_0", "sigma_1"], value=[100.0, 0.5], unit=["N/mm", "N s/mm"], reason=""

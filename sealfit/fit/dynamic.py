@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pandas as pd
 
 from sealfit.config import Config
+from sealfit.engine import run_map
 from sealfit.fit.breakaway import break_away_rows, largest_row, peaks
 from sealfit.fit.rises import Curve, Stroke
 from sealfit.fit.rows import nesting_run
 from sealfit.fit.starts import Start, cell_means, starts_of, whole_strokes
 from sealfit.fit.steady import condition_keys, parameter_units, table_row
 from sealfit.fit.stiffness import Stiffness, fit_stiffness
+from sealfit.samples import StoredTraces
 from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
 
+OF_TRACES = ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]  # columns that are read
 NO_START = "no stroke begins at rest or at a reversal within its rows: the rise of the force is not in these traces"
 TOO_FAST = "the force comes up within a few samples: sample faster, or start more slowly"
 MISSED = "the force does not come up as the model's does: {share:.0%} of the sliding force is left"
@@ -33,19 +37,28 @@ class Dynamic:
     curves: pd.DataFrame
 
 
-def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataFrame, config: Config) -> Dynamic:
+def fit_dynamic(
+    traces: pd.DataFrame | Sequence[StoredTraces],
+    steady: pd.DataFrame,
+    steady_fit: pd.DataFrame,
+    config: Config,
+    *,
+    workers: int = 1,
+) -> Dynamic:
     """Fit sigma_0 and sigma_1 of Eqs. 1 to 7 to the pre-sliding part of every condition's strokes.
 
     Parameters
     ----------
-    traces : DataFrame
-        Table `traces`.
+    traces : DataFrame or sequence of StoredTraces
+        Table `traces`, or where it lies: then no more of it is read at once than some conditions have.
     steady : DataFrame
         Table `steady`; rows with `used` false are left out.
     steady_fit : DataFrame
         Table `steady_fit`: the Stribeck curve of each condition; flat where that is not identified.
     config : Config
         Names the condition columns, the units and the sensor's accuracy.
+    workers : int
+        Processes.
 
     Returns
     -------
@@ -61,25 +74,19 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
     one unknown error of the force's size, the same for all samples.
     """
     steady = steady[steady["used"].astype(bool) & steady["condition"].notna()].reset_index(drop=True)
-    by_row = {start.row: start for start in starts_of(traces, steady)}
-    rows, curves, broken = [], [], []
-    for name, own in steady.groupby("condition", sort=True):
-        own = own[own.index.isin(list(by_row))]
-        starts = [by_row[row] for row in own.index]
-        curve = _curve(steady_fit, name, steady[steady["condition"] == name])
-        found = fit_stiffness(_strokes(starts, own, curve), curve)
-        rows += [{"condition": name, **row} for row in _rows(found, curve, config)]
-        models = found.forces_N if found is not None and found.seen else None
-        for (speed, direction), of in own.reset_index().groupby(["speed_set_mm_s", "direction"], dropna=False):
-            at = {"condition": name, "speed_set_mm_s": speed, "direction": direction}
-            places = of.index.to_numpy()
-            alike = [starts[k] for k in places]
-            distance, force = cell_means(alike, [s.force_N for s in alike])
-            broken.append((at, peaks(alike, distance, force, of)))
-            model = None if models is None else cell_means(alike, [models[k] for k in places])[1]
-            curves.append(_mean_curve(distance, force, model).assign(**at))
-    rows += _largest(traces, steady, config)
-    rows += break_away_rows([(at, own) for at, own in broken if len(own)], _widened(steady_fit), config)
+    if isinstance(traces, pd.DataFrame):
+        asked = [_Asked(traces, steady, steady_fit)]
+    else:
+        asked = [
+            _Asked(part, *(table[table["condition"].isin(part.conditions)] for table in (steady, steady_fit)))
+            for part in traces
+        ]
+    found = [one for made in run_map(partial(_fit_some, config=config), asked, workers=workers) for one in made]
+    found.sort(key=lambda one: one.name)
+    rows = [row for one in found for row in one.rows] + [row for one in found for row in one.largest]
+    broken = [each for one in found for each in one.broken if len(each[1])]
+    rows += break_away_rows(broken, _widened(steady_fit), config)
+    curves = [curve for one in found for curve in one.curves]
     keys = condition_keys(steady, config)
     table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
     fixed = DYNAMIC_FIT.names()
@@ -88,12 +95,61 @@ def fit_dynamic(traces: pd.DataFrame, steady: pd.DataFrame, steady_fit: pd.DataF
     return Dynamic(table.astype({"direction": "Int64"}), curves.reindex(columns=DYNAMIC_CURVES.names()))
 
 
-def _largest(traces: pd.DataFrame, steady: pd.DataFrame, config: Config) -> Iterator[dict]:
-    """Yield a row for the largest force of strokes at each condition, commanded speed and direction."""
-    by_row = {stroke.row: stroke for stroke in whole_strokes(traces, steady)}
-    own = steady[steady.index.isin(list(by_row))]
+@dataclass(frozen=True)
+class _Asked:
+    """Some conditions: their traces, and their rows of `steady` and `steady_fit`."""
+
+    traces: pd.DataFrame | StoredTraces
+    steady: pd.DataFrame
+    steady_fit: pd.DataFrame
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What one condition gives: rows of the fit, mean starts, break-aways per speed and direction, largest forces."""
+
+    name: str
+    rows: list[dict]
+    curves: list[pd.DataFrame]
+    broken: list[tuple]
+    largest: list[dict]
+
+
+def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
+    traces = asked.traces if isinstance(asked.traces, pd.DataFrame) else asked.traces.read(OF_TRACES)
+    steady = asked.steady.reset_index(drop=True)
+    starts = {start.row: start for start in starts_of(traces, steady)}
+    strokes = {stroke.row: stroke for stroke in whole_strokes(traces, steady)}
+    return [_fit_one(name, own, starts, strokes, asked, config) for name, own in steady.groupby("condition", sort=True)]
+
+
+def _fit_one(
+    name: str, own: pd.DataFrame, starts_at: Mapping, strokes: Mapping, asked: _Asked, config: Config
+) -> _Found:
+    curve = _curve(asked.steady_fit, name, own)
+    largest = list(_largest(strokes, own, config))
+    own = own[own.index.isin(list(starts_at))]
+    starts = [starts_at[row] for row in own.index]
+    found = fit_stiffness(_strokes(starts, own, curve), curve)
+    models = found.forces_N if found is not None and found.seen else None
+    curves, broken = [], []
+    for (speed, direction), of in own.reset_index().groupby(["speed_set_mm_s", "direction"], dropna=False):
+        at = {"condition": name, "speed_set_mm_s": speed, "direction": direction}
+        places = of.index.to_numpy()
+        alike = [starts[k] for k in places]
+        distance, force = cell_means(alike, [s.force_N for s in alike])
+        broken.append((at, peaks(alike, distance, force, of)))
+        model = None if models is None else cell_means(alike, [models[k] for k in places])[1]
+        curves.append(_mean_curve(distance, force, model).assign(**at))
+    rows = [{"condition": name, **row} for row in _rows(found, curve, config)]
+    return _Found(name, rows, curves, broken, largest)
+
+
+def _largest(strokes: Mapping[int, Start], own: pd.DataFrame, config: Config) -> Iterator[dict]:
+    """Yield a row for the largest force of a condition's strokes at each commanded speed and direction."""
+    own = own[own.index.isin(list(strokes))]
     for at, of in own.groupby(["condition", "speed_set_mm_s", "direction"], dropna=False, sort=True):
-        row = largest_row([by_row[k] for k in of.index], of, config)
+        row = largest_row([strokes[k] for k in of.index], of, config)
         if row is not None:
             yield {**row, **dict(zip(("condition", "speed_set_mm_s", "direction"), at, strict=True))}
 

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pandas.testing as pdt
 import pytest
 
 from sealfit.config import load_config
@@ -12,9 +13,12 @@ from sealfit.fit.rises import Curve, Stroke
 from sealfit.fit.starts import starts_of
 from sealfit.fit.steady import fit_conditions
 from sealfit.fit.stiffness import fit_stiffness
+from sealfit.ingest import parts
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.physics import lugre_force
 from sealfit.simulate import Spec, simulate
+from sealfit.steps import STEPS, run
+from sealfit.store import Store
 
 MODEL = {"mu_s": 0.9, "mu_c": 0.6, "v_s": 5.0, "sigma_2": 0.05, "sigma_0": 100.0, "sigma_1": 0.5}
 LOAD = 49.03
@@ -25,6 +29,7 @@ NOISE = (
     {"kind": "run_setup", "sd_rel": 0.005},
 )
 MEASURED = os.environ.get("SEALFIT_MEASURED")
+SIMULATED = Path(__file__).resolve().parents[2] / "sample_data" / "simulated"
 
 
 def start(file, speed, *, ramp=0.1, gain=1.0, deflection=0.0, rows=80, noise=0.0, seed=0, **other):
@@ -194,3 +199,16 @@ def test_warming_along_the_stroke_is_no_break_away(tmp_path):
     assert len(ratio) > 3
     assert (ratio["value"] - 1).abs().max() < 0.01
     assert not ratio["identified"].any()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_traces_that_are_read_condition_by_condition_give_the_same(tmp_path, monkeypatch, workers):
+    monkeypatch.setattr(parts, "PART_FILES", 20)
+    run(SIMULATED, tmp_path, steps=STEPS[:2])
+    store = Store.open(tmp_path)
+    assert len(store.traces()) > 3
+    tables, config = (store.read("steady"), store.read("steady_fit")), store.config
+    whole = fit_dynamic(store.read("traces"), *tables, config)
+    split = fit_dynamic(store.traces(), *tables, config, workers=workers)
+    pdt.assert_frame_equal(whole.fit, split.fit, check_exact=True)
+    pdt.assert_frame_equal(whole.curves, split.curves, check_exact=True)
