@@ -29,16 +29,21 @@ MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
 class Trace:
     """One trace as it was measured, in our columns and units.
 
-    `table` holds time_s, displacement_mm and force_N (and load_N, where it was measured) as float64 and any further
-    channel as float64 or text; bad rows are left out. `line` is the 1-based line in the file of every row of `table`,
-    `rows_read` the number of data rows in the file, and `faults` what was found in it.
+    `columns` holds time_s, displacement_mm and force_N (and load_N, where it was measured) as float64 and any further
+    channel as float64 or text, each of shape (n,); bad rows are left out. `line` is the 1-based line in the file of
+    every row, `rows_read` the number of data rows in the file, and `faults` what was found in it.
     """
 
     ref: TraceRef
-    table: pd.DataFrame
+    columns: Mapping[str, np.ndarray]
     line: np.ndarray
     rows_read: int
     faults: tuple[Fault, ...]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """The columns as a table."""
+        return pd.DataFrame(self.columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,12 +99,12 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
     if len(rows.line) < MIN_ROWS:
         reason = f"{len(rows.line)} of {len(good)} data rows are left; a trace needs {MIN_ROWS}."
         raise BadFile(*faults, _bad_file("no_rows", reason, file, "Check drop_first_rows, keep and the export."))
-    table = _table(rows, ref, settings)
-    if fault := check_speed(table, ref, config):
+    columns = _named_beside(rows, ref, settings)
+    if fault := check_speed(columns["time_s"], columns["displacement_mm"], ref, config):
         if fault.action == "file left out":
             raise BadFile(*faults, fault)
         faults.append(fault)
-    return Trace(ref, table, rows.line, len(good), tuple(faults))
+    return Trace(ref, columns, rows.line, len(good), tuple(faults))
 
 
 def _named(text: bytes, layout: Layout, settings: TraceFormat, file: str) -> tuple[_Rows, Cells]:
@@ -254,7 +259,7 @@ def _too_many(bad: int, counted: int, faults: list[Fault], config: Config, file:
     raise BadFile(*faults, replace(_bad_file("too_many_bad_rows", reason, file, mend), value=float(bad)))
 
 
-def _table(rows: _Rows, ref: TraceRef, settings: TraceFormat) -> pd.DataFrame:
+def _named_beside(rows: _Rows, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:
     """Return slots first, then channels, without helper columns.
 
     A channel that `ref` has too is left out where it is constant (`ref` says it); one that varies is another quantity
@@ -268,7 +273,7 @@ def _table(rows: _Rows, ref: TraceRef, settings: TraceFormat) -> pd.DataFrame:
         if name in ref.channels and (values == values[0]).all():
             continue
         columns[beside(name, RESERVED.union(columns, ref.channels))] = values
-    return pd.DataFrame(columns, copy=False)
+    return columns
 
 
 def _bad_file(check: str, reason: str, file: str, mend: str) -> Fault:

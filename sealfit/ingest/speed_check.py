@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import Fault
@@ -57,7 +56,7 @@ def _strokes(displacement_mm: np.ndarray) -> int:
     return int(np.count_nonzero(np.diff(ends > 0.5 * (low + high))))
 
 
-def check_speed(table: pd.DataFrame, ref: TraceRef, config: Config) -> Fault | None:
+def check_speed(time_s: np.ndarray, displacement: np.ndarray, ref: TraceRef, config: Config) -> Fault | None:
     """Return a fault if time and displacement disagree with the commanded speed, None if they agree or none is known.
 
     They agree if the commanded speed lies between the measured mean and the plateau, or misses them by no more than
@@ -67,7 +66,6 @@ def check_speed(table: pd.DataFrame, ref: TraceRef, config: Config) -> Fault | N
     commanded = ref.channels.get("speed_set_mm_s")
     if not isinstance(commanded, int | float) or not commanded > 0:
         return None
-    time_s, displacement = table["time_s"].to_numpy(), table["displacement_mm"].to_numpy()
     factor = speed_factor(config.units)
     mean, plateau = (factor * speed for speed in measured_speed(time_s, displacement))
     if not (0 < plateau < math.inf and mean < math.inf):

@@ -58,10 +58,9 @@ def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
 def strokes_of(trace: Trace, mark: Fingerprint, config: Config) -> FileStrokes:
     """Return the strokes of one trace that was read."""
     file, quality = trace.ref.file, config.quality
-    columns = {name: trace.table[name].to_numpy() for name in trace.table.columns}
-    keep, found = displacement_spikes(file, columns["displacement_mm"], trace.line, quality)
+    keep, found = displacement_spikes(file, trace.columns["displacement_mm"], trace.line, quality)
     faults = [*trace.faults, *found]
-    columns, line = _where(columns, trace.line, keep)
+    columns, line = _where(trace.columns, trace.line, keep)
     slots = [columns[name] for name in ("time_s", "displacement_mm", "force_N")]
     strokes = find_strokes(*slots, config.strokes)
     keep, found = force_spikes(file, columns["force_N"], strokes, line, quality)
@@ -93,8 +92,8 @@ def strokes_of(trace: Trace, mark: Fingerprint, config: Config) -> FileStrokes:
 
 
 def _where(
-    columns: dict[str, np.ndarray], line: np.ndarray, keep: np.ndarray
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    columns: Mapping[str, np.ndarray], line: np.ndarray, keep: np.ndarray
+) -> tuple[Mapping[str, np.ndarray], np.ndarray]:
     if keep.all():
         return columns, line
     return {name: values[keep] for name, values in columns.items()}, line[keep]
