@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -48,6 +49,11 @@ def fingerprint(path: Path, known: Fingerprint | None = None) -> Fingerprint:
     except OSError:
         return Fingerprint()
     return Fingerprint(stat.st_size, stat.st_mtime_ns, digest)
+
+
+def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
+    """Return the fingerprint of a file from its bytes, and its status when they were read."""
+    return Fingerprint(status.st_size, status.st_mtime_ns, hashlib.sha256(raw).hexdigest())
 
 
 def fingerprints(folder: Path, known: Mapping[str, Fingerprint], config: Config) -> dict[str, Fingerprint]:

@@ -17,10 +17,11 @@ from sealfit.ingest.cells import OVERLOAD, Cells, listed, read_cells
 from sealfit.ingest.channels import channel_columns
 from sealfit.ingest.columns import RESERVED, SLOTS, beside, locate, numeric_names, required
 from sealfit.ingest.expression import evaluate, parse
+from sealfit.ingest.folder import read_bytes
 from sealfit.ingest.names import name_parts
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.speed_check import check_speed
-from sealfit.ingest.text import Layout, as_utf8, find_layout, header_fields, read_bytes, split_line
+from sealfit.ingest.text import Layout, as_utf8, find_layout, header_fields, split_line
 
 MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
 
@@ -77,8 +78,13 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
         If the file must be left out: missing, empty, binary, a column missing, too many bad rows, a speed that
         contradicts the commanded one. It carries every fault found, the deciding one last.
     """
+    return trace_of(read_bytes(campaign, ref.file), ref, config)
+
+
+def trace_of(raw: bytes, ref: TraceRef, config: Config) -> Trace:
+    """Return one trace from the bytes of its file; raises as `read_trace`."""
     settings, file = config.trace, ref.file
-    text = as_utf8(read_bytes(campaign, file), settings.encoding, file)
+    text = as_utf8(raw, settings.encoding, file)
     layout = find_layout(text, settings, file)
     rows, cells = _named(text, layout, settings, file)
     known = {**ref.channels, **name_parts(file, config.files).values, **header_fields(layout.header, settings)}

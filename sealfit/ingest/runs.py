@@ -25,6 +25,7 @@ from sealfit.ingest.derive import (
     condition_keys,
     disagreements,
 )
+from sealfit.ingest.folder import read_bytes
 from sealfit.ingest.names import TEXT_COLUMNS, NameParts, name_parts
 from sealfit.ingest.read import read_trace
 from sealfit.ingest.refs import TraceRef
@@ -32,7 +33,7 @@ from sealfit.ingest.run_values import MISSING, out_of_range, to_values
 from sealfit.ingest.runs_csv import Entry, list_entries
 from sealfit.ingest.speed_check import measured_speed
 from sealfit.ingest.speed_unit import speed_factor
-from sealfit.ingest.text import as_utf8, find_layout, header_fields, read_bytes
+from sealfit.ingest.text import as_utf8, find_layout, header_fields
 
 __all__ = ["TraceRef", "list_traces"]
 

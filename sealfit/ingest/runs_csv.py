@@ -12,8 +12,9 @@ from pathlib import Path, PurePosixPath
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, Fault
 from sealfit.ingest.columns import nearest, suggestion
+from sealfit.ingest.folder import read_bytes
 from sealfit.ingest.folders import Folders
-from sealfit.ingest.text import as_number, as_utf8, read_bytes, split_line
+from sealfit.ingest.text import as_number, as_utf8, split_line
 
 RUNS_CSV = "runs.csv"
 KNOWN = (

@@ -6,7 +6,6 @@ import codecs
 import csv
 import re
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
 
 from sealfit.config import TraceFormat
 from sealfit.errors import BadFile, Fault
@@ -19,11 +18,6 @@ _BOMS = (  # UTF-32 first: its mark begins with that of UTF-16
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-_PACKED = {
-    b"PK\x03\x04": "a zip archive or .xlsx workbook",
-    b"\x1f\x8b": "gzip",
-    b"\xd0\xcf\x11\xe0": "an .xls workbook",
-}
 _CONTROL = bytes(set(range(32)) - {9, 10, 12, 13}) + b"\x7f"
 
 
@@ -40,47 +34,6 @@ class Layout:
     names_line: int | None
     start: int
     first_line: int
-
-
-def inside(campaign: Path, file: str) -> Path | None:
-    """Return the path of `file` if it lies inside the campaign folder, links followed; otherwise None."""
-    pure = PurePosixPath(file)
-    if pure.is_absolute() or re.match(r"[A-Za-z]:[\\/]|\\\\", file) or "\0" in file:
-        return None
-    path = campaign / pure
-    try:
-        resolved, root = path.resolve(), campaign.resolve()
-    except (OSError, RuntimeError):  # a loop of links
-        return None
-    return path if resolved != root and resolved.is_relative_to(root) else None
-
-
-def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
-    """Return the file's bytes, or with `head` its first ones.
-
-    Raises
-    ------
-    BadFile
-        If it is missing, outside the campaign, no file, not readable, empty, or packed.
-    """
-    path = inside(campaign, file)
-    if path is None:
-        raise _bad(file, "path_outside", "lies outside the campaign folder.", "Copy it into the folder of runs.csv.")
-    if path.exists() and not path.is_file():  # a folder; or a pipe, which would be waited for forever
-        raise _bad(file, "unreadable_file", "is no file.", "Check the path.")
-    try:
-        with path.open("rb") as stream:
-            raw = stream.read(HEAD_BYTES) if head else stream.read()
-    except FileNotFoundError:
-        raise _bad(file, "missing_file", "does not exist.", _similar(path)) from None
-    except OSError as error:
-        raise _bad(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.") from error
-    if not raw.strip(b"\xef\xbb\xbf\xff\xfe \t\r\n\0"):
-        raise _bad(file, "empty_file", "is empty.", "Export it again, or take it out of runs.csv.")
-    for magic, what in _PACKED.items():
-        if raw.startswith(magic):
-            raise _bad(file, "binary_file", f"is {what}, not text.", "Export the trace as CSV.")
-    return raw
 
 
 def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> bytes:
@@ -196,17 +149,6 @@ def as_number(cell: str, decimal: str = ".") -> float | None:
 
 def _bad(file: str, check: str, reason: str, mend: str, line: int | None = None) -> BadFile:
     return BadFile(Fault(check, reason, file=file, line=line, action="file left out", mend=mend))
-
-
-def _similar(path: Path) -> str:
-    """Return a mend for a missing file: the same name in other case or place, if there is one."""
-    try:
-        for other in path.parent.iterdir():
-            if other.name.lower() == path.name.lower():
-                return f"There is '{other.name}': the case of letters matters."
-    except OSError:
-        return f"There is no folder '{path.parent.name}' either; paths are relative to the folder of runs.csv."
-    return "Paths are relative to the folder of runs.csv."
 
 
 def _guess(raw: bytes) -> str:

@@ -11,10 +11,11 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import BadFile, Fault
-from sealfit.fingerprint import Fingerprint, fingerprint
+from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.average import standard_error
+from sealfit.ingest.folder import Folder
 from sealfit.ingest.quality import equal_neighbours, load_faults, speed_column_faults, stroke_faults
-from sealfit.ingest.read import Trace, read_trace
+from sealfit.ingest.read import Trace, trace_of
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.speed_unit import speed_factor
 from sealfit.ingest.spikes import displacement_spikes, force_spikes
@@ -47,11 +48,12 @@ def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
     config : Config
         The rig.
     """
-    mark = fingerprint(campaign / ref.file)
+    folder, mark = Folder(campaign), None
     try:
-        trace = read_trace(campaign, ref, config)
+        raw, mark = folder.read(ref.file)
+        trace = trace_of(raw, ref, config)
     except BadFile as error:
-        return FileStrokes(ref.file, mark, 0, error.faults)
+        return FileStrokes(ref.file, mark or folder.fingerprint(ref.file), 0, error.faults)
     return strokes_of(trace, mark, config)
 
 

@@ -1,0 +1,45 @@
+import os
+
+import pytest
+
+from sealfit.errors import BadFile
+from sealfit.fingerprint import Fingerprint, fingerprint
+from sealfit.ingest.folder import Folder
+
+
+def test_bytes_come_with_the_fingerprint_of_the_file(tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "a.csv").write_bytes(b"1,2,3\n")
+    raw, mark = Folder(tmp_path).read("sub/a.csv")
+    assert raw == b"1,2,3\n"
+    assert mark == fingerprint(tmp_path / "sub" / "a.csv")
+    assert Folder(tmp_path).fingerprint("sub/b.csv") == Fingerprint()
+
+
+def test_links_are_followed_and_none_leads_outside(tmp_path):
+    campaign, outside = tmp_path / "c", tmp_path / "other"
+    for folder in (campaign / "real", outside):
+        folder.mkdir(parents=True)
+        (folder / "a.csv").write_bytes(folder.name.encode())
+    (campaign / "linked").symlink_to(campaign / "real")
+    (campaign / "away").symlink_to(outside)
+    (campaign / "real" / "file.csv").symlink_to(campaign / "real" / "a.csv")
+    (campaign / "real" / "leak.csv").symlink_to(outside / "a.csv")
+    (campaign / "loop").symlink_to(campaign / "loop")
+    folder = Folder(campaign)
+    for file in ("real/a.csv", "linked/a.csv", "real/file.csv", "linked/file.csv", "real/../real/a.csv"):
+        assert folder.read(file)[0] == b"real"
+    for file in ("away/a.csv", "real/leak.csv", "linked/leak.csv", "real/../../other/a.csv", "loop", "loop/a.csv", ""):
+        with pytest.raises(BadFile, match="outside the campaign"):
+            folder.read(file)
+
+
+def test_folders_and_closed_files_are_named(tmp_path):
+    (tmp_path / "a.csv").mkdir()
+    with pytest.raises(BadFile, match="is no file"):
+        Folder(tmp_path).read("a.csv")
+    (tmp_path / "b.csv").write_text("1")
+    (tmp_path / "b.csv").chmod(0)
+    if not os.access(tmp_path / "b.csv", os.R_OK):  # root may read everything
+        with pytest.raises(BadFile, match="cannot be read"):
+            Folder(tmp_path).read("b.csv")
