@@ -7,7 +7,7 @@ where a number belongs, remarks typed beside a number, lines with too few or too
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,26 +44,68 @@ def listed(rows: np.ndarray, make: Callable[[int], Fault], rest: Callable[[int],
     return [*faults, rest(len(rows) - LISTED)] if len(rows) > LISTED else faults
 
 
-def read_cells(text: bytes, layout: Layout, settings: TraceFormat, numeric: dict[int, str], file: str) -> Cells:
-    """Return the data of a trace file.
+def read_cells(
+    bodies: Sequence[bytes],
+    files: Sequence[str],
+    layout: Layout,
+    settings: TraceFormat,
+    numeric: Mapping[int, str],
+) -> list[Cells]:
+    """Return the data of trace files that are written alike, those of each file by themselves.
 
     Parameters
     ----------
-    text : bytes
-        The whole file as clean UTF-8 (`text.as_utf8`).
+    bodies : sequence of bytes
+        The data lines of each file as clean UTF-8 (`text.body_of`), none of them empty.
+    files : sequence of str
+        What messages call the files.
     layout : Layout
-        Where its data begin.
-    numeric : dict of int to str
+        Where the data begin, in all of the files.
+    numeric : mapping of int to str
         Positions (from 0) that must hold numbers, and the names that messages call them.
     """
-    body = text[layout.start :].rstrip(b"\n \t" if settings.delimiter == "whitespace" else b"\n")
-    if not body.strip(b"\n \t,;"):
-        return Cells({}, np.empty(0, np.int64), np.empty(0, bool), ())
-    return _fast(body, layout, settings, numeric) or _patient(body, layout, settings, numeric, file)
+    found = _fast(bodies, layout, settings, numeric)
+    return [
+        _patient(body, layout, settings, numeric, file) if cells is None else cells
+        for cells, body, file in zip(found, bodies, files, strict=True)
+    ]
 
 
-def _fast(body: bytes, layout: Layout, settings: TraceFormat, numeric: dict[int, str]) -> Cells | None:
-    """Return the cells as Arrow reads them, or None where a cell, a line or the delimiter is beyond it."""
+def _fast(
+    bodies: Sequence[bytes], layout: Layout, settings: TraceFormat, numeric: Mapping[int, str]
+) -> list[Cells | None]:
+    """Return the cells as Arrow reads them, all files in one go; None for a file that is beyond it.
+
+    A file that spoils the reading of all is found by halving, so that it costs the others little.
+    """
+    rows = [_lines(body) for body in bodies]
+    table = _arrow(b"\n".join(bodies), sum(rows), settings, numeric)
+    texts = table is not None and any(not _is_number(column.type) for column in table.columns)
+    if len(bodies) > 1 and (table is None or texts):
+        # What is text in one file may be numbers in the next: such files are read one by one.
+        size = 1 if texts else (len(bodies) + 1) // 2
+        parts = [bodies[i : i + size] for i in range(0, len(bodies), size)]
+        return [cells for part in parts for cells in _fast(part, layout, settings, numeric)]
+    columns = None if table is None else _named_columns(table, layout)
+    if columns is None:
+        alone = ([None] if len(bodies) == 1 else _fast([body], layout, settings, numeric) for body in bodies)
+        return [cells for found in alone for cells in found]
+    stops = np.cumsum(rows)
+    starts = stops - rows
+    finite = np.ones(stops[-1], bool)
+    for i in numeric:
+        finite &= np.isfinite(columns[i])
+    made: list[Cells | None] = []
+    for start, stop, sound in zip(starts, stops, np.logical_and.reduceat(finite, starts), strict=True):
+        own = {i: values[start:stop] for i, values in columns.items()}
+        line = np.arange(layout.first_line, layout.first_line + stop - start)
+        # Empty cells, NaN and inf are to be named as they stand in the file.
+        made.append(Cells(own, line, np.zeros(stop - start, bool), ()) if sound else None)
+    return made
+
+
+def _arrow(body: bytes, rows: int, settings: TraceFormat, numeric: Mapping[int, str]) -> pa.Table | None:
+    """Return the table that Arrow reads; None where a cell, a line or the delimiter is beyond it."""
     delimiter = settings.delimiter
     if delimiter == "whitespace":
         body, delimiter = _single_tabs(body), "tab"
@@ -84,24 +126,31 @@ def _fast(body: bytes, layout: Layout, settings: TraceFormat, numeric: dict[int,
         )
     except pa.ArrowInvalid:
         return None
-    rows = body.count(b"\n") + 1
-    if table.num_rows != rows:  # blank lines, or line ends inside quotes: the line numbers would be wrong
-        return None
-    columns = {i: _column(table.column(i)) for i in range(width)}
-    if not all(np.isfinite(columns[i]).all() for i in numeric):
-        return None  # empty cells, NaN and inf are to be named as they stand in the file
-    extra = [i for i in range(len(layout.names), width)] if layout.names else []
-    if any(columns[i].dtype.kind != "f" or not np.isnan(columns[i]).all() for i in extra):
-        return None  # something stands beyond the last named column
-    for i in extra:
+    # Blank lines, or line ends inside quotes: the line numbers would be wrong.
+    return table if table.num_rows == rows else None
+
+
+def _named_columns(table: pa.Table, layout: Layout) -> dict[int, np.ndarray] | None:
+    """Return the columns by position; None where something stands beyond the last named one."""
+    columns = {i: _column(column) for i, column in enumerate(table.columns)}
+    for i in range(len(layout.names), len(columns)) if layout.names else ():
+        if columns[i].dtype.kind != "f" or not np.isnan(columns[i]).all():
+            return None
         del columns[i]
-    line = np.arange(layout.first_line, layout.first_line + rows)
-    return Cells(columns, line, np.zeros(rows, bool), ())
+    return columns
+
+
+def _lines(body: bytes) -> int:
+    return int(np.count_nonzero(np.frombuffer(body, np.uint8) == ord("\n"))) + 1
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_null(kind)
 
 
 def _column(column: pa.ChunkedArray) -> np.ndarray:
-    if pa.types.is_floating(column.type) or pa.types.is_integer(column.type) or pa.types.is_null(column.type):
-        return column.cast(pa.float64()).to_numpy()
+    if _is_number(column.type):
+        return column.cast(pa.float64(), safe=False).to_numpy()  # a whole number beyond 2**53 is rounded
     text = np.array(column.cast(pa.string()).to_pylist(), dtype=object)
     text[text == ""] = None
     return text
@@ -114,7 +163,7 @@ def _single_tabs(body: bytes) -> bytes:
     return body
 
 
-def _patient(body: bytes, layout: Layout, settings: TraceFormat, numeric: dict[int, str], file: str) -> Cells:
+def _patient(body: bytes, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str], file: str) -> Cells:
     """Return the cells line by line, with a fault for everything that is not as it should be."""
     lines = body.decode("utf-8", "replace").split("\n")
     rows, number = [], []

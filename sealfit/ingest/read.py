@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,13 +15,14 @@ from sealfit.config import Config, TraceFormat
 from sealfit.errors import BadFile, ConfigError, Fault
 from sealfit.ingest.cells import OVERLOAD, Cells, listed, read_cells
 from sealfit.ingest.channels import channel_columns
-from sealfit.ingest.columns import RESERVED, SLOTS, beside, locate, numeric_names, required
+from sealfit.ingest.columns import RESERVED, SLOTS, beside, required
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.folder import read_bytes
+from sealfit.ingest.form import Form, form_of
 from sealfit.ingest.names import name_parts
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.speed_check import check_speed
-from sealfit.ingest.text import Layout, as_utf8, find_layout, header_fields, split_line
+from sealfit.ingest.text import Layout, as_utf8, header_fields
 
 MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
 
@@ -78,16 +79,53 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
         If the file must be left out: missing, empty, binary, a column missing, too many bad rows, a speed that
         contradicts the commanded one. It carries every fault found, the deciding one last.
     """
-    return trace_of(read_bytes(campaign, ref.file), ref, config)
+    (found,) = read_traces([(ref, read_bytes(campaign, ref.file))], config)
+    if isinstance(found, BadFile):
+        raise found
+    return found
 
 
-def trace_of(raw: bytes, ref: TraceRef, config: Config) -> Trace:
-    """Return one trace from the bytes of its file; raises as `read_trace`."""
-    settings, file = config.trace, ref.file
-    text = as_utf8(raw, settings.encoding, file)
-    layout = find_layout(text, settings, file)
-    rows, cells = _named(text, layout, settings, file)
-    known = {**ref.channels, **name_parts(file, config.files).values, **header_fields(layout.header, settings)}
+def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list[Trace | BadFile]:
+    """Return a trace for each of several files, or why it must be left out; files written alike are read in one go.
+
+    Parameters
+    ----------
+    files : sequence of (TraceRef, bytes)
+        What is known of each file, and its bytes; some dozens of them, as all are held at once.
+    config : Config
+        How the files are written.
+    """
+    found: list[Trace | BadFile | None] = [None] * len(files)
+    alike: dict[int, list[tuple[int, bytes]]] = {}
+    forms: list[Form] = []
+    for place, (ref, raw) in enumerate(files):
+        try:
+            text = as_utf8(raw, config.trace.encoding, ref.file)
+            number = next((i for i, form in enumerate(forms) if form.fits(text)), None)
+            if number is None:
+                number = len(forms)
+                forms.append(form_of(text, config.trace, ref.file))
+            alike.setdefault(number, []).append((place, forms[number].body(text)))
+        except BadFile as error:
+            found[place] = error
+    for number, members in alike.items():
+        form, names = forms[number], [files[place][0].file for place, _ in members]
+        made = read_cells([body for _, body in members], names, form.layout, config.trace, form.numeric)
+        for (place, _), cells in zip(members, made, strict=True):
+            try:
+                found[place] = _trace(cells, form, files[place][0], config)
+            except BadFile as error:
+                found[place] = error
+    return found
+
+
+def _trace(cells: Cells, form: Form, ref: TraceRef, config: Config) -> Trace:
+    """Return the trace that the cells of a file make; raises as `read_trace`."""
+    settings, file, layout = config.trace, ref.file, form.layout
+    rows = _Rows({name: cells.columns[i] for i, name in form.ours.items() if i in cells.columns}, cells.line)
+    known: Mapping[str, object] = {}
+    if settings.compute or settings.keep is not None:
+        known = {**ref.channels, **name_parts(file, config.files).values, **header_fields(layout.header, settings)}
     faults = list(cells.faults)
     good = ~cells.bad
     first = settings.drop_first_rows
@@ -96,12 +134,13 @@ def trace_of(raw: bytes, ref: TraceRef, config: Config) -> Trace:
     faults += found
     good &= ~dropped
     bad = int((~good[first:]).sum())
-    rows = _Rows(columns, rows.line).where(good & (np.arange(len(good)) >= first))
-    rows, wrong, found = _derive(rows, known, settings, layout, file)
+    good[:first] = False
+    rows, wrong, found = _derive(_Rows(columns, rows.line).where(good), known, settings, layout, file)
     faults += found
     bad += wrong
     faults += _too_many(bad, counted, faults, config, file)
-    rows = rows.where(_kept(rows, known, settings, file))
+    if settings.keep is not None:
+        rows = rows.where(_kept(rows, known, settings, file))
     if len(rows.line) < MIN_ROWS:
         reason = f"{len(rows.line)} of {len(good)} data rows are left; a trace needs {MIN_ROWS}."
         raise BadFile(*faults, _bad_file("no_rows", reason, file, "Check drop_first_rows, keep and the export."))
@@ -111,19 +150,6 @@ def trace_of(raw: bytes, ref: TraceRef, config: Config) -> Trace:
             raise BadFile(*faults, fault)
         faults.append(fault)
     return Trace(ref, columns, rows.line, len(good), tuple(faults))
-
-
-def _named(text: bytes, layout: Layout, settings: TraceFormat, file: str) -> tuple[_Rows, Cells]:
-    """Return the file's columns under our names, and the cells they come from."""
-    end = text.find(b"\n", layout.start)
-    first = text[layout.start : end if end >= 0 else len(text)].decode("utf-8", "replace")
-    if not text[layout.start :].strip(b"\n \t,;"):
-        raise BadFile(_bad_file("no_rows", "has a header but no data.", file, "Export it again."))
-    width = len(layout.names) or len(split_line(first, settings.delimiter))
-    ours = locate(layout, width, settings, file)
-    must = numeric_names(settings)
-    cells = read_cells(text, layout, settings, {i: name for i, name in ours.items() if name in must}, file)
-    return _Rows({name: cells.columns[i] for i, name in ours.items() if i in cells.columns}, cells.line), cells
 
 
 def _derive(
@@ -181,19 +207,18 @@ def _evaluate(expression, values: Mapping[str, object], file: str) -> np.ndarray
 
 
 def _kept(rows: _Rows, known: Mapping[str, object], settings: TraceFormat, file: str) -> np.ndarray:
-    if settings.keep is None:
-        return np.ones(len(rows.line), bool)
     values = {**known, **settings.constants, **rows.columns}
     return np.broadcast_to(_evaluate(parse(settings.keep, condition=True), values, file), rows.line.shape)
 
 
 def _clean(rows: _Rows, names: list[str], file: str) -> tuple[_Rows, int, list[Fault]]:
     """Return the rows whose slots are finite and whose time rises, the number left out, and the faults."""
+    names = [name for name in names if name in rows.columns]
+    if _in_order(rows, names):
+        return rows, 0, []
     faults: list[Fault] = []
     finite = np.ones(len(rows.line), bool)
     for name in names:
-        if name not in rows.columns:
-            continue
         sizes = np.abs(rows.columns[name])
         wrong, overload = ~np.isfinite(sizes), (sizes >= OVERLOAD) & np.isfinite(sizes)
         finite &= ~(wrong | overload)
@@ -203,6 +228,14 @@ def _clean(rows: _Rows, names: list[str], file: str) -> tuple[_Rows, int, list[F
     back = _out_of_order(good.columns["time_s"])
     faults += _row_faults("time_order", "time repeats or runs backwards.", "time_s", good, back, file)
     return good.where(~back), int((~finite).sum() + back.sum()), faults
+
+
+def _in_order(rows: _Rows, names: Sequence[str]) -> bool:
+    """Return whether nothing is to be found: every slot measured, time rising throughout."""
+    time_s = rows.columns["time_s"]
+    if len(time_s) < 2 or not (time_s[1:] > time_s[:-1]).all():
+        return False
+    return all(np.abs(rows.columns[name]).max() < OVERLOAD for name in names)  # not so of nan
 
 
 def _row_faults(check: str, reason: str, name: str, rows: _Rows, wrong: np.ndarray, file: str) -> list[Fault]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.average import standard_error
 from sealfit.ingest.folder import Folder
 from sealfit.ingest.quality import equal_neighbours, load_faults, speed_column_faults, stroke_faults
-from sealfit.ingest.read import Trace, trace_of
+from sealfit.ingest.read import Trace, read_traces
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.speed_unit import speed_factor
 from sealfit.ingest.spikes import displacement_spikes, force_spikes
@@ -48,13 +48,36 @@ def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
     config : Config
         The rig.
     """
-    folder, mark = Folder(campaign), None
-    try:
-        raw, mark = folder.read(ref.file)
-        trace = trace_of(raw, ref, config)
-    except BadFile as error:
-        return FileStrokes(ref.file, mark or folder.fingerprint(ref.file), 0, error.faults)
-    return strokes_of(trace, mark, config)
+    (made,) = read_files([ref], campaign, config)
+    return made
+
+
+def read_files(refs: Sequence[TraceRef], campaign: Path, config: Config) -> list[FileStrokes]:
+    """Return the strokes of several trace files in their order; what reading them in one go saves is its point.
+
+    Parameters
+    ----------
+    refs : sequence of TraceRef
+        Some dozens of files, as all are held at once; see `read_strokes` for the others.
+    """
+    folder = Folder(campaign)
+    marks: dict[int, Fingerprint] = {}
+    left: dict[int, BadFile] = {}
+    contents: list[tuple[TraceRef, bytes]] = []
+    for i, ref in enumerate(refs):
+        try:
+            raw, marks[i] = folder.read(ref.file)
+            contents.append((ref, raw))
+        except BadFile as error:
+            marks[i], left[i] = folder.fingerprint(ref.file), error
+    traces = iter(read_traces(contents, config))
+    found = [left[i] if i in left else next(traces) for i in range(len(refs))]
+    return [
+        FileStrokes(ref.file, marks[i], 0, made.faults)
+        if isinstance(made, BadFile)
+        else strokes_of(made, marks[i], config)
+        for i, (ref, made) in enumerate(zip(refs, found, strict=True))
+    ]
 
 
 def strokes_of(trace: Trace, mark: Fingerprint, config: Config) -> FileStrokes:
