@@ -1,0 +1,129 @@
+"""One flat array that holds many traces, or many strokes, one after the other: what is computed of each in one go.
+
+A function of numpy costs a microsecond before it sees a number, and a trace of a thousand rows needs a few hundred of
+them. So the traces of some dozens of files are laid end to end, and every step is done for all of them at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+
+class Pieces:
+    """Where each of k pieces lies in a flat array: rows `start` to `stop` (exclusive), both of shape (k,).
+
+    The pieces follow one another without gaps, and none is empty.
+    """
+
+    def __init__(self, sizes: Sequence[int] | np.ndarray):
+        self.size = np.asarray(sizes, np.int64)
+        self.stop = np.cumsum(self.size)
+        self.start = self.stop - self.size
+
+    def __len__(self) -> int:
+        return len(self.size)
+
+    @property
+    def rows(self) -> int:
+        """Length of the flat array."""
+        return int(self.stop[-1]) if len(self.stop) else 0
+
+    @cached_property
+    def of(self) -> np.ndarray:
+        """The piece of every row, shape (rows,)."""
+        return np.repeat(np.arange(len(self)), self.size)
+
+    @cached_property
+    def slices(self) -> list[slice]:
+        """The rows of every piece."""
+        return [slice(*ends) for ends in zip(self.start.tolist(), self.stop.tolist(), strict=True)]
+
+    def spread(self, per_piece: np.ndarray) -> np.ndarray:
+        """Return a value per piece as one per row."""
+        return np.repeat(per_piece, self.size)
+
+    def max(self, values: np.ndarray) -> np.ndarray:
+        """Return the largest value of every piece, shape (k,)."""
+        return np.maximum.reduceat(values, self.start)
+
+    def min(self, values: np.ndarray) -> np.ndarray:
+        """Return the smallest value of every piece, shape (k,)."""
+        return np.minimum.reduceat(values, self.start)
+
+    def sum(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum over every piece, shape (k,); of a mask, how many are true."""
+        return np.add.reduceat(values, self.start, dtype=np.int64 if values.dtype == bool else None)
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """Return the mean of every piece, shape (k,)."""
+        return self.sum(values) / self.size
+
+    def steps(self, values: np.ndarray) -> np.ndarray:
+        """Return how far it is from every row to the next one of its piece, shape (rows,); 0 at the last."""
+        made = np.zeros(self.rows)
+        np.subtract(values[1:], values[:-1], out=made[:-1])
+        made[self.stop - 1] = 0.0
+        return made
+
+    def within(self, mask: np.ndarray) -> np.ndarray:
+        """Return how many rows of every piece are in `mask`, shape (k,)."""
+        return self.sum(mask)
+
+    def split(self, rows: np.ndarray) -> list[np.ndarray]:
+        """Return, for every piece, those of `rows` (rising) that lie in it, counted from its first row."""
+        at = np.searchsorted(rows, [*self.start, self.rows]).tolist()
+        return [rows[a:b] - start for a, b, start in zip(at, at[1:], self.start.tolist(), strict=False)]
+
+
+def median(values: np.ndarray) -> float:
+    """Return the median, as `np.median` does, of an array that holds no nan."""
+    half, odd = divmod(len(values), 2)
+    ordered = np.partition(values, half)
+    return float(ordered[half]) if odd else float((ordered[:half].max() + ordered[half]) / 2.0)
+
+
+def quantile(values: np.ndarray, share: float) -> float:
+    """Return the quantile between neighbours, as `np.quantile` does, of an array that holds no nan.
+
+    Examples
+    --------
+    >>> quantile(np.array([3.0, 1.0, 2.0, 4.0]), 0.5), quantile(np.array([3.0, 1.0, 2.0, 4.0]), 0.9)
+    (2.5, 3.7)
+    """
+    place = (len(values) - 1) * share
+    low = int(place)
+    ordered = np.partition(values, low)
+    below = float(ordered[low])
+    if low + 1 == len(values):
+        return below
+    above, part = float(ordered[low + 1 :].min()), place - low
+    return above - (above - below) * (1.0 - part) if part >= 0.5 else below + (above - below) * part
+
+
+def weighted_medians(values: np.ndarray, weights: np.ndarray, pieces: Pieces) -> np.ndarray:
+    """Return, for every piece, the value at which half of the weight lies at smaller ones; 0 where there is none.
+
+    Only what is positive weighs: `weights` are 0 wherever `values` are not above 0.
+    """
+    bins = 256  # first how much lies in which part of the range, then the order within the part where the half is
+    top = pieces.max(values)
+    scale = np.divide(bins * (1.0 - 1e-9), top, out=np.zeros(len(pieces)), where=top > 0.0)
+    place = np.maximum(values * pieces.spread(scale), 0.0).astype(np.int64)
+    place += pieces.of * bins
+    held = np.bincount(place, weights, minlength=bins * len(pieces)).reshape(len(pieces), bins)
+    covered = np.cumsum(held, axis=1)
+    half = 0.5 * covered[:, -1]
+    crossing = np.minimum((covered < half[:, None]).sum(axis=1), bins - 1)
+    before = covered[np.arange(len(pieces)), crossing] - held[np.arange(len(pieces)), crossing]
+    rows = np.flatnonzero(place == pieces.spread(crossing + bins * np.arange(len(pieces))))
+    made = np.zeros(len(pieces))
+    for i, (own, start) in enumerate(zip(pieces.split(rows), pieces.start.tolist(), strict=True)):
+        if half[i] > 0.0:
+            speed = values[own + start]
+            order = np.argsort(speed)
+            reached = np.searchsorted(before[i] + np.cumsum(weights[own + start][order]), half[i])
+            made[i] = speed[order[min(int(reached), len(order) - 1)]]
+    return made
