@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealfit.ingest.pieces import median, quantile
+
 SETTLED = np.log(50000.0)  # the rise is over when 1/50000 is left: 1/5000 showed in means over a campaign
 AFTER_RAMP = 3.0  # rise lengths after the speed ramp: the bristles follow the changing speed over one rise length
 ENOUGH = np.log(100.0)  # where 1/50000 would take more than a third of the stroke, 1 % of the rise may stay
@@ -12,6 +14,7 @@ SHORT = 0.01  # this share of the stroke; a longer climb is an effect (run-in, w
 EARLY = (0.05, 0.5)  # share of the distance in which the plateau is read: near the rise, past any ordinary rise
 LATE = (0.6, 0.95)  # the same where the rise takes so long that half of the stroke may still be part of it
 LONG = 0.1  # rise to 63 % over more than this share of the stroke: a stroke hardly longer than its pre-sliding
+LENGTHS = np.geomspace(0.3, 3.0, 25)  # rise lengths that are tried, as multiples of the distance to 63 %
 MARGIN = 1.05  # the first arrival in the later band is early by a part of the last bend
 
 
@@ -55,16 +58,16 @@ def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> 
     True
     """
     length = float(distance_mm[-1])
-    low, high = np.searchsorted(distance_mm, [EARLY[0] * length, EARLY[1] * length])
+    low, high = (int(distance_mm.searchsorted(share * length)) for share in EARLY)
     low = max(low, ramp_end)
     plateau = force_N[low:high]
     if len(plateau) < 8:
         return 0.0
-    level = float(np.median(plateau))
-    noise = float(np.median(np.abs(np.diff(plateau)))) / (0.6745 * np.sqrt(2.0))
-    begin = float(force_N[0])
-    band = float(np.percentile(plateau, 1)) - 4.0 * noise
-    if begin >= band or level - begin <= 0.02 * abs(level):
+    level, begin = median(plateau), float(force_N[0])
+    if level - begin <= 0.02 * abs(level):
+        return 0.0
+    noise = median(np.abs(plateau[1:] - plateau[:-1])) / (0.6745 * np.sqrt(2.0))
+    if begin >= quantile(plateau, 0.01) - 4.0 * noise:
         return 0.0
     scale = _scale_mm(distance_mm[:high], force_N[:high], begin, level)
     if scale <= 0.0:
@@ -84,31 +87,37 @@ def _arrival_mm(distance_mm: np.ndarray, force_N: np.ndarray) -> float:
     low, high = np.searchsorted(distance_mm, [share * distance_mm[-1] for share in LATE])
     if high - low < 8:
         return 0.0
-    return float(distance_mm[int(np.argmax(force_N >= np.percentile(force_N[low:high], 2)))])
+    return float(distance_mm[int(np.argmax(force_N >= quantile(force_N[low:high], 0.02)))])
 
 
 def _scale_mm(distance_mm: np.ndarray, force_N: np.ndarray, begin: float, level: float) -> float:
     """Return the distance over which the force first comes up by 63 %, between samples; counted from where it begins
     to."""
     target = begin + (1.0 - np.exp(-1.0)) * (level - begin)
-    above = np.flatnonzero(force_N >= target)
-    if not len(above) or above[0] == 0:
+    above = force_N >= target
+    after = int(above.argmax())
+    if after == 0:  # none is, or the first one already
         return 0.0
-    after = int(above[0])
     share = (target - force_N[after - 1]) / (force_N[after] - force_N[after - 1])
     return float(distance_mm[after - 1] + share * (distance_mm[after] - distance_mm[after - 1]))
 
 
 def _rise_length_mm(distance_mm: np.ndarray, force_N: np.ndarray, scale_mm: float) -> float:
-    """Return x_0 of F = A + B x - C exp(-x / x_0), by least squares on a grid around `scale_mm`."""
-    rows = int(np.searchsorted(distance_mm, 12.0 * scale_mm))
+    """Return x_0 of F = A + B x - C exp(-x / x_0), by least squares on a grid around `scale_mm`.
+
+    What A + B x explains is the same for every x_0. So both are taken out of the force and of each exponential, and
+    the best x_0 is the one whose exponential's rest explains most of the force's rest.
+    """
+    rows = int(distance_mm.searchsorted(12.0 * scale_mm))
     rows = min(max(rows, 16), len(distance_mm))
-    x, y = distance_mm[:rows], force_N[:rows]
-    lengths = scale_mm * np.geomspace(0.3, 3.0, 25)
-    design = np.stack(
-        [np.broadcast_to(1.0, (25, rows)), np.broadcast_to(x / x[-1], (25, rows)), np.exp(-x / lengths[:, None])],
-        axis=2,
-    )
-    basis, _ = np.linalg.qr(design)
-    explained = np.einsum("kij,i->kj", basis, y)
-    return float(lengths[np.argmax((explained**2).sum(axis=1))])
+    x, y = distance_mm[:rows] - distance_mm[:rows].mean(), force_N[:rows] - force_N[:rows].mean()
+    lengths = scale_mm * LENGTHS
+    rise = np.exp(distance_mm[:rows] / -lengths[:, None])
+    rise -= rise.mean(axis=1)[:, None]
+    square = float(x @ x)
+    explained = rise @ (y - (float(x @ y) / square) * x)
+    whole = np.einsum("ij,ij->i", rise, rise)
+    rest = whole - (rise @ x) ** 2 / square
+    # Of two different distances only (a coarse sensor), a straight line explains all that an exponential can.
+    gained = np.divide(explained**2, rest, out=np.zeros(len(rest)), where=rest > 1e-12 * whole)
+    return float(lengths[np.argmax(gained)])

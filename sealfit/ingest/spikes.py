@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from sealfit.config import Quality
 from sealfit.errors import Fault
-from sealfit.ingest.strokes import Stroke, displacement_noise_mm
+from sealfit.ingest.pieces import Pieces
+from sealfit.ingest.running import running_median
+from sealfit.ingest.strokes import Stroke, displacement_noises_mm
 
 NEIGHBOURS = 5  # a median over five samples is blind to one or two wrong ones, and exact on any slope
 # A spike stands apart, four times as far off as 95 % of the samples (of noise: 7.8 SDs); else it is one of many bursts.
@@ -27,10 +28,11 @@ def displacement_spikes(
     keep = np.ones(len(displacement_mm), bool)
     if len(displacement_mm) < 4 * NEIGHBOURS:
         return keep, []
-    off = displacement_mm - median_filter(displacement_mm, NEIGHBOURS, mode="mirror")
+    one = Pieces([len(displacement_mm)])
+    off = displacement_mm - running_median(displacement_mm, one, NEIGHBOURS, "mirror")
     # At a turn the median lags by one step of the fastest samples around, never by more than a few of the usual ones.
     step = float(np.median(np.abs(np.diff(displacement_mm))))
-    noise = displacement_noise_mm(displacement_mm)
+    (noise,) = displacement_noises_mm(displacement_mm, one)
     least = max(5.0 * step, APART * float(np.percentile(np.abs(off), USUAL)), 1e-9 * float(np.ptp(displacement_mm)))
     spikes = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, least))
     if len(spikes) > settings.max_bad_rows * len(off):
@@ -52,7 +54,7 @@ def force_spikes(
     keep = np.ones(len(force_N), bool)
     if len(force_N) < 4 * NEIGHBOURS:
         return keep, []
-    off = force_N - median_filter(force_N, NEIGHBOURS, mode="mirror")
+    off = force_N - running_median(force_N, Pieces([len(force_N)]), NEIGHBOURS, "mirror")
     steady = np.zeros(len(force_N), bool)
     for stroke in strokes:
         steady[stroke.rows] = True

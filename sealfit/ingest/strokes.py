@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
 
 from sealfit.config import Strokes
-from sealfit.ingest.window import slope, steady_window
+from sealfit.ingest.pieces import Pieces, quantile
+from sealfit.ingest.running import running_mean, running_median
+from sealfit.ingest.window import slopes, steady_windows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,74 +46,155 @@ class Stroke:
         return self.start + np.flatnonzero(self.steady)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """The strokes of several traces that lie one after the other.
+
+    Arrays of shape (strokes,), in order: `trace` (its place among the traces) and what a `Stroke` has, with `start`,
+    `stop` and `origin` as rows of the flat arrays. `steady` and `sliding` are of shape (rows,), false in traces
+    without strokes.
+    """
+
+    trace: np.ndarray
+    number: np.ndarray
+    start: np.ndarray
+    stop: np.ndarray
+    origin: np.ndarray
+    direction: np.ndarray
+    speed_mm_s: np.ndarray
+    short: list[str | None]
+    steady: np.ndarray
+    sliding: np.ndarray
+
+    def of_trace(self, trace: int, first_row: int) -> list[Stroke]:
+        """Return the strokes of one trace, whose first row is given, with rows counted from there."""
+        return [self.stroke(i, first_row) for i in np.flatnonzero(self.trace == trace).tolist()]
+
+    def stroke(self, i: int, first_row: int) -> Stroke:
+        """Return one stroke, with rows counted from the first one of its trace."""
+        rows = slice(int(self.start[i]), int(self.stop[i]))
+        ends = (int(row) - first_row for row in (self.start[i], self.stop[i], self.origin[i]))
+        way, speed = int(self.direction[i]), float(self.speed_mm_s[i])
+        return Stroke(int(self.number[i]), *ends, way, speed, self.steady[rows], self.sliding[rows], self.short[i])
+
+
 def find_strokes(
     time_s: np.ndarray, displacement_mm: np.ndarray, force_N: np.ndarray, settings: Strokes
 ) -> list[Stroke]:
-    """Return the strokes of one trace in order; none where nothing moves.
+    """Return the strokes of one trace in order; none where nothing moves. For arguments see `find_all`."""
+    if not len(time_s):
+        return []
+    return find_all(time_s, displacement_mm, force_N, Pieces([len(time_s)]), settings).of_trace(0, 0)
+
+
+def find_all(
+    time_s: np.ndarray, displacement_mm: np.ndarray, force_N: np.ndarray, traces: Pieces, settings: Strokes
+) -> Found:
+    """Return the strokes of several traces.
 
     Parameters
     ----------
     time_s, displacement_mm, force_N : ndarray, shape (n,)
-        A trace in the rig's own units, finite, time rising (steps may differ, and hide gaps); displacement without
-        spikes.
+        Traces in the rig's own units, one after the other, finite, time rising in each (steps may differ, and hide
+        gaps); displacement without spikes.
+    traces : Pieces
+        Where each of them lies.
     settings : Strokes
         The config's `strokes`.
 
     Returns
     -------
-    list of Stroke
+    Found
         Strokes shorter than `min_travel_mm` are part of their neighbours' ends.
     """
-    n = len(time_s)
-    if n < 3 or np.ptp(displacement_mm) == 0.0:
-        return []
+    moves = (traces.size >= 3) & (traces.max(displacement_mm) != traces.min(displacement_mm))
     if settings.whole_file:
-        return [_whole_file(time_s, displacement_mm, settings)]
-    noise = displacement_noise_mm(displacement_mm)
-    smooth = smoothed(displacement_mm, settings.smooth_samples)
-    span = float(np.ptp(smooth))
-    if span <= 8.0 * noise:  # the range of some hundred samples of noise alone is about six SDs
-        return []
-    travel = settings.min_travel_mm if settings.min_travel_mm is not None else 0.05 * span
-    turns = turning_rows(smooth, travel)
-    if len(turns) < 2:
-        return []
-    bounds, origin = _bounds(smooth, turns, max(3.0 * noise, 1e-3 * span), settings.smooth_samples)
-    filtered = median_filter(force_N, 3, mode="nearest")  # single spikes must not decide where a rise ends
-    strokes = []
-    for i, (start, stop) in enumerate(pairwise(bounds)):
-        first = origin if i == 0 else start
-        direction = 1 if smooth[turns[i + 1]] > smooth[turns[i]] else -1
-        rows = slice(start, stop)
-        strokes.append(
-            _stroke(
-                i + 1, start, first, direction, time_s[rows], displacement_mm[rows], filtered[rows], noise, settings
-            )
-        )
-    return strokes
+        whole = np.flatnonzero(moves)
+        last, first = displacement_mm[traces.stop[whole] - 1], displacement_mm[traces.start[whole]]
+        way = np.where(last >= first, 1, -1)
+        cut = _Cut(whole, np.ones_like(whole), traces.start[whole], traces.stop[whole], traces.start[whole], way)
+        return _whole_files(time_s, displacement_mm, traces.spread(moves), cut, settings)
+    noise = displacement_noises_mm(displacement_mm, traces)
+    smooth = smoothed(displacement_mm, traces, settings.smooth_samples)
+    span = traces.max(smooth) - traces.min(smooth)
+    moves &= ~(span <= 8.0 * noise)  # the range of some hundred samples of noise alone is about six SDs
+    travel = np.full(len(traces), settings.min_travel_mm) if settings.min_travel_mm is not None else 0.05 * span
+    cut = _cut(smooth, traces, moves, travel, np.maximum(3.0 * noise, 1e-3 * span), settings.smooth_samples)
+    moves = np.isin(np.arange(len(traces)), cut.trace)
+    rows = slice(None) if moves.all() else traces.spread(moves)
+    strokes = Pieces(cut.stop - cut.start)
+    way = strokes.spread(cut.direction)
+    filtered = running_median(force_N, traces, 3)  # single spikes must not decide where a rise ends
+    time_s, along, displacement_mm = time_s[rows], way * displacement_mm[rows], displacement_mm[rows]
+    steady, sliding = np.zeros(traces.rows, bool), np.zeros(traces.rows, bool)
+    if not len(strokes):
+        return Found(*cut, np.empty(0), [], steady, sliding)
+    steady[rows], sliding[rows] = steady_windows(
+        time_s, along, way * filtered[rows], strokes, cut.origin - cut.start, noise[cut.trace], settings.speed_tolerance
+    )
+    count, share = strokes.sum(steady[rows]), _share_covered(along, steady[rows], strokes)
+    short = [_too_short(n, part, settings) for n, part in zip(count.tolist(), share.tolist(), strict=True)]
+    return Found(*cut, slopes(time_s, displacement_mm, steady[rows], strokes), short, steady, sliding)
 
 
-def smoothed(values: np.ndarray, samples: int) -> np.ndarray:
+def smoothed(values: np.ndarray, traces: Pieces, samples: int) -> np.ndarray:
     """Return `values` as a running mean of running medians over `samples` samples, shape (n,)."""
     if samples == 1:
         return np.asarray(values, float)
-    return uniform_filter1d(median_filter(values, samples, mode="nearest"), samples, mode="nearest")
+    return running_mean(running_median(values, traces, samples), traces, samples)
 
 
-def displacement_noise_mm(displacement_mm: np.ndarray) -> float:
-    """Return the standard deviation of one displacement sample, noise and resolution together.
+def displacement_noises_mm(displacement_mm: np.ndarray, traces: Pieces) -> np.ndarray:
+    """Return the standard deviation of one displacement sample, noise and resolution together, of every trace.
 
     Second differences of a steady motion hold noise only: their variance is six times that of a sample. The 90th
     percentile is blind to gaps, stops and spikes. Where many neighbours are equal the step between the others is the
-    resolution, whose rounding error is uniform: step / sqrt(12).
+    resolution, whose rounding error is uniform: step / sqrt(12). 0 of less than three samples.
     """
-    bend = np.abs(np.diff(displacement_mm, 2))
-    noise = float(np.percentile(bend, 90)) / (1.645 * np.sqrt(6.0))
-    steps = np.abs(np.diff(displacement_mm))
-    moving = steps[steps > 0.0]
-    if len(moving) and len(moving) < 0.9 * len(steps):
-        noise = max(noise, float(np.percentile(moving, 5)) / np.sqrt(12.0))
-    return noise
+    steps = traces.steps(displacement_mm)
+    bend = np.zeros(len(steps))
+    np.abs(steps[1:] - steps[:-1], out=bend[:-1])
+    steps = np.abs(steps)
+    moving = traces.sum(steps > 0.0)
+    few = (moving > 0) & (moving < 0.9 * (traces.size - 1))
+    made = np.zeros(len(traces))
+    for i, rows in enumerate(traces.slices):
+        if rows.stop - rows.start < 3:
+            continue
+        made[i] = quantile(bend[rows.start : rows.stop - 2], 0.9) / (1.645 * np.sqrt(6.0))
+        if few[i]:
+            own = steps[rows]
+            made[i] = max(made[i], quantile(own[own > 0.0], 0.05) / np.sqrt(12.0))
+    return made
+
+
+class _Cut(NamedTuple):
+    """Where strokes lie, as `Found` has it."""
+
+    trace: np.ndarray
+    number: np.ndarray
+    start: np.ndarray
+    stop: np.ndarray
+    origin: np.ndarray
+    direction: np.ndarray
+
+
+def _cut(
+    smooth_mm: np.ndarray, traces: Pieces, moves: np.ndarray, travel_mm: np.ndarray, near_mm: np.ndarray, samples: int
+) -> _Cut:
+    """Return the strokes of every trace that moves."""
+    made: list[tuple[int, ...]] = []
+    for i, (rows, change) in enumerate(zip(traces.slices, traces.split(_extremes(smooth_mm, traces)), strict=True)):
+        own = smooth_mm[rows]
+        turns = _turns(own, change.tolist(), float(travel_mm[i])) if moves[i] else []
+        if len(turns) < 2:
+            continue
+        bounds, origin = _bounds(own, turns, float(near_mm[i]), samples)
+        for number, (start, stop) in enumerate(pairwise(bounds), start=1):
+            way = 1 if own[turns[number]] > own[turns[number - 1]] else -1
+            first = origin if number == 1 else start
+            made.append((i, number, rows.start + start, rows.start + stop, rows.start + first, way))
+    return _Cut(*np.array(made, np.int64).reshape(-1, 6).T)
 
 
 def turning_rows(smooth_mm: np.ndarray, travel_mm: float) -> list[int]:
@@ -120,11 +203,20 @@ def turning_rows(smooth_mm: np.ndarray, travel_mm: float) -> list[int]:
     A turn counts once the displacement has come back by `travel_mm`, so neither noise nor a small backlash is one.
     Fewer than two rows where nothing moves that far.
     """
-    # Only local extremes can be turning points; the ends belong to them.
-    step = np.sign(np.diff(smooth_mm))
+    return _turns(smooth_mm, _extremes(smooth_mm, Pieces([len(smooth_mm)])).tolist(), travel_mm)
+
+
+def _extremes(smooth_mm: np.ndarray, traces: Pieces) -> np.ndarray:
+    """Return the rows in all traces where the motion changes its sign."""
+    step = np.sign(traces.steps(smooth_mm))
     nonzero = np.flatnonzero(step)
-    change = nonzero[1:][step[nonzero[1:]] != step[nonzero[:-1]]]
-    candidates = [0, *change.tolist(), len(smooth_mm) - 1]
+    of, way = traces.of[nonzero], step[nonzero]
+    return nonzero[1:][(way[1:] != way[:-1]) & (of[1:] == of[:-1])]
+
+
+def _turns(smooth_mm: np.ndarray, extremes: list[int], travel_mm: float) -> list[int]:
+    # Only local extremes can be turning points; the ends belong to them.
+    candidates = [0, *extremes, len(smooth_mm) - 1]
     values = smooth_mm[candidates].tolist()
     turns: list[int] = []
     heading = high = low = 0  # `high` and `low` are places in `candidates`
@@ -155,58 +247,36 @@ def _bounds(smooth_mm: np.ndarray, turns: list[int], near_mm: float, samples: in
 
 
 def _last_at_rest(smooth_mm: np.ndarray, turn: int, after: int, near_mm: float, samples: int) -> int:
-    far = np.flatnonzero(np.abs(smooth_mm[turn : after + 1] - smooth_mm[turn]) > near_mm)
-    rest = int(far[0]) - 1 if len(far) else 0
-    per_row = abs(smooth_mm[after] - smooth_mm[turn]) / (after - turn)
+    far = np.abs(smooth_mm[turn : after + 1] - smooth_mm[turn]) > near_mm
+    rest = max(int(far.argmax()) - 1, 0)
+    per_row = float(abs(smooth_mm[after] - smooth_mm[turn])) / (after - turn)
     # That many rows are as near as that to any turn without a rest.
     return turn + rest if rest > 3.0 * near_mm / per_row + samples else turn
 
 
-def _whole_file(time_s: np.ndarray, displacement_mm: np.ndarray, settings: Strokes) -> Stroke:
-    n = len(time_s)
-    speed = slope(time_s, displacement_mm, np.ones(n, bool))
-    short = None if n >= settings.min_samples else f"only {n} samples; at least {settings.min_samples} are needed"
-    return Stroke(
-        1,
-        0,
-        n,
-        0,
-        1 if displacement_mm[-1] >= displacement_mm[0] else -1,
-        speed,
-        np.ones(n, bool),
-        np.ones(n, bool),
-        short,
-    )
+def _whole_files(
+    time_s: np.ndarray, displacement_mm: np.ndarray, moves: np.ndarray, cut: _Cut, settings: Strokes
+) -> Found:
+    """Return every trace that moves as one stroke, steady throughout."""
+    size = cut.stop - cut.start
+    least = settings.min_samples
+    short = [None if n >= least else f"only {n} samples; at least {least} are needed" for n in size.tolist()]
+    strokes = Pieces(size)
+    speed = slopes(time_s[moves], displacement_mm[moves], np.ones(strokes.rows, bool), strokes)
+    return Found(*cut, speed, short, moves, moves.copy())
 
 
-def _stroke(
-    number: int,
-    start: int,
-    origin: int,
-    direction: int,
-    time_s: np.ndarray,
-    displacement_mm: np.ndarray,
-    force_N: np.ndarray,
-    noise_mm: float,
-    settings: Strokes,
-) -> Stroke:
-    """Return one stroke from its own rows."""
-    n = len(time_s)
-    along = direction * displacement_mm
-    steady, sliding = steady_window(
-        time_s, along, direction * force_N, origin - start, noise_mm, settings.speed_tolerance
-    )
-    share = _covered(along, steady) / max(float(np.ptp(along)), 1e-300)
-    count = int(steady.sum())
-    measured = slope(time_s, displacement_mm, steady)
-    short = None
-    if count < settings.min_samples:
-        short = f"the steady window has {count} samples; at least {settings.min_samples} are needed"
-    elif share < settings.min_steady_share:
-        short = f"the steady window is {share:.0%} of the stroke; at least {settings.min_steady_share:.0%} is needed"
-    return Stroke(number, start, start + n, origin, direction, measured, steady, sliding, short)
+def _too_short(samples: int, share: float, settings: Strokes) -> str | None:
+    """Return why a steady window is too short to be used."""
+    if samples < settings.min_samples:
+        return f"the steady window has {samples} samples; at least {settings.min_samples} are needed"
+    if share < settings.min_steady_share:
+        return f"the steady window is {share:.0%} of the stroke; at least {settings.min_steady_share:.0%} is needed"
+    return None
 
 
-def _covered(along_mm: np.ndarray, steady: np.ndarray) -> float:
-    both = steady[1:] & steady[:-1]
-    return float(np.abs(np.diff(along_mm)[both]).sum()) if both.any() else 0.0
+def _share_covered(along_mm: np.ndarray, steady: np.ndarray, strokes: Pieces) -> np.ndarray:
+    """Return the share of its range that a stroke covers within its steady window."""
+    covered = np.abs(strokes.steps(along_mm))
+    covered[:-1] *= steady[1:] & steady[:-1]
+    return strokes.sum(covered) / np.maximum(strokes.max(along_mm) - strokes.min(along_mm), 1e-300)

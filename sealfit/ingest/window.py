@@ -1,11 +1,14 @@
-"""The steady window of one stroke: where its speed is on the plateau and its force past the pre-sliding rise."""
+"""The steady window of a stroke: where its speed is on the plateau and its force past the pre-sliding rise."""
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.ndimage import median_filter
+from dataclasses import dataclass
 
+import numpy as np
+
+from sealfit.ingest.pieces import Pieces, median, weighted_medians
 from sealfit.ingest.presliding import rise_end_mm
+from sealfit.ingest.running import running_median
 
 REST = 0.5  # slower than this share of the plateau is a rest, not a ripple of the speed
 STANDSTILL = 0.05  # slower than this share of the plateau: not moving yet, or no more
@@ -16,155 +19,209 @@ BEFORE_STOP = 0.5  # an S-shaped stop leaves the plateau earlier than a straight
 SPEED_NOISE = 0.25  # noise of the local speed, as a share of the tolerance: a false exit is then a matter of four SDs
 
 
-def steady_window(
-    time_s: np.ndarray, along_mm: np.ndarray, force_N: np.ndarray, origin: int, noise_mm: float, tolerance: float
+def steady_windows(
+    time_s: np.ndarray,
+    along_mm: np.ndarray,
+    force_N: np.ndarray,
+    strokes: Pieces,
+    origin: np.ndarray,
+    noise_mm: np.ndarray,
+    tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which rows of a stroke are in its steady window, and in which it slides at all, shape (n,) each.
+    """Return which rows of strokes are in their steady window, and in which they slide at all, shape (n,) each.
 
     Parameters
     ----------
     time_s, along_mm, force_N : ndarray, shape (n,)
-        One stroke; displacement rising with the motion, force positive against it.
-    origin : int
-        Row from which it may move.
-    noise_mm : float
+        Strokes, one after the other; displacement rising with the motion, force positive against it.
+    strokes : Pieces
+        Where each of them lies.
+    origin : ndarray of int, shape (strokes,)
+        Row, counted from the stroke's first one, from which it may move.
+    noise_mm : ndarray, shape (strokes,)
         Standard deviation of a displacement sample.
     tolerance : float
         Share by which the speed may be off its plateau.
     """
     # A glitch of one sample is not a rest.
-    speed, half = local_speed(time_s, median_filter(along_mm, 5, mode="nearest"), noise_mm, tolerance)
-    plateau = plateau_speed(time_s, speed)
+    speed, half = local_speeds(time_s, running_median(along_mm, strokes, 5), strokes, noise_mm, tolerance)
+    plateau = plateau_speeds(time_s, speed, strokes)
     steady = np.zeros(len(time_s), bool)
-    since = origin
-    for first, last in _moving(time_s, along_mm, speed, plateau, since, half):
-        still = _standstill(speed, plateau, since, first)
-        begin = _ramp_end(time_s, speed, plateau, still, first, last, half, tolerance)
-        end = _stop_begin(time_s, speed, plateau, first, last, half, tolerance)
-        if end - begin >= 4:
-            steady[_rise_end(along_mm, force_N, still, begin, end) : end] = True
-        since = last
-    sliding = speed > STANDSTILL * plateau
-    sliding[:origin] = False
+    usual = strokes.spread(plateau)
+    slow = speed < STANDSTILL * usual
+    fast = speed >= (1.0 - tolerance) * usual
+    sliding = speed > STANDSTILL * usual
+    moves = speed > REST * usual
+    for start, rows in zip(strokes.start[origin > 0].tolist(), origin[origin > 0].tolist(), strict=True):
+        sliding[start : start + rows] = moves[start : start + rows] = False
+    begins, ends = (strokes.split(rows) for rows in _edges(moves, strokes))
+    for i, rows in enumerate(strokes.slices):
+        if plateau[i] <= 0.0:
+            continue
+        stroke = _Motion(
+            time_s[rows], along_mm[rows], speed[rows], slow[rows], fast[rows], float(plateau[i]), int(half[i])
+        )
+        since = int(origin[i])
+        for first, last in stroke.moving(begins[i].tolist(), ends[i].tolist()):
+            still = stroke.standstill(since, first)
+            begin, end = stroke.ramp_end(still, first, last), stroke.stop_begin(first, last)
+            if end - begin >= 4:
+                past = _rise_end(stroke.along_mm, force_N[rows], still, begin, end)
+                steady[rows.start + past : rows.start + end] = True
+            since = last
     return steady, sliding
 
 
-def local_speed(time_s: np.ndarray, along_mm: np.ndarray, noise_mm: float, tolerance: float) -> tuple[np.ndarray, int]:
-    """Return the speed over `half` rows to either side of each row, and `half`, wide enough for the noise.
+def local_speeds(
+    time_s: np.ndarray, along_mm: np.ndarray, strokes: Pieces, noise_mm: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the speed over `half` rows to either side of each row, and each stroke's `half`: wide enough for noise.
 
     Differences of displacement over differences of time: a gap does no harm.
     """
-    n = len(time_s)
-    mean_step = abs(along_mm[-1] - along_mm[0]) / (n - 1)
+    last = strokes.stop - 1
+    mean_step = np.abs(along_mm[last] - along_mm[strokes.start]) / np.maximum(strokes.size - 1, 1)
     # The speed's SD is sqrt(2) noise over the width, wanted below SPEED_NOISE * tolerance of the speed itself.
-    wanted = np.sqrt(2.0) * noise_mm / max(2.0 * SPEED_NOISE * tolerance * mean_step, 1e-300)
-    half = int(min(max(np.ceil(wanted), 1), max(n // 8, 1)))
-    rows = np.arange(n)
-    low, high = np.maximum(rows - half, 0), np.minimum(rows + half, n - 1)
+    wanted = np.sqrt(2.0) * noise_mm / np.maximum(2.0 * SPEED_NOISE * tolerance * mean_step, 1e-300)
+    half = np.minimum(np.maximum(np.ceil(wanted), 1), np.maximum(strokes.size // 8, 1)).astype(np.int64)
+    rows, width = np.arange(strokes.rows), strokes.spread(half)
+    low = np.maximum(rows - width, strokes.spread(strokes.start))
+    high = np.minimum(rows + width, strokes.spread(last))
     return (along_mm[high] - along_mm[low]) / (time_s[high] - time_s[low]), half
 
 
-def plateau_speed(time_s: np.ndarray, speed: np.ndarray) -> float:
+def plateau_speeds(time_s: np.ndarray, speed: np.ndarray, strokes: Pieces) -> np.ndarray:
     """Return the speed at which half of the distance is slid slower and half faster: blind to rests and ramps."""
-    distance = np.maximum(speed, 0.0) * np.gradient(time_s)
-    order = np.argsort(speed)
-    covered = np.cumsum(distance[order])
-    if covered[-1] <= 0.0:
-        return 0.0
-    return float(speed[order][np.searchsorted(covered, 0.5 * covered[-1])])
+    lasts = np.empty(len(time_s))  # how long each sample lasts, as np.gradient says it
+    lasts[1:-1] = (time_s[2:] - time_s[:-2]) / 2.0
+    first, last = strokes.start, strokes.stop - 1
+    lasts[first] = time_s[np.minimum(first + 1, last)] - time_s[first]
+    lasts[last] = time_s[last] - time_s[np.maximum(last - 1, first)]
+    return weighted_medians(speed, np.maximum(speed, 0.0) * lasts, strokes)
 
 
-def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -> float:
-    """Return the slope of displacement over time by least squares, with one slope for all pieces of the window.
+def slopes(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray, strokes: Pieces) -> np.ndarray:
+    """Return the slope of displacement over time by least squares, with one slope for all pieces of a stroke's window.
 
     Each piece (between rests) has its own intercept, so a rest does not count as slow sliding. NaN without samples.
     """
     rows = np.flatnonzero(steady)
-    if len(rows) < 2:
-        return float("nan")
-    piece = np.cumsum(np.diff(rows, prepend=rows[0]) > 1)
+    made = np.full(len(strokes), np.nan)
+    if not len(rows):
+        return made
+    stroke = strokes.of[rows]
+    piece = np.concatenate(([0], np.cumsum((rows[1:] - rows[:-1] > 1) | (stroke[1:] != stroke[:-1]))))
     count = np.bincount(piece)
     t, d = time_s[rows], displacement_mm[rows]
     t = t - (np.bincount(piece, t) / count)[piece]
     d = d - (np.bincount(piece, d) / count)[piece]
-    return float(np.dot(t, d) / np.dot(t, t))
+    samples = np.bincount(stroke, minlength=len(strokes))
+    windows = Pieces(samples[samples > 0])
+    for i, own in zip(np.flatnonzero(samples).tolist(), windows.slices, strict=True):
+        if samples[i] > 1:
+            made[i] = np.dot(t[own], d[own]) / np.dot(t[own], t[own])
+    return made
 
 
-def _moving(
-    time_s: np.ndarray, along_mm: np.ndarray, speed: np.ndarray, plateau: float, origin: int, half: int
-) -> list[tuple[int, int]]:
-    """Return first and last (exclusive) row of every stretch of motion after `origin`.
-
-    Slow samples are a rest only if they cost more time than the width over which the speed is taken: noise does not.
-    """
-    if plateau <= 0.0:
-        return []
-    moves = speed > REST * plateau
-    moves[: max(origin, 0)] = False
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], moves, [False])).astype(np.int8)))
-    stretches: list[tuple[int, int]] = []
-    step = float(np.median(np.diff(time_s)))
-    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        if stretches:
-            a, b = max(stretches[-1][1] - half, 0), min(first + half, len(time_s) - 1)
-            lost = (time_s[b] - time_s[a]) - (along_mm[b] - along_mm[a]) / plateau
-            if lost <= 2.0 * half * step:
-                stretches[-1] = (stretches[-1][0], last)
-                continue
-        stretches.append((first, last))
-    return [(first, last) for first, last in stretches if last - first > 2 * half + 3]
+def _edges(mask: np.ndarray, strokes: Pieces) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first rows of all stretches of `mask`, none longer than its stroke, and their last rows."""
+    begins, ends = mask.copy(), mask.copy()
+    begins[1:] &= ~mask[:-1]
+    ends[:-1] &= ~mask[1:]
+    begins[strokes.start] = mask[strokes.start]
+    ends[strokes.stop - 1] = mask[strokes.stop - 1]
+    return np.flatnonzero(begins), np.flatnonzero(ends)
 
 
-def _standstill(speed: np.ndarray, plateau: float, since: int, first: int) -> int:
-    """Return the last row from `since` on, and before `first`, at which the platform still stood; `since` if none."""
-    still = np.flatnonzero(speed[since:first] < STANDSTILL * plateau)
-    return since + int(still[-1]) if len(still) else since
+@dataclass(frozen=True, slots=True, eq=False)
+class _Motion:
+    """How one stroke moves: arrays of shape (n,); `slow` and `fast` mark standstill and the band of the plateau."""
+
+    time_s: np.ndarray
+    along_mm: np.ndarray
+    speed: np.ndarray
+    slow: np.ndarray
+    fast: np.ndarray
+    plateau: float
+    half: int
+
+    def moving(self, begins: list[int], ends: list[int]) -> list[tuple[int, int]]:
+        """Return first and last (exclusive) row of every stretch of motion, from where it is faster than a rest.
+
+        Slow samples are a rest only if they cost more time than the width over which the speed is taken: noise does
+        not.
+        """
+        stretches: list[tuple[int, int]] = []
+        time_s, along_mm, half = self.time_s, self.along_mm, self.half
+        step = median(time_s[1:] - time_s[:-1]) if len(begins) > 1 else 0.0
+        for first, end in zip(begins, ends, strict=True):
+            if stretches:
+                a, b = max(stretches[-1][1] - half, 0), min(first + half, len(time_s) - 1)
+                lost = (time_s[b] - time_s[a]) - (along_mm[b] - along_mm[a]) / self.plateau
+                if lost <= 2.0 * half * step:
+                    stretches[-1] = (stretches[-1][0], end + 1)
+                    continue
+            stretches.append((first, end + 1))
+        return [(first, last) for first, last in stretches if last - first > 2 * half + 3]
+
+    def standstill(self, since: int, first: int) -> int:
+        """Return the last row from `since` on, and before `first`, at which the platform still stood; else `since`."""
+        still = _last(self.slow[since:first])
+        return since if still is None else since + still
+
+    def ramp_end(self, still: int, first: int, last: int) -> int:
+        """Return the row from which the speed is on its plateau."""
+        reached = _first(self.fast[first:last])
+        if reached is None:
+            return last
+        time_s, arrived = self.time_s, first + reached
+        if arrived <= still:
+            return arrived
+        # The local speed smears a sudden start over 2 half rows, 1.7 of them between standstill and arrival.
+        step = float(time_s[last - 1] - time_s[first]) / max(last - 1 - first, 1)
+        took = float(time_s[arrived] - time_s[still])
+        ramp = max(took - 1.7 * self.half * step, 0.0)
+        half_way = still + int(np.argmax(self.speed[still : arrived + 1] >= 0.5 * self.plateau))
+        shape = took / max(float(time_s[half_way] - time_s[still]), step)
+        after = _after_ramp(shape) * ramp
+        return int(time_s.searchsorted(time_s[arrived] + after)) + self.half // 3 + 1
+
+    def stop_begin(self, first: int, last: int) -> int:
+        """Return the row at which the speed leaves its plateau for good."""
+        fast = _last(self.fast[first:last])
+        if fast is None:
+            return first
+        time_s, left = self.time_s, first + fast
+        n = len(time_s)
+        if left == n - 1:
+            return n
+        still = _first(self.slow[left:])
+        stopped = left + still if still is not None else n - 1
+        step = float(time_s[last - 1] - time_s[first]) / max(last - 1 - first, 1)
+        brake = max(float(time_s[stopped] - time_s[left]) - 1.7 * self.half * step, 0.0)
+        return int(time_s.searchsorted(time_s[left] - BEFORE_STOP * brake)) - self.half // 3
 
 
-def _ramp_end(
-    time_s: np.ndarray,
-    speed: np.ndarray,
-    plateau: float,
-    still: int,
-    first: int,
-    last: int,
-    half: int,
-    tolerance: float,
-) -> int:
-    reached = np.flatnonzero(speed[first:last] >= (1.0 - tolerance) * plateau)
-    if not len(reached):
-        return last
-    arrived = first + int(reached[0])
-    if arrived <= still:
-        return arrived
-    # The local speed smears a sudden start over 2 half rows, 1.7 of them between standstill and arrival.
-    step = (time_s[last - 1] - time_s[first]) / max(last - 1 - first, 1)
-    ramp = max(time_s[arrived] - time_s[still] - 1.7 * half * step, 0.0)
-    half_way = still + int(np.argmax(speed[still : arrived + 1] >= 0.5 * plateau))
-    shape = (time_s[arrived] - time_s[still]) / max(time_s[half_way] - time_s[still], step)
-    after = float(np.interp(shape, [STRAIGHT[0], LAG[0]], [STRAIGHT[1], LAG[1]])) * ramp
-    return int(np.searchsorted(time_s, time_s[arrived] + after)) + half // 3 + 1
+def _after_ramp(shape: float) -> float:
+    """Return how much of the ramp follows after 90 % of the plateau, from the times to 90 % and to 50 % of it."""
+    (low, least), (high, most) = STRAIGHT, LAG
+    return least + (most - least) / (high - low) * (min(max(shape, low), high) - low)
 
 
-def _stop_begin(
-    time_s: np.ndarray, speed: np.ndarray, plateau: float, first: int, last: int, half: int, tolerance: float
-) -> int:
-    fast = np.flatnonzero(speed[first:last] >= (1.0 - tolerance) * plateau)
-    if not len(fast):
-        return first
-    left = first + int(fast[-1])
-    n = len(speed)
-    if left == n - 1:
-        return n
-    still = np.flatnonzero(speed[left:] < STANDSTILL * plateau)
-    stopped = left + int(still[0]) if len(still) else n - 1
-    step = (time_s[last - 1] - time_s[first]) / max(last - 1 - first, 1)
-    brake = max(time_s[stopped] - time_s[left] - 1.7 * half * step, 0.0)
-    return int(np.searchsorted(time_s, time_s[left] - BEFORE_STOP * brake)) - half // 3
+def _first(mask: np.ndarray) -> int | None:
+    """Return the first row that is true, if any."""
+    at = int(mask.argmax()) if len(mask) else 0
+    return at if len(mask) and mask[at] else None
+
+
+def _last(mask: np.ndarray) -> int | None:
+    """Return the last row that is true, if any."""
+    found = _first(mask[::-1])
+    return None if found is None else len(mask) - 1 - found
 
 
 def _rise_end(along_mm: np.ndarray, force_N: np.ndarray, still: int, begin: int, end: int) -> int:
     """Return the row, at or after `begin`, from which the force is past its pre-sliding rise."""
     distance = np.maximum.accumulate(along_mm[still:end]) - along_mm[still]
     past = rise_end_mm(distance, force_N[still:end], begin - still)
-    return max(begin, still + int(np.searchsorted(distance, past)))
+    return max(begin, still + int(distance.searchsorted(past)))

@@ -5,9 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealfit.config import Strokes
+from sealfit.ingest.pieces import Pieces
 from sealfit.ingest.presliding import rise_end_mm
 from sealfit.ingest.strokes import find_strokes, turning_rows
-from sealfit.ingest.window import slope
+from sealfit.ingest.window import slopes
 
 
 def stroke(
@@ -227,7 +228,8 @@ def test_neighbouring_turns_alternate_and_are_at_least_the_travel_apart(values, 
 def test_slope_of_two_pieces_ignores_the_rest_between_them():
     time = np.arange(10.0)
     x = np.array([0, 2, 4, 6, 8, 8, 8, 10, 12, 14.0])
-    assert slope(time, x, np.array([1, 1, 1, 1, 0, 0, 1, 1, 1, 1], bool)) == pytest.approx(2.0)
+    steady = np.array([1, 1, 1, 1, 0, 0, 1, 1, 1, 1], bool)
+    assert slopes(time, x, steady, Pieces([10]))[0] == pytest.approx(2.0)
 
 
 def test_no_rise_is_found_in_a_force_that_falls_or_begins_within_its_later_band():
