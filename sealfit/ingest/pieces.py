@@ -55,7 +55,10 @@ class Pieces:
 
     def sum(self, values: np.ndarray) -> np.ndarray:
         """Return the sum over every piece, shape (k,); of a mask, how many are true."""
-        return np.add.reduceat(values, self.start, dtype=np.int64 if values.dtype == bool else None)
+        if values.dtype == bool:
+            return np.add.reduceat(values, self.start, dtype=np.int64)
+        # Not by reduceat, which adds one after the other: the mean of a constant would not be that constant.
+        return np.array([np.add.reduce(values[own]) for own in self.slices])
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """Return the mean of every piece, shape (k,)."""
@@ -67,10 +70,6 @@ class Pieces:
         np.subtract(values[1:], values[:-1], out=made[:-1])
         made[self.stop - 1] = 0.0
         return made
-
-    def within(self, mask: np.ndarray) -> np.ndarray:
-        """Return how many rows of every piece are in `mask`, shape (k,)."""
-        return self.sum(mask)
 
     def split(self, rows: np.ndarray) -> list[np.ndarray]:
         """Return, for every piece, those of `rows` (rising) that lie in it, counted from its first row."""

@@ -14,6 +14,7 @@ import pandas as pd
 
 from sealfit.config import Config, Quality
 from sealfit.errors import Fault
+from sealfit.ingest.pieces import Pieces
 from sealfit.ingest.strokes import Stroke
 from sealfit.tables import QUALITY
 
@@ -23,6 +24,35 @@ FINE = 0.3  # share of equal neighbours below which noise is plainly larger than
 # cannot be told from a stuck one.
 COARSE = 0.6
 FEW_LEVELS = 5
+
+
+def suspects(
+    time_s: np.ndarray, force_N: np.ndarray, steady: np.ndarray, strokes: Pieces, settings: Quality
+) -> np.ndarray:
+    """Return in which strokes there may be a gap, or a sensor at its end or stuck, shape (strokes,).
+
+    `stroke_faults` finds none of these in the others. Arguments as in `steady_windows`; a stroke without a steady
+    window is none of them.
+    """
+    step = time_s[1:] - time_s[:-1]
+    step = np.append(step, step[-1:])
+    last, first = strokes.stop - 1, strokes.start
+    step[last] = step[np.maximum(last - 1, first)]  # the step to the next stroke is none
+    made = strokes.max(step) > settings.max_gap_factor * strokes.min(step)
+    count = strokes.sum(steady)
+    some, rows = count > 0, np.flatnonzero(steady)
+    if not len(rows):
+        return made
+    windows, force = Pieces(count[some]), force_N[rows]
+    size = np.abs(force)
+    extreme = windows.mean(size == windows.spread(windows.max(size)))
+    made[some] |= extreme >= settings.saturated_share
+    ends = windows.steps(force) != 0.0  # of runs of equal samples
+    ends[windows.stop - 1] = True
+    at = np.flatnonzero(ends)
+    runs = np.append(at[:1] + 1, at[1:] - at[:-1])
+    made[some] |= np.maximum.reduceat(runs, np.searchsorted(at, windows.start)) >= settings.stuck_samples
+    return made
 
 
 def stroke_faults(
@@ -87,9 +117,14 @@ def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault
     ]
 
 
-def equal_neighbours(force_N: np.ndarray) -> float:
-    """Return the share of samples that equal the one before: near 0 where noise is finer than the sensor's steps."""
-    return float(np.mean(np.diff(force_N) == 0.0)) if len(force_N) > 1 else 0.0
+def equal_neighbours(force_N: np.ndarray, windows: Pieces) -> np.ndarray:
+    """Return the share of samples of every window that equal the one before, shape (windows,).
+
+    Near 0 where noise is finer than the sensor's steps.
+    """
+    same = windows.steps(force_N) == 0.0
+    same[windows.stop - 1] = False
+    return windows.sum(same) / np.maximum(windows.size - 1, 1)
 
 
 def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault]:

@@ -8,14 +8,33 @@ import numpy as np
 
 from sealfit.config import Quality
 from sealfit.errors import Fault
-from sealfit.ingest.pieces import Pieces
+from sealfit.ingest.pieces import Pieces, median, quantile
 from sealfit.ingest.running import running_median
 from sealfit.ingest.strokes import Stroke, displacement_noises_mm
 
 NEIGHBOURS = 5  # a median over five samples is blind to one or two wrong ones, and exact on any slope
 # A spike stands apart, four times as far off as 95 % of the samples (of noise: 7.8 SDs); else it is one of many bursts.
-APART, USUAL = 4.0, 95.0
+APART, USUAL = 4.0, 0.95
 MEND = "Correct the cell if the true value is known."
+
+
+def displacement_suspects(
+    displacement_mm: np.ndarray, traces: Pieces, noise_mm: np.ndarray, settings: Quality
+) -> np.ndarray:
+    """Return which traces may hold a spike of displacement, shape (traces,): of the others none is found."""
+    off = np.abs(displacement_mm - running_median(displacement_mm, traces, NEIGHBOURS, "mirror"))
+    return (traces.size >= 4 * NEIGHBOURS) & (traces.max(off) > settings.spike_sigma * noise_mm)
+
+
+def force_suspects(force_N: np.ndarray, steady: np.ndarray, traces: Pieces, settings: Quality) -> np.ndarray:
+    """Return which traces may hold a spike of force, shape (traces,): of the others none is found."""
+    off = np.abs(force_N - running_median(force_N, traces, NEIGHBOURS, "mirror"))
+    far = traces.max(off)
+    made = traces.size >= 4 * NEIGHBOURS
+    for i, rows in enumerate(traces.slices):
+        usual = off[rows][steady[rows]]
+        made[i] &= far[i] > settings.spike_sigma * (1.4826 * median(usual if len(usual) else off[rows]))
+    return made
 
 
 def displacement_spikes(
@@ -31,9 +50,9 @@ def displacement_spikes(
     one = Pieces([len(displacement_mm)])
     off = displacement_mm - running_median(displacement_mm, one, NEIGHBOURS, "mirror")
     # At a turn the median lags by one step of the fastest samples around, never by more than a few of the usual ones.
-    step = float(np.median(np.abs(np.diff(displacement_mm))))
+    step = median(np.abs(np.diff(displacement_mm)))
     (noise,) = displacement_noises_mm(displacement_mm, one)
-    least = max(5.0 * step, APART * float(np.percentile(np.abs(off), USUAL)), 1e-9 * float(np.ptp(displacement_mm)))
+    least = max(5.0 * step, APART * quantile(np.abs(off), USUAL), 1e-9 * float(np.ptp(displacement_mm)))
     spikes = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, least))
     if len(spikes) > settings.max_bad_rows * len(off):
         return keep, []
@@ -59,9 +78,9 @@ def force_spikes(
     for stroke in strokes:
         steady[stroke.rows] = True
     usual = off[steady] if steady.any() else off
-    least = max(0.5 * resolution(force_N), 1e-9 * float(np.median(np.abs(force_N))), 1e-300)
-    noise = max(1.4826 * float(np.median(np.abs(usual))), least)
-    apart = APART * float(np.percentile(np.abs(usual), USUAL))
+    least = max(0.5 * resolution(force_N), 1e-9 * median(np.abs(force_N)), 1e-300)
+    noise = max(1.4826 * median(np.abs(usual)), least)
+    apart = APART * quantile(np.abs(usual), USUAL)
     suspects = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, apart))
     if not len(suspects):
         return keep, []

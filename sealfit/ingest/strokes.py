@@ -88,7 +88,12 @@ def find_strokes(
 
 
 def find_all(
-    time_s: np.ndarray, displacement_mm: np.ndarray, force_N: np.ndarray, traces: Pieces, settings: Strokes
+    time_s: np.ndarray,
+    displacement_mm: np.ndarray,
+    force_N: np.ndarray,
+    traces: Pieces,
+    settings: Strokes,
+    noise_mm: np.ndarray | None = None,
 ) -> Found:
     """Return the strokes of several traces.
 
@@ -101,6 +106,8 @@ def find_all(
         Where each of them lies.
     settings : Strokes
         The config's `strokes`.
+    noise_mm : ndarray, shape (traces,), optional
+        What `displacement_noises_mm` says of them, where it is known.
 
     Returns
     -------
@@ -114,7 +121,7 @@ def find_all(
         way = np.where(last >= first, 1, -1)
         cut = _Cut(whole, np.ones_like(whole), traces.start[whole], traces.stop[whole], traces.start[whole], way)
         return _whole_files(time_s, displacement_mm, traces.spread(moves), cut, settings)
-    noise = displacement_noises_mm(displacement_mm, traces)
+    noise = displacement_noises_mm(displacement_mm, traces) if noise_mm is None else noise_mm
     smooth = smoothed(displacement_mm, traces, settings.smooth_samples)
     span = traces.max(smooth) - traces.min(smooth)
     moves &= ~(span <= 8.0 * noise)  # the range of some hundred samples of noise alone is about six SDs

@@ -1,0 +1,245 @@
+"""Traces to what is known of their strokes: which are of use, their means, and the samples with their place in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sealfit.config import Config
+from sealfit.errors import Fault
+from sealfit.ingest.average import standard_errors
+from sealfit.ingest.pieces import Pieces
+from sealfit.ingest.quality import equal_neighbours, load_faults, speed_column_faults, stroke_faults, suspects
+from sealfit.ingest.read import Trace
+from sealfit.ingest.refs import TraceRef
+from sealfit.ingest.speed_unit import speed_factor
+from sealfit.ingest.spikes import displacement_spikes, displacement_suspects, force_spikes, force_suspects
+from sealfit.ingest.strokes import Found, displacement_noises_mm, find_all
+
+OWN_SPEED = "speed_file_mm_s"  # what the reader calls a speed column of the trace itself
+SLOTS = ("time_s", "displacement_mm", "force_N")
+
+
+class Made(NamedTuple):
+    """What one trace gives: findings, a row per stroke, and its samples as columns of equal length."""
+
+    faults: tuple[Fault, ...]
+    strokes: tuple[Mapping[str, object], ...] = ()
+    samples: Mapping[str, np.ndarray] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Bundle:
+    """Traces with the same columns, end to end: columns and `line` of shape (n,), and what was found in each trace."""
+
+    refs: Sequence[TraceRef]
+    columns: Mapping[str, np.ndarray]
+    line: np.ndarray
+    traces: Pieces
+    faults: Sequence[list[Fault]]
+
+    @classmethod
+    def of(cls, traces: Sequence[Trace]) -> _Bundle:
+        columns = {name: np.concatenate([trace.columns[name] for trace in traces]) for name in traces[0].columns}
+        line = np.concatenate([trace.line for trace in traces])
+        pieces = Pieces([len(trace.line) for trace in traces])
+        return cls([trace.ref for trace in traces], columns, line, pieces, [list(trace.faults) for trace in traces])
+
+    def slots(self) -> tuple[np.ndarray, ...]:
+        return tuple(self.columns[name] for name in SLOTS)
+
+    def where(self, keep: np.ndarray) -> _Bundle:
+        """Return the bundle with some of its rows, at least one of every trace."""
+        columns = {name: values[keep] for name, values in self.columns.items()}
+        return _Bundle(self.refs, columns, self.line[keep], Pieces(self.traces.sum(keep)), self.faults)
+
+    def only(self, chosen: Sequence[int]) -> _Bundle:
+        """Return the bundle with some of its traces."""
+        rows = np.concatenate([np.arange(own.start, own.stop) for own in (self.traces.slices[i] for i in chosen)])
+        columns = {name: values[rows] for name, values in self.columns.items()}
+        refs, faults = [self.refs[i] for i in chosen], [self.faults[i] for i in chosen]
+        return _Bundle(refs, columns, self.line[rows], Pieces(self.traces.size[list(chosen)]), faults)
+
+
+def strokes_of(traces: Sequence[Trace], config: Config) -> list[Made]:
+    """Return the strokes of traces that were read, in their order; all that have the same columns in one go."""
+    alike: dict[tuple, list[int]] = {}
+    for i, trace in enumerate(traces):
+        alike.setdefault(tuple((name, v.dtype.kind) for name, v in trace.columns.items()), []).append(i)
+    made: dict[int, Made] = {}
+    for members in alike.values():
+        made.update(zip(members, _bundled(_Bundle.of([traces[i] for i in members]), config), strict=True))
+    return [made[i] for i in range(len(traces))]
+
+
+def _bundled(bundle: _Bundle, config: Config) -> list[Made]:
+    bundle, noise = _without_displacement_spikes(bundle, config)
+    found = find_all(*bundle.slots(), bundle.traces, config.strokes, noise)
+    made: dict[int, Made] = {}
+    suspected = force_suspects(bundle.columns["force_N"], found.steady, bundle.traces, config.quality)
+    for i in np.flatnonzero(suspected).tolist():
+        rows, force = bundle.traces.slices[i], bundle.columns["force_N"]
+        own = found.of_trace(i, rows.start)
+        keep, faults = force_spikes(bundle.refs[i].file, force[rows], own, bundle.line[rows], config.quality)
+        bundle.faults[i].extend(faults)
+        if not keep.all():
+            # Rows do not decide where a stroke begins: found again without the spikes, it is found at the same place.
+            one = bundle.only([i]).where(keep)
+            again = find_all(*one.slots(), one.traces, config.strokes)
+            (made[i],) = _finished(one, again, config) if len(again.trace) else [_unmoved(one, 0, config)]
+    moved = set(found.trace.tolist())
+    made |= {i: _unmoved(bundle, i, config) for i in range(len(bundle.refs)) if i not in moved and i not in made}
+    left = [i for i in range(len(bundle.refs)) if i not in made]
+    if left and len(moved) < len(bundle.refs):
+        bundle = bundle.only(left)
+        found = find_all(*bundle.slots(), bundle.traces, config.strokes)
+        made |= dict(zip(left, _finished(bundle, found, config), strict=True))
+    elif left:
+        made = dict(enumerate(_finished(bundle, found, config, set(made)))) | made
+    return [made[i] for i in range(len(made))]
+
+
+def _without_displacement_spikes(bundle: _Bundle, config: Config) -> tuple[_Bundle, np.ndarray]:
+    """Return the bundle without rows whose displacement jumps away and back, and the displacement's noise."""
+    displacement, traces = bundle.columns["displacement_mm"], bundle.traces
+    noise = displacement_noises_mm(displacement, traces)
+    keep = np.ones(traces.rows, bool)
+    for i in np.flatnonzero(displacement_suspects(displacement, traces, noise, config.quality)).tolist():
+        rows, file = traces.slices[i], bundle.refs[i].file
+        keep[rows], faults = displacement_spikes(file, displacement[rows], bundle.line[rows], config.quality)
+        bundle.faults[i].extend(faults)
+    if keep.all():
+        return bundle, noise
+    bundle = bundle.where(keep)
+    return bundle, displacement_noises_mm(bundle.columns["displacement_mm"], bundle.traces)
+
+
+def _unmoved(bundle: _Bundle, i: int, config: Config) -> Made:
+    """Return what is to be said of a trace without strokes."""
+    span = np.ptp(bundle.columns["displacement_mm"][bundle.traces.slices[i]])
+    fault = Fault(
+        "no_motion",
+        f"nothing moves: displacement stays within {span:.3g} {config.units.unit('displacement')}.",
+        file=bundle.refs[i].file,
+        column="displacement_mm",
+        action="file left out",
+        mend="Check the displacement column and its unit, or set strokes.min_travel_mm in the config.",
+    )
+    return Made((*bundle.faults[i], fault))
+
+
+def _finished(bundle: _Bundle, found: Found, config: Config, skip: Sequence[int] | set[int] = ()) -> list[Made]:
+    """Return the strokes of a bundle whose every trace has some; nothing is made of those in `skip`."""
+    strokes, count = Pieces(found.stop - found.start), np.bincount(found.trace, minlength=len(bundle.refs))
+    several = count > 1
+    samples = _samples(bundle.columns, found, strokes, several)
+    files = [bundle.refs[i].file for i in found.trace.tolist()]
+    rows = _stroke_rows(samples, files, found, strokes, speed_factor(config.units))
+    time_s, _, force = bundle.slots()
+    suspected = suspects(time_s, force, found.steady, strokes, config.quality)
+    made, first = [], 0
+    for i, own in enumerate(bundle.traces.slices):
+        mine = range(first, first + int(count[i]))
+        first = mine.stop
+        if i in skip:
+            made.append(Made(()))
+            continue
+        ref, faults, several_here = bundle.refs[i], bundle.faults[i], bool(several[i])
+        for k in mine:
+            number = int(found.number[k]) if several_here else None
+            wrong: list[Fault] = []
+            if suspected[k] or found.short[k] is not None:
+                stroke = found.stroke(k, own.start)
+                wrong = stroke_faults(ref.file, number, stroke, time_s[own], force[own], bundle.line[own], config)
+            used = not any(fault.action == "stroke left out" for fault in wrong)
+            row = rows[k] = {**ref.channels, **rows[k], "several": several_here, "used": used}
+            if used and OWN_SPEED in row:
+                wrong = wrong + speed_column_faults(ref.file, number, row["speed_mm_s"], row[OWN_SPEED], config)
+            faults.extend(wrong)
+        faults.extend(_load_faults(ref, bundle.columns, [rows[k] for k in mine], config))
+        columns = {name: values[own] for name, values in samples.items()}
+        made.append(Made(tuple(faults), tuple(rows[k] for k in mine), columns))
+    return made
+
+
+def _load_faults(
+    ref: TraceRef, columns: Mapping[str, np.ndarray], rows: Sequence[Mapping[str, object]], config: Config
+) -> list[Fault]:
+    """Return where the load measured in the strokes of use differs from the declared one."""
+    declared = ref.channels.get("load_N")
+    loads = [row["load_N"] for row in rows if row["used"]] if "load_N" in columns else []
+    if not loads or not isinstance(declared, int | float):
+        return []
+    return load_faults(ref.file, float(np.mean(loads)), declared, config.units.unit("load"))
+
+
+def _samples(
+    columns: Mapping[str, np.ndarray], found: Found, strokes: Pieces, several: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the samples of traces with stroke, distance, and flags; time from the stroke's start if a trace has
+    several."""
+    time_s, displacement = columns["time_s"], columns["displacement_mm"]
+    since = np.where(several[found.trace], time_s[found.origin], 0.0)
+    return {
+        "stroke": strokes.spread(found.number),
+        "time_s": time_s - strokes.spread(since),
+        "displacement_mm": displacement,
+        "force_N": columns["force_N"],
+        "steady": found.steady,
+        "sliding": found.sliding,
+        "distance_mm": np.abs(displacement - strokes.spread(displacement[found.origin])),
+        **{name: values for name, values in columns.items() if name not in SLOTS},
+    }
+
+
+def _stroke_rows(
+    samples: Mapping[str, np.ndarray], files: list[str], found: Found, strokes: Pieces, factor: float
+) -> list[dict[str, object]]:
+    """Return what the samples say of every stroke: its means over its steady window, and what is found there."""
+    count = strokes.sum(found.steady)
+    some, rows = count > 0, np.flatnonzero(found.steady)
+    windows = Pieces(count[some])
+
+    def of_strokes(per_window: np.ndarray, missing: float = np.nan) -> list:
+        made = np.full(len(strokes), missing, per_window.dtype)
+        made[some] = per_window
+        return made.tolist()
+
+    force, place = samples["force_N"][rows], samples["displacement_mm"][rows]
+    columns: dict[str, list] = {"stroke": found.number.tolist()}
+    for name, values in samples.items():
+        if name in columns or name in ("steady", "sliding"):
+            continue
+        if values.dtype.kind in "fiub":
+            columns[name] = of_strokes(windows.mean(values[rows]))
+        else:
+            own = values[rows]
+            labels = [_most_frequent(own[slots]) for slots in windows.slices]
+            columns[name] = of_strokes(np.array(labels, object), None)
+    deviation = force - windows.spread(windows.mean(force))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sd = np.where(windows.size > 1, np.sqrt(windows.sum(deviation * deviation) / (windows.size - 1)), np.nan)
+    size = np.abs(samples["force_N"])
+    columns |= {
+        "file": files,
+        "direction": found.direction.tolist(),
+        "speed_mm_s": (factor * found.speed_mm_s).tolist(),
+        "force_sd_N": of_strokes(sd),
+        "force_se_N": of_strokes(standard_errors(force, windows)),
+        "n": count.tolist(),
+        "displacement_from_mm": of_strokes(place[windows.start]),
+        "displacement_to_mm": of_strokes(place[windows.stop - 1]),
+        "equal": of_strokes(equal_neighbours(force, windows), 0.0),
+        "extreme": of_strokes(windows.max(size[rows]) >= strokes.max(size)[some], False),
+    }
+    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+
+
+def _most_frequent(labels: np.ndarray) -> str | None:
+    """Return the most frequent of labels; null of nothing."""
+    found = pd.Series(labels).mode()
+    return found.iloc[0] if len(found) else None
