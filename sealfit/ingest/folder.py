@@ -80,10 +80,10 @@ def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
     BadFile
         If it is missing, outside the campaign, no file, not readable, empty, or packed.
     """
-    return _read(Folder(campaign).inside(file), file, HEAD_BYTES if head else -1)[0]
+    return _read(Folder(campaign).inside(file), file, HEAD_BYTES if head else None)[0]
 
 
-def _read(path: str | None, file: str, size: int = -1) -> tuple[bytes, os.stat_result]:
+def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, os.stat_result]:
     if path is None:
         raise _bad(file, "path_outside", "lies outside the campaign folder.", "Copy it into the folder of runs.csv.")
     try:
@@ -95,8 +95,9 @@ def _read(path: str | None, file: str, size: int = -1) -> tuple[bytes, os.stat_r
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
             raise _bad(file, "unreadable_file", "is no file.", "Check the path.")
-        with open(handle, "rb", buffering=0, closefd=False) as stream:
-            raw = stream.read(size)
+        raw = os.read(handle, status.st_size + 1 if size is None else size)
+        while size is None and (more := os.read(handle, 1 << 20)):
+            raw += more
     except OSError as error:
         raise _bad(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.") from error
     finally:

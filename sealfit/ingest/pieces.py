@@ -11,6 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
+BINS = 64  # parts of a range that a weighted median is looked for in
+
 
 class Pieces:
     """Where each of k pieces lies in a flat array: rows `start` to `stop` (exclusive), both of shape (k,).
@@ -107,22 +109,26 @@ def weighted_medians(values: np.ndarray, weights: np.ndarray, pieces: Pieces) ->
 
     Only what is positive weighs: `weights` are 0 wherever `values` are not above 0.
     """
-    bins = 256  # first how much lies in which part of the range, then the order within the part where the half is
-    top = pieces.max(values)
-    scale = np.divide(bins * (1.0 - 1e-9), top, out=np.zeros(len(pieces)), where=top > 0.0)
-    place = np.maximum(values * pieces.spread(scale), 0.0).astype(np.int64)
-    place += pieces.of * bins
-    held = np.bincount(place, weights, minlength=bins * len(pieces)).reshape(len(pieces), bins)
-    covered = np.cumsum(held, axis=1)
-    half = 0.5 * covered[:, -1]
-    crossing = np.minimum((covered < half[:, None]).sum(axis=1), bins - 1)
-    before = covered[np.arange(len(pieces)), crossing] - held[np.arange(len(pieces)), crossing]
-    rows = np.flatnonzero(place == pieces.spread(crossing + bins * np.arange(len(pieces))))
-    made = np.zeros(len(pieces))
-    for i, (own, start) in enumerate(zip(pieces.split(rows), pieces.start.tolist(), strict=True)):
-        if half[i] > 0.0:
-            speed = values[own + start]
-            order = np.argsort(speed)
-            reached = np.searchsorted(before[i] + np.cumsum(weights[own + start][order]), half[i])
-            made[i] = speed[order[min(int(reached), len(order) - 1)]]
+    made, rows, of = np.zeros(len(pieces)), np.arange(pieces.rows), pieces.of
+    low, high, before = np.zeros(len(pieces)), pieces.max(values), np.zeros(len(pieces))
+    half: np.ndarray | None = None
+    # First how much lies in which part of the range, and again within the part where the half is; then their order.
+    for _ in range(2):
+        scale = np.divide(BINS, high - low, out=np.zeros(len(pieces)), where=high > low)
+        place = ((values[rows] - low[of]) * scale[of]).clip(0.0, BINS - 1.0).astype(np.int64) + BINS * of
+        held = np.bincount(place, weights[rows], minlength=BINS * len(pieces)).reshape(len(pieces), BINS)
+        covered = before[:, None] + np.cumsum(held, axis=1)
+        half = 0.5 * covered[:, -1] if half is None else half
+        crossing = np.minimum((covered < half[:, None]).sum(axis=1), BINS - 1)
+        before = np.where(crossing > 0, covered[np.arange(len(pieces)), crossing - 1], before)
+        inside = place == (crossing + BINS * np.arange(len(pieces)))[of]
+        rows, of = rows[inside], of[inside]
+        width = np.where(high > low, high - low, 0.0) / BINS
+        low, high = low + crossing * width, low + (crossing + 1) * width
+    for i, own in enumerate(pieces.split(rows)):
+        if half[i] > 0.0 and len(own):
+            held = own + pieces.start[i]
+            order = held[np.argsort(values[held])]
+            reached = np.searchsorted(before[i] + np.cumsum(weights[order]), half[i])
+            made[i] = values[order[min(int(reached), len(order) - 1)]]
     return made

@@ -20,8 +20,9 @@ from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.folder import read_bytes
 from sealfit.ingest.form import Form, form_of
 from sealfit.ingest.names import name_parts
+from sealfit.ingest.pieces import Pieces
 from sealfit.ingest.refs import TraceRef
-from sealfit.ingest.speed_check import check_speed
+from sealfit.ingest.speed_check import speed_faults
 from sealfit.ingest.text import Layout, as_utf8, header_fields
 
 MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
@@ -116,7 +117,27 @@ def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list
                 found[place] = _trace(cells, form, files[place][0], config)
             except BadFile as error:
                 found[place] = error
-    return found
+    return _at_their_speed(found, config)
+
+
+def _at_their_speed(found: Sequence[Trace | BadFile], config: Config) -> list[Trace | BadFile]:
+    """Return the traces with what is to be said of their speed; those that contradict it grossly are left out."""
+    traces = [trace for trace in found if isinstance(trace, Trace)]
+    if not traces:
+        return list(found)
+    time_s, displacement = (np.concatenate([t.columns[name] for t in traces]) for name in ("time_s", "displacement_mm"))
+    pieces = Pieces([len(trace.line) for trace in traces])
+    faults = iter(speed_faults(time_s, displacement, pieces, [trace.ref for trace in traces], config))
+    made: list[Trace | BadFile] = []
+    for trace in found:
+        fault = next(faults) if isinstance(trace, Trace) else None
+        if fault is None:
+            made.append(trace)
+        elif fault.action == "file left out":
+            made.append(BadFile(*trace.faults, fault))
+        else:
+            made.append(replace(trace, faults=(*trace.faults, fault)))
+    return made
 
 
 def _trace(cells: Cells, form: Form, ref: TraceRef, config: Config) -> Trace:
@@ -144,12 +165,7 @@ def _trace(cells: Cells, form: Form, ref: TraceRef, config: Config) -> Trace:
     if len(rows.line) < MIN_ROWS:
         reason = f"{len(rows.line)} of {len(good)} data rows are left; a trace needs {MIN_ROWS}."
         raise BadFile(*faults, _bad_file("no_rows", reason, file, "Check drop_first_rows, keep and the export."))
-    columns = _named_beside(rows, ref, settings)
-    if fault := check_speed(columns["time_s"], columns["displacement_mm"], ref, config):
-        if fault.action == "file left out":
-            raise BadFile(*faults, fault)
-        faults.append(fault)
-    return Trace(ref, columns, rows.line, len(good), tuple(faults))
+    return Trace(ref, _named_beside(rows, ref, settings), rows.line, len(good), tuple(faults))
 
 
 def _derive(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from sealfit.config import Config
 from sealfit.errors import Fault
+from sealfit.ingest.pieces import Pieces, quantile
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.speed_unit import speed_factor
 
@@ -16,18 +18,7 @@ GROSS = 1.5  # beyond this factor the file contradicts itself and is left out; b
 
 
 def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
-    """Return the mean speed of a trace, rests included, and its plateau speed; magnitudes, nan if there is none.
-
-    Parameters
-    ----------
-    time_s, displacement_mm : ndarray, shape (n,)
-        Rising time and displacement, in any unit; the speeds are in their quotient.
-
-    Notes
-    -----
-    The trace is cut into 100 pieces, or 50 per stroke. The mean is that of all pieces; the plateau is the median of
-    those faster than half their 90th percentile, so rests, turns and ramps do not count. In stick-slip the speed that
-    was set is the mean, in a stroke with rests it is the plateau; elsewhere the two agree.
+    """Return the mean speed of a trace, rests included, and its plateau speed: see `measured_speeds`.
 
     Examples
     --------
@@ -36,40 +27,115 @@ def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[flo
     >>> round(mean, 6), round(plateau, 6)
     (1.5, 3.0)
     """
-    pieces = BLOCKS * max(1, _strokes(displacement_mm) // 2)
-    at = np.unique(np.linspace(0, len(time_s) - 1, min(len(time_s), pieces + 1)).astype(int))
-    if len(at) < 2:
-        return math.nan, math.nan
+    mean, plateau = measured_speeds(time_s, displacement_mm, Pieces([len(time_s)]))
+    return float(mean[0]), float(plateau[0])
+
+
+def measured_speeds(time_s: np.ndarray, displacement_mm: np.ndarray, traces: Pieces) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean speed of every trace, rests included, and its plateau speed; magnitudes, nan if there is none.
+
+    Parameters
+    ----------
+    time_s, displacement_mm : ndarray, shape (n,)
+        Rising time and displacement of traces, one after the other, in any unit; the speeds are in their quotient.
+    traces : Pieces
+        Where each of them lies.
+
+    Notes
+    -----
+    A trace is cut into 100 pieces, or 50 per stroke. The mean is that of all pieces; the plateau is the median of
+    those faster than half their 90th percentile, so rests, turns and ramps do not count. In stick-slip the speed that
+    was set is the mean, in a stroke with rests it is the plateau; elsewhere the two agree.
+    """
+    pieces = np.full(len(traces), BLOCKS)
+    for i in np.flatnonzero(~_slides_once(displacement_mm, traces)).tolist():
+        pieces[i] *= max(1, _strokes(displacement_mm[traces.slices[i]]) // 2)
+    cuts = np.minimum(traces.size, pieces + 1)
+    mean, plateau = np.full(len(traces), np.nan), np.full(len(traces), np.nan)
+    for count in np.unique(cuts[cuts > 1]).tolist():
+        alike = np.flatnonzero(cuts == count)
+        at = np.linspace(0, traces.size[alike] - 1, count, axis=1).astype(np.int64) + traces.start[alike, None]
+        mean[alike], plateau[alike] = _of_cuts(time_s[at], displacement_mm[at])
+    return mean, plateau
+
+
+def _of_cuts(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and plateau of traces of which so many rows are given, shape (traces, rows)."""
     with np.errstate(all="ignore"):  # beyond 1e308 there is no speed: nan or inf, and no check
-        path, time = np.abs(np.diff(displacement_mm[at])), np.diff(time_s[at])
-        speeds = path / time
-        moving = speeds[speeds > 0.5 * np.quantile(speeds, 0.9)]
-        return float(path.sum() / time.sum()), float(np.median(moving)) if len(moving) else math.nan
+        path, time = np.abs(np.diff(displacement_mm)), np.diff(time_s)
+        speeds = np.sort(path / time)
+        usual = np.quantile(speeds, 0.9, axis=1)
+        slow = (speeds <= 0.5 * usual[:, None]).sum(axis=1)
+        fast = speeds.shape[1] - slow
+        # The middle of those that are faster, which stand at the end.
+        ends = np.minimum(slow + np.array([(fast - 1) // 2, fast // 2]), speeds.shape[1] - 1)
+        low, high = np.take_along_axis(speeds, ends.T, axis=1).T
+        return path.sum(axis=1) / time.sum(axis=1), np.where(fast > 0, (low + high) / 2.0, np.nan)
+
+
+def _slides_once(displacement_mm: np.ndarray, traces: Pieces) -> np.ndarray:
+    """Return which traces surely hold less than four strokes, shape (traces,).
+
+    A stroke, as `_strokes` counts it, covers half of what lies between the 1st and the 99th percentile. Where a
+    hundredth of the samples lies in the tenth at either end, that is 0.4 of the range.
+    """
+    low, high = traces.min(displacement_mm), traces.max(displacement_mm)
+    tenth, few = 0.1 * (high - low), 0.01 * (traces.size - 1) + 1.0
+    below = traces.sum(displacement_mm <= traces.spread(low + tenth))
+    above = traces.sum(displacement_mm >= traces.spread(high - tenth))
+    path = traces.sum(np.abs(traces.steps(displacement_mm)))
+    return (below >= few + 1.0) & (above >= few + 1.0) & (path < 4.0 * 0.4 * (high - low))
 
 
 def _strokes(displacement_mm: np.ndarray) -> int:
     """Return how often the trace goes from its lowest quarter to its highest or back: roughly, its strokes."""
-    low, high = np.quantile(displacement_mm, (0.01, 0.99))
+    low, high = quantile(displacement_mm, 0.01), quantile(displacement_mm, 0.99)
     ends = displacement_mm[
         (displacement_mm < low + 0.25 * (high - low)) | (displacement_mm > high - 0.25 * (high - low))
     ]
     return int(np.count_nonzero(np.diff(ends > 0.5 * (low + high))))
 
 
-def check_speed(time_s: np.ndarray, displacement: np.ndarray, ref: TraceRef, config: Config) -> Fault | None:
-    """Return a fault if time and displacement disagree with the commanded speed, None if they agree or none is known.
+def speed_faults(
+    time_s: np.ndarray, displacement_mm: np.ndarray, traces: Pieces, refs: Sequence[TraceRef], config: Config
+) -> list[Fault | None]:
+    """Return, for every trace, a fault if time and displacement disagree with the commanded speed.
 
-    They agree if the commanded speed lies between the measured mean and the plateau, or misses them by no more than
-    `quality.speed_disagreement`. Up to a factor of 1.5 the file is kept with a warning: every table holds the measured
-    speed. Beyond, the file is left out, and the mend names the mix-up that fits the factor.
+    None if they agree or no speed is commanded. They agree if the commanded speed lies between the measured mean and
+    the plateau, or misses them by no more than `quality.speed_disagreement`. Up to a factor of 1.5 the file is kept
+    with a warning: every table holds the measured speed. Beyond, the file is left out, and the mend names the mix-up
+    that fits the factor. Arguments as in `measured_speeds`.
     """
-    commanded = ref.channels.get("speed_set_mm_s")
-    if not isinstance(commanded, int | float) or not commanded > 0:
-        return None
+    commanded = [_commanded(ref) for ref in refs]
+    if not any(commanded):
+        return [None] * len(refs)
     factor = speed_factor(config.units)
-    mean, plateau = (factor * speed for speed in measured_speed(time_s, displacement))
-    if not (0 < plateau < math.inf and mean < math.inf):
-        return None  # nothing moves: said where strokes are sought
+    speeds = (factor * speed for speed in measured_speeds(time_s, displacement_mm, traces))
+    faults: list[Fault | None] = []
+    for ref, speed, mean, plateau, own in zip(
+        refs, commanded, *(s.tolist() for s in speeds), traces.slices, strict=True
+    ):
+        fault = None
+        if speed and 0 < plateau < math.inf and mean < math.inf:  # else nothing moves: said where strokes are sought
+            fault = _disagreement(ref, speed, mean, plateau, time_s[own], displacement_mm[own], config)
+        faults.append(fault)
+    return faults
+
+
+def _commanded(ref: TraceRef) -> float | None:
+    speed = ref.channels.get("speed_set_mm_s")
+    return speed if isinstance(speed, int | float) and speed > 0 else None
+
+
+def _disagreement(
+    ref: TraceRef,
+    commanded: float,
+    mean: float,
+    plateau: float,
+    time_s: np.ndarray,
+    displacement: np.ndarray,
+    config: Config,
+) -> Fault | None:
     measured = min(max(commanded, min(mean, plateau)), max(mean, plateau))  # the nearest to the commanded one
     ratio = measured / commanded
     tolerance = config.quality.speed_disagreement

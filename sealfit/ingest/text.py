@@ -7,6 +7,8 @@ import csv
 import re
 from dataclasses import dataclass
 
+import numpy as np
+
 from sealfit.config import TraceFormat
 from sealfit.errors import BadFile, Fault
 
@@ -18,6 +20,7 @@ _BOMS = (  # UTF-32 first: its mark begins with that of UTF-16
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
+_ASCII = ("auto", "utf-8", "utf8", "utf_8", "latin-1")  # encodings that are ASCII where the text is
 _CONTROL = bytes(set(range(32)) - {9, 10, 12, 13}) + b"\x7f"
 
 
@@ -46,6 +49,8 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
     BadFile
         If the bytes are not text in that encoding.
     """
+    if _is_plain(raw) and encoding.lower() in _ASCII:
+        return raw
     if encoding == "auto":
         encoding = next((name for mark, name in _BOMS if raw.startswith(mark)), None) or _guess(raw)
     elif encoding.lower().replace("_", "-") in ("utf-8", "utf8"):
@@ -70,6 +75,12 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
     if b"\r" in raw:
         raw = raw.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     return raw
+
+
+def _is_plain(raw: bytes) -> bool:
+    """Return whether the bytes are letters, figures and marks of ASCII between line feeds, and nothing else."""
+    codes = np.frombuffer(raw, np.uint8)
+    return np.count_nonzero(codes - np.uint8(32) < 95) + np.count_nonzero(codes == 10) == len(raw)  # 127 is no mark
 
 
 def find_layout(text: bytes, settings: TraceFormat, file: str) -> Layout:
