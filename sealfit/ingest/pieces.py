@@ -112,8 +112,8 @@ def weighted_medians(values: np.ndarray, weights: np.ndarray, pieces: Pieces) ->
     made, rows, of = np.zeros(len(pieces)), np.arange(pieces.rows), pieces.of
     low, high, before = np.zeros(len(pieces)), pieces.max(values), np.zeros(len(pieces))
     half: np.ndarray | None = None
-    # First how much lies in which part of the range, and again within the part where the half is; then their order.
-    for _ in range(2):
+    # How much lies in which part of the range, and again within the part where the half is, until few are to be sorted.
+    for _ in range(4):
         scale = np.divide(BINS, high - low, out=np.zeros(len(pieces)), where=high > low)
         place = ((values[rows] - low[of]) * scale[of]).clip(0.0, BINS - 1.0).astype(np.int64) + BINS * of
         held = np.bincount(place, weights[rows], minlength=BINS * len(pieces)).reshape(len(pieces), BINS)
@@ -123,10 +123,15 @@ def weighted_medians(values: np.ndarray, weights: np.ndarray, pieces: Pieces) ->
         before = np.where(crossing > 0, covered[np.arange(len(pieces)), crossing - 1], before)
         inside = place == (crossing + BINS * np.arange(len(pieces)))[of]
         rows, of = rows[inside], of[inside]
-        width = np.where(high > low, high - low, 0.0) / BINS
-        low, high = low + crossing * width, low + (crossing + 1) * width
+        count = np.bincount(of, minlength=len(pieces))
+        left, part = count > 0, Pieces(count[count > 0])
+        low[left], high[left] = part.min(values[rows]), part.max(values[rows])
+        if ((count <= BINS) | (low == high)).all():
+            break
     for i, own in enumerate(pieces.split(rows)):
-        if half[i] > 0.0 and len(own):
+        if half[i] > 0.0 and low[i] == high[i]:
+            made[i] = low[i]
+        elif half[i] > 0.0:
             held = own + pieces.start[i]
             order = held[np.argsort(values[held])]
             reached = np.searchsorted(before[i] + np.cumsum(weights[order]), half[i])

@@ -9,6 +9,7 @@ import numpy as np
 
 from sealfit.ingest.pieces import Pieces
 
+BLOCK = 8192  # rows at once: what is held of them fits into the cache
 Edge = Literal["nearest", "mirror"]
 # Which two of a window are put in order, one pair after the other, until its middle holds the median: N. Devillard
 # 1998, Fast median search: an ANSI C implementation.
@@ -30,8 +31,9 @@ def running_median(values: np.ndarray, pieces: Pieces, samples: int, edge: Edge 
     left = samples // 2
     made = np.empty(len(values))
     inner = len(values) - samples + 1
-    if inner > 0:
-        made[left : left + inner] = _medians([values[i : i + inner] for i in range(samples)])
+    for first in range(0, inner, BLOCK):
+        last = min(first + BLOCK, inner)
+        made[left + first : left + last] = _medians([values[first + i : last + i] for i in range(samples)])
     rows = _near_ends(pieces, left, samples - left - 1)
     window = _reached(rows, np.arange(-left, samples - left), pieces, edge)
     made[rows] = _medians(list(values[window]))

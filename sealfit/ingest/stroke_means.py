@@ -21,6 +21,7 @@ from sealfit.ingest.spikes import displacement_spikes, displacement_suspects, fo
 from sealfit.ingest.strokes import Found, displacement_noises_mm, find_all
 
 OWN_SPEED = "speed_file_mm_s"  # what the reader calls a speed column of the trace itself
+BUNDLE_ROWS = 32_768  # traces computed at once: enough that numpy's calls cost little, few enough for the cache
 SLOTS = ("time_s", "displacement_mm", "force_N")
 
 
@@ -66,12 +67,19 @@ class _Bundle:
 
 
 def strokes_of(traces: Sequence[Trace], config: Config) -> list[Made]:
-    """Return the strokes of traces that were read, in their order; all that have the same columns in one go."""
-    alike: dict[tuple, list[int]] = {}
+    """Return the strokes of traces that were read, in their order; those that have the same columns in one go."""
+    bundles: list[list[int]] = []
+    open_: dict[tuple, tuple[list[int], int]] = {}  # the last bundle of each kind, and its rows
     for i, trace in enumerate(traces):
-        alike.setdefault(tuple((name, v.dtype.kind) for name, v in trace.columns.items()), []).append(i)
+        kind = tuple((name, values.dtype.kind) for name, values in trace.columns.items())
+        members, rows = open_.get(kind, ([], 0))
+        if not members or rows + len(trace.line) > BUNDLE_ROWS:
+            members, rows = [], 0
+            bundles.append(members)
+        members.append(i)
+        open_[kind] = members, rows + len(trace.line)
     made: dict[int, Made] = {}
-    for members in alike.values():
+    for members in bundles:
         made.update(zip(members, _bundled(_Bundle.of([traces[i] for i in members]), config), strict=True))
     return [made[i] for i in range(len(traces))]
 
