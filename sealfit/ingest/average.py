@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pandas as pd
 
@@ -9,8 +11,7 @@ from sealfit.config import Bins
 from sealfit.ingest.pieces import Pieces
 from sealfit.tables import TRACES_MEAN
 
-LAGS = 64  # sums of correlation end within so many, unless the noise is slow
-TRANSFORMED = 64  # series at once: bounds the memory
+LAGS = 20  # the sum of correlations ends within so few, unless the noise is slow: then all lags are computed at once
 MAX_CELLS = 2000  # per run, in traces_mean: finer than any screen shows
 SAME_TRAVEL = 2  # cells by which strokes that are averaged before they slide steadily may differ in travel
 BRIDGED = 3  # empty cells in a row that are filled by a straight line: scarce samples, not a gap
@@ -37,55 +38,34 @@ def standard_error(values: np.ndarray) -> float:
 
 def standard_errors(values: np.ndarray, series: Pieces) -> np.ndarray:
     """Return the standard error of the mean of every series, shape (series,): see `standard_error`."""
-    centred = values - series.spread(series.mean(values))
-    made = np.full(len(series), np.nan)
-    length = [1 << (2 * n - 1).bit_length() for n in series.size.tolist()]  # padded so that no lag wraps around
-    alike: dict[int, list[int]] = {}
-    for i, n in enumerate(series.size.tolist()):
-        if n < 2:
-            continue
-        group = alike.setdefault(length[i], [])
-        group.append(i)
-        if len(group) == TRANSFORMED:
-            made[group] = _standard_errors([centred[series.slices[i]] for i in group], length[i])
-            alike[length[i]] = []
-    for padded, group in alike.items():
-        made[group] = _standard_errors([centred[series.slices[i]] for i in group], padded)
-    return made
+    means = series.mean(values).tolist()
+    return np.array([_standard_error(values[own] - mean) for own, mean in zip(series.slices, means, strict=True)])
 
 
-def _standard_errors(series: list[np.ndarray], padded: int) -> np.ndarray:
-    """Return the standard errors of series without their means, each not longer than half of `padded`."""
-    table = np.zeros((len(series), padded))
-    for row, values in zip(table, series, strict=True):
-        row[: len(values)] = values
-    n = np.array([len(values) for values in series])
-    variance = np.array([float(values @ values) for values in series]) / (n - 1)
-    spectrum = np.fft.rfft(table)
-    lagged = np.fft.irfft(spectrum * spectrum.conj())
-    made = np.zeros(len(series))
-    lags = min(LAGS, padded // 2)
-    for i in np.flatnonzero(variance > 0.0).tolist():
-        near = min(lags, int(n[i]))
-        window = _window(lagged[i, :near])
-        if window is None:
-            window = _window(lagged[i, : n[i]])
-            if window is None:
-                window = _tau(lagged[i, : n[i]]).max()
-        made[i] = np.sqrt(variance[i] * max(2.0 * window, 1.0) / n[i])
-    return made
+def _standard_error(centred: np.ndarray) -> float:
+    n, square = len(centred), float(centred @ centred)
+    if n < 2:
+        return float("nan")
+    if square == 0.0:
+        return 0.0
+    tau = 0.5
+    for lag in range(1, min(LAGS, n)):
+        tau += float(centred[lag:] @ centred[:-lag]) / square
+        if lag >= 5.0 * tau:
+            break
+    else:
+        tau = _slow_tau(centred)
+    return math.sqrt(square / (n - 1) * max(2.0 * tau, 1.0) / n)
 
 
-def _tau(lagged: np.ndarray) -> np.ndarray:
-    return 0.5 + np.concatenate(([0.0], np.cumsum(lagged[1:] / lagged[0])))
-
-
-def _window(lagged: np.ndarray) -> float | None:
-    """Return tau at the first lag that is at least 5 tau, if there is one."""
-    tau = _tau(lagged)
-    inside = np.arange(len(tau)) >= 5.0 * tau
-    at = int(inside.argmax())
-    return float(tau[at]) if inside[at] else None
+def _slow_tau(centred: np.ndarray) -> float:
+    """Return the autocorrelation time of a series, all lags at once; the largest sum where the window never ends."""
+    n = len(centred)
+    spectrum = np.fft.rfft(centred, 1 << (2 * n - 1).bit_length())  # padded so that no lag wraps around
+    lagged = np.fft.irfft(spectrum * spectrum.conj())[:n]
+    tau = 0.5 + np.concatenate(([0.0], np.cumsum(lagged[1:] / lagged[0])))
+    inside = np.flatnonzero(np.arange(n) >= 5.0 * tau)
+    return float(tau[inside[0]] if len(inside) else tau.max())
 
 
 def mean_by_group(values: np.ndarray, group: np.ndarray, groups: int, count: np.ndarray) -> np.ndarray:

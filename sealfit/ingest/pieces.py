@@ -109,24 +109,27 @@ def weighted_medians(values: np.ndarray, weights: np.ndarray, pieces: Pieces) ->
 
     Only what is positive weighs: `weights` are 0 wherever `values` are not above 0.
     """
-    made, rows, of = np.zeros(len(pieces)), np.arange(pieces.rows), pieces.of
+    made, numbers = np.zeros(len(pieces)), np.arange(len(pieces))
     low, high, before = np.zeros(len(pieces)), pieces.max(values), np.zeros(len(pieces))
     half: np.ndarray | None = None
+    rows, part, here = np.arange(pieces.rows), pieces, numbers  # what is left to look at: its rows, its pieces, whose
+    value, weight = values, weights
     # How much lies in which part of the range, and again within the part where the half is, until few are to be sorted.
     for _ in range(4):
         scale = np.divide(BINS, high - low, out=np.zeros(len(pieces)), where=high > low)
-        place = ((values[rows] - low[of]) * scale[of]).clip(0.0, BINS - 1.0).astype(np.int64) + BINS * of
-        held = np.bincount(place, weights[rows], minlength=BINS * len(pieces)).reshape(len(pieces), BINS)
+        place = (value - part.spread(low[here])) * part.spread(scale[here])
+        place = place.clip(0.0, BINS - 1.0).astype(np.int64) + part.spread(BINS * here)
+        held = np.bincount(place, weight, minlength=BINS * len(pieces)).reshape(len(pieces), BINS)
         covered = before[:, None] + np.cumsum(held, axis=1)
         half = 0.5 * covered[:, -1] if half is None else half
         crossing = np.minimum((covered < half[:, None]).sum(axis=1), BINS - 1)
-        before = np.where(crossing > 0, covered[np.arange(len(pieces)), crossing - 1], before)
-        inside = place == (crossing + BINS * np.arange(len(pieces)))[of]
-        rows, of = rows[inside], of[inside]
-        count = np.bincount(of, minlength=len(pieces))
-        left, part = count > 0, Pieces(count[count > 0])
-        low[left], high[left] = part.min(values[rows]), part.max(values[rows])
-        if ((count <= BINS) | (low == high)).all():
+        before = np.where(crossing > 0, covered[numbers, crossing - 1], before)
+        inside = place == part.spread((crossing + BINS * numbers)[here])
+        count = part.sum(inside)
+        rows, value, weight = rows[inside], value[inside], weight[inside]
+        here, part = here[count > 0], Pieces(count[count > 0])
+        low[here], high[here] = part.min(value), part.max(value)
+        if ((part.size <= BINS) | (low == high)[here]).all():
             break
     for i, own in enumerate(pieces.split(rows)):
         if half[i] > 0.0 and low[i] == high[i]:

@@ -110,14 +110,16 @@ def _rise_length_mm(distance_mm: np.ndarray, force_N: np.ndarray, scale_mm: floa
     """
     rows = int(distance_mm.searchsorted(12.0 * scale_mm))
     rows = min(max(rows, 16), len(distance_mm))
-    x, y = distance_mm[:rows] - distance_mm[:rows].mean(), force_N[:rows] - force_N[:rows].mean()
+    x, y = distance_mm[:rows], force_N[:rows]
+    x = x - np.add.reduce(x) / rows
+    square = float(x @ x)
+    y = y - np.add.reduce(y) / rows
+    y = y - (float(x @ y) / square) * x
     lengths = scale_mm * LENGTHS
     rise = np.exp(distance_mm[:rows] / -lengths[:, None])
-    rise -= rise.mean(axis=1)[:, None]
-    square = float(x @ x)
-    explained = rise @ (y - (float(x @ y) / square) * x)
+    total, slope, explained = np.stack([np.ones(rows), x, y]) @ rise.T
     whole = np.einsum("ij,ij->i", rise, rise)
-    rest = whole - (rise @ x) ** 2 / square
+    rest = whole - total**2 / rows - slope**2 / square
     # Of two different distances only (a coarse sensor), a straight line explains all that an exponential can.
     gained = np.divide(explained**2, rest, out=np.zeros(len(rest)), where=rest > 1e-12 * whole)
     return float(lengths[np.argmax(gained)])

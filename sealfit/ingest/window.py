@@ -105,21 +105,15 @@ def slopes(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray, 
 
     Each piece (between rests) has its own intercept, so a rest does not count as slow sliding. NaN without samples.
     """
-    rows = np.flatnonzero(steady)
-    made = np.full(len(strokes), np.nan)
-    if not len(rows):
-        return made
-    stroke = strokes.of[rows]
-    piece = np.concatenate(([0], np.cumsum((rows[1:] - rows[:-1] > 1) | (stroke[1:] != stroke[:-1]))))
-    count = np.bincount(piece)
-    t, d = time_s[rows], displacement_mm[rows]
-    t = t - (np.bincount(piece, t) / count)[piece]
-    d = d - (np.bincount(piece, d) / count)[piece]
-    samples = np.bincount(stroke, minlength=len(strokes))
-    windows = Pieces(samples[samples > 0])
-    for i, own in zip(np.flatnonzero(samples).tolist(), windows.slices, strict=True):
-        if samples[i] > 1:
-            made[i] = np.dot(t[own], d[own]) / np.dot(t[own], t[own])
+    made, sums = np.full(len(strokes), np.nan), np.zeros((len(strokes), 3))
+    firsts, lasts = _edges(steady, strokes)
+    for i, first, last in zip(strokes.of[firsts].tolist(), firsts.tolist(), lasts.tolist(), strict=True):
+        t, d, n = time_s[first : last + 1], displacement_mm[first : last + 1], last + 1 - first
+        t = t - np.add.reduce(t) / n
+        sums[i] += n, t @ (d - np.add.reduce(d) / n), t @ t
+    enough = sums[:, 0] > 1
+    with np.errstate(invalid="ignore"):  # rows that are all single pieces have no slope
+        made[enough] = sums[enough, 1] / sums[enough, 2]
     return made
 
 
