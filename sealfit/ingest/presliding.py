@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from sealfit.ingest.pieces import median, quantile
@@ -66,8 +68,7 @@ def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> 
     level, begin = median(plateau), float(force_N[0])
     if level - begin <= 0.02 * abs(level):
         return 0.0
-    noise = median(np.abs(plateau[1:] - plateau[:-1])) / (0.6745 * np.sqrt(2.0))
-    if begin >= quantile(plateau, 0.01) - 4.0 * noise:
+    if not _below(plateau, begin):
         return 0.0
     scale = _scale_mm(distance_mm[:high], force_N[:high], begin, level)
     if scale <= 0.0:
@@ -80,6 +81,16 @@ def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> 
     settled = min(SETTLED * fitted, max(length / 3.0, ENOUGH * fitted))
     ramp = float(distance_mm[min(ramp_end, len(distance_mm) - 1)])
     return float(max(settled, ramp + AFTER_RAMP * fitted if ramp > 0.0 else 0.0))
+
+
+def _below(plateau_N: np.ndarray, begin_N: float) -> bool:
+    """Return whether the force begins below everything that the plateau shows, its noise included."""
+    steps = np.abs(plateau_N[1:] - plateau_N[:-1])
+    to_noise = 1.0 / (0.6745 * math.sqrt(2.0))
+    # A median is at most twice the mean: far below, no percentile is needed.
+    if begin_N < float(plateau_N.min()) - 8.0 * to_noise * float(np.add.reduce(steps)) / len(steps):
+        return True
+    return begin_N < quantile(plateau_N, 0.01) - 4.0 * (median(steps) * to_noise)
 
 
 def _arrival_mm(distance_mm: np.ndarray, force_N: np.ndarray) -> float:
@@ -117,7 +128,7 @@ def _rise_length_mm(distance_mm: np.ndarray, force_N: np.ndarray, scale_mm: floa
     y = y - (float(x @ y) / square) * x
     lengths = scale_mm * LENGTHS
     rise = np.exp(distance_mm[:rows] / -lengths[:, None])
-    total, slope, explained = np.stack([np.ones(rows), x, y]) @ rise.T
+    total, slope, explained = rise.sum(axis=1), rise @ x, rise @ y
     whole = np.einsum("ij,ij->i", rise, rise)
     rest = whole - total**2 / rows - slope**2 / square
     # Of two different distances only (a coarse sensor), a straight line explains all that an exponential can.

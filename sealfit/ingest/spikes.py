@@ -29,12 +29,11 @@ def displacement_suspects(
 def force_suspects(force_N: np.ndarray, steady: np.ndarray, traces: Pieces, settings: Quality) -> np.ndarray:
     """Return which traces may hold a spike of force, shape (traces,): of the others none is found."""
     off = np.abs(force_N - running_median(force_N, traces, NEIGHBOURS, "mirror"))
-    far = traces.max(off)
-    made = traces.size >= 4 * NEIGHBOURS
-    for i, rows in enumerate(traces.slices):
-        usual = off[rows][steady[rows]]
-        made[i] &= far[i] > settings.spike_sigma * (1.4826 * median(usual if len(usual) else off[rows]))
-    return made
+    # Where more than half of the usual samples are off by a share of the farthest, so is their median.
+    noisy = off >= traces.spread(traces.max(off) * ((1.0 + 1e-9) / (1.4826 * settings.spike_sigma)))
+    usual = traces.sum(steady)
+    usual, noisy = np.where(usual > 0, (usual, traces.sum(noisy & steady)), (traces.size, traces.sum(noisy)))
+    return (traces.size >= 4 * NEIGHBOURS) & (2 * noisy < usual + 2)
 
 
 def displacement_spikes(
