@@ -96,8 +96,8 @@ def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, 
         if not stat.S_ISREG(status.st_mode):
             raise _bad(file, "unreadable_file", "is no file.", "Check the path.")
         raw = os.read(handle, status.st_size + 1 if size is None else size)
-        grown = size is None and len(raw) > status.st_size
-        while grown and (more := os.read(handle, 1 << 20)):
+        # Short where it is the whole file; a network's file system, or a file above 2 GB, may give it piece by piece.
+        while size is None and len(raw) != status.st_size and (more := os.read(handle, 1 << 24)):
             raw += more
     except OSError as error:
         raise _bad(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.") from error

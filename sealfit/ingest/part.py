@@ -17,7 +17,7 @@ from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.average import bin_table, mean_traces
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.shaped import STEADY_ONLY, shaped
-from sealfit.ingest.trace_file import FileStrokes, read_strokes
+from sealfit.ingest.trace_file import FileStrokes, read_files
 from sealfit.tables import BINS
 
 SAMPLED = ("traces", "traces_mean", "bins")  # tables that are made, and stored, part by part
@@ -74,7 +74,7 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
     config : Config
         The rig.
     """
-    files = [read_strokes(ref, campaign, config) for ref in asked.refs]
+    files = read_files(asked.refs, campaign, config)
     strokes = stroke_table(files, config)
     known = pa.Table.from_pandas(_plain(strokes), preserve_index=False)
     found = tuple(FileFound(made.file, made.mark, made.rows, len(made.strokes)) for made in files)

@@ -13,7 +13,7 @@ from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, Fault
 from sealfit.ingest.columns import nearest, suggestion
 from sealfit.ingest.folder import read_bytes
-from sealfit.ingest.folders import Folders
+from sealfit.ingest.listing import Folders
 from sealfit.ingest.text import as_number, as_utf8, split_line
 
 RUNS_CSV = "runs.csv"

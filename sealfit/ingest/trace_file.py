@@ -29,29 +29,17 @@ class FileStrokes:
     samples: Mapping[str, np.ndarray] | None = None
 
 
-def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
-    """Return the strokes of one trace file; without strokes where the file must be left out, and why.
-
-    Parameters
-    ----------
-    ref : TraceRef
-        The file, and what is known of it as a whole.
-    campaign : Path
-        Campaign folder.
-    config : Config
-        The rig.
-    """
-    (made,) = read_files([ref], campaign, config)
-    return made
-
-
 def read_files(refs: Sequence[TraceRef], campaign: Path, config: Config) -> list[FileStrokes]:
-    """Return the strokes of several trace files in their order; what reading them in one go saves is its point.
+    """Return the strokes of several trace files, in order; without strokes where a file must be left out, and why.
 
     Parameters
     ----------
     refs : sequence of TraceRef
-        Some dozens of files, as all are held at once; see `read_strokes` for the others.
+        The files, and what is known of each as a whole; all are held at once, so no more than memory has room for.
+    campaign : Path
+        Campaign folder.
+    config : Config
+        The rig.
     """
     folder = Folder(campaign)
     marks: dict[int, Fingerprint] = {}

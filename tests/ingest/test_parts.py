@@ -125,13 +125,13 @@ def test_three_added_files_leave_the_other_parts_as_they_are(campaign, tmp_path,
 def count_reading(monkeypatch, read):
     from sealfit.ingest import part
 
-    real = part.read_strokes
+    real = part.read_files
 
-    def counted(ref, *args):
-        read.append(ref.file)
-        return real(ref, *args)
+    def counted(refs, *args):
+        read.extend(ref.file for ref in refs)
+        return real(refs, *args)
 
-    monkeypatch.setattr(part, "read_strokes", counted)
+    monkeypatch.setattr(part, "read_files", counted)
 
 
 def test_a_changed_file_and_a_deleted_one_are_seen(campaign, tmp_path):

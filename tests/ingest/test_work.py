@@ -9,10 +9,10 @@ import pytest
 from trace_helpers import campaign, config
 
 from sealfit.ingest import folders, outlying, peers, run_values
-from sealfit.ingest.folders import Folders
+from sealfit.ingest.folder import inside
+from sealfit.ingest.listing import Folders
 from sealfit.ingest.outlying import outlying_repeats
 from sealfit.ingest.runs import list_traces
-from sealfit.ingest.text import inside
 
 HEAD = "file,run_id,repeat,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s,started_at"
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from sealfit.ingest.text import inside
+from sealfit.ingest.folder import inside
 
 
 class _Names(NamedTuple):
@@ -24,7 +24,7 @@ class Folders:
     _seen: dict[str, _Names] = field(default_factory=dict)
 
     def hold(self, file: str) -> bool:
-        """Return whether a path, there or not, lies inside the campaign, links followed: as `text.inside`."""
+        """Return whether a path, there or not, lies inside the campaign, links followed: as `folder.inside`."""
         if ":" not in file and "\\" not in file:  # these may mean a drive
             folder, _, name = file.rpartition("/")
             if name in self._names(folder).plain:
