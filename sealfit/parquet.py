@@ -99,19 +99,24 @@ def read(path: Path | Sequence[Path], columns: list[str] | None = None) -> pd.Da
 
 def _array(values: pd.Series, column: Column, table: str) -> pa.Array:
     try:
+        if column.dtype == TEXT and isinstance(values.dtype, pd.StringDtype):
+            return _whole(pa.array(values, from_pandas=True)).cast(TEXT)
         if column.dtype == TEXT or (column.dtype is None and _mixed(values)):
             values = values.map(str, na_action="ignore").astype(object)
             return pa.array(values, type=TEXT, from_pandas=True)
         array = pa.array(values, type=column.dtype, from_pandas=True)
     except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError) as error:
         raise ValueError(f"table {table}, column '{column.name}': {error}") from error
-    if isinstance(array, pa.ChunkedArray):
-        array = array.combine_chunks()
+    array = _whole(array)
     if pa.types.is_null(array.type):  # an optional channel without a single value
         return array.cast(pa.float64())
     if pa.types.is_large_string(array.type):
         return array.cast(TEXT)
     return array
+
+
+def _whole(array: pa.Array | pa.ChunkedArray) -> pa.Array:
+    return array.combine_chunks() if isinstance(array, pa.ChunkedArray) else array
 
 
 def _mixed(values: pd.Series) -> bool:

@@ -195,37 +195,56 @@ def mean_traces(samples: pd.DataFrame, strokes: pd.DataFrame) -> pd.DataFrame:
     force, steady = _bridged(force, steady, owner)
     cell = np.arange(size) - offset[owner]
     known = np.isfinite(force)
-    table = pd.DataFrame(
-        {
-            "run": run[owner[known]],
-            "cell": cell[known],
-            "file": pd.factorize(strokes["file"])[0][owner[known]],
-            "force_N": force[known],
-            "steady": steady[known],
-            "travel": _travel(cell, known, owner, strokes["direction"].to_numpy()),
-        }
-    )
-    table = table[_comparable(table)]
-    files = table.groupby(["run", "cell", "file"], sort=True).agg(
-        force_N=("force_N", "mean"), steady=("steady", "min"), n=("force_N", "size")
-    )
-    means = files.groupby(["run", "cell"], sort=True).agg(
-        force_N=("force_N", "mean"), force_se_N=("force_N", "sem"), n=("n", "sum"), steady=("steady", "min")
-    )
-    means = means.reset_index()
-    of = means["run"].to_numpy()
+    travel = _travel(cell, known, owner, strokes["direction"].to_numpy())
+    owner, cell, force, steady = owner[known], cell[known], force[known], steady[known]
+    first_spot = np.concatenate(([0], np.cumsum(cells)))  # of each run in one flat array of the cells of all runs
+    spot, spots = first_spot[run[owner]] + cell, int(first_spot[-1])
+    keep = _comparable(spot, spots, steady, travel)
+    owner, spot, force, steady = owner[keep], spot[keep], force[keep], steady[keep]
+    strokes_there = np.bincount(spot, minlength=spots)
+    spot, force, steady = _one_per_file(spot, pd.factorize(strokes["file"])[0][owner], force, steady)
+    files = np.bincount(spot, minlength=spots)
+    mean = mean_by_group(force, spot, spots, files)
+    square = np.bincount(spot, (force - mean[spot]) ** 2, minlength=spots)
+    error = np.sqrt(np.divide(square, (files - 1.0) * files, out=np.full(spots, np.nan), where=files > 1))
+    lowest = _extreme(np.minimum, np.inf, spot, spots, steady)
+    shown = np.flatnonzero(files)
+    of = np.searchsorted(first_spot, shown, side="right") - 1
     first = strokes.iloc[np.unique(run, return_index=True)[1]]
     return pd.DataFrame(
         {
             "run_id": first["run_id"].to_numpy()[of],
             "direction": first["direction"].to_numpy()[of],
             "condition": first["condition"].to_numpy()[of],
-            "displacement_mm": low[of] + (means["cell"].to_numpy() + 0.5) * step[of],
-            "force_N": means["force_N"].to_numpy(),
-            "force_se_N": means["force_se_N"].to_numpy(),
-            "n": means["n"].to_numpy(),
-            "steady": means["steady"].to_numpy() >= 1.0,
+            "displacement_mm": low[of] + (shown - first_spot[of] + 0.5) * step[of],
+            "force_N": mean[shown],
+            "force_se_N": error[shown],
+            "n": strokes_there[shown],
+            "steady": lowest[shown] >= 1.0,
         }
+    )
+
+
+def _extreme(ufunc: np.ufunc, start: float, group: np.ndarray, groups: int, values: np.ndarray) -> np.ndarray:
+    """Return the least or largest value of each group, shape (groups,); `start` for none."""
+    found = np.full(groups, start)
+    ufunc.at(found, group, values)
+    return found
+
+
+def _one_per_file(
+    spot: np.ndarray, file: np.ndarray, force: np.ndarray, steady: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return place, mean force and whether all is steady, once for every file at every place."""
+    pair, own, count = np.unique(spot * (int(file.max(initial=0)) + 1) + file, return_inverse=True, return_counts=True)
+    if len(pair) == len(spot):
+        return spot, force, steady
+    place = np.zeros(len(pair), int)
+    place[own] = spot
+    return (
+        place,
+        mean_by_group(force, own, len(pair), count),
+        _extreme(np.minimum, np.inf, own, len(pair), steady),
     )
 
 
@@ -238,18 +257,16 @@ def _travel(cell: np.ndarray, known: np.ndarray, owner: np.ndarray, direction: n
     return np.where(direction[own] > 0, cell[known] - first[own], last[own] - cell[known])
 
 
-def _comparable(table: pd.DataFrame) -> np.ndarray:
-    """Return which cells of which strokes may be averaged with the others at the same place of their run.
+def _comparable(spot: np.ndarray, spots: int, steady: np.ndarray, travel: np.ndarray) -> np.ndarray:
+    """Return which cells of which strokes may be averaged with the others at the same place (`spot`) of their run.
 
     Repeats need not start at the same place: where one slides steadily, another may just be starting, and its
     pre-sliding rise would be a dip in the mean. So steady strokes are averaged where there are any, and elsewhere those
     that have come equally far from their own start.
     """
-    place = [table["run"], table["cell"]]
-    steady = table["steady"] >= 1.0
-    somewhere = steady.groupby(place).transform("max")
-    furthest = table["travel"].groupby(place).transform("max")
-    return np.where(somewhere, steady, table["travel"] >= furthest - SAME_TRAVEL)
+    somewhere = np.bincount(spot, steady >= 1.0, minlength=spots) > 0
+    furthest = _extreme(np.maximum, -np.inf, spot, spots, travel)
+    return np.where(somewhere[spot], steady >= 1.0, travel >= furthest[spot] - SAME_TRAVEL)
 
 
 def _grid(x: np.ndarray, row: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

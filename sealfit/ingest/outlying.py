@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy.special import stdtr
 
 from sealfit.ingest.scatter import Layout, ScatterFit, fit_scatter
 
@@ -138,7 +138,7 @@ def _judge(fit: ScatterFit, apart: ScatterFit, taken: list[np.ndarray], tests: i
     sd = np.sqrt((1.0 - gone) * fit.scatter.sd_N(force) ** 2 + gone * apart.scatter.sd_N(force) ** 2)
     t = fit.residual[worst] / (np.maximum(sd, tiny) * np.sqrt(fit.share[worst]))
     df = [(1.0 - n) * fit.df_at(f) + n * apart.df_at(f) for n, f in zip(number.tolist(), force.tolist(), strict=True)]
-    p_one = 2.0 * stats.t.sf(np.abs(t), df)
+    p_one = 2.0 * stdtr(df, -np.abs(t))
     judged = []
     for k, rows in enumerate(taken):
         p = -np.expm1((tests - (len(rows) - 1)) * np.log1p(-min(p_one[k], 1.0 - 1e-16)))
