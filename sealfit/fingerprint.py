@@ -38,13 +38,13 @@ class Fingerprint:
     sha256: str | None = None
 
 
-def fingerprint(path: Path, known: Fingerprint | None = None) -> Fingerprint:
+def fingerprint(path: Path | str, known: Fingerprint | None = None) -> Fingerprint:
     """Return the fingerprint of `path`; the file is read only if its size or time differ from those `known`."""
     try:
-        stat = path.stat()
+        stat = os.stat(path)
         if known is not None and (stat.st_size, stat.st_mtime_ns) == (known.size, known.mtime_ns):
             return known
-        with path.open("rb") as file:
+        with open(path, "rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return Fingerprint()
@@ -59,7 +59,7 @@ def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
 def fingerprints(folder: Path, known: Mapping[str, Fingerprint], config: Config) -> dict[str, Fingerprint]:
     """Return the fingerprints, now, of every `known` file of the campaign `folder` and of every new trace file."""
     names = sorted({*known, *glob_names(folder, config.files)})
-    return {name: fingerprint(folder / name, known.get(name)) for name in names}
+    return {name: fingerprint(os.path.join(folder, name), known.get(name)) for name in names}
 
 
 def glob_names(folder: Path, files: Files) -> list[str]:

@@ -84,8 +84,9 @@ def write(frame: pd.DataFrame, schema: Schema, units: Units, path: Path) -> None
 
 def write_arrow(table: pa.Table, path: Path) -> None:
     """Write a table as it is, and wait until it is on the disk itself. Raises OSError if the disk refuses."""
+    words = [field.name for field in table.schema if field.type == TEXT]  # measured numbers have no dictionary
     with path.open("wb") as file:  # a file of Python's, so that a full disk is an OSError with its number
-        pq.write_table(table, file, compression="zstd")
+        pq.write_table(table, file, compression="zstd", use_dictionary=words or False)
         file.flush()
         os.fsync(file.fileno())
 

@@ -13,7 +13,7 @@ from sealfit.errors import ConfigError, OutError
 from sealfit.fingerprint import Fingerprint
 
 STATE = "state.json"
-FORMAT = 1
+FORMAT = 2
 DEFAULT = "default"
 
 
@@ -92,7 +92,7 @@ class State:
             "format": FORMAT,
             "campaign": str(self.campaign),
             "config": {"path": str(self.config.path) if self.config.path else None, "text": self.config.text},
-            "inputs": {name: asdict(mark) for name, mark in self.inputs.items()},
+            "inputs": _columns(self.inputs),
             "steps": {name: asdict(done) for name, done in self.steps.items()},
         }
 
@@ -114,7 +114,7 @@ class State:
             return cls(
                 Path(kept["campaign"]),
                 ConfigCopy(Path(at) if at else None, kept["config"]["text"]),
-                {name: Fingerprint(**mark) for name, mark in kept["inputs"].items()},
+                _fingerprints(kept["inputs"]),
                 {name: Done(**done) for name, done in kept["steps"].items()},
             )
         except (FileNotFoundError, NotADirectoryError):
@@ -127,9 +127,24 @@ class State:
             ) from error
 
 
-def to_json(document: object) -> str:
+def _columns(inputs: Mapping[str, Fingerprint]) -> dict[str, list]:
+    """Return fingerprints column by column: of a hundred thousand files, a fifth of the text of names and values."""
+    marks = inputs.values()
+    return {"file": list(inputs), **{name: [getattr(mark, name) for mark in marks] for name in Fingerprint.__slots__}}
+
+
+def _fingerprints(columns: Mapping[str, list]) -> dict[str, Fingerprint]:
+    marks = zip(*(columns[name] for name in Fingerprint.__slots__), strict=True)
+    return {file: Fingerprint(*mark) for file, mark in zip(columns["file"], marks, strict=True)}
+
+
+def to_json(document: object, *, indent: int | None = 1) -> str:
     """Return `document` as JSON text: numbers that are not finite become null, numpy's become Python's."""
-    return json.dumps(_plain(document), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    style = {"indent": indent, "ensure_ascii": False, "allow_nan": False}
+    try:
+        return json.dumps(document, **style) + "\n"
+    except (TypeError, ValueError):  # what JSON does not know, or a number that is not finite
+        return json.dumps(_plain(document), **style) + "\n"
 
 
 def _plain(value: object) -> object:

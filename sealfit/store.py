@@ -37,6 +37,7 @@ class Store:
         self.out, self.state = out, state
         self.config: Config = state.config.parse()
         self.warnings: list[str] = []
+        self._keys: dict[str, str] | None = None  # of every step for the campaign as it is now
         self.anew = False  # whether what is stored already is to be made again
         if state.campaign.is_dir():
             self._now = fingerprints(state.campaign, state.inputs, self.config)
@@ -125,7 +126,7 @@ class Store:
         if tidy != kept:
             staged = Staged(self.out, self.config.units)
             try:
-                staged.text(STATE, to_json(tidy.as_dict()))
+                staged.text(STATE, to_json(tidy.as_dict(), indent=None))
                 with disk(self.out):
                     staged.move(STATE)
             finally:
@@ -134,7 +135,9 @@ class Store:
     # ------------------------------------------------------------ current or stale
     def why_stale(self, step: str) -> str:
         """Return in words why `step` has to be done, or "" if it is current."""
-        keys = step_keys(self._now, self.config)
+        if self._keys is None:
+            self._keys = step_keys(self._now, self.config)
+        keys = self._keys
         for name in STEPS[: STEPS.index(step) + 1]:
             done = self.state.steps.get(name)
             if done is None:
@@ -239,9 +242,9 @@ class Store:
         earlier = {step: self.state.steps[step] for step in STEPS[: STEPS.index(name)] if step in self.state.steps}
         begun = replace(self.state, inputs=inputs, steps=earlier)
         ended = replace(begun, steps={**earlier, name: done})
-        staged.text("begun.json", to_json(begun.as_dict()))
-        staged.text("ended.json", to_json(ended.as_dict()))
-        staged.text(PROVENANCE, to_json(provenance(ended)))
+        staged.text("begun.json", to_json(begun.as_dict(), indent=None))
+        staged.text("ended.json", to_json(ended.as_dict(), indent=None))
+        staged.text(PROVENANCE, to_json(provenance(ended), indent=None))
         old = self.state.steps[name].files if name in self.state.steps else {}
         with undisturbed(), disk(self.out):
             staged.move("begun.json", STATE)
@@ -256,7 +259,7 @@ class Store:
             sync(self.out)
             self.state = ended
         if staged.inputs is not None:
-            self._now = dict(inputs)
+            self._now, self._keys = dict(inputs), None
 
     def _left_over(self, old: Mapping[str, int], files: Mapping[str, int]) -> set[str]:
         """Return the files of an earlier time of the step that are not its any more.

@@ -3,6 +3,7 @@ processes."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -114,14 +115,14 @@ def ingest_campaign(
 
 def _planned(campaign: Path, refs: Sequence[TraceRef], config: Config) -> list[Asked]:
     conditions = condition_keys([ref.channels for ref in refs], config)
-    sizes = [_size(campaign / ref.file) for ref in refs]
+    sizes = [_size(os.path.join(campaign, ref.file)) for ref in refs]
     plan = plan_parts(conditions, [str(ref.channels["run_id"]) for ref in refs], sizes)
     return [Asked(tuple(refs[i] for i in files)) for files in plan]
 
 
-def _size(path: Path) -> int:
+def _size(path: str) -> int:
     try:
-        return path.stat().st_size
+        return os.stat(path).st_size
     except OSError:  # reading it will say why
         return 0
 

@@ -17,7 +17,8 @@ LEAST, MOST = 0.25, 2.0  # smallest and largest part, in parts as wanted; a run 
 def plan_parts(conditions: Sequence[str], runs: Sequence[str], sizes: Sequence[int]) -> list[list[int]]:
     """Return the files of each part, by their numbers, rising within a part; every file is in one part.
 
-    Conditions stay together, in the order in which they first appear, unless one is larger than a part; runs always.
+    Conditions stay together unless one is larger than a part; runs always. A part holds conditions that are neighbours
+    in the order of their names, so the least and the largest name, which Parquet keeps, tell a reader what to skip.
 
     Parameters
     ----------
@@ -36,7 +37,7 @@ def plan_parts(conditions: Sequence[str], runs: Sequence[str], sizes: Sequence[i
         whole.setdefault(condition, {}).setdefault(run, []).append(i)
     parts: list[list[int]] = [[]]
     filled = 0.0
-    for condition, of_run in whole.items():
+    for condition, of_run in sorted(whole.items()):
         weights = {run: _weight(files, sizes) for run, files in of_run.items()}
         total = sum(weights.values())
         if filled >= LEAST and filled + total > MOST:

@@ -12,7 +12,7 @@ import json
 import os
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
@@ -76,7 +76,7 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
             "unused": sorted(asked.unused),
             "wanted": asked.columns,
             "columns": columns,
-            "files": [asdict(found) for found in part.files],
+            "files": [(f.file, f.mark.size, f.mark.mtime_ns, f.mark.sha256, f.rows, f.strokes) for f in part.files],
             "faults": [fault.as_dict() for fault in part.faults],
             "stored": stored,
         }
@@ -124,7 +124,7 @@ def load_part(asked: Asked, path: Path) -> Made:
     strokes = pq.read_table(path)
     about = json.loads(strokes.schema.metadata[_ABOUT])
     unused = frozenset((file, stroke) for file, stroke in about["unused"])
-    files = tuple(FileFound(**{**found, "mark": Fingerprint(**found["mark"])}) for found in about["files"])
+    files = tuple(FileFound(file, Fingerprint(*mark), n, count) for file, *mark, n, count in about["files"])
     stored = {**about["stored"], f"{PARTS}/{path.name}": path.stat().st_size}
     faults = tuple(Fault(**fault) for fault in about["faults"])
     asked = replace(asked, unused=unused, columns=about["wanted"])

@@ -36,6 +36,14 @@ def test_every_file_is_in_one_part_and_no_run_is_cut(numbers):
     assert all(part == sorted(part) for part in plan)
 
 
+def test_a_condition_lies_in_no_part_but_those_whose_names_span_it():
+    conditions = [f"day {(37 * i) % 101}" for i in range(2_000)]
+    plan, _ = plan_of(conditions)
+    spans = [(min(conditions[i // 3] for i in part), max(conditions[i // 3] for i in part)) for part in plan]
+    assert len(spans) > 15
+    assert sum(low <= "day 50" <= high for low, high in spans) <= 2
+
+
 def test_large_files_make_parts_of_few():
     assert [len(part) for part in plan_parts(["a"] * 6, list("112233"), [50_000_000] * 6)] == [2, 2, 2]
 
