@@ -36,6 +36,7 @@ Scheduler = Annotated[
 ]
 Force = Annotated[bool, typer.Option("--force", help="Do it again even if it is current.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
+Profile = Annotated[bool, typer.Option("--profile", help="Print seconds and rows per step.")]
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
 
 
@@ -63,10 +64,11 @@ def ingest(
     scheduler: Scheduler = None,
     force: Force = False,
     strict: Strict = False,
+    profile: Profile = False,
     as_json: Json = False,
 ) -> None:
     """Read a campaign into tables of traces."""
-    _run(("ingest",), campaign, out, config, workers, scheduler, force, strict, as_json)
+    _run(("ingest",), campaign, out, config, workers, scheduler, force, strict, profile, as_json)
 
 
 @app.command("fit-steady")
@@ -75,10 +77,11 @@ def fit_steady(
     workers: Workers = None,
     scheduler: Scheduler = None,
     force: Force = False,
+    profile: Profile = False,
     as_json: Json = False,
 ) -> None:
     """Fit steady LuGre to each condition."""
-    _single("fit-steady", out, force, as_json, workers, scheduler)
+    _single("fit-steady", out, force, profile, as_json, workers, scheduler)
 
 
 @app.command("fit-aging")
@@ -87,10 +90,11 @@ def fit_aging(
     workers: Workers = None,
     scheduler: Scheduler = None,
     force: Force = False,
+    profile: Profile = False,
     as_json: Json = False,
 ) -> None:
     """Fit the aging law across days."""
-    _single("fit-aging", out, force, as_json, workers, scheduler)
+    _single("fit-aging", out, force, profile, as_json, workers, scheduler)
 
 
 @app.command("fit-dynamic")
@@ -99,10 +103,11 @@ def fit_dynamic(
     workers: Workers = None,
     scheduler: Scheduler = None,
     force: Force = False,
+    profile: Profile = False,
     as_json: Json = False,
 ) -> None:
     """Fit sigma_0 and sigma_1 to the pre-sliding part."""
-    _single("fit-dynamic", out, force, as_json, workers, scheduler)
+    _single("fit-dynamic", out, force, profile, as_json, workers, scheduler)
 
 
 @app.command("close-loop")
@@ -111,16 +116,17 @@ def close_loop(
     workers: Workers = None,
     scheduler: Scheduler = None,
     force: Force = False,
+    profile: Profile = False,
     as_json: Json = False,
 ) -> None:
     """Find, name and add what the model lacks."""
-    _single("close-loop", out, force, as_json, workers, scheduler)
+    _single("close-loop", out, force, profile, as_json, workers, scheduler)
 
 
 @app.command()
-def report(out: Results, force: Force = False, as_json: Json = False) -> None:
+def report(out: Results, force: Force = False, profile: Profile = False, as_json: Json = False) -> None:
     """Write report.html and its plots."""
-    _single("report", out, force, as_json)
+    _single("report", out, force, profile, as_json)
 
 
 @app.command()
@@ -132,12 +138,13 @@ def run(
     scheduler: Scheduler = None,
     force: Force = False,
     strict: Strict = False,
+    profile: Profile = False,
     as_json: Json = False,
 ) -> None:
     """Do every step that is not current, in order."""
     from sealfit.fingerprint import STEPS
 
-    _run(STEPS, campaign, out, config, workers, scheduler, force, strict, as_json)
+    _run(STEPS, campaign, out, config, workers, scheduler, force, strict, profile, as_json)
 
 
 @app.command()
@@ -236,33 +243,41 @@ def _run(
     scheduler: str | None,
     force: bool,
     strict: bool,
+    profile: bool,
     as_json: bool,
 ) -> None:
-    count = _workers(workers, scheduler)
-    from sealfit import progress, steps, summary
-
-    made = steps.run(
-        campaign,
-        out,
-        config,
-        steps=names,
-        workers=count,
-        scheduler=scheduler,
-        force=force,
-        strict=strict,
-        progress=progress.to_stderr(),
+    options = {"workers": _workers(workers, scheduler), "scheduler": scheduler, "force": force, "strict": strict}
+    command = "ingest" if len(names) == 1 else "run"
+    _do(
+        command,
+        profile,
+        as_json,
+        lambda steps, progress: steps.run(campaign, out, config, steps=names, progress=progress, **options),
     )
-    _end("ingest" if len(names) == 1 else "run", made, summary.lines, as_json)
 
 
 def _single(
-    step: str, out: Path, force: bool, as_json: bool, workers: int | None = None, scheduler: str | None = None
+    step: str,
+    out: Path,
+    force: bool,
+    profile: bool,
+    as_json: bool,
+    workers: int | None = None,
+    scheduler: str | None = None,
 ) -> None:
-    count = _workers(workers, scheduler)
-    from sealfit import progress, steps, summary
+    options = {"workers": _workers(workers, scheduler), "scheduler": scheduler, "force": force}
+    _do(step, profile, as_json, lambda steps, progress: steps.single(step, out, progress=progress, **options))
 
-    made = steps.single(step, out, workers=count, scheduler=scheduler, force=force, progress=progress.to_stderr())
-    _end(step, made, summary.lines, as_json)
+
+def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
+    """Do steps, with progress, and print what they came to."""
+    from sealfit import profiling, progress, steps, summary
+
+    with profiling.profiled() as parts:
+        made = work(steps, progress.to_stderr())
+    if profile:
+        made["profile"] = profiling.as_dicts(parts)
+    _end(command, made, lambda made: summary.lines(made) + profiling.lines(made.get("profile", ())), as_json)
 
 
 def _workers(workers: int | None, scheduler: str | None) -> int:

@@ -10,6 +10,7 @@ from sealfit.engine import on_cluster
 from sealfit.errors import CampaignError, Fault
 from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, glob_names
 from sealfit.places import RUNS, campaign_folder, existing_out, refuse_effects_in
+from sealfit.profiling import timed
 from sealfit.progress import Silent
 from sealfit.staging import Staged
 from sealfit.state import ConfigCopy
@@ -22,6 +23,7 @@ INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bin
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
 FITTED = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
 UNREPORTED = ("traces", "bins")  # as many rows as samples, and nothing in the report needs them
+Counted = tuple[int, str]
 FAULTY = ("warning", "error")  # severities that count as a fault
 
 
@@ -108,14 +110,16 @@ def _do_steps(
         if why or force:
             if why and step in store.state.steps:
                 progress.say(why)
-            with store.step(step) as staged:
-                _WORK[step](store, staged, workers, progress)
+            with timed(step) as part, store.step(step) as staged:
+                part.rows, part.of = _WORK[step](store, staged, workers, progress)
             done.append(step)
         else:
             progress.say(f"{step}: current, not redone")
         if step == "ingest" and strict:
             _refuse_faults(store.read("quality"))
-    return {"out": str(store.out), "done": done, **summary.of_steps(store, steps)}
+    with timed("summary"):
+        found = summary.of_steps(store, steps)
+    return {"out": str(store.out), "done": done, **found}
 
 
 def _refuse_faults(quality: pd.DataFrame) -> None:
@@ -132,9 +136,10 @@ def faults_of(quality: pd.DataFrame) -> list[Fault]:
     return [Fault(**row) for row in rows.assign(**whole).to_dict("records")]
 
 
-# ---------------------------------------------------------------- the work of each step
-def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
-    from sealfit.ingest.campaign import Place, ingest_campaign
+# ---------------------------------------------------------------- the work of each step; how many rows of what it saw
+def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+    with timed("loading libraries"):
+        from sealfit.ingest.campaign import Place, ingest_campaign
 
     campaign, config = store.state.campaign, store.seen_config("ingest")
     runs_before = fingerprint(campaign / RUNS)  # as it was when the reading began
@@ -142,14 +147,16 @@ def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> Non
     with progress.counting("reading trace files") as on_file:
         ingested = ingest_campaign(campaign, config, workers=workers, on_file=on_file, place=place)
     progress.faults(ingested.faults)
-    for name, table in ingested.tables.items():
-        staged.table(name, table)
+    with timed("writing tables"):
+        for name, table in ingested.tables.items():
+            staged.table(name, table)
     staged.adopt(ingested.stored)
     marks = _as_read(ingested.tables["inputs"])
     named = {fault.file for fault in ingested.faults if fault.file} | set(glob_names(campaign, config.files))
     for name in sorted(named - marks.keys()):  # missing or unreadable: if that changes, the campaign has changed
         marks[name] = fingerprint(campaign / name)
     staged.inputs = {**marks, RUNS: runs_before}
+    return int(ingested.tables["inputs"]["rows"].sum()), "samples"
 
 
 def _as_read(inputs: pd.DataFrame) -> dict[str, Fingerprint]:
@@ -158,15 +165,16 @@ def _as_read(inputs: pd.DataFrame) -> dict[str, Fingerprint]:
     return {name: Fingerprint(int(size), int(mtime_ns), sha256) for name, size, mtime_ns, sha256 in marks}
 
 
-def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     from sealfit.fit.steady import fit_conditions
 
     steady = store.read("steady")
     progress.say(f"fitting {steady['condition'].nunique()} conditions")
     staged.table("steady_fit", fit_conditions(steady, store.seen_config("fit-steady")))
+    return len(steady), "strokes"
 
 
-def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     from sealfit.fit.aging import aging_curves, fit_series
     from sealfit.fit.all_series import joint_laws
 
@@ -183,9 +191,10 @@ def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> 
         staged.table(name, table)
     staged.table("aging_fit", fitted)
     staged.table("aging_curves", aging_curves(fitted))
+    return int(steady_fit["condition"].nunique()), "conditions"
 
 
-def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     from sealfit.fit.dynamic import fit_dynamic
 
     progress.say("fitting the pre-sliding part")
@@ -193,37 +202,42 @@ def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -
     found = fit_dynamic(store.traces(), *tables, config, workers=workers)
     staged.table("dynamic_fit", found.fit)
     staged.table("dynamic_curves", found.curves)
+    return len(tables[0]), "strokes"
 
 
-def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     from sealfit.closure.loop import close_loop
 
-    closure = close_loop(
-        store.read("bins"),
-        store.read("traces", ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]),
-        store.seen_config("close-loop"),
-        workers=workers,
-        on_progress=progress.say,
-    )
-    for name in CLOSED:
-        staged.table(name, closure.tables[name])
+    with timed("reading tables"):
+        bins = store.read("bins")
+        traces = store.read("traces", ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"])
+    count = len(bins)
+    closure = close_loop(bins, traces, store.seen_config("close-loop"), workers=workers, on_progress=progress.say)
+    with timed("writing tables"):
+        for name in CLOSED:
+            staged.table(name, closure.tables[name])
     started = store.read("runs", ["started_at"])["started_at"].dropna()
     staged.json("model", {**closure.model, "first_started_at": min(started) if len(started) else None})
     staged.json("closure", closure.document)
+    return count, "bins"
 
 
-def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> None:
+def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     from sealfit.report.page import build_report
 
     progress.say("drawing the report")
-    tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED) if name not in UNREPORTED}
-    report = build_report(tables, store.read_json("closure"), store.provenance(), store.seen_config("report"))
-    for name, figure in report.figures.items():
-        staged.figure(name, figure)
+    with timed("reading tables"):
+        tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED) if name not in UNREPORTED}
+    with timed("page"):
+        report = build_report(tables, store.read_json("closure"), store.provenance(), store.seen_config("report"))
+    with timed("plots as files", rows=len(report.figures), of="plots"):
+        for name, figure in report.figures.items():
+            staged.figure(name, figure)
     staged.text("report.html", report.html)
+    return sum(len(table) for table in tables.values()), "rows of tables"
 
 
-_WORK: dict[str, Callable[[Store, Staged, int, Silent], None]] = {
+_WORK: dict[str, Callable[[Store, Staged, int, Silent], Counted]] = {
     "ingest": _ingest,
     "fit-steady": _fit_steady,
     "fit-aging": _fit_aging,

@@ -23,6 +23,7 @@ from sealfit.effects.contract import Effect
 from sealfit.engine import begin_map, many_workers
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.rows import Rows, make_rows, thin
+from sealfit.profiling import timed
 from sealfit.verdict import predicts_worse
 
 ROWS = 4_000  # that the search works on; more are merged along their strokes,
@@ -79,12 +80,15 @@ def close_loop(
     heldout = _HeldOut(rows, coarse, samples, config, effects, workers)
     with closing(heldout):
         fine = rows if merged else None
-        grown = grow(coarse, samples, config, effects, fine=fine, on_found=heldout.begin, on_progress=say)
+        with timed("search", rows=coarse.force.size, of="bins, merged"):
+            grown = grow(coarse, samples, config, effects, fine=fine, on_found=heldout.begin, on_progress=say)
         say("before and after on all rows")
-        before, after = (_on_all(rows, grown, f) if merged else f for f in (grown.before, grown.after))
-        after = after if grown.added else before
+        with timed("before and after", rows=rows.force.size, of="bins"):
+            before, after = (_on_all(rows, grown, f) if merged else f for f in (grown.before, grown.after))
+            after = after if grown.added else before
         say(f"held out by {heldout.level}: the search repeated without each fold")
-        held_before, held_after = heldout.forces(grown, say)
+        with timed("held out", rows=len(heldout.masks), of="folds"):
+            held_before, held_after = heldout.forces(grown, say)
     document = _document(config, effects, grown, before, after, held_before, held_after, heldout.level)
     tables = {
         "effects": effect_table([e for e in document["effects"] if not e["candidate"]], grown.added),

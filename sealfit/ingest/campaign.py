@@ -26,6 +26,7 @@ from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.shaped import STEADY_ONLY, shaped
 from sealfit.ingest.stored import Made, agrees, common_columns, load_part, make_part, part_key
+from sealfit.profiling import timed
 from sealfit.tables import RUNS, STEADY
 
 OF_SAMPLES = ("time_s", "displacement_mm", "distance_mm", "force_N", "force_sd_N", "n")  # their means are in `steady`
@@ -86,9 +87,14 @@ def ingest_campaign(
         For faults that concern the whole campaign, or where not one stroke can be used.
     """
     campaign = Path(campaign)
-    refs, faults = list_traces(campaign, config)
+    with timed("listing trace files") as part:
+        refs, faults = list_traces(campaign, config)
+        planned = _planned(campaign, refs, config)
+        part.rows, part.of = len(refs), "files"
     make = _Maker(campaign, config, workers, on_file, place)
-    parts = make.parts(_planned(campaign, refs, config))
+    with timed("reading trace files") as part:
+        parts = make.parts(planned)
+        part.rows, part.of = make.reread, "files"
     order = {ref.file: i for i, ref in enumerate(refs)}
     faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: order[fault.file])
     strokes = _in_order(strokes_of([part.strokes for part in parts]), order)
