@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-BINS = 64  # parts of a range that a weighted median is looked for in
+SAMPLE = 64  # rows of a piece that tell where about its weighted median lies
 
 
 class Pieces:
@@ -109,34 +109,28 @@ def weighted_medians(values: np.ndarray, weights: np.ndarray, pieces: Pieces) ->
 
     Only what is positive weighs: `weights` are 0 wherever `values` are not above 0.
     """
-    made, numbers = np.zeros(len(pieces)), np.arange(len(pieces))
-    low, high, before = np.zeros(len(pieces)), pieces.max(values), np.zeros(len(pieces))
-    half: np.ndarray | None = None
-    rows, part, here = np.arange(pieces.rows), pieces, numbers  # what is left to look at: its rows, its pieces, whose
-    value, weight = values, weights
-    # How much lies in which part of the range, and again within the part where the half is, until few are to be sorted.
-    for _ in range(4):
-        scale = np.divide(BINS, high - low, out=np.zeros(len(pieces)), where=high > low)
-        place = (value - part.spread(low[here])) * part.spread(scale[here])
-        place = place.clip(0.0, BINS - 1.0).astype(np.int64) + part.spread(BINS * here)
-        held = np.bincount(place, weight, minlength=BINS * len(pieces)).reshape(len(pieces), BINS)
-        covered = before[:, None] + np.cumsum(held, axis=1)
-        half = 0.5 * covered[:, -1] if half is None else half
-        crossing = np.minimum((covered < half[:, None]).sum(axis=1), BINS - 1)
-        before = np.where(crossing > 0, covered[numbers, crossing - 1], before)
-        inside = place == part.spread((crossing + BINS * numbers)[here])
-        count = part.sum(inside)
-        rows, value, weight = rows[inside], value[inside], weight[inside]
-        here, part = here[count > 0], Pieces(count[count > 0])
-        low[here], high[here] = part.min(value), part.max(value)
-        if ((part.size <= BINS) | (low == high)[here]).all():
-            break
-    for i, own in enumerate(pieces.split(rows)):
-        if half[i] > 0.0 and low[i] == high[i]:
+    # A sample of rows tells between which values the half will lie; only what lies between them is put in order.
+    at = pieces.start[:, None] + np.arange(SAMPLE) * pieces.size[:, None] // SAMPLE
+    order = np.argsort(values[at], axis=1)
+    sample = np.take_along_axis(values[at], order, axis=1)
+    covered = np.cumsum(np.take_along_axis(weights[at], order, axis=1), axis=1)
+    ends = [np.argmax(covered >= share * covered[:, -1:], axis=1) for share in (0.35, 0.65)]
+    low, high = np.take_along_axis(sample, np.array(ends).T, axis=1).T
+    inside = (values >= pieces.spread(low)) & (values <= pieces.spread(high))
+    half = 0.5 * np.add.reduceat(weights, pieces.start)
+    before = np.add.reduceat(weights * (values < pieces.spread(low)), pieces.start)
+    held = np.add.reduceat(weights * inside, pieces.start)
+    caught = (before < half) & (half <= before + held)
+    made = np.zeros(len(pieces))
+    for i, own in enumerate(pieces.slices):
+        if half[i] <= 0.0:
+            continue
+        if caught[i] and low[i] == high[i]:
             made[i] = low[i]
-        elif half[i] > 0.0:
-            held = own + pieces.start[i]
-            order = held[np.argsort(values[held])]
-            reached = np.searchsorted(before[i] + np.cumsum(weights[order]), half[i])
-            made[i] = values[order[min(int(reached), len(order) - 1)]]
+            continue
+        chosen = inside[own] if caught[i] else slice(None)
+        value, weight = values[own][chosen], weights[own][chosen]
+        order = np.argsort(value)
+        reached = (before[i] if caught[i] else 0.0) + np.cumsum(weight[order])
+        made[i] = value[order[min(int(reached.searchsorted(half[i])), len(order) - 1)]]
     return made
