@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sealfit.ingest.pieces import Pieces, median, weighted_medians
-from sealfit.ingest.presliding import rise_end_mm
+from sealfit.ingest.presliding import Start, rise_ends_mm
 from sealfit.ingest.running import running_median
 
 REST = 0.5  # slower than this share of the plateau is a rest, not a ripple of the speed
@@ -55,21 +56,35 @@ def steady_windows(
     for start, rows in zip(strokes.start[origin > 0].tolist(), origin[origin > 0].tolist(), strict=True):
         sliding[start : start + rows] = moves[start : start + rows] = False
     begins, ends = (strokes.split(rows) for rows in _edges(moves, strokes))
+    stretches: list[tuple[int, int, int]] = []  # standstill, and where the speed is steady
     for i, rows in enumerate(strokes.slices):
         if plateau[i] <= 0.0:
             continue
-        stroke = _Motion(
-            time_s[rows], along_mm[rows], speed[rows], slow[rows], fast[rows], float(plateau[i]), int(half[i])
-        )
-        since = int(origin[i])
+        own = (values[rows] for values in (time_s, along_mm, speed, slow, fast))
+        stroke, since = _Motion(*own, float(plateau[i]), int(half[i])), int(origin[i])
         for first, last in stroke.moving(begins[i].tolist(), ends[i].tolist()):
             still = stroke.standstill(since, first)
             begin, end = stroke.ramp_end(still, first, last), stroke.stop_begin(first, last)
             if end - begin >= 4:
-                past = _rise_end(stroke.along_mm, force_N[rows], still, begin, end)
-                steady[rows.start + past : rows.start + end] = True
+                stretches.append((rows.start + still, rows.start + begin, rows.start + end))
             since = last
+    for begin, end in _past_rises(along_mm, force_N, stretches):
+        steady[begin:end] = True
     return steady, sliding
+
+
+def _past_rises(
+    along_mm: np.ndarray, force_N: np.ndarray, stretches: Sequence[tuple[int, int, int]]
+) -> list[tuple[int, int]]:
+    """Return the rows of each stretch from where the force is past its pre-sliding rise."""
+    starts = []
+    for still, begin, end in stretches:
+        distance = np.maximum.accumulate(along_mm[still:end]) - along_mm[still]
+        starts.append(Start(distance, force_N[still:end], begin - still))
+    return [
+        (max(begin, still + int(start.distance_mm.searchsorted(past))), end)
+        for (still, begin, end), start, past in zip(stretches, starts, rise_ends_mm(starts), strict=True)
+    ]
 
 
 def local_speeds(
@@ -212,10 +227,3 @@ def _last(mask: np.ndarray) -> int | None:
     """Return the last row that is true, if any."""
     found = _first(mask[::-1])
     return None if found is None else len(mask) - 1 - found
-
-
-def _rise_end(along_mm: np.ndarray, force_N: np.ndarray, still: int, begin: int, end: int) -> int:
-    """Return the row, at or after `begin`, from which the force is past its pre-sliding rise."""
-    distance = np.maximum.accumulate(along_mm[still:end]) - along_mm[still]
-    past = rise_end_mm(distance, force_N[still:end], begin - still)
-    return max(begin, still + int(distance.searchsorted(past)))
