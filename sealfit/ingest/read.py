@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +12,7 @@ import pandas as pd
 
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import BadFile, ConfigError, Fault
-from sealfit.ingest.cells import OVERLOAD, Cells, listed, read_cells
+from sealfit.ingest.cells import Cells, read_cells
 from sealfit.ingest.channels import channel_columns
 from sealfit.ingest.columns import RESERVED, SLOTS, beside, required
 from sealfit.ingest.expression import evaluate, parse
@@ -22,6 +21,7 @@ from sealfit.ingest.form import Form, form_of
 from sealfit.ingest.names import name_parts
 from sealfit.ingest.pieces import Pieces
 from sealfit.ingest.refs import TraceRef
+from sealfit.ingest.rows import Rows, clean
 from sealfit.ingest.speed_check import speed_faults
 from sealfit.ingest.text import Layout, as_utf8, header_fields
 
@@ -47,19 +47,6 @@ class Trace:
     def table(self) -> pd.DataFrame:
         """The columns as a table."""
         return pd.DataFrame(self.columns)
-
-
-@dataclass(frozen=True, slots=True)
-class _Rows:
-    """Columns of equal length on their way through the checks, and the lines they come from."""
-
-    columns: dict[str, np.ndarray]
-    line: np.ndarray
-
-    def where(self, mask: np.ndarray) -> _Rows:
-        if mask.all():
-            return self
-        return _Rows({name: values[mask] for name, values in self.columns.items()}, self.line[mask])
 
 
 def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
@@ -143,7 +130,7 @@ def _at_their_speed(found: Sequence[Trace | BadFile], config: Config) -> list[Tr
 def _trace(cells: Cells, form: Form, ref: TraceRef, config: Config) -> Trace:
     """Return the trace that the cells of a file make; raises as `read_trace`."""
     settings, file, layout = config.trace, ref.file, form.layout
-    rows = _Rows({name: cells.columns[i] for i, name in form.ours.items() if i in cells.columns}, cells.line)
+    rows = Rows({name: cells.columns[i] for i, name in form.ours.items() if i in cells.columns}, cells.line)
     known: Mapping[str, object] = {}
     if settings.compute or settings.keep is not None:
         known = {**ref.channels, **name_parts(file, config.files).values, **header_fields(layout.header, settings)}
@@ -154,9 +141,9 @@ def _trace(cells: Cells, form: Form, ref: TraceRef, config: Config) -> Trace:
     columns, dropped, found = channel_columns(rows.columns, SLOTS, good, rows.line, config, file)
     faults += found
     good &= ~dropped
-    bad = int((~good[first:]).sum())
+    bad = len(good[first:]) - int(np.count_nonzero(good[first:]))
     good[:first] = False
-    rows, wrong, found = _derive(_Rows(columns, rows.line).where(good), known, settings, layout, file)
+    rows, wrong, found = _derive(Rows(columns, rows.line).where(good), known, settings, layout, file)
     faults += found
     bad += wrong
     faults += _too_many(bad, counted, faults, config, file)
@@ -169,8 +156,8 @@ def _trace(cells: Cells, form: Form, ref: TraceRef, config: Config) -> Trace:
 
 
 def _derive(
-    rows: _Rows, known: Mapping[str, object], settings: TraceFormat, layout: Layout, file: str
-) -> tuple[_Rows, int, list[Fault]]:
+    rows: Rows, known: Mapping[str, object], settings: TraceFormat, layout: Layout, file: str
+) -> tuple[Rows, int, list[Fault]]:
     """Return the rows with computed columns and integrated displacement, the number of bad ones, and the faults."""
     speed = settings.integrate_displacement
     compute = {name: parse(text) for name, text in settings.compute.items()}
@@ -181,13 +168,13 @@ def _derive(
         if speed not in rows.columns or "time_s" not in rows.columns:
             missing = speed if speed not in rows.columns else "time_s"
             raise BadFile(_missing(missing, layout, file))
-        rows, bad, faults = _clean(rows, ["time_s", speed, "force_N"], file)
-        rows = _Rows({**rows.columns, "displacement_mm": _integral(rows, speed, settings)}, rows.line)
+        rows, bad, faults = clean(rows, ["time_s", speed, "force_N"], file)
+        rows = Rows({**rows.columns, "displacement_mm": _integral(rows, speed, settings)}, rows.line)
         rows = _computed(rows, {name: compute[name] for name in later}, known, settings, file)
         required(rows.columns, layout, file)
         return rows, bad, faults
     required(rows.columns, layout, file)
-    rows, bad, faults = _clean(rows, [name for name in SLOTS if name in rows.columns], file)
+    rows, bad, faults = clean(rows, [name for name in SLOTS if name in rows.columns], file)
     return rows, bad, faults
 
 
@@ -207,12 +194,12 @@ def _after_integral(compute: Mapping[str, object]) -> list[str]:
     return later
 
 
-def _computed(rows: _Rows, compute: Mapping, known: Mapping[str, object], settings: TraceFormat, file: str) -> _Rows:
+def _computed(rows: Rows, compute: Mapping, known: Mapping[str, object], settings: TraceFormat, file: str) -> Rows:
     columns = dict(rows.columns)
     for name, expression in compute.items():
         value = _evaluate(expression, {**known, **settings.constants, **columns}, file)
         columns[name] = np.broadcast_to(value, rows.line.shape).astype(float)
-    return _Rows(columns, rows.line)
+    return Rows(columns, rows.line)
 
 
 def _evaluate(expression, values: Mapping[str, object], file: str) -> np.ndarray:
@@ -222,83 +209,12 @@ def _evaluate(expression, values: Mapping[str, object], file: str) -> np.ndarray
         raise BadFile(replace(_bad_file("expression", error.message, file, error.mend), column=error.column)) from error
 
 
-def _kept(rows: _Rows, known: Mapping[str, object], settings: TraceFormat, file: str) -> np.ndarray:
+def _kept(rows: Rows, known: Mapping[str, object], settings: TraceFormat, file: str) -> np.ndarray:
     values = {**known, **settings.constants, **rows.columns}
     return np.broadcast_to(_evaluate(parse(settings.keep, condition=True), values, file), rows.line.shape)
 
 
-def _clean(rows: _Rows, names: list[str], file: str) -> tuple[_Rows, int, list[Fault]]:
-    """Return the rows whose slots are finite and whose time rises, the number left out, and the faults."""
-    names = [name for name in names if name in rows.columns]
-    if _in_order(rows, names):
-        return rows, 0, []
-    faults: list[Fault] = []
-    finite = np.ones(len(rows.line), bool)
-    for name in names:
-        sizes = np.abs(rows.columns[name])
-        wrong, overload = ~np.isfinite(sizes), (sizes >= OVERLOAD) & np.isfinite(sizes)
-        finite &= ~(wrong | overload)
-        faults += _row_faults("not_finite", "the computed value is not a finite number.", name, rows, wrong, file)
-        faults += _row_faults("overload", "is an instrument's mark for overload.", name, rows, overload, file)
-    good = rows.where(finite)
-    back = _out_of_order(good.columns["time_s"])
-    faults += _row_faults("time_order", "time repeats or runs backwards.", "time_s", good, back, file)
-    return good.where(~back), int((~finite).sum() + back.sum()), faults
-
-
-def _in_order(rows: _Rows, names: Sequence[str]) -> bool:
-    """Return whether nothing is to be found: every slot measured, time rising throughout."""
-    time_s = rows.columns["time_s"]
-    if len(time_s) < 2 or not (time_s[1:] > time_s[:-1]).all():
-        return False
-    return all(np.abs(rows.columns[name]).max() < OVERLOAD for name in names)  # not so of nan
-
-
-def _row_faults(check: str, reason: str, name: str, rows: _Rows, wrong: np.ndarray, file: str) -> list[Fault]:
-    place = {"file": file, "column": name, "action": "row left out"}
-    mend = {
-        "time_order": "Check the recorder's clock, or delete the line.",
-        "not_finite": "Check [trace.compute].",
-        "overload": "Check the sensor's range.",
-    }[check]
-
-    def make(i: int) -> Fault:
-        value = float(rows.columns[name][i])
-        shown = value if np.isfinite(value) else str(value)  # JSON has no nan
-        return Fault(check, reason, line=int(rows.line[i]), value=shown, mend=mend, **place)
-
-    def rest(count: int) -> Fault:
-        return Fault(check, f"and {count} more rows: {reason}", value=float(count), **place)
-
-    return listed(np.flatnonzero(wrong), make, rest)
-
-
-def _out_of_order(time_s: np.ndarray) -> np.ndarray:
-    """Return a mask of the fewest rows whose removal leaves a time that rises from row to row.
-
-    They are the rows outside a longest rising subsequence (patience sorting), so one wrong time that lies far ahead
-    costs one row and not all that follow.
-    """
-    if len(time_s) < 2 or (np.diff(time_s) > 0).all():
-        return np.zeros(len(time_s), bool)
-    tails: list[float] = []
-    at: list[int] = []
-    before = np.full(len(time_s), -1)
-    for i, t in enumerate(time_s.tolist()):
-        place = bisect_left(tails, t)
-        if place < len(tails) and tails[place] == t:
-            continue  # of two equal times the first stays
-        before[i] = at[place - 1] if place else -1
-        tails[place : place + 1], at[place : place + 1] = [t], [i]
-    bad = np.ones(len(time_s), bool)
-    i = at[-1]
-    while i >= 0:
-        bad[i] = False
-        i = before[i]
-    return bad
-
-
-def _integral(rows: _Rows, speed: str, settings: TraceFormat) -> np.ndarray:
+def _integral(rows: Rows, speed: str, settings: TraceFormat) -> np.ndarray:
     """Return the displacement, trapezoid rule over time, 0 at the first row; a speed per minute is divided by 60."""
     time_s, v = rows.columns["time_s"], rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
     return np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(time_s))]) if len(v) else v
@@ -314,7 +230,7 @@ def _too_many(bad: int, counted: int, faults: list[Fault], config: Config, file:
     raise BadFile(*faults, replace(_bad_file("too_many_bad_rows", reason, file, mend), value=float(bad)))
 
 
-def _named_beside(rows: _Rows, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:
+def _named_beside(rows: Rows, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:
     """Return slots first, then channels, without helper columns.
 
     A channel that `ref` has too is left out where it is constant (`ref` says it); one that varies is another quantity

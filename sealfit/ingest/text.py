@@ -80,7 +80,7 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
 def _is_plain(raw: bytes) -> bool:
     """Return whether the bytes are letters, figures and marks of ASCII between line feeds, and nothing else."""
     codes = np.frombuffer(raw, np.uint8)
-    return np.count_nonzero(codes - np.uint8(32) < 95) + np.count_nonzero(codes == 10) == len(raw)  # 127 is no mark
+    return bool(codes.max(initial=0) < 127) and np.count_nonzero(codes < 32) == np.count_nonzero(codes == 10)
 
 
 def find_layout(text: bytes, settings: TraceFormat, file: str) -> Layout:
