@@ -16,6 +16,8 @@ from sealfit.ingest.read import Trace, read_traces
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.stroke_means import strokes_of
 
+BATCH_BYTES = 4_000_000  # of files held at once, and hardly more: bounds the memory where files are long
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FileStrokes:
@@ -29,34 +31,58 @@ class FileStrokes:
     samples: Mapping[str, np.ndarray] | None = None
 
 
-def read_files(refs: Sequence[TraceRef], campaign: Path, config: Config) -> list[FileStrokes]:
-    """Return the strokes of several trace files, in order; without strokes where a file must be left out, and why.
+def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
+    """Return the strokes of one trace file; without strokes where the file must be left out, and why.
 
     Parameters
     ----------
-    refs : sequence of TraceRef
-        The files, and what is known of each as a whole; all are held at once, so no more than memory has room for.
+    ref : TraceRef
+        The file, and what is known of it as a whole.
     campaign : Path
         Campaign folder.
     config : Config
         The rig.
     """
+    (made,) = read_files([ref], campaign, config)
+    return made
+
+
+def read_files(refs: Sequence[TraceRef], campaign: Path, config: Config) -> list[FileStrokes]:
+    """Return the strokes of several trace files, in their order; those that are written alike are read in one go.
+
+    What is returned does not depend on which files are read together, but for the last digit of sums.
+
+    Parameters
+    ----------
+    refs : sequence of TraceRef
+        Some 32 or 64 files; more gain nothing. See `read_strokes` for the others.
+    """
     folder = Folder(campaign)
-    marks: dict[int, Fingerprint] = {}
-    left: dict[int, BadFile] = {}
-    contents: list[tuple[TraceRef, bytes]] = []
-    for i, ref in enumerate(refs):
+    made: list[FileStrokes] = []
+    batch: list[tuple[TraceRef, Fingerprint, bytes | BadFile]] = []
+    held = 0
+    for ref in refs:
         try:
-            raw, marks[i] = folder.read(ref.file)
-            contents.append((ref, raw))
+            raw, mark = folder.read(ref.file)
+            batch.append((ref, mark, raw))
+            held += len(raw)
         except BadFile as error:
-            marks[i], left[i] = folder.fingerprint(ref.file), error
-    traces = iter(read_traces(contents, config))
-    found = [left[i] if i in left else next(traces) for i in range(len(refs))]
+            batch.append((ref, folder.fingerprint(ref.file), error))
+        if held > BATCH_BYTES:
+            made += _strokes_of_batch(batch, config)
+            batch, held = [], 0
+    return made + _strokes_of_batch(batch, config)
+
+
+def _strokes_of_batch(
+    batch: Sequence[tuple[TraceRef, Fingerprint, bytes | BadFile]], config: Config
+) -> list[FileStrokes]:
+    read = iter(read_traces([(ref, raw) for ref, _, raw in batch if isinstance(raw, bytes)], config))
+    found = [next(read) if isinstance(raw, bytes) else raw for _, _, raw in batch]
     strokes = iter(strokes_of([trace for trace in found if isinstance(trace, Trace)], config))
     return [
-        FileStrokes(ref.file, marks[i], 0, made.faults)
-        if isinstance(made, BadFile)
-        else FileStrokes(ref.file, marks[i], made.rows_read, *next(strokes))
-        for i, (ref, made) in enumerate(zip(refs, found, strict=True))
+        FileStrokes(ref.file, mark, made.rows_read, *next(strokes))
+        if isinstance(made, Trace)
+        else FileStrokes(ref.file, mark, 0, made.faults)
+        for (ref, mark, _), made in zip(batch, found, strict=True)
     ]
