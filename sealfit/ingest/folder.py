@@ -30,7 +30,8 @@ class Folder:
         """Return the path of `file` if it lies inside the campaign folder, links followed; otherwise None."""
         folder, _, name = file.rpartition("/")
         path = os.path.join(self.campaign, file)
-        if not self._safe_folder(folder) or name in ("", ".", "..") or "\0" in name or "\\" in name or ":" in name:
+        odd = name in ("", ".", "..") or file.startswith("/") or any(mark in file for mark in "\0\\:")
+        if odd or not self._safe_folder(folder):
             return path if inside(self.campaign, file) is not None else None
         try:
             linked = stat.S_ISLNK(os.lstat(path).st_mode)
