@@ -6,7 +6,7 @@ NO_NETWORK = echo "make: the packages that sealfit needs could not be installed;
 CODE := $(wildcard sealfit tests benchmarks)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost paper clean
+.PHONY: help demo test lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed paper clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -23,7 +23,7 @@ lint: .venv/.installed-test ## check style and formatting
 
 check: test ## what the continuous integration runs: the same as test
 
-bench: bench-null bench-effects bench-coverage ## long counts of false alarms, effects found and coverage (about half an hour)
+bench: bench-null bench-effects bench-coverage bench-start ## long counts of false alarms, effects found and coverage (about half an hour)
 
 bench-null: .venv/.installed-test
 	$(BIN)/python benchmarks/false_alarms.py --seeds 3
@@ -37,6 +37,13 @@ bench-coverage: .venv/.installed-test
 # In an environment of its own, as pygam holds scipy back. What is in out/loop.jsonl already is not run again.
 bench-loop: .venv/.installed-bench ## close the loop on some 700 campaigns beside what people would use instead (90 minutes)
 	.venv/bench/bin/python benchmarks/loop.py --out out/loop.jsonl
+
+# Side by side with a bare loop of pyarrow and with typer alone, so on a quiet machine.
+bench-start: .venv/.installed-test
+	$(BIN)/python benchmarks/speed.py startup ingest --work out/speed
+
+bench-speed: .venv/.installed-test ## seconds and memory beside a bare read and a pandas script; up to 100,000 files (quiet machine)
+	$(BIN)/python benchmarks/speed.py startup ingest memory run growth --work out/speed
 
 bench-loop-cost: .venv/.installed-test
 	$(BIN)/python benchmarks/loop_cost.py

@@ -26,7 +26,7 @@ import speed_growth
 import speed_ingest
 import speed_run
 import speed_startup
-from campaigns import campaign
+from campaigns import paper_campaign
 from in_turns import heading
 
 from sealfit.simulate import simulate
@@ -91,7 +91,7 @@ def paper(given: argparse.Namespace, work: Path) -> Path:
         return given.campaign
     place = work / f"paper_seed_{given.seed}"
     if not (place / "runs.csv").exists():
-        simulate(campaign("paper", seed=given.seed), place)
+        simulate(paper_campaign(seed=given.seed), place)
     return place
 
 
