@@ -6,8 +6,8 @@
     python benchmarks/speed.py startup [--repeats 20]                    beside `python -c "import typer"`; imports
     python benchmarks/speed.py growth  [--files 1000 10000 100000] [--steps all]
 
-Several parts may be named at once. Without --campaign the paper's own, 1,752 files of 1,000 rows, is simulated first (2
-minutes). What is written goes to a temporary folder, or to --work DIR, where campaigns are kept for the next time.
+Several parts may be named at once. Without --campaign the paper's own, 1,752 files of 1,000 rows, is simulated first.
+What is written goes to a temporary folder, or to --work DIR, where campaigns are kept for the next time.
 
 Seconds are wall time of whole processes, from start to end, with the files in the system's cache: each campaign is read
 once before. What runs on "one core" is pinned to one, everything else to the first two. Memory: see `process_tree.py`.
