@@ -67,6 +67,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fa
         {**_header(campaign, entry.file, config), **named.channels, **_cells(entry)}
         for entry, named in zip(entries, parts, strict=True)
     ]
+    entries = [entry.place() for entry in entries]  # their cells are not needed any more, and are much memory
     files, found = to_values(entries, files, config)
     faults += found
     needed = _Needed.of(config)

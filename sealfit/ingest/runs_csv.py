@@ -38,6 +38,10 @@ class Entry:
     line: int | None = None  # in runs.csv; None where the file was found by the glob
     cells: dict[str, str] = field(default_factory=dict)
 
+    def place(self) -> Entry:
+        """Return the entry without its cells."""
+        return Entry(self.file, self.line)
+
     def fault(self, check: str, reason: str, column: str | None = None, **rest) -> Fault:
         """Return a fault at this entry's place: its line in runs.csv, or the file itself."""
         place = {"file": RUNS_CSV, "line": self.line} if self.line is not None else {"file": self.file}
