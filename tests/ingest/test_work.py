@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from trace_helpers import campaign, config
 
-from sealfit.ingest import folders, outlying, peers, run_values
+from sealfit.ingest import listing, outlying, peers, run_values
 from sealfit.ingest.folder import inside
 from sealfit.ingest.listing import Folders
 from sealfit.ingest.outlying import outlying_repeats
@@ -42,7 +42,7 @@ def test_listing_follows_links_per_folder_and_reads_each_different_cell_once(tmp
     work = []
     for files in (30, 300):
         folder = listed(tmp_path / str(files), files)
-        resolved, parsed = counted(monkeypatch, folders, "inside"), counted(monkeypatch, run_values, "as_number")
+        resolved, parsed = counted(monkeypatch, listing, "inside"), counted(monkeypatch, run_values, "as_number")
         looked = counted(monkeypatch, os, "scandir")
         refs, faults = list_traces(folder, config())
         assert (len(refs), faults) == (files, [])
