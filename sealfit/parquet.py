@@ -94,7 +94,10 @@ def write_arrow(table: pa.Table, path: Path) -> None:
 def read(path: Path | Sequence[Path], columns: list[str] | None = None) -> pd.DataFrame:
     """Return the table at `path`, a file or its parts in their order, or those columns of it."""
     paths = [path] if isinstance(path, Path) else path
-    parts = [pq.read_table(one, columns=columns, partitioning=None) for one in paths]
+    parts = []
+    for one in paths:
+        with pq.ParquetFile(one) as file:  # a tenth of what read_table takes for a small file
+            parts.append(file.read(columns=columns))
     return pa.concat_tables(parts).to_pandas(self_destruct=True)
 
 

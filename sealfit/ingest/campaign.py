@@ -89,7 +89,7 @@ def ingest_campaign(
     campaign = Path(campaign)
     with timed("listing trace files") as part:
         refs, faults = list_traces(campaign, config)
-        planned = _planned(campaign, refs, config)
+        planned = _planned(campaign, refs, config, place.marks if place else {})
         part.rows, part.of = len(refs), "files"
     make = _Maker(campaign, config, workers, on_file, place)
     with timed("reading trace files") as part:
@@ -119,9 +119,12 @@ def ingest_campaign(
     return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY], stored, make.reread)
 
 
-def _planned(campaign: Path, refs: Sequence[TraceRef], config: Config) -> list[Asked]:
+def _planned(campaign: Path, refs: Sequence[TraceRef], config: Config, marks: Mapping[str, Fingerprint]) -> list[Asked]:
     conditions = condition_keys([ref.channels for ref in refs], config)
-    sizes = [_size(os.path.join(campaign, ref.file)) for ref in refs]
+    known = (marks[ref.file].size if ref.file in marks else None for ref in refs)
+    sizes = [
+        _size(os.path.join(campaign, ref.file)) if size is None else size for ref, size in zip(refs, known, strict=True)
+    ]
     plan = plan_parts(conditions, [str(ref.channels["run_id"]) for ref in refs], sizes)
     return [Asked(tuple(refs[i] for i in files)) for files in plan]
 
