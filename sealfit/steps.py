@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from sealfit.engine import on_cluster
 from sealfit.errors import CampaignError, Fault
-from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, glob_names
+from sealfit.fingerprint import STEPS, fingerprint, glob_names
 from sealfit.places import RUNS, campaign_folder, existing_out, refuse_effects_in
 from sealfit.profiling import timed
 from sealfit.progress import Silent
@@ -151,18 +151,12 @@ def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
         for name, table in ingested.tables.items():
             staged.table(name, table)
     staged.adopt(ingested.stored)
-    marks = _as_read(ingested.tables["inputs"])
+    marks = dict(ingested.marks)
     named = {fault.file for fault in ingested.faults if fault.file} | set(glob_names(campaign, config.files))
     for name in sorted(named - marks.keys()):  # missing or unreadable: if that changes, the campaign has changed
         marks[name] = fingerprint(campaign / name)
     staged.inputs = {**marks, RUNS: runs_before}
     return int(ingested.tables["inputs"]["rows"].sum()), "samples"
-
-
-def _as_read(inputs: pd.DataFrame) -> dict[str, Fingerprint]:
-    rows = inputs[inputs["sha256"].notna() & inputs["size"].notna() & inputs["mtime_ns"].notna()]
-    marks = zip(rows["file"], rows["size"], rows["mtime_ns"], rows["sha256"], strict=True)
-    return {name: Fingerprint(int(size), int(mtime_ns), sha256) for name, size, mtime_ns, sha256 in marks}
 
 
 def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:

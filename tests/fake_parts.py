@@ -80,7 +80,7 @@ class Parts:
         good = Fault("read", "was read.", "a.csv", severity="info", action="kept")
         quality = pd.DataFrame([fault.as_dict() for fault in (good, *self.faults)])
         tables |= {"inputs": inputs, "quality": quality}
-        return SimpleNamespace(tables=tables, faults=[good, *self.faults], stored={})
+        return SimpleNamespace(tables=tables, faults=[good, *self.faults], marks=marks, stored={})
 
     def fit_conditions(self, steady, config):
         self._called("fit-steady", config)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -47,14 +47,14 @@ class Place:
 class Ingested:
     """Tables inputs, runs, quality and steady, and traces, traces_mean and bins where they are not stored by parts.
 
-    `faults` are the warnings and errors among the findings of `quality`; `stored` the files of the parts, by their
-    names below OUT, with their sizes; `reread` the number of trace files that were read.
+    `faults` are the warnings and errors among the findings of `quality`; `marks` the files as they were read; `stored`
+    the files of the parts, by their names below OUT, with their sizes.
     """
 
     tables: dict[str, pd.DataFrame]
     faults: list[Fault]
-    stored: dict[str, int] = field(default_factory=dict)
-    reread: int = 0
+    marks: dict[str, Fingerprint]
+    stored: dict[str, int]
 
 
 def ingest_campaign(
@@ -98,6 +98,7 @@ def ingest_campaign(
     order = {ref.file: i for i, ref in enumerate(refs)}
     faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: order[fault.file])
     strokes = _in_order(strokes_of([part.strokes for part in parts]), order)
+    parts = [replace(part, strokes=part.strokes.slice(0, 0)) for part in parts]  # they are in one table now
     strokes, found = judged(strokes)
     faults += found
     if not strokes["used"].any():
@@ -106,7 +107,7 @@ def ingest_campaign(
     faults += found
     strokes = strokes.assign(used=_still_used(strokes, steady))
     parts = make.settled(parts, strokes)
-    inputs = _inputs(campaign, parts, order, strokes, faults)
+    inputs, marks = _inputs(campaign, parts, order, strokes, faults)
     tables = {
         "inputs": inputs,
         "runs": shaped(strokes, RUNS, drop=(*STEADY_ONLY, *OF_SAMPLES)),
@@ -116,7 +117,7 @@ def ingest_campaign(
     if place is None:
         tables |= {name: _stacked([part.tables[name] for part in parts if name in part.tables]) for name in SAMPLED}
     stored = {name: size for part in parts for name, size in part.stored.items()}
-    return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY], stored, make.reread)
+    return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY], marks, stored)
 
 
 def _planned(campaign: Path, refs: Sequence[TraceRef], config: Config, marks: Mapping[str, Fingerprint]) -> list[Asked]:
@@ -258,8 +259,8 @@ def _stacked(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
 
 def _inputs(
     campaign: Path, parts: Sequence[Made], order: Mapping[str, int], strokes: pd.DataFrame, faults: Sequence[Fault]
-) -> pd.DataFrame:
-    """Return table `inputs`: every trace file of the campaign, and those that are not used."""
+) -> tuple[pd.DataFrame, dict[str, Fingerprint]]:
+    """Return table `inputs`, every trace file of the campaign and those that are not used, and their fingerprints."""
     used = set(strokes.loc[strokes["used"], "file"])
     files = sorted((found for part in parts for found in part.files), key=lambda found: order[found.file])
     rows = [(f.file, f.mark, f.rows, f.strokes, "used" if f.file in used else "left out") for f in files]
@@ -273,7 +274,8 @@ def _inputs(
         [(file, m.size, m.mtime_ns, m.sha256, n, count, status) for file, m, n, count, status in rows],
         columns=["file", "size", "mtime_ns", "sha256", "rows", "strokes", "status"],
     )
-    return table.astype({"file": "str", "size": "Int64", "mtime_ns": "Int64", "sha256": "str", "status": "str"})
+    types = {"file": "str", "size": "Int64", "mtime_ns": "Int64", "sha256": "str", "status": "str"}
+    return table.astype(types), {file: mark for file, mark, *_ in rows if mark.sha256 is not None}
 
 
 def _nothing_left(faults: Sequence[Fault], files: int) -> list[Fault]:

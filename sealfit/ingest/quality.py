@@ -24,6 +24,7 @@ FINE = 0.3  # share of equal neighbours below which noise is plainly larger than
 # cannot be told from a stuck one.
 COARSE = 0.6
 FEW_LEVELS = 5
+FINE_FILE = {"check": "ok", "severity": "info", "action": "kept", "reason": "nothing found.", "mend": ""}
 
 
 def suspects(
@@ -242,14 +243,15 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
     files : sequence of str
         Every trace file of the campaign, in order.
     """
-    silent = set(files) - {fault.file for fault in faults}
-    fine = [
-        Fault("ok", "nothing found.", file=file, severity="info", action="kept") for file in files if file in silent
-    ]
     place = {file: i for i, file in enumerate(files)}
-    ordered = sorted([*faults, *fine], key=lambda f: (place.get(f.file or "", -1), f.stroke or 0, f.line or 0))
+    silent = place.keys() - {fault.file for fault in faults}
+    ordered = sorted(faults, key=lambda fault: (place.get(fault.file or "", -1), fault.stroke or 0, fault.line or 0))
+    at = [place.get(fault.file or "", -1) for fault in ordered] + [place[file] for file in silent]
     rows = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in ordered]
-    table = pd.DataFrame(rows, columns=QUALITY.names())
+    found = pd.DataFrame(rows, columns=QUALITY.names())
+    fine = pd.DataFrame({"file": list(silent), **FINE_FILE}, columns=QUALITY.names())
+    table = pd.concat([part for part in (found, fine) if len(part)] or [found], ignore_index=True)
+    table = table.iloc[np.argsort(at, kind="stable")].reset_index(drop=True)
     whole = {"stroke": "Int64", "line": "Int64"}
     return table.astype({**{name: "str" for name in QUALITY.names() if name not in whole}, **whole})
 
