@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
@@ -325,6 +326,7 @@ def main() -> None:
 
 def _exit_code() -> int:
     one_thread()
+    gc.set_threshold(100_000, 20, 20)  # a campaign is many objects and no cycles: looking for them takes a fifth
     try:
         code = app(standalone_mode=False, prog_name="sealfit") or 0
         return _interrupted() if code == INTERRUPTED else code

@@ -189,11 +189,14 @@ class Store:
     def traces(self) -> list[StoredTraces]:
         """Return where table `traces` lies, in groups of whole conditions."""
         from sealfit import parquet
-        from sealfit.ingest.stored import PARTS
+        from sealfit.ingest.stored import ARROW, PARTS
         from sealfit.samples import by_conditions
 
-        parts = {path: parquet.read(self.out / PARTS / path.name, ["condition"]) for path in self._parts_of("traces")}
-        return by_conditions({path: table["condition"].dropna().unique() for path, table in parts.items()})
+        conditions = {}
+        for path in self._parts_of("traces"):
+            strokes = parquet.read_ipc((self.out / PARTS / path.name).with_suffix(ARROW))
+            conditions[path] = strokes["condition"].drop_null().unique().to_pylist()
+        return by_conditions(conditions)
 
     def read_json(self, name: str) -> dict:
         """Return `<name>.json`."""
@@ -266,7 +269,7 @@ class Store:
 
         In the folder of a table nothing else may lie, whoever left it there: readers take all of it.
         """
-        folders = {file.split("/")[0] for file in files if file.endswith(PARQUET) and "/" in file}
+        folders = {file.split("/")[0] for file in files if "/" in file and not file.startswith("plots/")}
         lying = {f"{folder}/{path.name}" for folder in folders for path in (self.out / folder).iterdir()}
         return (old.keys() | lying) - files.keys()
 

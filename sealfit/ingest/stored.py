@@ -11,13 +11,12 @@ import hashlib
 import json
 import os
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sealfit import __version__, parquet
 from sealfit.config import Config
@@ -28,7 +27,7 @@ from sealfit.staging import disk
 from sealfit.tables import SCHEMAS
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
-PARQUET = ".parquet"
+PARQUET, ARROW = ".parquet", ".arrow"
 _ABOUT = b"part"
 
 Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each column, as Arrow spells it
@@ -70,7 +69,8 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     name = _file_name(part_key(asked, {found.file: found.mark for found in part.files}, config), asked)
     with disk(folder.parent):
         stored = {
-            f"{of}{PARQUET}/{name}": _write(table, folder / f"{of}{PARQUET}" / name) for of, table in arrow.items()
+            (file := f"{of}{PARQUET}/{name}"): _write(table, folder / file, parquet.write_arrow)
+            for of, table in arrow.items()
         }
         about = {
             "unused": sorted(asked.unused),
@@ -80,10 +80,9 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
             "faults": [fault.as_dict() for fault in part.faults],
             "stored": stored,
         }
-        strokes = part.strokes.replace_schema_metadata(
-            {**(part.strokes.schema.metadata or {}), _ABOUT: json.dumps(about)}
-        )
-        stored[f"{PARTS}/{name}"] = _write(strokes, folder / PARTS / name)
+        metadata = {**(part.strokes.schema.metadata or {}), _ABOUT: json.dumps(about)}
+        file = f"{PARTS}/{Path(name).with_suffix(ARROW)}"
+        stored[file] = _write(part.strokes.replace_schema_metadata(metadata), folder / file, parquet.write_ipc)
     return Made(asked, part.files, part.faults, part.strokes, columns, {}, stored)
 
 
@@ -92,8 +91,9 @@ def part_key(asked: Asked, marks: Mapping[str, Fingerprint], config: Config) -> 
     hashes = [marks[ref.file].sha256 if ref.file in marks else None for ref in asked.refs]
     if None in hashes:
         return None
-    seen = [__version__, config.model_dump(mode="json"), [(r.file, dict(r.channels)) for r in asked.refs], hashes]
-    return hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()[:20]
+    known = [(ref.file, list(ref.channels.items())) for ref in asked.refs]
+    seen = [__version__, config.model_dump(mode="json"), known, hashes]
+    return hashlib.sha256(json.dumps(seen).encode()).hexdigest()[:20]
 
 
 def _file_name(key: str | None, asked: Asked) -> str:
@@ -111,18 +111,17 @@ def known_parts(out: Path, files: Mapping[str, int]) -> dict[str, Path]:
     files : dict of str to int
         Files that the last ingest left there, and their sizes in bytes.
     """
-    whole = {name.split("/", 1)[1] for name in files if name.startswith(f"{PARTS}/")}
+    whole = {Path(name).stem: out / name for name in files if name.startswith(f"{PARTS}/")}
     for name, size in files.items():
         path = out / name
-        if name.endswith(PARQUET) and "/" in name and not (path.is_file() and path.stat().st_size == size):
-            whole.discard(name.split("/", 1)[1])
-    return {name.split("-", 1)[0]: out / PARTS / name for name in whole}
+        if "/" in name and not (path.is_file() and path.stat().st_size == size):
+            whole.pop(path.stem, None)
+    return {name.split("-", 1)[0]: path for name, path in whole.items()}
 
 
 def load_part(asked: Asked, path: Path) -> Made:
     """Return a part that was stored before, without its tables."""
-    with pq.ParquetFile(path) as file:  # a tenth of what read_table takes for a small file
-        strokes = file.read()
+    strokes = parquet.read_ipc(path)
     about = json.loads(strokes.schema.metadata[_ABOUT])
     unused = frozenset((file, stroke) for file, stroke in about["unused"])
     files = tuple(FileFound(file, Fingerprint(*mark), n, count) for file, *mark, n, count in about["files"])
@@ -153,12 +152,12 @@ def agrees(part: Made, columns: Columns) -> bool:
     return all(list(types.items()) == list(columns[table].items()) for table, types in has.items())
 
 
-def _write(table: pa.Table, path: Path) -> int:
+def _write(table: pa.Table, path: Path, write: Callable[[pa.Table, Path], None]) -> int:
     """Write a table, whole or not at all, and return its size; two that write the same do not disturb each other."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
     try:
-        parquet.write_arrow(table, draft)
+        write(table, draft)
         os.replace(draft, path)
     finally:
         draft.unlink(missing_ok=True)
