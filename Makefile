@@ -43,7 +43,7 @@ bench-start: .venv/.installed-test
 	$(BIN)/python benchmarks/speed.py startup ingest --work out/speed
 
 bench-speed: .venv/.installed-test ## seconds and memory beside a bare read and a pandas script; up to 100,000 files (quiet machine)
-	$(BIN)/python benchmarks/speed.py startup ingest memory run growth --work out/speed
+	$(BIN)/python benchmarks/speed.py startup ingest memory run growth cluster --work out/speed
 
 bench-loop-cost: .venv/.installed-test
 	$(BIN)/python benchmarks/loop_cost.py

@@ -4,6 +4,7 @@
     python benchmarks/speed.py memory  [--files 1752 17520]              peak memory of ingest with ten times the files
     python benchmarks/speed.py run     [--campaign DIR] [--repeats 3]    beside `pandas_script.py`
     python benchmarks/speed.py startup [--repeats 20]                    beside `python -c "import typer"`; imports
+    python benchmarks/speed.py cluster [--campaign DIR] [--repeats 3]    a Dask cluster beside processes, both of here
     python benchmarks/speed.py growth  [--files 1000 10000 100000] [--steps all]
 
 Several parts may be named at once. Without --campaign the paper's own, 1,752 files of 1,000 rows, is simulated first.
@@ -22,6 +23,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import speed_cluster
 import speed_growth
 import speed_ingest
 import speed_run
@@ -31,9 +33,9 @@ from in_turns import heading
 
 from sealfit.simulate import simulate
 
-PARTS = ("ingest", "memory", "run", "startup", "growth")
-NEEDS_CAMPAIGN = ("ingest", "run")
-REPEATS = {"ingest": 5, "run": 3, "startup": 20}
+PARTS = ("ingest", "memory", "run", "startup", "growth", "cluster")
+NEEDS_CAMPAIGN = ("ingest", "run", "cluster")
+REPEATS = {"ingest": 5, "run": 3, "startup": 20, "cluster": 3}
 FILES = {"memory": (1752, 17520), "growth": (1000, 10_000, 100_000)}
 
 
@@ -56,6 +58,8 @@ def main() -> None:
                     speed_run.run(campaign, cores, repeats, given.resamples, work)
                 case "startup":
                     speed_startup.startup(cores, repeats)
+                case "cluster":
+                    speed_cluster.cluster(campaign, cores, repeats, work)
                 case "growth":
                     growth(given, sizes, cores, work)
 

@@ -3,8 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -12,6 +10,8 @@ import pandas.testing as pdt
 import pytest
 
 pytest.importorskip("distributed")
+
+from dask_here import DaskHere
 
 from sealfit.cluster import Cluster
 from sealfit.engine import on_cluster, run_map
@@ -26,48 +26,9 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 
 
-class DaskOfTwo:
-    """A scheduler and two workers without nannies: one that is killed stays dead."""
-
-    def __init__(self, folder):
-        self.file = folder / "scheduler.json"
-        self.log = (folder / "log.txt").open("w")
-        scheduler = "--host 127.0.0.1 --port 0 --no-dashboard --scheduler-file"
-        self.scheduler = self._start("dask_scheduler", f"{scheduler} {self.file}")
-        worker = f"--scheduler-file {self.file} --nthreads 1 --no-nanny --no-dashboard --local-directory {folder}"
-        self.workers = [self._start("dask_worker", f"{worker} --name {name}") for name in "ab"]
-
-    def _start(self, what, options):
-        command = [sys.executable, "-m", f"distributed.cli.{what}", *options.split()]
-        paths = os.pathsep.join([str(HERE), str(ROOT)])
-        environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
-        return subprocess.Popen(command, stdout=self.log, stderr=self.log, env=environment, cwd=ROOT)
-
-    def wait(self, workers=2):
-        until = time.monotonic() + 60
-        while time.monotonic() < until:
-            if self.file.exists():
-                try:
-                    cluster = Cluster(str(self.file))
-                except RequestError:
-                    continue
-                count = cluster.threads()
-                cluster.close()
-                if count == workers:
-                    return self
-            time.sleep(0.2)
-        raise AssertionError("the workers did not start")
-
-    def stop(self):
-        for process in (*self.workers, self.scheduler):
-            process.kill()
-            process.wait()
-        self.log.close()
-
-
 @pytest.fixture
 def dask(tmp_path):
-    made = DaskOfTwo(tmp_path)
+    made = DaskHere(tmp_path, workers=2, paths=(HERE, ROOT / "benchmarks"))
     try:
         yield made.wait()
     finally:

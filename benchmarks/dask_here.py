@@ -1,0 +1,72 @@
+"""A Dask scheduler and workers as processes of this computer, for tests and measurements of `--scheduler`."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from sealfit.cluster import Cluster
+from sealfit.errors import RequestError
+
+ROOT = Path(__file__).resolve().parents[1]
+START_S = 60.0
+
+
+class DaskHere:
+    """A scheduler and workers without nannies: a worker that is killed stays dead.
+
+    Parameters
+    ----------
+    folder : Path
+        For the scheduler file (`file`), the log and what the workers put down.
+    workers : int
+        How many, of one thread each.
+    paths : tuple of Path
+        Where the workers find modules beside those that are installed.
+    """
+
+    def __init__(self, folder: Path, workers: int = 2, paths: tuple[Path, ...] = ()) -> None:
+        self.file, self._paths = folder / "scheduler.json", paths
+        self._log = (folder / "log.txt").open("w")
+        scheduler = "--host 127.0.0.1 --port 0 --no-dashboard --scheduler-file"
+        self.scheduler = self._start("dask_scheduler", f"{scheduler} {self.file}")
+        worker = f"--scheduler-file {self.file} --nthreads 1 --no-nanny --no-dashboard --local-directory {folder}"
+        self.workers = [self._start("dask_worker", f"{worker} --name worker-{number}") for number in range(workers)]
+
+    def _start(self, what: str, options: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", f"distributed.cli.{what}", *options.split()]
+        paths = os.pathsep.join(str(path) for path in (*self._paths, ROOT))
+        environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+        return subprocess.Popen(command, stdout=self._log, stderr=self._log, env=environment, cwd=ROOT)
+
+    def wait(self) -> DaskHere:
+        """Return when all workers are there.
+
+        Raises
+        ------
+        TimeoutError
+            If they do not come.
+        """
+        until = time.monotonic() + START_S
+        while time.monotonic() < until:
+            if self.file.exists():
+                try:
+                    cluster = Cluster(str(self.file))
+                except RequestError:
+                    continue
+                there = cluster.threads()
+                cluster.close()
+                if there == len(self.workers):
+                    return self
+            time.sleep(0.2)
+        raise TimeoutError("the workers did not start")
+
+    def stop(self) -> None:
+        """End all of them."""
+        for process in (*self.workers, self.scheduler):
+            process.kill()
+            process.wait()
+        self._log.close()
