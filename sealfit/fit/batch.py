@@ -1,6 +1,7 @@
-"""Least squares with one nonlinear number each, for thousands of small problems at once as arrays.
+"""The linear part of least squares with one nonlinear number each, for thousands of small problems at once as arrays.
 
-The linear coefficients are exact once the nonlinear number is given; that number is searched on a grid, then polished.
+The linear coefficients are exact once the nonlinear number is given, so the sum of squares has a profile along it; its
+global minimum is found by `moving`.
 Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036 (variable projection).
 """
 
@@ -16,8 +17,6 @@ from sealfit.errors import FitError
 
 DEPENDENT = 1e-13  # share of a column's variance left by the others below which it adds nothing in double precision
 CHUNK = 2_000_000  # numbers per temporary array: 16 MB, stays near the cache and never fills a laptop
-MINIMA = 3  # local minima of the grid that are polished; more have never been seen in Eq. 14 or Eq. 15
-TURNS = 80
 
 
 # ---------------------------------------------------------------- the linear part
@@ -143,10 +142,7 @@ def profile(basis: Basis, y, weight, u, nonnegative, *, refine: int = 0):
     rss, slope : ndarray, shape (problems, g)
     coefficients : ndarray, shape (problems, g, p)
     """
-    return _profile(basis, y, np.sqrt(weight), u, nonnegative, np.arange(len(y)), refine)
-
-
-def _profile(basis, y, root, u, nonnegative, rows, refine):
+    root, rows = np.sqrt(weight), np.arange(len(y))
     p = len(nonnegative)
     rss, slope = np.empty(u.shape), np.empty(u.shape)
     coefficients = np.empty((*u.shape, p))
@@ -165,98 +161,20 @@ def _profile(basis, y, root, u, nonnegative, rows, refine):
     return rss, slope, coefficients
 
 
-def solve_batch(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
-    """Global optimum of many small problems, each linear once its one nonlinear number u is given.
+def at_edge(u, low, high) -> np.ndarray:
+    """Return -1 where u is at its lower limit, +1 at the upper, else 0."""
+    return np.where(u <= low, -1, np.where(u >= high, 1, 0))
 
-    The grid finds the basin, a bracketed secant on the slope then finds u to about 1e-12 (in log u, relative). The best
-    `MINIMA` local minima of the grid are all polished, so two that are nearly equal are not confused.
 
-    Parameters
-    ----------
-    basis, y, weight, nonnegative
-        As `profile`.
-    grid : ndarray, shape (problems, g)
-        Rising values of u that cover every basin.
+def check(y, weight) -> None:
+    """Refuse measured values and weights that cannot be fitted.
 
     Raises
     ------
     FitError
-        If a measured value or a weight is not finite, or a weight is negative.
-
-    Examples
-    --------
-    Two decays, y = c exp(-t / tau), with u = ln tau:
-
-    >>> t = np.array([[0.0, 1.0, 2.0, 4.0]])
-    >>> def basis(u, rows):
-    ...     x = t[rows][:, None, :] / np.exp(u)[..., None]
-    ...     return np.exp(-x)[..., None], (x * np.exp(-x))[..., None]
-    >>> grid = np.linspace(-3, 3, 40)[None, :]
-    >>> fit = solve_batch(basis, 5 * np.exp(-t / 1.7), np.ones((1, 4)), grid, (True,))
-    >>> round(float(np.exp(fit.u[0])), 10), round(float(fit.coefficients[0, 0]), 10)
-    (1.7, 5.0)
+        If one is not finite, or a weight is negative.
     """
-    y, weight, grid = (np.asarray(a, float) for a in (y, weight, grid))
     if not (np.all(np.isfinite(y)) and np.all(np.isfinite(weight)) and np.all(weight >= 0)):
         raise FitError(
             "measured values and weights must be finite, weights not negative.", mend="Look for empty cells."
         )
-    root = np.sqrt(weight)
-    everyone = np.arange(len(y))
-    rss, slope, _ = _profile(basis, y, root, grid, nonnegative, everyone, 0)
-    last = grid.shape[1] - 1
-    padded = np.pad(rss, ((0, 0), (1, 1)), constant_values=np.inf)
-    minimum = (rss <= padded[:, :-2]) & (rss <= padded[:, 2:])
-    ranked = np.argsort(np.where(minimum, rss, np.inf), axis=1, kind="stable")[:, : min(MINIMA, last + 1)]
-    rows = np.repeat(everyone, ranked.shape[1])
-    k = ranked.ravel()
-    real = minimum[rows, k]
-    rows, k = rows[real], k[real]
-    rising = slope[rows, k] > 0
-    neighbour = np.clip(np.where(rising, k - 1, k + 1), 0, last)
-    at_k, at_neighbour = grid[rows, k], grid[rows, neighbour]
-    u = _root(basis, y, root, nonnegative, rows, at_k, at_neighbour, slope[rows, k], slope[rows, neighbour])
-    both = np.stack([u, at_k], axis=1)
-    rss_both, _, c_both = _profile(basis, y, root, both, nonnegative, rows, 2)
-    # the polished point, unless the grid's own point is better by more than rounding
-    pick = (rss_both[:, 1] < rss_both[:, 0] * (1 - 1e-12)).astype(int)
-    each = np.arange(len(rows))
-    value, u, c = rss_both[each, pick], both[each, pick], c_both[each, pick]
-    order = np.lexsort((value, rows))
-    first = order[np.searchsorted(rows[order], everyone)]
-    u, value, c = u[first], value[first], c[first]
-    at_edge = np.where(u <= grid[:, 0], -1, np.where(u >= grid[:, -1], 1, 0))
-    return BatchFit(u, c, value, at_edge)
-
-
-def _root(basis, y, root, nonnegative, rows, near, far, slope_near, slope_far):
-    """Zero of the slope between two grid points, all problems at once: secant steps inside a bracket (Illinois).
-
-    Where both ends slope alike (a bump inside one cell) the signs still steer to a minimum or to an end; the caller
-    compares the result with the grid's point and keeps the better.
-    """
-    low, high = np.minimum(near, far), np.maximum(near, far)
-    is_low = near <= far
-    at_low, at_high = np.where(is_low, slope_near, slope_far), np.where(is_low, slope_far, slope_near)
-    at_low, at_high = -np.abs(at_low), np.abs(at_high)
-    best = near.copy()
-    todo = np.flatnonzero((low < high) & (slope_near != 0))
-    for turn in range(TURNS):
-        if not todo.size:
-            break
-        a, b, fa, fb = low[todo], high[todo], at_low[todo], at_high[todo]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            secant = (a * fb - b * fa) / (fb - fa)
-        middle = (a + b) / 2
-        inside = np.isfinite(secant) & (secant > a) & (secant < b)
-        u = np.where(inside & (turn % 4 != 3), secant, middle)  # a halving now and then bounds the number of turns
-        _, f, _ = _profile(basis, y, root, u[:, None], nonnegative, rows[todo], 1)
-        f = f[:, 0]
-        rising = f > 0
-        done = (f == 0) | (b - a < 4e-14 * np.maximum(1.0, np.abs(u))) | (np.abs(u - best[todo]) < 1e-14)
-        best[todo] = u
-        # Illinois: halve the kept end's value so that it does not stay for ever
-        low[todo], at_low[todo] = np.where(rising, a, u), np.where(rising, fa / 2, f)
-        high[todo], at_high[todo] = np.where(rising, u, b), np.where(rising, f, fb / 2)
-        todo = todo[~done]
-    return best

@@ -12,30 +12,18 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import brentq
 
-from sealfit.fit.batch import BatchFit, solve_batch
+from sealfit.fit.batch import BatchFit, at_edge, check
+from sealfit.fit.law_search import search_law
 from sealfit.fit.polish import Polished, polish
 
 SOONEST, LATEST = 1e-9, 1e3  # b is sought from 1e-9 of the first aged day to 1000 times the last
-PER_DECADE = 8  # ln(1 + t/b) is smooth: it changes over a decade of b
 PROFILED = 17  # points along ln b at which the intervals of a and c are taken
 
 
-def law_basis(days):
-    """Return the columns of mu_0 - a ln(1 + t/b) and their slopes along ln b, as `solve_batch` calls them."""
-
-    def basis(u, rows):
-        x = days[rows][:, None, :] * np.exp(-u)[..., None]
-        one = np.ones_like(x)
-        return np.stack([one, -np.log1p(x)], axis=-1), np.stack([0 * one, x / (1 + x)], axis=-1)
-
-    return basis
-
-
-def search_limits(days) -> tuple[float, float]:
-    """Return the limits of ln b for the days tested, shape (n,), at least one of them above zero."""
-    aged = np.asarray(days, float)
-    aged = aged[aged > 0]
-    return float(np.log(aged.min() * SOONEST)), float(np.log(aged.max() * LATEST))
+def search_limits(days) -> tuple[np.ndarray, np.ndarray]:
+    """Return the limits of ln b for the days tested, shape (..., n), at least one of each n above zero."""
+    first = np.min(days, axis=-1, where=days > 0, initial=np.inf)
+    return np.log(first * SOONEST), np.log(np.max(days, axis=-1) * LATEST)
 
 
 def solve_law(days, value, weight) -> BatchFit:
@@ -59,10 +47,10 @@ def solve_law(days, value, weight) -> BatchFit:
     [0.9, 0.05, 0.3]
     """
     days, value, weight = np.broadcast_arrays(*(np.asarray(x, float) for x in (days, value, weight)))
-    limits = np.array([search_limits(row[w > 0]) for row, w in zip(days, weight, strict=True)])
-    points = int(np.ceil(PER_DECADE * np.max(limits[:, 1] - limits[:, 0]) / np.log(10))) + 1
-    grid = limits[:, :1] + np.diff(limits, axis=1) * np.linspace(0, 1, points)
-    return solve_batch(law_basis(days), value, weight, grid, (False, False))
+    check(value, weight)
+    low, high = search_limits(np.where(weight > 0, days, 0.0))
+    found = search_law(days, value, weight, low, high)
+    return BatchFit(found.u, found.coefficients.T, found.rss, at_edge(found.u, low, high))
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """Separable least squares: the linear numbers exactly, the nonlinear ones by a global grid and a polish.
 
-`solve_batch` (from `batch.py`) does thousands of small problems with one nonlinear number each, as arrays;
-`solve_separable` does one problem with one to three nonlinear numbers. Neither takes a starting guess. `polish` takes
-one, for any model.
+`solve_separable` does one problem with one to three nonlinear numbers, without a starting guess. `polish` takes one,
+for any model.
 
 Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036 (variable projection);
 Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995 (its tangent).
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sealfit.errors import FitError
-from sealfit.fit.batch import CHUNK, BatchFit, least_squares_of, profile, project, solve_batch
+from sealfit.fit.batch import CHUNK, BatchFit, least_squares_of, profile, project
 from sealfit.fit.polish import Polished, central_jacobian, covariance_of, polish
 
 __all__ = [
@@ -26,7 +25,6 @@ __all__ = [
     "least_squares_of",
     "polish",
     "profile",
-    "solve_batch",
     "solve_separable",
 ]
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from sealfit.fit.batch import BatchFit, profile, solve_batch
+from sealfit.fit.batch import at_edge, check, profile
 from sealfit.fit.interval import constrained_ends
 from sealfit.fit.polish import covariance_of
+from sealfit.fit.stribeck_search import search
 
 SLOWEST, FASTEST = 1 / 5, 20.0  # v_s is sought from a fifth of the slowest speed to twenty times the fastest:
 # below, E is 1e-11 at every speed and nothing changes any more; above, 1 - E is 0.0025 and follows v^2 throughout
@@ -35,7 +36,12 @@ class StribeckFit:
     sigma_2: np.ndarray
     rss: np.ndarray
     at_edge: np.ndarray
-    grid: np.ndarray  # (problems, g): ln v_s searched
+    limits: tuple[np.ndarray, np.ndarray]  # (problems,) each: lowest and highest ln v_s searched
+
+    @property
+    def grid(self) -> np.ndarray:
+        """ln v_s over all that was searched, shape (problems, g)."""
+        return even_grid(*self.limits)
 
     def values(self) -> np.ndarray:
         """Return mu_s, mu_c, v_s, sigma_2 as columns, shape (problems, 4)."""
@@ -43,7 +49,7 @@ class StribeckFit:
 
 
 def stribeck_basis(speed, load):
-    """Return the columns of Eq. 14 and their slopes along ln v_s, as `solve_batch` calls them.
+    """Return the columns of Eq. 14 and their slopes along ln v_s, as `profile` calls them.
 
     Parameters
     ----------
@@ -62,11 +68,21 @@ def stribeck_basis(speed, load):
     return basis
 
 
+def search_limits(speed, weight) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest ln v_s to be searched, shape (problems,); speed, weight (problems, n)."""
+    used = weight > 0
+    slowest = np.min(speed, axis=1, where=used, initial=np.inf)
+    fastest = np.max(speed, axis=1, where=used, initial=0.0)
+    return np.log(slowest * SLOWEST), np.log(fastest * FASTEST)
+
+
 def search_grid(speed, weight) -> np.ndarray:
     """Return ln v_s to be searched, shape (problems, g), the same number of points for every problem."""
-    used = np.where(weight > 0, speed, np.nan)
-    low = np.log(np.nanmin(used, axis=1) * SLOWEST)
-    high = np.log(np.nanmax(used, axis=1) * FASTEST)
+    return even_grid(*search_limits(speed, weight))
+
+
+def even_grid(low, high) -> np.ndarray:
+    """Return even points from `low` to `high`, shape (problems, g)."""
     points = int(np.ceil(PER_DECADE * np.max(high - low) / np.log(10))) + 1
     return low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
 
@@ -94,11 +110,12 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
     >>> [round(float(value[0]), 8) for value in (fit.mu_s, fit.mu_c, fit.v_s, fit.sigma_2)]
     [0.4, 0.3, 6.0, 0.02]
     """
-    speed, load, force, weight = np.broadcast_arrays(speed, load, force, weight)
-    grid = search_grid(speed, weight)
-    fit: BatchFit = solve_batch(stribeck_basis(speed, load), force, weight, grid, nonnegative)
-    mu_s, mu_c, sigma_2 = fit.coefficients.T
-    return StribeckFit(mu_s, mu_c, np.exp(fit.u), sigma_2, fit.rss, fit.at_edge, grid)
+    arrays = np.broadcast_arrays(*(np.asarray(x, float) for x in (speed, load, force, weight)))
+    check(arrays[2], arrays[3])
+    limits = search_limits(arrays[0], arrays[3])
+    found = search(*arrays, *limits, nonnegative)
+    mu_s, mu_c, sigma_2 = found.coefficients
+    return StribeckFit(mu_s, mu_c, np.exp(found.u), sigma_2, found.rss, at_edge(found.u, *limits), limits)
 
 
 # ---------------------------------------------------------------- intervals

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize, nnls
 
 from sealfit.errors import FitError
-from sealfit.fit.batch import least_squares_of, solve_batch
+from sealfit.fit.batch import least_squares_of
 from sealfit.fit.interval import constrained_ends
 from sealfit.fit.stribeck import flat_p_value, solve_stribeck, stribeck_intervals
 from sealfit.physics import stribeck_force
@@ -129,7 +129,7 @@ def test_a_rise_with_speed_is_allowed():
 
 def test_refuses_empty_cells():
     with pytest.raises(FitError, match="must be finite"):
-        solve_batch(lambda u, rows: None, np.array([[np.nan]]), np.ones((1, 1)), np.zeros((1, 2)), (True,))
+        solve_stribeck(SPEEDS[None], LOAD, np.full((1, 9), np.nan), np.ones((1, 9)))
 
 
 # ---------------------------------------------------------------- intervals
