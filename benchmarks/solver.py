@@ -1,10 +1,13 @@
 """How many steady and aging fits a second, beside scipy's curve_fit from a good start, least_squares and lmfit.
 
-    python benchmarks/solver.py [--problems N] [--seed N]     (about a minute)
+    make bench-solver                                          (about a minute; lmfit is in .venv/bench)
+    python benchmarks/solver.py [--problems N] [--seed N]
 
 Every solver gets the same simulated problems (24 points and 4 numbers of Eq. 14; 7 points and 3 numbers of Eq. 15), on
-one core. The others start at the truth, which nobody has; ours searches all v_s, or all b. Prints fits a second, the
-ratio to ours, and the worst excess of our sum of squares over the best of the others.
+one core. The others start at the truth, which nobody has; ours searches all v_s, or all b. Both with one design shared
+by all problems, as bootstraps and simulations have it, and with measured speeds or days of their own. Ours and the
+others take turns, `ROUNDS` times, and of each the fastest round counts: other work on the machine slows all. Prints
+fits a second, the ratio to ours, and the worst excess of our sum of squares over the best of the others.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import argparse
 import platform
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import scipy
@@ -26,7 +30,8 @@ from sealfit.threads import one_thread
 SPEEDS = np.tile(np.geomspace(0.5, 64.0, 8), 3)
 DAYS = np.array([0.0, 1, 2, 4, 8, 12, 16])
 LOAD = 49.03
-SHARED = 200  # problems that the slow solvers get: their rate does not depend on how many
+SHARED = 100  # problems that the slow solvers get: their rate does not depend on how many
+ROUNDS = 5
 
 
 def main() -> None:
@@ -35,33 +40,44 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     one_thread()
-    print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}, "
-          f"scipy {scipy.__version__}, {given.problems} problems, seed {given.seed}")  # fmt: skip
+    print(f"{cpu()}, Python {platform.python_version()}, numpy {np.__version__}, scipy {scipy.__version__}, "
+          f"{given.problems} problems, seed {given.seed}, one core")  # fmt: skip
     rng = np.random.default_rng(given.seed)
-    compare("steady", *steady(given.problems, rng))
-    compare("aging", *aging(given.problems, rng))
+    for own in (False, True):
+        design = "each its own" if own else "all the same"
+        compare(f"steady, speeds {design}", *steady(given.problems, rng, own))
+        compare(f"aging, days {design}", *aging(given.problems, rng, own))
 
 
-def steady(count: int, rng: np.random.Generator) -> tuple:
-    """Return ours, the model and its problems: x, y and the truth as a start, shape (problems, ...)."""
+def cpu() -> str:
+    """Return the processor's name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def steady(count: int, rng: np.random.Generator, own: bool) -> tuple:
+    """Return ours, the model and its problems: x (problems or 1, n), y and the truth as a start, and bounds."""
     truth = np.column_stack([rng.uniform(0.6, 1, count), rng.uniform(0.3, 0.6, count), rng.uniform(2, 10, count),
                              rng.uniform(0.01, 0.1, count)])  # fmt: skip
 
     def model(speed, mu_s, mu_c, v_s, sigma_2):
         return LOAD * (mu_c + (mu_s - mu_c) * np.exp(-((speed / v_s) ** 2))) + sigma_2 * speed
 
-    force = stribeck_force(
-        SPEEDS, LOAD, **dict(zip(("mu_s", "mu_c", "v_s", "sigma_2"), truth.T[..., None], strict=True))
-    )
+    speed = SPEEDS * np.exp(0.01 * rng.standard_normal((count, SPEEDS.size))) if own else SPEEDS[None, :]
+    names = ("mu_s", "mu_c", "v_s", "sigma_2")
+    force = stribeck_force(speed, LOAD, **dict(zip(names, truth.T[..., None], strict=True)))
     force = force * (1 + 0.01 * rng.standard_normal(force.shape))
 
     def ours() -> np.ndarray:
-        return solve_stribeck(SPEEDS[None, :], np.full((1, 1), LOAD), force, np.ones((1, 1))).rss
+        return solve_stribeck(speed, np.full((1, 1), LOAD), force, np.ones((1, 1))).rss
 
-    return ours, model, SPEEDS, force, truth, (np.zeros(4), np.array([5.0, 5.0, 1000.0, 10.0]))
+    return ours, model, speed, force, truth, (np.zeros(4), np.array([5.0, 5.0, 1000.0, 10.0]))
 
 
-def aging(count: int, rng: np.random.Generator) -> tuple:
+def aging(count: int, rng: np.random.Generator, own: bool) -> tuple:
     """Return the same for the aging law; b as its logarithm, so that the others stay where it is positive."""
     truth = np.column_stack(
         [rng.uniform(0.6, 1, count), rng.uniform(0.02, 0.06, count), np.log(rng.uniform(0.05, 1, count))]
@@ -70,43 +86,51 @@ def aging(count: int, rng: np.random.Generator) -> tuple:
     def model(days, mu_0, a, log_b):
         return mu_0 - a * np.log1p(days / np.exp(log_b))
 
-    value = aging_law(DAYS, mu_0=truth[:, :1], a=truth[:, 1:2], b=np.exp(truth[:, 2:]))
+    days = DAYS * np.exp(0.05 * rng.standard_normal((count, DAYS.size))) if own else DAYS[None, :]
+    value = aging_law(days, mu_0=truth[:, :1], a=truth[:, 1:2], b=np.exp(truth[:, 2:]))
     value = value * (1 + 0.002 * rng.standard_normal(value.shape))
 
     def ours() -> np.ndarray:
-        return solve_law(np.broadcast_to(DAYS, value.shape), value, np.ones(value.shape)).rss
+        return solve_law(days, value, np.ones((1, 1))).rss
 
-    return ours, model, DAYS, value, truth, (np.array([0.0, -1.0, -20.0]), np.array([5.0, 1.0, 10.0]))
+    return ours, model, days, value, truth, (np.array([0.0, -1.0, -20.0]), np.array([5.0, 1.0, 10.0]))
 
 
 def compare(title: str, ours: Callable, model: Callable, x, y, truth, bounds) -> None:
     """Print a line per solver."""
-    begun = time.perf_counter()
-    found = ours()
-    rate = len(y) / (time.perf_counter() - begun)
-    print(f"\n{title}, {len(x)} points: sealfit {rate:,.0f} fits a second on one core")
-    shared, best = range(min(SHARED, len(y))), np.full(min(SHARED, len(y)), np.inf)
-    for name, solver in others(model, x, bounds).items():
+    few = range(min(SHARED, len(y)))
+    x = np.broadcast_to(x, y.shape)
+    solvers = others(model, bounds)
+    quickest = dict.fromkeys(["ours", *solvers], np.inf)
+    best = np.full(len(few), np.inf)
+    for _ in range(ROUNDS):
         begun = time.perf_counter()
-        rss = np.array([solver(y[k], truth[k]) for k in shared])
-        own = len(rss) / (time.perf_counter() - begun)
-        best = np.fmin(best, rss)
-        print(f"  {name:42s} {own:8,.0f} a second: sealfit does {rate / own:,.0f} times as many")
+        found = ours()
+        quickest["ours"] = min(quickest["ours"], (time.perf_counter() - begun) / len(y))
+        for name, solver in solvers.items():
+            begun = time.perf_counter()
+            rss = np.array([solver(x[k], y[k], truth[k]) for k in few])
+            quickest[name] = min(quickest[name], (time.perf_counter() - begun) / len(few))
+            best = np.fmin(best, rss)
+    mine = quickest.pop("ours")
+    print(f"\n{title}, {x.shape[1]} points: sealfit {1 / mine:,.0f} fits a second, {1e6 * mine:.1f} us each")
+    for name, each in quickest.items():
+        print(f"  {name:42s} {1 / each:8,.0f} a second: sealfit does {each / mine:,.0f} times as many")
     excess = float(np.max(found[: len(best)] / best - 1))
     print(f"  worst excess of sealfit's sum of squares over the best of these: {excess:.1e}")
 
 
-def others(model: Callable, x: np.ndarray, bounds: tuple) -> dict[str, Callable[[np.ndarray, np.ndarray], float]]:
-    """Return solvers (y, start) -> sum of squares."""
+def others(model: Callable, bounds: tuple) -> dict[str, Callable[..., float]]:
+    """Return solvers (x, y, start) -> sum of squares."""
 
-    def by_curve_fit(y, start):
+    def by_curve_fit(x, y, start):
         try:
             found, _ = curve_fit(model, x, y, p0=start)
         except RuntimeError:
             return np.inf
         return float(((model(x, *found) - y) ** 2).sum())
 
-    def by_least_squares(y, start):
+    def by_least_squares(x, y, start):
         return 2 * least_squares(lambda p: model(x, *p) - y, start, bounds=bounds, x_scale="jac").cost
 
     solvers = {"scipy curve_fit from the truth": by_curve_fit, "scipy least_squares with bounds": by_least_squares}
@@ -116,7 +140,7 @@ def others(model: Callable, x: np.ndarray, bounds: tuple) -> dict[str, Callable[
         return solvers
     fitter = lmfit.Model(model)
 
-    def by_lmfit(y, start):
+    def by_lmfit(x, y, start):
         return float(fitter.fit(y, fitter.make_params(**dict(zip(fitter.param_names, start, strict=True))),
                                 **{fitter.independent_vars[0]: x}).chisqr)  # fmt: skip
 
