@@ -15,8 +15,8 @@ from sealfit.fit.batch import DEPENDENT
 from sealfit.fit.moving import Moving, Optimum, chosen, polish
 
 ROUNDING = 1e-12  # of |y|^2: bound of the error of what is explained, where the moving column is all its own
-BLOCK = 2048  # problems at once: their arrays stay in the cache, and numpy's 1 us a call is little for each
-TABLE = 2_000_000  # numbers in one table of moving columns: 16 MB
+BLOCK = 4096  # problems at once: numpy takes 1 us a call, and a block some 500 calls
+TABLE = 500_000  # numbers in one table of moving columns: 4 MB, larger ones leave the cache
 
 
 def common(values) -> np.ndarray:

@@ -17,6 +17,8 @@ from sealfit.fit.moving import Moving, chosen
 from sealfit.fit.moving_grid import BLOCK, ROUNDING, Grid, common, polish_best, polish_peaks
 from sealfit.fit.stribeck_columns import STEP, TINY, Weighted, weighted
 
+MISSED = 1e-10  # of |F|^2: that far above what a grid point reaches, an optimum was dropped by mistake
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -133,8 +135,12 @@ def feasible(coefficients, held):
     return np.all([c >= 0 for c, hold in zip(coefficients, held, strict=True) if hold], axis=0)
 
 
-def search_held(w: Weighted, held) -> Found:
-    """Global optimum with the coefficients `held` not negative, the best over all sets of zeros."""
+def search_held(w: Weighted, held, *, prune: bool = True) -> Found:
+    """Global optimum with the coefficients `held` not negative, the best over all sets of zeros.
+
+    `prune` leaves out peaks that cannot reach what a grid point reaches for certain; where nothing then reaches it
+    (rounding, with as many coefficients as points), all peaks are polished after all.
+    """
     by_speed = np.maximum(w.by_speed, 0.0) if held[2] else w.by_speed
     zero = np.zeros_like(w.total)
     best = Found(w.low + zero, np.stack([zero, zero, by_speed / w.speed_size]), w.total - by_speed**2)
@@ -148,14 +154,19 @@ def search_held(w: Weighted, held) -> Found:
         certain = np.maximum(certain, np.max(sure, axis=1) + base)
         grids.append((kind, grid, base))
     for kind, grid, base in grids:
-        rows, k = grid.peaks(certain - base)
-        tried = polish_peaks(kind.moving(w), grid, rows, k, base, (w.total - certain)[rows])
+        rows, k = grid.peaks(certain - base if prune else np.full(w.total.size, -np.inf))
+        beat = (w.total - certain)[rows] if prune else None
+        tried = polish_peaks(kind.moving(w), grid, rows, k, base, beat)
         values = np.stack(kind.coefficients(w.part(rows), tried.a, tried.inner))
         better = feasible(values, held) & (tried.rss < best.rss[rows])
         order = np.flatnonzero(better)[np.argsort(-tried.rss[better], kind="stable")]  # the best is written last
         at = rows[order]
         best.u[at], best.coefficients[:, at], best.rss[at] = tried.u[order], values[:, order], tried.rss[order]
+    missed = np.flatnonzero(best.rss > w.total - certain + MISSED * w.total)
     best.rss[:] += w.scatter
+    if prune and missed.size:
+        again = search_held(w.part(missed), held, prune=False)
+        best.u[missed], best.coefficients[:, missed], best.rss[missed] = again.u, again.coefficients, again.rss
     return best
 
 
@@ -181,9 +192,10 @@ def search(speed, load, force, weight, low, high, held) -> Found:
         part = solve(own)
         found.u[rows], found.coefficients[:, rows], found.rss[rows] = part.u, part.coefficients, part.rss
 
-    for start in range(0, problems, BLOCK):
-        fill(slice(start, min(start + BLOCK, problems)), search_free)
+    block = BLOCK if len(parts[0]) == 1 else BLOCK // 2  # speeds of their own need more room
+    for start in range(0, problems, block):
+        fill(slice(start, min(start + block, problems)), search_free)
     bad = np.flatnonzero(~feasible(found.coefficients, held))
-    for start in range(0, bad.size, BLOCK):
-        fill(bad[start : start + BLOCK], lambda own: search_held(own, held))
+    for start in range(0, bad.size, block):
+        fill(bad[start : start + block], lambda own: search_held(own, held))
     return found
