@@ -15,7 +15,7 @@ from sealfit.fit.batch import DEPENDENT
 from sealfit.fit.moving import Moving, Optimum, chosen, polish
 
 ROUNDING = 1e-12  # of |y|^2: bound of the error of what is explained, where the moving column is all its own
-BLOCK = 4096  # problems at once: numpy takes 1 us a call, and a block some 500 calls
+BLOCK = 4096  # problems at once: numpy takes 1 us a call, and a block takes hundreds
 TABLE = 500_000  # numbers in one table of moving columns: 4 MB, larger ones leave the cache
 
 
