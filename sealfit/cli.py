@@ -247,7 +247,8 @@ def _run(
     profile: bool,
     as_json: bool,
 ) -> None:
-    options = {"workers": _workers(workers, scheduler), "scheduler": scheduler, "force": force, "strict": strict}
+    count = _workers(workers, scheduler, "sealfit.ingest.stored")
+    options = {"workers": count, "scheduler": scheduler, "force": force, "strict": strict}
     command = "ingest" if len(names) == 1 else "run"
     _do(
         command,
@@ -266,7 +267,8 @@ def _single(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> None:
-    options = {"workers": _workers(workers, scheduler), "scheduler": scheduler, "force": force}
+    needed = {"fit-dynamic": ("sealfit.fit.dynamic",), "close-loop": ("sealfit.closure.loop",)}.get(step, ())
+    options = {"workers": _workers(workers, scheduler, *needed), "scheduler": scheduler, "force": force}
     _do(step, profile, as_json, lambda steps, progress: steps.single(step, out, progress=progress, **options))
 
 
@@ -281,13 +283,16 @@ def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
     _end(command, made, lambda made: summary.lines(made) + profiling.lines(made.get("profile", ())), as_json)
 
 
-def _workers(workers: int | None, scheduler: str | None) -> int:
-    """Return how many processes of this computer to use; told apart from a cluster before anything is loaded."""
+def _workers(workers: int | None, scheduler: str | None, *needed: str) -> int:
+    """Return how many processes of this computer to use; they begin to load the modules `needed` at once."""
     from sealfit import engine
 
     if workers is not None and scheduler is not None:
         raise typer.BadParameter("use either --workers (this computer) or --scheduler (a Dask cluster), not both.")
-    return workers or engine.cores()
+    workers = workers or engine.cores()
+    if needed and scheduler is None:
+        engine.prepare(*needed, workers=workers)
+    return workers
 
 
 def _end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: bool) -> None:
