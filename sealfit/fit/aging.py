@@ -9,6 +9,7 @@ import pandas as pd
 from scipy import stats
 
 from sealfit.config import Config
+from sealfit.fit.condition import FULL
 from sealfit.fit.law import LawFit, Values, between_scatter, fit_law
 from sealfit.fit.lawprofile import curve_intervals
 from sealfit.fit.lawrows import DAYS_FOR_LAW, Curve, covariance_rows, law_rows, statistics_rows, without_law
@@ -73,6 +74,7 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
     if pair is None:
         return []
     found = found[found["parameter"].isin(pair) & found["aging_days"].notna()]
+    found = _of_one_meaning(found, own, pair)
     found = found.assign(quantity=found["parameter"]).sort_values(["condition", "quantity"], kind="stable")
     aged = own[own["aging_days"].to_numpy(float) > 0]
     quantities = [name for name in pair if (found["quantity"] == name).any()]
@@ -100,6 +102,19 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
         steady_covariance(used, own),
     )
     return list(_rubber_rows(values, curves, fitted, used, own, unit, found))
+
+
+def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
+    """Return the values without Coulomb coefficients of too few speeds, where other conditions have a Stribeck curve.
+
+    Over two or three slow speeds, "mu_c" is what friction is like at them: mu_s included, it is another quantity.
+    """
+    with_curve = set(found.loc[found["parameter"] == pair[0], "condition"])
+    if not with_curve:
+        return found
+    speeds = own[(own["quantity"] == "statistics") & (own["parameter"] == "n_speeds")]
+    few = set(speeds.loc[speeds["value"] < FULL, "condition"]) - with_curve
+    return found[~((found["parameter"] == pair[1]) & found["condition"].isin(few))]
 
 
 def _curves(found: pd.DataFrame, series: list[str], quantities: list[str]) -> list[Curve]:
@@ -130,13 +145,13 @@ def steady_covariance(used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:
     """
     rows = own[own["quantity"] == "covariance"]
     known = dict(zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"], strict=True))
-    condition, quantity = used["condition"].to_numpy(object), used["quantity"].to_numpy(object)
+    quantity = used["quantity"].to_numpy(object)
     covariance = np.diag((SMALLEST * used["value"].to_numpy(float)) ** 2 + 1e-300)
-    for i in range(len(used)):
-        for j in range(len(used)):
-            if condition[i] == condition[j]:
+    for condition, places in used.groupby("condition", sort=False).indices.items():
+        for i in places:
+            for j in places:
                 names = sorted((quantity[i], quantity[j]), reverse=True)  # mu_s before mu_c
-                value = known.get((condition[i], f"{names[0]},{names[1]}"), np.nan)
+                value = known.get((condition, f"{names[0]},{names[1]}"), np.nan)
                 covariance[i, j] += value if np.isfinite(value) else 0.0
     return covariance
 

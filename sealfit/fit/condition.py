@@ -174,6 +174,7 @@ def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
     elif condition.model == VISCOUS and most < FULL:
         few = f"{most} speeds in one direction: the Stribeck curve needs four, two of them below about 2 v_s."
         verdict |= {name: (False, few) for name in ("mu_s", "v_s")}
+        verdict["mu_c"] = (True, "the sliding coefficient over these speeds, without Stribeck curve.")
     elif condition.model == VISCOUS:
         flat = f"mu_s = mu_c is not rejected (p = {condition.flat_p:.2g}): no Stribeck curve is seen"
         verdict |= {"mu_s": (False, f"{flat}, mu_s is mu_c."), "v_s": (False, f"{flat}, so v_s has no meaning.")}

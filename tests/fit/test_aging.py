@@ -282,3 +282,18 @@ def test_curves_follow_the_law_and_their_band_narrows_where_rubber_was_tested(ca
     assert half[1] < half[0]
     assert half[3] > 2 * half[1]
     assert aging_curves(fit).aging_days.max() == 16
+
+
+def test_a_condition_of_a_few_slow_speeds_does_not_bend_the_law_of_mu_c(campaign):
+    """Over slow speeds alone the sliding coefficient is nearly mu_s, which is no mu_c."""
+    steady = campaign(days=DAYS, seed=3)
+    name = f"{NAME}, aging_days=8"
+    few = steady[(steady["condition"] != name) | (steady["speed_mm_s"].abs() < 2.5)]
+    assert few.loc[few["condition"] == name, "speed_mm_s"].abs().nunique() == 3
+    fits = [fit_conditions(table, Config()) for table in (steady, few)]
+    alone = fits[1].set_index(["condition", "quantity", "parameter"]).loc[(name, "steady", "mu_c")]
+    assert alone["identified"]
+    assert "without Stribeck curve" in alone["reason"]
+    whole, part = (law(fit_series(fit, Config()), "mu_c", "mu_0") for fit in fits)
+    assert part["value"] == pytest.approx(whole["value"], abs=2 * whole["se"])
+    assert part["se"] < 0.005  # it was 0.07, and mu_0 0.577
