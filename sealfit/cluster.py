@@ -6,6 +6,9 @@ file system that all workers share. So Dask may do a chunk again on another work
 
 from __future__ import annotations
 
+import json
+import re
+import socket
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
 
 WAITING_PER_THREAD = 2  # chunks sent ahead for every thread of the cluster: bounds what the scheduler has to hold
 CONNECT_S = 15.0
+EXAMPLE = "tcp://host:8786"
 LOOK_S = 1.0  # how often a wait for an answer looks whether there is anybody to give it
 ALONE_S = 60.0  # without a single worker before giving up: a batch system takes its time to start the next
 
@@ -147,12 +151,21 @@ def _connected(scheduler: str) -> Client:
         from distributed import Client
     except ImportError as error:
         raise RequestError("Dask is not installed.", mend="Run: pip install 'sealfit[cluster]'") from error
-    where = {"scheduler_file": scheduler} if Path(scheduler).is_file() else {"address": scheduler}
     try:
-        return Client(**where, timeout=CONNECT_S, set_as_default=False)
+        address = json.loads(Path(scheduler).read_text("utf-8"))["address"] if Path(scheduler).is_file() else scheduler
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RequestError(
+            f"{scheduler} is no scheduler file.", mend=f"Give one that Dask wrote, or {EXAMPLE}."
+        ) from error
+    place = re.fullmatch(r"\w+://\[?(?P<host>[^]]+)\]?:(?P<port>\d+)", address)
+    if place is None:
+        raise RequestError(f"'{scheduler}' is no address of a scheduler.", mend=f"Write {EXAMPLE}, or its file.")
+    try:  # by hand first: a client that finds nobody holds the program for a minute
+        socket.create_connection((place["host"], int(place["port"])), timeout=CONNECT_S).close()
+        return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise RequestError(
-            f"no Dask scheduler answers at {scheduler}.",
+            f"no Dask scheduler answers at {address}.",
             mend="Start one (dask scheduler), or give the path of its scheduler file.",
         ) from error
 

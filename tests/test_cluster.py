@@ -93,6 +93,14 @@ def test_no_scheduler_is_a_clear_error(monkeypatch):
         Cluster("tcp://127.0.0.1:1")
 
 
+def test_what_is_no_scheduler_is_said_at_once(tmp_path):
+    with pytest.raises(RequestError, match=r"'foo' is no address of a scheduler\. Write tcp://host:8786"):
+        Cluster("foo")
+    (tmp_path / "scheduler.json").write_text("{}")
+    with pytest.raises(RequestError, match=r"scheduler\.json is no scheduler file"):
+        Cluster(str(tmp_path / "scheduler.json"))
+
+
 def test_a_cluster_without_workers_is_a_clear_error(dask):
     for worker in dask.workers:
         worker.kill()
