@@ -179,7 +179,8 @@ def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple
         return covariance, 0
     scale = np.linalg.norm(jacobian[:, free], axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    _, singular, rows = np.linalg.svd(jacobian[:, free] / scale, full_matrices=True)
+    wide = jacobian.shape[0] < scale.size  # then only the full decomposition has the null directions; else no one asks
+    _, singular, rows = np.linalg.svd(jacobian[:, free] / scale, full_matrices=wide)
     known = np.zeros(rows.shape[0], bool)
     known[: singular.size] = singular > RANK * max(singular.max(initial=0.0), 1e-300)
     inverse = (rows[known].T / singular[known[: singular.size]] ** 2) @ rows[known]
