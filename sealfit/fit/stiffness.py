@@ -22,12 +22,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from sealfit.fit.polish import polish
-from sealfit.fit.rises import Curve, Rises, Stroke
+from sealfit.fit.polish import SHRINKS
+from sealfit.fit.rises import Curve, Rises, Stroke, Tangent
 
 LEAST = 3  # such samples below which nothing can be said
 RISES = 30.0  # residual variances by which a rise must do better than none
 MISSED_NOISE, MISSED_LEVEL = 2.0, 0.03  # of the noise and of the sliding force: what a fit leaves that has missed
+STEPS = 200  # of Gauss and Newton, at most
+SETTLED = 1e-11  # of the residual: a step that moves the model by less
+UNSEEN = 1e-7  # of the residual: a step that moves the model by less changes the sum of squares by rounding only
+SHORTEST = 1e-6  # of a step: the sum of squares does not fall along it
 OPEN = np.log(3.0)  # of log sigma_0: an interval that reaches further each way is no estimate
 
 
@@ -118,47 +122,69 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
     if not strokes:
         return None
     rises = Rises(strokes, curve)
-    stiffness, tau = rises.grid()
-    best = int(np.argmin(rises.squares(stiffness, tau)))
-    low = np.array([np.log(stiffness.min()) - 1.0, 0.0])
-    high = np.array([np.log(stiffness.max()) + 1.0, np.inf])
-    found = polish(rises.residual, None, np.array([np.log(stiffness[best]), tau[best]]), (low, high))
-    levels, start_N = rises.amplitudes(found.x)
-    level = rises.run_levels(levels)
+    x, (least, most) = rises.best_of_grid()
+    bounds = np.array([[least - 1.0, 0.0], [most + 1.0, np.inf]])
+    x, found = _descended(rises, x, bounds)
+    level = rises.run_levels(found.level)
+    inverse = np.linalg.pinv(found.normal.sum(axis=0), rcond=1e-12, hermitian=True)
     shifts = []
-    for other in (Rises(strokes, moved) for moved in curve.moved()):
-        at = _one_step(found.jacobian, other.residual(found.x), found.x, low, high)
-        shifts.append(at - found.x + [other.run_levels(other.amplitudes(at)[0]).mean() - level.mean(), 0.0])
-    by_files, df = _between_files(found.jacobian, found.residual, rises.file)
+    for other in (rises.along(moved) for moved in curve.moved()):
+        at = x + _step(found.normal.sum(axis=0), np.einsum("ikr,kr->i", found.jacobian, other.solved(x)[1]), x, bounds)
+        shifts.append(at - x + [other.run_levels(other.solved(at)[0]).mean() - level.mean(), 0.0])
+    by_files, df = _between_files(found, inverse, rises.file)
     by_level = float(level.var(ddof=1) / level.size) if level.size > 1 else np.nan
     by_curve = np.array(shifts).T @ np.array(shifts) if shifts else np.zeros((2, 2))
     parts = ((np.diag(by_files), df), (np.array([by_level, 0.0]), level.size - 1), (np.diag(by_curve), curve.df))
     return Stiffness(
-        sigma_0=float(np.exp(found.x[0] + level.mean())),
-        tau_s=float(found.x[1]),
+        sigma_0=float(np.exp(x[0] + level.mean())),
+        tau_s=float(x[1]),
         covariance=by_files + np.diag([by_level, 0.0]) + by_curve,
         df=together(parts),
         gain=rises.gain_of(found.rss),
-        within=rises.inside(float(np.exp(found.x[0])), levels, start_N),
-        files=rises.files,
+        within=rises.inside(float(np.exp(x[0])), found.level, found.begin),
+        files=int(rises.file.max()) + 1,
         forces_N=rises.forces(found.residual),
         noise_N=rises.noise_N(),
-        rmse_N=float(np.sqrt(found.rss / found.residual.size)),
+        rmse_N=float(np.sqrt(found.rss / rises.there.sum())),
     )
 
 
-def _one_step(jacobian: np.ndarray, residual: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray):
-    """Return where one Gauss-Newton step leads, shape (p,); what it would carry over a bound is held there."""
+def _descended(rises: Rises, x: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, Tangent]:
+    """Return the least-squares optimum that (log sigma_0, tau) leads to, shape (2,), and the tangent there.
+
+    Gauss-Newton steps within the bounds, halved until the sum of squares falls, until they move the model no more.
+    """
+    x, last = np.clip(x, *bounds), np.inf
+    found = rises.tangent(x)
+    for _ in range(STEPS):
+        step, share = _step(found.normal.sum(axis=0), found.pull.sum(axis=0), x, bounds), 1.0
+        moved = float(np.sqrt(max(step @ found.normal.sum(axis=0) @ step, 0.0) / max(found.rss, 1e-300)))
+        if moved <= SETTLED or UNSEEN > moved > SHRINKS * last:
+            break
+        trial = rises.tangent(x + step)
+        while moved > UNSEEN and not trial.rss < found.rss and share > SHORTEST:
+            share /= 2
+            trial = rises.tangent(x + share * step)
+        if share <= SHORTEST:
+            break
+        x, found, last = x + share * step, trial, moved
+    return x, found
+
+
+def _step(normal: np.ndarray, pull: np.ndarray, x: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Return one Gauss-Newton step from J'J and J'r, shape (p,); what it would carry over a bound is held there."""
     step, free = np.zeros(x.size), np.ones(x.size, bool)
+    scale = np.sqrt(np.diag(normal))
+    scale = np.where(scale > 0, scale, 1.0)
     for _ in range(x.size):
-        step[free] = np.linalg.lstsq(jacobian[:, free], -residual - jacobian @ np.where(free, 0.0, step), rcond=1e-12)[
-            0
-        ]
-        over = free & ((x + step < low) | (x + step > high))
+        left = -(pull + normal @ np.where(free, 0.0, step)) / scale
+        scaled = (normal / np.outer(scale, scale))[np.ix_(free, free)]
+        step[free] = np.linalg.lstsq(scaled, left[free], rcond=1e-12)[0] / scale[free]
+        over = free & ((x + step < bounds[0]) | (x + step > bounds[1]))
         if not over.any():
             break
-        step[over], free = (np.clip(x + step, low, high) - x)[over], free & ~over
-    return x + step
+        step[over], free = (np.clip(x + step, *bounds) - x)[over], free & ~over
+    return step
 
 
 def together(parts: Sequence[tuple[np.ndarray, np.ndarray | int]]) -> np.ndarray:
@@ -168,22 +194,29 @@ def together(parts: Sequence[tuple[np.ndarray, np.ndarray | int]]) -> np.ndarray
     return total**2 / np.maximum(spread, 1e-300)
 
 
-def _between_files(jacobian: np.ndarray, residual: np.ndarray, file: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _between_files(found: Tangent, inverse: np.ndarray, file: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the covariance of the estimates from how files pull at them, shape (p, p), and its degrees of freedom.
 
     Each file's pull is that on a fit without it (the jackknife's, CR3); the degrees of freedom follow from how evenly
     files share the information.
+
+    Parameters
+    ----------
+    found : Tangent
+        At the optimum.
+    inverse : ndarray, shape (p, p)
+        Of J'J.
+    file : ndarray of int, shape (strokes,)
+        Number of each stroke's file.
     """
-    files = int(file.max()) + 1
-    p = jacobian.shape[1]
-    normal = jacobian.T @ jacobian
-    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    own = np.stack([jacobian[file == k].T @ jacobian[file == k] for k in range(files)])
-    pull = np.stack([jacobian[file == k].T @ residual[file == k] for k in range(files)])
+    files, p = int(file.max()) + 1, len(inverse)
     if files < 2:
         return np.full((p, p), np.nan), np.ones(p)
+    own, pull = np.zeros((files, p, p)), np.zeros((files, p))
+    np.add.at(own, file, found.normal)
+    np.add.at(pull, file, found.pull)
     left = np.eye(p) - own @ inverse
-    moved = np.stack([inverse @ np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(left, pull, strict=True)])
+    moved = (inverse @ np.linalg.pinv(left, rcond=1e-9) @ pull[..., None])[..., 0]
     covariance = (files - 1) / files * moved.T @ moved
     information = np.einsum("pq,kqr,rp->kp", inverse, own, inverse) / np.maximum(np.diag(inverse), 1e-300)
     df = 1 / np.maximum((information**2).sum(axis=0), 1e-12) - 1
