@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit import parquet
+from sealfit.ingest.pieces import median
 
 
 @dataclass(frozen=True)
@@ -19,9 +20,9 @@ class StoredTraces:
     conditions: frozenset[str]
     paths: tuple[Path, ...]
 
-    def read(self, columns: list[str] | None = None) -> pd.DataFrame:
-        """Return them, or those columns of table `traces`."""
-        return parquet.read(self.paths, columns)
+    def read(self, columns: list[str] | None = None, coded: Sequence[str] = ()) -> pd.DataFrame:
+        """Return them, or those columns of table `traces`; words of `coded` as categories."""
+        return parquet.read(self.paths, columns, coded)
 
 
 def by_conditions(parts: Mapping[Path, Iterable[str]]) -> list[StoredTraces]:
@@ -65,10 +66,15 @@ def strokes_of(traces: pd.DataFrame, strokes: pd.DataFrame) -> tuple[np.ndarray,
     own : ndarray of int, shape (n,)
         Its row in `strokes`; -1 where it is not among them.
     """
-    file, stroke = traces["file"].to_numpy(), traces["stroke"].to_numpy()
+    file = traces["file"]
+    if isinstance(file.dtype, pd.CategoricalDtype):
+        file, names = file.cat.codes.to_numpy(), file.cat.categories
+    else:
+        file, names = pd.factorize(file)
+    stroke = traces["stroke"].to_numpy()
     first = np.flatnonzero(np.r_[True, (file[1:] != file[:-1]) | (stroke[1:] != stroke[:-1])])
     own = pd.MultiIndex.from_frame(strokes[["file", "stroke"]]).get_indexer(
-        pd.MultiIndex.from_arrays([file[first], stroke[first]])
+        pd.MultiIndex.from_arrays([np.asarray(names, object)[file[first]], stroke[first]])
     )
     return np.r_[first, file.size], own
 
@@ -78,4 +84,4 @@ def noise_from_bends(bends: np.ndarray) -> float:
 
     Their variance is six times a sample's; the median absolute deviation is blind to where the signal itself bends.
     """
-    return 1.4826 * float(np.median(np.abs(bends - np.median(bends)))) / np.sqrt(6.0) if bends.size else 0.0
+    return 1.4826 * median(np.abs(bends - median(bends))) / np.sqrt(6.0) if bends.size else 0.0
