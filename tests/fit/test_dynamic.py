@@ -10,7 +10,7 @@ import pytest
 from sealfit.config import load_config
 from sealfit.fit.dynamic import fit_dynamic
 from sealfit.fit.rises import Curve, Stroke
-from sealfit.fit.starts import starts_of
+from sealfit.fit.starts import starts_of, strokes_along
 from sealfit.fit.steady import fit_conditions
 from sealfit.fit.stiffness import fit_stiffness
 from sealfit.ingest import parts
@@ -152,7 +152,7 @@ def test_traces_that_begin_in_steady_sliding_say_so(tmp_path):
     tables, _ = made(tmp_path)
     config = load_config()
     traces = tables["traces"][tables["traces"]["steady"]]
-    assert list(starts_of(traces, tables["steady"])) == []
+    assert starts_of(strokes_along(traces, tables["steady"])) == []
     found = fit_dynamic(traces, tables["steady"], fit_conditions(tables["steady"], config), config)
     table = dynamic(found.fit)
     assert not table["identified"].any()
@@ -165,7 +165,7 @@ def test_a_ramp_of_another_shape_is_followed_by_its_own_speed(tmp_path):
     traces = tables["traces"]
     time = traces["time_s"].to_numpy()
     bent = traces.assign(displacement_mm=traces["displacement_mm"] + 0.05 * np.sin(40 * time))
-    for one in list(starts_of(bent, tables["steady"]))[:3]:
+    for one in starts_of(strokes_along(bent, tables["steady"]))[:3]:
         assert (np.diff(one.distance_mm) >= 0).all()
         assert one.speed_mm_s.min() >= 0
 
