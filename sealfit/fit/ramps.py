@@ -16,6 +16,9 @@ PADDED = (
 TOGETHER = 16_384  # rows of strokes at once: what is held of them stays in the cache
 TRIALS = 100  # of steps, at most
 SETTLED = 1e-18  # of the sum of squares: a step that would change it by less
+UNSEEN = (
+    1e-13  # of the sum of squares: a step that would change it by less is taken, as rounding hides whether it falls
+)
 TOO_SHORT = 1e-13  # of the step in time: a step that moves the beginning by less is rounding
 DAMPED = (1e-4, 1e-10, 1e12)  # Marquardt's number: to begin with, and where it makes steps those of Newton, or none
 
@@ -149,12 +152,12 @@ def _descended(rows: _Rows, shape: Shape, at: np.ndarray, unit: np.ndarray) -> n
         settled |= damping[alive] > DAMPED[2]
         if settled.any():
             alive, own = alive[~settled], own.some(~settled)
-            squares, pull, normal, move = (values[~settled] for values in (squares, pull, normal, move))
+            squares, pull, normal, move, gain = (values[~settled] for values in (squares, pull, normal, move, gain))
             if not len(alive):
                 break
         trial = at[alive] + move * unit[alive]
         new_squares, new_pull, new_normal = _tangent(own, shape, trial, unit[alive])
-        better = new_squares < squares
+        better = (new_squares < squares) | (gain <= UNSEEN * squares)
         damping[alive] = np.where(better, np.maximum(damping[alive] / 10, DAMPED[1]), damping[alive] * 10)
         at[alive[better]] = trial[better]
         squares, pull, normal = (

@@ -119,6 +119,11 @@ class Along:
         """Noise of the displacement."""
         return noise_from_bends(_bends(self.along_mm))
 
+    @property
+    def noisy(self) -> bool:
+        """Whether the displacement has noise at all."""
+        return self.noise_mm > ROUNDING * float(np.abs(self.along_mm[[0, -1]]).max())
+
 
 def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
     """Return every stroke that slides steadily somewhere.
@@ -147,7 +152,7 @@ def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
 def starts_of(strokes: Sequence[Along]) -> list[Start]:
     """Return the beginning of every stroke that has one; a stroke whose rows begin in steady sliding has none."""
     strokes = [stroke for stroke in strokes if stroke.until >= LEAST]
-    noisy = [stroke for stroke in strokes if stroke.noise_mm > ROUNDING * float(np.abs(stroke.along_mm[[0, -1]]).max())]
+    noisy = [stroke for stroke in strokes if stroke.noisy]
     rows = [slice(0, 2 * stroke.until) for stroke in noisy]  # up to steady sliding, and as many after
     ramps = fit_ramps(
         [stroke.time_s[own] for stroke, own in zip(noisy, rows, strict=True)],
@@ -189,12 +194,15 @@ def _begun(stroke: Along, ramp: Ramp | None) -> Start | None:
 
 
 def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance and speed by a parabola through as many rows to either side as the noise asks for.
+    """Return distance and speed up to steady sliding, by a parabola through as many rows to either side as the noise
+    asks for.
 
     Beyond the ends lie the first and the last displacement (Savitzky and Golay 1964, Anal. Chem. 36(8), 1627-1639,
     doi:10.1021/ac60214a047).
     """
-    along, half = stroke.along_mm, _half_width(stroke)
+    half = _half_width(stroke) if stroke.noisy else 1
+    rows = slice(0, stroke.until + half + 1)  # all that the rows before steady sliding see
+    along, time = stroke.along_mm[rows], stroke.time_s[rows]
     if half == 1:
         smooth, rate = along, np.gradient(along)
     else:
@@ -203,7 +211,7 @@ def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
         square = half * (half + 1) * (2 * half + 1) / 3
         weight = (3 * half**2 + 3 * half - 1 - 5 * away**2) * 3 / ((2 * half - 1) * (2 * half + 1) * (2 * half + 3))
         smooth, rate = np.correlate(padded, weight, "valid"), np.correlate(padded, away / square, "valid")
-    return smooth, np.maximum(rate / np.gradient(stroke.time_s), 0.0)
+    return smooth, np.maximum(rate / np.gradient(time), 0.0)
 
 
 def _half_width(stroke: Along) -> int:
