@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import io
 import os
 import shutil
 import signal
@@ -20,10 +19,10 @@ from sealfit.tables import SCHEMAS, Units
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
+
+    from sealfit.report.drawn import Drawn
 
 STAGING = ".staging-"
-PLOT_DPI = 150  # a half-page plot stays sharp in print
 
 
 class Staged:
@@ -49,12 +48,10 @@ class Staged:
         """Write a text file."""
         self._write(name, lambda path: path.write_bytes(text.encode("utf-8")))
 
-    def figure(self, name: str, figure: Figure) -> None:
-        """Write a figure as `plots/<name>.png` and `.svg`."""
-        for kind, about in (("png", {"Software": None}), ("svg", {"Date": None})):
-            drawn = io.BytesIO()
-            figure.savefig(drawn, format=kind, dpi=PLOT_DPI, metadata=about)
-            self._write(f"plots/{name}.{kind}", lambda path, drawn=drawn: path.write_bytes(drawn.getbuffer()))
+    def figure(self, name: str, figure: Drawn) -> None:
+        """Write a drawn figure as `plots/<name>.png` and `.svg`."""
+        self._write(f"plots/{name}.png", lambda path: path.write_bytes(figure.png))
+        self.text(f"plots/{name}.svg", figure.svg)
 
     def folder(self) -> Path:
         """Return the folder in which other processes may write files of this step, told with `adopt`."""

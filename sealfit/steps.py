@@ -224,7 +224,7 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
         tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED) if name not in UNREPORTED}
     with timed("page"):
         report = build_report(tables, store.read_json("closure"), store.provenance(), store.seen_config("report"))
-    with timed("plots as files", rows=len(report.figures), of="plots"):
+    with timed("writing plots", rows=len(report.figures), of="plots"):
         for name, figure in report.figures.items():
             staged.figure(name, figure)
     staged.text("report.html", report.html)

@@ -9,17 +9,18 @@ from importlib.resources import files
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from sealfit.config import Config
+from sealfit.profiling import timed
 from sealfit.report import facts
+from sealfit.report.drawn import Drawn, data_uri, draw
 from sealfit.report.figures import draw_all
 from sealfit.report.figures_residual import MOST_CHANNELS
 from sealfit.report.law_tables import law_rows
 from sealfit.report.loop_tables import channel_tests, effect_cards, error_rows, next_runs, scatter_rows
 from sealfit.report.numbers import count, given, number
 from sealfit.report.parameters import break_away_rows, parameter_tables
-from sealfit.report.style import Plot, compose, data_uri, panel_figure, svg
+from sealfit.report.style import Plot
 from sealfit.report.symbols import ConditionNames, symbol_html
 from sealfit.report.words import left_over, verdict, with_left_channels
 
@@ -41,7 +42,7 @@ class Report:
     """The page, and its plots by name for whoever saves them as files."""
 
     html: str
-    figures: dict[str, Figure]
+    figures: dict[str, Drawn]
 
 
 def build_report(
@@ -63,16 +64,19 @@ def build_report(
     Returns
     -------
     Report
-        The page asks for nothing outside itself. The figures are not yet drawn to a file.
+        The page asks for nothing outside itself. Figures are drawn once; the page shows their panels.
     """
     tables = facts.complete(tables, TABLES)
     if closure is not None:
         closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
     plots = draw_all(tables, closure, config)
+    with timed("plots", rows=len(plots), of="plots"):
+        figures = {name: draw(plot) for name, plot in plots.items()}
+    images = {name: _images(plot, figures[name]) for name, plot in plots.items()}
     html = _environment().from_string(_text("template.html")).render(
-        style=Markup(_text("style.css")), **_content(tables, closure, provenance, config, plots)
+        style=Markup(_text("style.css")), plots=images, **_content(tables, closure, provenance, config)
     )  # fmt: skip
-    return Report(html, {name: compose(plot) for name, plot in plots.items()})
+    return Report(html, figures)
 
 
 def _content(
@@ -80,7 +84,6 @@ def _content(
     closure: Mapping | None,
     provenance: Mapping,
     config: Config,
-    plots: Mapping[str, Plot],
 ) -> dict:
     fitted = parameter_tables(tables["steady_fit"], "condition", config)
     fitted += parameter_tables(tables["aging_fit"], "series", config)
@@ -113,25 +116,21 @@ def _content(
         "findings": findings,
         "findings_in_all": in_all,
         "provenance": facts.provenance_facts(provenance),
-        "plots": {name: _images(plot) for name, plot in plots.items()},
     }
 
 
-def _images(plot: Plot) -> dict:
+def _images(plot: Plot, drawn: Drawn) -> dict:
     """Return a plot as the template draws it: every panel an image of its own, so that they flow with the page."""
-    panels = []
-    for panel in plot.panels:
-        figure = panel_figure(panel)
-        width, height = figure.get_size_inches() * 96
-        panels.append(
-            {
-                "src": data_uri(svg(figure)),
-                "alt": panel.alt,
-                "effect": panel.effect,
-                "width": round(width),
-                "height": round(height),
-            }
-        )
+    panels = [
+        {
+            "src": data_uri(image.svg),
+            "alt": panel.alt,
+            "effect": panel.effect,
+            "width": image.width,
+            "height": image.height,
+        }
+        for panel, image in zip(plot.panels, drawn.panels, strict=True)
+    ]
     legend = [
         {"label": symbol_html(key.label) if key.symbol else key.label, "colour": key.colour, "mark": key.mark}
         for key in plot.legend

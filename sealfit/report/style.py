@@ -1,11 +1,8 @@
-"""One look for every plot: colours, sizes, and how panels become a figure or an image in the page."""
+"""One look for every plot: colours, sizes, and how panels become a figure."""
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
-from base64 import b64encode
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,9 +14,9 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import AutoLocator
+from matplotlib.ticker import AutoLocator, ScalarFormatter
 
-from sealfit.report.axes import round_ticks
+from sealfit.report.axes import PlainNumbers, round_ticks
 from sealfit.report.symbols import plain, symbol_math
 
 # Okabe & Ito, Color Universal Design (2008): told apart by all common kinds of colour vision. Yellow is left out: too
@@ -32,6 +29,7 @@ BEFORE, AFTER, FLOOR, QUIET = VERMILION, BLUE, "#5f6670", "#8a9099"
 
 WIDTH = 3.55  # inches of one panel: 340 px of a page, so its text is as large as the page's small print
 HEIGHT = 2.55
+DPI = 150  # a half-page plot stays sharp in print
 _EDGE, _BOTTOM, _TOP = 0.14, 0.5, 0.32  # inches around the axes
 
 RC = {
@@ -51,7 +49,6 @@ RC = {
     "axes.grid": True,
     "axes.axisbelow": True,
     "axes.formatter.limits": (-3, 5),
-    "axes.formatter.use_mathtext": True,
     "grid.color": "#e6e8eb",
     "grid.linewidth": 0.7,
     "xtick.labelsize": 8,
@@ -119,32 +116,44 @@ def shades(n: int) -> list[str]:
     return [to_hex(scale(0.82 * k / max(n - 1, 1))) for k in range(n)]
 
 
-def panel_figure(panel: Panel) -> Figure:
-    """Return a figure of one panel."""
-    with look():
-        figure = Figure(figsize=(WIDTH, panel.height), dpi=150)
-        _place(figure, panel, 0.0, 0.0)
-        return figure
+@dataclass(frozen=True)
+class Layout:
+    """Where the panels of a plot stand, all in inches: the figure's size, its legend's lines, lower left corners."""
+
+    width: float
+    height: float
+    lines: int
+    corners: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def of(cls, plot: Plot) -> Layout:
+        """Return the layout of a plot: up to four panels a row, below its title and its legend."""
+        columns = min(len(plot.panels), 4 if len(plot.panels) > 6 else 3)
+        rows = [plot.panels[k : k + columns] for k in range(0, len(plot.panels), columns)]
+        heights = [max(panel.height for panel in row) for row in rows]
+        width = columns * WIDTH
+        lines = _legend_lines(plot.legend, width)
+        corners = [
+            (c * WIDTH, sum(heights[r:]) + 0.04 - panel.height)
+            for r, row in enumerate(rows)
+            for c, panel in enumerate(row)
+        ]
+        return cls(width, sum(heights) + 0.36 + 0.19 * lines, lines, tuple(corners))
 
 
 def compose(plot: Plot) -> Figure:
-    """Return all panels of a plot in one figure, with its title and legend."""
-    columns = min(len(plot.panels), 4 if len(plot.panels) > 6 else 3)
-    rows = math.ceil(len(plot.panels) / columns)
-    heights = [max(p.height for p in plot.panels[r * columns : (r + 1) * columns]) for r in range(rows)]
-    width = columns * WIDTH
-    lines = _legend_lines(plot.legend, width)
-    head = 0.32 + 0.19 * lines
+    """Return all panels of a plot in one figure, with title and legend; panel k is the group "panel_k" of an SVG."""
+    layout = Layout.of(plot)
+    width, total = layout.width, layout.height
     with look():
-        figure = Figure(figsize=(width, sum(heights) + head + 0.04), dpi=150)
-        total = figure.get_figheight()
+        figure = Figure(figsize=(width, total), dpi=DPI)
         figure.text(_EDGE / width, 1 - 0.1 / total, plot.title, va="top", weight="bold", size=10)
         if plot.legend:
             figure.legend(
                 handles=[_handle(key) for key in plot.legend],
                 loc="upper left",
                 bbox_to_anchor=(_EDGE / width, 1 - 0.32 / total),
-                ncols=math.ceil(len(plot.legend) / lines),
+                ncols=math.ceil(len(plot.legend) / layout.lines),
                 handlelength=1.8,
                 columnspacing=1.4,
                 labelspacing=0.35,
@@ -152,14 +161,12 @@ def compose(plot: Plot) -> Figure:
                 borderpad=0,
                 fontsize=8,
             )
-        top = total - head
-        for r in range(rows):
-            for c, panel in enumerate(plot.panels[r * columns : (r + 1) * columns]):
-                _place(figure, panel, c * WIDTH, top - sum(heights[:r]) - panel.height)
+        for k, (panel, corner) in enumerate(zip(plot.panels, layout.corners, strict=True)):
+            _place(figure, panel, *corner).set_gid(f"panel_{k}")
         return figure
 
 
-def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> None:
+def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> Axes:
     width, height = figure.get_figwidth(), figure.get_figheight()
     box = (
         (left + panel.left) / width,
@@ -171,8 +178,13 @@ def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> None:
     panel.draw(ax)
     if ax.get_xscale() == "linear" and isinstance(ax.xaxis.get_major_locator(), AutoLocator):
         ax.xaxis.set_major_locator(round_ticks())
+    for axis in (ax.xaxis, ax.yaxis):
+        if type(axis.get_major_formatter()) is ScalarFormatter:
+            axis.set_major_formatter(PlainNumbers())
     if panel.title:
-        ax.set_title(plain(panel.title), x=-(panel.left - _EDGE) / (WIDTH - panel.left - _EDGE))
+        # its height is given too, or every drawing measures all tick labels to see whether they are in its way
+        ax.set_title(plain(panel.title), x=-(panel.left - _EDGE) / (WIDTH - panel.left - _EDGE), y=1.0)
+    return ax
 
 
 def _legend_lines(legend: Sequence[Key], width: float) -> int:
@@ -199,20 +211,3 @@ def _handle(key: Key) -> Line2D | Patch:
         return Line2D([], [], color=key.colour, marker=marker, markerfacecolor=face, linestyle="", label=label)
     style = {"line": "-", "dotted": ":", "dashed": "--"}[key.mark]
     return Line2D([], [], color=key.colour, linestyle=style, label=label)
-
-
-def svg(figure: Figure) -> str:
-    """Return a figure as SVG; text as outlines, or as text where the plot's font lacks a letter of it."""
-    for outlines in ("path", "none"):
-        with look(), mpl.rc_context({"svg.fonttype": outlines}), warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            buffer = io.StringIO()
-            figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-        if not any("missing from font" in str(warning.message) for warning in caught):
-            break
-    return buffer.getvalue()
-
-
-def data_uri(text: str) -> str:
-    """Return SVG as an address that holds it, so that the page asks for nothing."""
-    return "data:image/svg+xml;base64," + b64encode(text.encode()).decode()

@@ -1,4 +1,6 @@
+import re
 import warnings
+from xml.etree import ElementTree
 
 import numpy as np
 import numpy.testing as npt
@@ -9,13 +11,14 @@ from report.made_campaigns import Made, aging_campaign, not_run, paper_sized, to
 from report.made_tables import DROP, empty, shapes, table
 
 from sealfit.config import Config
-from sealfit.report.axes import is_logarithmic, value_ticks
+from sealfit.report.axes import PlainNumbers, is_logarithmic, value_ticks
+from sealfit.report.drawn import draw, svg
 from sealfit.report.figures import draw_all
 from sealfit.report.figures_curves import draw_aging, draw_trace, envelope
 from sealfit.report.figures_loop import draw_errors, draw_levels, run_means
 from sealfit.report.figures_residual import channel_order, draw_channel, draw_shape
 from sealfit.report.figures_speed import curve_lines, force_speed, run_points
-from sealfit.report.style import Key, Panel, Plot, compose, panel_figure, svg
+from sealfit.report.style import Key, Panel, Plot, compose
 from sealfit.tables import Units
 
 TORQUE = Units({"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")})
@@ -29,6 +32,10 @@ def ax():
 @pytest.fixture(scope="module")
 def made():
     return aging_campaign()
+
+
+def panel_figure(panel):
+    return compose(Plot("one", "", (panel,)))
 
 
 # ---------------------------------------------------------------- force against speed
@@ -250,7 +257,42 @@ def test_letters_that_the_font_lacks_become_text():
 
 def test_the_same_tables_give_the_same_bytes(made):
     plot = draw_all(made.tables, made.closure, made.config)["variance_levels"]
-    assert svg(panel_figure(plot.panels[0])) == svg(panel_figure(plot.panels[0]))
+    assert draw(plot) == draw(plot)
+
+
+def test_a_panel_of_the_page_holds_all_that_it_uses_and_nothing_of_its_neighbours(made):
+    drawn = draw(draw_all(made.tables, made.closure, made.config)["aging"])
+    assert len(drawn.panels) == 2
+    for image in drawn.panels:
+        page = ElementTree.fromstring(image.svg)
+        names = [element.get("id") for element in page.iter() if element.get("id")]
+        used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', image.svg))
+        assert used == set(names)
+        assert len(names) == len(used)
+        assert (image.width, image.height) == (341, 245)
+        box = [float(number) for number in page.get("viewBox").split()]
+        inside = [float(found) for found in re.findall(r"translate\(([\d.]+) [\d.]+\) (?:rotate|scale)", image.svg)]
+        assert all(box[0] <= x <= box[0] + box[2] for x in inside)
+    assert drawn.panels[0].svg != drawn.panels[1].svg
+    assert drawn.png.startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("values", "offset"),
+    [
+        ([0, 2e-5], "×10⁻⁵"),
+        ([1e7, 3e7], "×10⁷"),
+        ([0, 40], ""),
+        ([1e6 + 1, 1e6 + 2], "+10⁶"),
+        ([5e6, 5e6 + 2], "+5×10⁶"),
+    ],
+)
+def test_powers_of_ten_beside_an_axis_are_written_out(ax, values, offset):
+    ax.yaxis.set_major_formatter(PlainNumbers())
+    ax.yaxis.get_major_formatter().set_powerlimits((-3, 5))
+    ax.plot([0, 1], values)
+    ax.figure.draw_without_rendering()
+    assert ax.yaxis.get_offset_text().get_text() == offset
 
 
 def test_text_lies_inside_every_figure():
