@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
@@ -17,7 +17,10 @@ STATISTICS = (
     "rmse_N", "rmse", "max_error_pct", "specimen_sd_pct", "reduced_chi2", "lack_of_fit_p", "df",
     "n_runs", "n_files", "n_speeds", "n_days", "last_day",
 )  # fmt: skip
+ENDS = ("value", "lo95", "hi95")
 HIDDEN = ("covariance", "sensor_shift")  # for programs; they stand in the Parquet tables
+
+Rows = dict[tuple[str, str], dict]  # of one condition or series, by parameter and unit
 
 
 @dataclass(frozen=True)
@@ -55,14 +58,17 @@ def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> list[dict]:
         Names the conditions and gives the true units.
     """
     names, found = ConditionNames.of(config), []
-    keys = ["condition", "speed_set_mm_s", "direction"]
-    rows = dynamic_fit[dynamic_fit["quantity"] == "break_away"]
-    for (condition, speed, direction), own in rows.groupby(keys, dropna=False, sort=False):
-        by = own.set_index("parameter")
-        if by.loc["F_ba/F", "reason"] or not by.loc["F_ba/F", "identified"]:
+    keys = ("condition", "speed_set_mm_s", "direction")
+    groups: dict[tuple, dict[str, dict]] = {}
+    for row in _records(dynamic_fit[dynamic_fit["quantity"] == "break_away"], *keys):
+        groups.setdefault(tuple(row[name] for name in keys), {})[row["parameter"]] = row
+    for (condition, speed, direction), by in groups.items():
+        ratio = by["F_ba/F"]
+        if ratio["reason"] or not ratio["identified"]:
             continue
-        force, interval = measured(*by.loc["F_ba", ["value", "lo95", "hi95"]])
-        share, share_interval = measured(*(100.0 * (by.loc["F_ba/F", ["value", "lo95", "hi95"]].astype(float) - 1.0)))
+        force, interval = measured(*(by["F_ba"][name] for name in ENDS))
+        above = (None if ratio[name] is None else 100.0 * (ratio[name] - 1.0) for name in ENDS)
+        share, share_interval = measured(*above)
         found.append(
             {
                 "condition": names(condition),
@@ -121,8 +127,7 @@ def _table(
 ) -> ParameterTable:
     several = len(quantities) > 1 or key == "series"
     found = []
-    for (name, quantity), rows in _ordered(fit.groupby([key, "quantity"], sort=False), names):
-        by = {(row["parameter"], row["unit"] or ""): row for row in _records(rows)}
+    for (name, quantity), by in _rows_of(fit, key, "quantity", names):
         cells = tuple(_cell(by.get(parameter)) for parameter in parameters)
         keys = (names(name), symbol_html(quantity)) if several else (names(name),)
         found.append((keys, cells, _note(by, config)))
@@ -136,12 +141,11 @@ def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Conf
     split = fit["parameter"].str.rpartition(":")  # "mu_s:lack_of_fit_p" is about mu_s alone
     fit = fit.assign(of=split[0], parameter=split[2])
     several = fit["of"].ne("").any()
-    present = {(row["parameter"], row["unit"] or "") for row in _records(fit)}
+    present = set(zip(fit["parameter"], fit["unit"].fillna(""), strict=True))
     shown = [(name, unit) for name in STATISTICS for found, unit in sorted(present) if found == name]
     shown = shown or sorted(present)
     found = []
-    for (name, of), rows in _ordered(fit.groupby([key, "of"], sort=False), names):
-        by = {(row["parameter"], row["unit"] or ""): row for row in _records(rows)}
+    for (name, of), by in _rows_of(fit, key, "of", names):
         cells = tuple(Cell(_statistic(by[p]) if p in by else NOTHING) for p in shown)
         lack = {p: row for p, row in by.items() if p[0] == "lack_of_fit_p"}
         keys = (names(name), symbol_html(of)) if several else (names(name),)
@@ -152,19 +156,19 @@ def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Conf
     return ParameterTable(title, heads, groups, tuple(found), single=True)
 
 
-def _records(rows: pd.DataFrame) -> list[dict]:
-    plain = rows[["parameter", "unit", "value", "lo95", "hi95", "u_sys", "identified", "reason"]].astype(object)
+def _rows_of(fit: pd.DataFrame, key: str, second: str, names: ConditionNames) -> list[tuple[tuple[str, str], Rows]]:
+    """Return ((key, second), rows by parameter and unit): unaged rubber first, then by temperature, ..., days."""
+    found: dict[tuple[str, str], Rows] = {}
+    for row in _records(fit, key, second):
+        found.setdefault((row[key], row[second]), {})[row["parameter"], row["unit"] or ""] = row
+    spelled = {name: (not is_unaged(name), natural((names(name), None))) for name, _ in found}
+    return sorted(found.items(), key=lambda entry: spelled[entry[0][0]])
+
+
+def _records(rows: pd.DataFrame, *keys: str) -> list[dict]:
+    """Return rows as dictionaries, None where nothing stands: a table of one dtype takes pandas one pass."""
+    plain = rows[[*keys, "parameter", "unit", "value", "lo95", "hi95", "u_sys", "identified", "reason"]].astype(object)
     return plain.where(plain.notna(), None).to_dict("records")
-
-
-def _ordered(groups: Iterable[tuple], names: ConditionNames) -> list[tuple]:
-    """Return groups with unaged rubber first, then by temperature, ..., days, numbers by their size."""
-
-    def place(group: tuple) -> tuple:
-        name = group[0][0] if isinstance(group[0], tuple) else group[0]
-        return (not is_unaged(name), natural((names(name), None)))
-
-    return sorted(groups, key=place)
 
 
 def _statistic(row: Mapping) -> str:
