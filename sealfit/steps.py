@@ -23,6 +23,11 @@ INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bin
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
 FITTED = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
 UNREPORTED = ("traces", "bins")  # as many rows as samples, and nothing in the report needs them
+REPORTED = {  # of tables with a row per bin or step of a trace, what the report looks at
+    "traces_mean": ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"],
+    **{f"residuals_{stage}": ["condition", "run_id", "file", "residual_N", "heldout_residual_N"]
+       for stage in ("before", "after")},
+}  # fmt: skip
 Counted = tuple[int, str]
 FAULTY = ("warning", "error")  # severities that count as a fault
 
@@ -221,7 +226,11 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
 
     progress.say("drawing the report")
     with timed("reading tables"):
-        tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED) if name not in UNREPORTED}
+        tables = {
+            name: store.read(name, REPORTED.get(name))
+            for name in (*INGESTED, *FITTED, *CLOSED)
+            if name not in UNREPORTED
+        }
     with timed("page"):
         report = build_report(tables, store.read_json("closure"), store.provenance(), store.seen_config("report"))
     with timed("writing plots", rows=len(report.figures), of="plots"):
