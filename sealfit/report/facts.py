@@ -13,6 +13,7 @@ from sealfit.report.symbols import channel_label, true_units
 from sealfit.tables import SCHEMAS
 
 MOST_FINDINGS = 400  # listed in the page; all of them stand in quality.parquet
+MOST_INPUTS = 2000  # listed with their hashes; all of them stand in inputs.parquet
 SEVERITIES = ("error", "warning", "info")
 
 
@@ -90,9 +91,10 @@ def provenance_facts(provenance: Mapping) -> dict:
     """Return provenance.json with every key that the page reads, in a form fit to print."""
     config = provenance.get("config") or {}
     campaign = str(provenance.get("campaign") or "")
+    every = provenance.get("inputs") or []
     inputs = [
         {"file": entry.get("file", ""), "size": entry.get("size"), "sha256": entry.get("sha256") or ""}
-        for entry in provenance.get("inputs") or []
+        for entry in every[:MOST_INPUTS]
     ]
     steps = [
         {**step, "finished_at": str(step.get("finished_at", "")).replace("T", " ").replace("+00:00", " UTC")}
@@ -109,8 +111,9 @@ def provenance_facts(provenance: Mapping) -> dict:
         "config_path": config.get("path"),
         "config_text": config.get("text", ""),
         "inputs": inputs,
+        "inputs_in_all": len(every),
         "steps": steps,
-        "bytes": sum(entry["size"] or 0 for entry in inputs),
+        "bytes": sum(entry.get("size") or 0 for entry in every),
     }
 
 

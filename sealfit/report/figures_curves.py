@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from sealfit.config import Config
 from sealfit.report.axes import evenly, natural, padded, round_ticks
 from sealfit.report.numbers import count, given, number
+from sealfit.report.shown import MOST_PANELS, rms, telling
 from sealfit.report.style import AFTER, CYCLE, FLOOR, QUIET, SKY, Key, Panel, Plot
 from sealfit.report.symbols import ConditionNames, is_unaged, joined, plain, short, symbol_plain
 from sealfit.tables import Units
@@ -68,16 +69,24 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     quantities = list(dict.fromkeys(curves["quantity"]))
     points = aging_points(tables["steady_fit"], quantities, names)
     series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural((names(s), None)))
+    misfit = _law_misfits(points, curves) if len(series) > MOST_PANELS else {}
+    series, note = telling(
+        series,
+        [misfit.get(s, np.nan) for s in series],
+        [names.number(s, "temperature_C") for s in series],
+        "series",
+    )
+    if note:
+        note += " All stand in steady_fit.parquet and aging_curves.parquet."
     rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
     shown = pd.concat([curves["value"], curves["lo95"], curves["hi95"], points["value"]]).dropna()
     span = padded(shown.quantile(0.002), shown.quantile(0.998))
     right = max(curves["aging_days"].max(), points["aging_days"].max() if len(points) else 0.0)
+    unaged = points["series"].map(is_unaged).astype(bool)
     panels = []
     for name in series:
         curve = curves[curves["series"] == name]
-        own = points["series"] == name
-        start = points["series"].map(is_unaged).astype(bool) & (points["rubber"] == rubber.get(name))
-        here = points[own | start]
+        here = points[(points["series"] == name) | (unaged & (points["rubber"] == rubber.get(name)))]
 
         def draw(ax: Axes, here=here, curve=curve) -> None:
             draw_aging(ax, here, curve, config.units)
@@ -90,14 +99,26 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         panels.append(Panel(short(names(name)), alt, draw))
     legend = [Key(q, CYCLE[k % len(CYCLE)], symbol=True) for k, q in enumerate(quantities)]
     legend += [Key("fit per condition, 95 %", FLOOR, "point"), Key("aging law, 95 % band", FLOOR, "band")]
-    return Plot("aging", "Aging", tuple(panels), tuple(legend))
+    return Plot("aging", "Aging", tuple(panels), tuple(legend), note)
+
+
+def _law_misfits(points: pd.DataFrame, curves: pd.DataFrame) -> dict[str, float]:
+    """Return how far the conditions of every series lie from its law, as an rms of all coefficients."""
+    laws = {place: curve.sort_values("aging_days") for place, curve in curves.groupby(["series", "quantity"])}
+    gaps: dict[str, list[float]] = {}
+    for (name, quantity), own in points.groupby(["series", "quantity"]):
+        if (law := laws.get((name, quantity))) is not None:
+            expected = np.interp(own["aging_days"].astype(float), law["aging_days"], law["value"].astype(float))
+            gaps.setdefault(name, []).extend((own["value"].astype(float) - expected).tolist())
+    return {name: rms(values) for name, values in gaps.items()}
 
 
 def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str], names: ConditionNames) -> pd.DataFrame:
     """Return the identified coefficients of every condition with the days they belong to."""
     rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["identified"].astype(bool)]
     rows = rows[rows["parameter"].isin(list(quantities))]
-    days = [0.0 if is_unaged(c) else float(names.parts(c).get("aging_days", "nan")) for c in rows["condition"]]
+    of = {c: 0.0 if is_unaged(c) else names.number(c, "aging_days") for c in rows["condition"].unique()}
+    days = rows["condition"].map(of).astype(float)
     columns = ["series", "rubber", "value", "lo95", "hi95"]
     return rows[columns].assign(quantity=rows["parameter"], aging_days=days)
 

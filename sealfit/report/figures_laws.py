@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from sealfit.config import Config
 from sealfit.report.axes import padded
 from sealfit.report.numbers import given, number
+from sealfit.report.shown import MOST_KEYS, MOST_PANELS, spread
 from sealfit.report.style import BLACK, FLOOR, Key, Panel, Plot, shades
 from sealfit.report.symbols import plain, symbol_math, symbol_plain
 from sealfit.tables import Units
@@ -64,8 +65,8 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
     celsius = np.sort(table["temperature_C"].dropna().unique())
     colours = dict(zip(celsius.tolist(), shades(len(celsius)), strict=True))
     several = table["rubber"].nunique() > 1
-    panels = []
-    for (rubber, quantity), rows in table.groupby(["rubber", "quantity"], sort=False):
+    panels, groups = [], list(table.groupby(["rubber", "quantity"], sort=False))
+    for (rubber, quantity), rows in spread(groups, MOST_PANELS):
         span = padded(rows["value"].min(), rows["value"].max())
 
         def draw(ax: Axes, rows=rows, span=span) -> None:
@@ -75,6 +76,7 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
         title = f"{rubber}, {symbol_plain(quantity)}" if several else symbol_plain(quantity)
         alt = f"Master curve of {title}: from {number(rows['value'].max())} to {number(rows['value'].min())}."
         panels.append(Panel(title, alt, draw))
-    legend = [Key(f"{given(t)} °C", colour, "point") for t, colour in colours.items()]
+    legend = [Key(f"{given(t)} °C", colour, "point") for t, colour in spread(list(colours.items()), MOST_KEYS)]
     legend += [Key("unaged", BLACK, "point"), Key("law, 95 % band", FLOOR, "band")]
-    return Plot("master_curve", "Master curve", tuple(panels), tuple(legend))
+    note = "" if len(groups) == len(panels) else f"{len(panels)} of {len(groups)}; all stand in master_curve.parquet."
+    return Plot("master_curve", "Master curve", tuple(panels), tuple(legend), note)

@@ -12,6 +12,7 @@ from sealfit.config import Config
 from sealfit.report.axes import capital, category_ticks, is_logarithmic, log_axis, value_ticks
 from sealfit.report.figures_speed import LOG_SPAN as SPEED_SPAN
 from sealfit.report.numbers import number, p_value
+from sealfit.report.shown import MOST_MARKS
 from sealfit.report.style import AFTER, BEFORE, FLOOR, QUIET, Key, Panel, Plot
 from sealfit.report.symbols import channel_label, channel_words, effect_label, plain, short, symbol_math, symbol_plain
 from sealfit.tables import Units
@@ -62,6 +63,7 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
             capsize=0.0 if many else 1.8,
             markeredgewidth=0.6 if many else 0.9,
             zorder=2 if stage == "before" else 3,
+            rasterized=len(rows) > MOST_MARKS,
         )
     if log:
         log_axis(ax)

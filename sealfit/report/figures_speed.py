@@ -12,11 +12,13 @@ from matplotlib.axes import Axes
 from sealfit.config import Config
 from sealfit.report.axes import capital, in_order, is_number, log_axis, natural, padded
 from sealfit.report.numbers import count, number
+from sealfit.report.shown import MOST_KEYS, MOST_MARKS, MOST_PANELS, condition_misfits, rms, spread, telling
 from sealfit.report.style import BLACK, CYCLE, FLOOR, HEIGHT, Key, Panel, Plot, shades
 from sealfit.report.symbols import ConditionNames, channel_words, is_unaged, plain, short
 from sealfit.tables import Units
 
-MOST_COLOURS = 10  # in one panel; with more, each value of the last condition column has its own
+MOST_CURVES = 24  # in one panel
+MOST_COLOURS = 10  # in one panel; with more, each condition has its own, or numbers are thinned
 TALL = 3.1  # inches, where one or two panels hold everything
 LOG_SPAN = 20.0  # speeds that span this factor are drawn on a logarithmic axis
 
@@ -49,6 +51,7 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
     log : bool
         Whether the speed axis is logarithmic.
     """
+    dense = sum(len(line.points) for line in lines) > MOST_MARKS
     for line in lines:
         for curve in line.curves:
             ax.fill_between(curve["speed"], curve["lo"], curve["hi"], color=line.colour, alpha=0.2, linewidth=0)
@@ -67,7 +70,8 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
                 markerfacecolor=line.colour if direction > 0 else "white",
                 markeredgewidth=0.9,
                 elinewidth=0.8,
-                capsize=1.5,
+                capsize=0.0 if dense else 1.5,
+                rasterized=dense,
             )
     if log:
         log_axis(ax)
@@ -90,6 +94,7 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     groups = _groups([c for c in conditions if not is_unaged(c)], names, last)
     if not groups:
         groups = {"": unaged}
+    groups, note = _telling(groups, len(conditions) - len(unaged), tables, names)
     levels = in_order({names.parts(c).get(last, "") for group in groups.values() for c in group} - {""})
     numeric = all(is_number(level) for level in levels)
     colour = dict(zip(levels, shades(len(levels)) if numeric else _cycle(len(levels)), strict=True))
@@ -101,6 +106,13 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     shown = pd.concat([shown, curves["after"], curves["before"]]).dropna()
     span = padded(shown.min(), shown.max())
     x_span = (speeds.min() / 1.2 if log else 0.0, speeds.max() * (1.2 if log else 1.06))
+    drawn = {*unaged, *(c for group in groups.values() for c in group)}
+    most = max(2, MOST_CURVES // max(len(group) for group in groups.values()))  # of a condition: directions and loads
+    own_curves = {
+        c: tuple(spread([part for _, part in own.groupby(["direction", "load"], dropna=False)], most))
+        for c, own in curves[curves["condition"].isin(drawn)].groupby("condition")
+    }
+    own_points = dict(list(points.groupby("condition", sort=False)))
     panels = []
     for title, group in groups.items():
         shared = [c for c in unaged if c not in group and rubber.get(c) in {rubber.get(g) for g in group}]
@@ -108,10 +120,8 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
             Line(
                 names(c),
                 BLACK if is_unaged(c) else colour[names.parts(c)[last]],
-                tuple(
-                    part for _, part in curves[curves["condition"] == c].groupby(["direction", "load"], dropna=False)
-                ),
-                points[points["condition"] == c],
+                own_curves.get(c, ()),
+                own_points.get(c, points.iloc[:0]),
             )
             for c in [*shared, *group]
         ]
@@ -123,8 +133,8 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
                 height=HEIGHT if len(groups) > 2 else TALL,
             )
         )
-    legend = [Key(short(names(c)), BLACK) for c in unaged]
-    legend += [Key(short(_level_label(last, level, names)), colour[level]) for level in levels]
+    legend = [Key(short(names(c)), BLACK) for c in spread(unaged, MOST_KEYS)]
+    legend += [Key(short(_level_label(last, level, names)), colour[level]) for level in spread(levels, MOST_KEYS)]
     both = points["direction"].nunique() > 1
     legend.append(Key("run means, forward" if both else "run means", FLOOR, "point"))
     if both:
@@ -138,9 +148,8 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         if _differ(curves):
             legend.append(Key("declared model", FLOOR, "dotted"))
     quantity = config.units.quantity("force")
-    return Plot(
-        "force_speed", f"{capital(quantity)} against {config.units.quantity('speed')}", tuple(panels), tuple(legend)
-    )
+    title = f"{capital(quantity)} against {config.units.quantity('speed')}"
+    return Plot("force_speed", title, tuple(panels), tuple(legend), note)
 
 
 def _force_drawer(lines, config: Config, log: bool, span, x_span) -> Callable[[Axes], None]:
@@ -232,9 +241,29 @@ def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict
     groups = {
         t: in_order(g, key=lambda c: names.parts(c).get(last, "")) for t, g in sorted(groups.items(), key=natural)
     }
-    if any(len(group) > MOST_COLOURS for group in groups.values()):
-        return {names(c): [c] for group in groups.values() for c in group}
-    return groups
+    if all(len(group) <= MOST_COLOURS for group in groups.values()):
+        return groups
+    if len(conditions) > MOST_PANELS and all(is_number(names.parts(c).get(last, "")) for c in conditions):
+        return {title: spread(group, MOST_COLOURS) for title, group in groups.items()}  # numbers have an order
+    return {names(c): [c] for group in groups.values() for c in group}
+
+
+def _telling(
+    groups: dict[str, list[str]], aged: int, tables: Mapping[str, pd.DataFrame], names: ConditionNames
+) -> tuple[dict[str, list[str]], str]:
+    """Return the panels that are drawn, and in words which of how many, and of how many conditions, they are."""
+    misfit = condition_misfits(tables) if len(groups) > MOST_PANELS else {}
+    titles, note = telling(
+        list(groups),
+        [rms(misfit.get(c, np.nan) for c in group) for group in groups.values()],
+        [np.fmax.reduce([names.number(c, "temperature_C") for c in group]) for group in groups.values()],
+        "panels",
+    )
+    groups = {title: groups[title] for title in titles}
+    drawn = sum(len(group) for group in groups.values())
+    if drawn < aged:
+        note = f"{note} Of {count(aged, 'condition')} {drawn} are in them.".strip()
+    return groups, f"{note} All stand in steady.parquet and curves.parquet." if note else ""
 
 
 def _differ(curves: pd.DataFrame) -> bool:

@@ -89,6 +89,7 @@ def _content(
     fitted += parameter_tables(tables["aging_fit"], "series", config)
     dynamic = tables["dynamic_fit"]
     fitted += parameter_tables(dynamic[dynamic["quantity"] == "dynamic"], "condition", config)
+    break_aways, break_aways_in_all = break_away_rows(dynamic, config)
     findings, in_all = facts.quality_findings(tables["quality"], config)
     return {
         "closure": closure,
@@ -106,7 +107,8 @@ def _content(
         "aging_fitted": len(tables["aging_fit"]) > 0,
         "aging": config.aging,
         "laws": law_rows(tables["aging_laws"]),
-        "break_aways": break_away_rows(dynamic, config),
+        "break_aways": break_aways,
+        "break_aways_in_all": break_aways_in_all,
         "condition_key": ConditionNames.of(config).key,
         "sensor": config.sensor,
         "unit": config.units.unit("force"),
@@ -135,7 +137,7 @@ def _images(plot: Plot, drawn: Drawn) -> dict:
         {"label": symbol_html(key.label) if key.symbol else key.label, "colour": key.colour, "mark": key.mark}
         for key in plot.legend
     ]
-    return {"title": plot.title, "panels": panels, "legend": legend}
+    return {"title": plot.title, "panels": panels, "legend": legend, "note": plot.note}
 
 
 def _environment() -> Environment:

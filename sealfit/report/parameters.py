@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pandas as pd
 from markupsafe import Markup
 
 from sealfit.config import Config
 from sealfit.report.axes import natural
-from sealfit.report.numbers import NOTHING, given, known, measured, number
+from sealfit.report.numbers import NOTHING, count, given, known, measured, number
+from sealfit.report.shown import MOST_ROWS, spread
 from sealfit.report.symbols import ConditionNames, is_unaged, quantity_words, symbol_html, true_units
 
 STATISTICS = (
@@ -18,6 +19,7 @@ STATISTICS = (
     "n_runs", "n_files", "n_speeds", "n_days", "last_day",
 )  # fmt: skip
 ENDS = ("value", "lo95", "hi95")
+MOST_BREAK_AWAYS = 600
 HIDDEN = ("covariance", "sensor_shift")  # for programs; they stand in the Parquet tables
 
 Rows = dict[tuple[str, str], dict]  # of one condition or series, by parameter and unit
@@ -45,10 +47,11 @@ class ParameterTable:
     groups: tuple[tuple[Markup, str], ...]
     rows: tuple[tuple[tuple[str | Markup, ...], tuple[Cell, ...], Markup], ...]
     single: bool = False  # values only: statistics have neither interval nor u_sys
+    note: str = ""  # which of how many there are, where they are too many
 
 
-def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> list[dict]:
-    """Return the break-aways that stand above the sliding force, as plain values for the page.
+def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
+    """Return the break-aways that stand above the sliding force, as plain values for the page, and how many there are.
 
     Parameters
     ----------
@@ -62,13 +65,13 @@ def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> list[dict]:
     groups: dict[tuple, dict[str, dict]] = {}
     for row in _records(dynamic_fit[dynamic_fit["quantity"] == "break_away"], *keys):
         groups.setdefault(tuple(row[name] for name in keys), {})[row["parameter"]] = row
-    for (condition, speed, direction), by in groups.items():
-        ratio = by["F_ba/F"]
-        if ratio["reason"] or not ratio["identified"]:
-            continue
+    ratios = {place: by["F_ba/F"] for place, by in groups.items()}
+    above = [place for place, ratio in ratios.items() if ratio["identified"] and not ratio["reason"]]
+    for condition, speed, direction in spread(above, MOST_BREAK_AWAYS):
+        by, ratio = groups[condition, speed, direction], ratios[condition, speed, direction]
         force, interval = measured(*(by["F_ba"][name] for name in ENDS))
-        above = (None if ratio[name] is None else 100.0 * (ratio[name] - 1.0) for name in ENDS)
-        share, share_interval = measured(*above)
+        percents = (None if ratio[name] is None else 100.0 * (ratio[name] - 1.0) for name in ENDS)
+        share, share_interval = measured(*percents)
         found.append(
             {
                 "condition": names(condition),
@@ -80,7 +83,7 @@ def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> list[dict]:
                 "share_interval": share_interval,
             }
         )
-    return found
+    return found, len(above)
 
 
 def parameter_tables(fit: pd.DataFrame, key: str, config: Config) -> list[ParameterTable]:
@@ -106,6 +109,7 @@ def parameter_tables(fit: pd.DataFrame, key: str, config: Config) -> list[Parame
         quantity: tuple(dict.fromkeys(zip(rows["parameter"], rows["unit"].fillna(""), strict=True)))
         for quantity, rows in fit.groupby("quantity", sort=False)
     }
+    fit, note = _readable(fit, key, names)
     tables = []
     for parameters in dict.fromkeys(of_quantity.values()):
         quantities = [quantity for quantity, own in of_quantity.items() if own == parameters]
@@ -114,7 +118,19 @@ def parameter_tables(fit: pd.DataFrame, key: str, config: Config) -> list[Parame
             tables.append(_statistics(rows, key, names, config))
         else:
             tables.append(_table(rows, key, quantities, parameters, names, config))
-    return tables
+    return [replace(table, note=note) for table in tables]
+
+
+def _readable(fit: pd.DataFrame, key: str, names: ConditionNames) -> tuple[pd.DataFrame, str]:
+    """Return the rows of as many conditions or series as one reads, and in words which they are."""
+    every = sorted(fit[key].unique(), key=lambda name: _place(name, names))
+    if len(every) <= MOST_ROWS:
+        return fit, ""
+    stored = "aging_fit" if key == "series" else "dynamic_fit" if "dynamic" in set(fit["quantity"]) else "steady_fit"
+    note = (
+        f"{MOST_ROWS} of {count(len(every), key, key if key == 'series' else None)}, spread evenly over all of them; "
+    )
+    return fit[fit[key].isin(spread(every, MOST_ROWS))], f"{note}the others stand in {stored}.parquet."
 
 
 def _table(
@@ -161,8 +177,13 @@ def _rows_of(fit: pd.DataFrame, key: str, second: str, names: ConditionNames) ->
     found: dict[tuple[str, str], Rows] = {}
     for row in _records(fit, key, second):
         found.setdefault((row[key], row[second]), {})[row["parameter"], row["unit"] or ""] = row
-    spelled = {name: (not is_unaged(name), natural((names(name), None))) for name, _ in found}
-    return sorted(found.items(), key=lambda entry: spelled[entry[0][0]])
+    places = {name: _place(name, names) for name, _ in found}
+    return sorted(found.items(), key=lambda entry: places[entry[0][0]])
+
+
+def _place(name: str, names: ConditionNames) -> tuple[bool, list]:
+    """Return a sort key of a condition or series."""
+    return not is_unaged(name), natural((names(name), None))
 
 
 def _records(rows: pd.DataFrame, *keys: str) -> list[dict]:

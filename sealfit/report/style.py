@@ -95,12 +95,13 @@ class Panel:
 
 @dataclass(frozen=True)
 class Plot:
-    """Panels that belong together, with one legend."""
+    """Panels that belong together, with one legend; a note says what of a large campaign is left out."""
 
     name: str
     title: str
     panels: tuple[Panel, ...]
     legend: tuple[Key, ...] = ()
+    note: str = ""
 
 
 @contextmanager

@@ -196,6 +196,13 @@ class ConditionNames:
             return {}
         return dict(zip(pieces[1::2], pieces[2::2], strict=True))
 
+    def number(self, text: object, column: str) -> float:
+        """Return a condition's value of a column as a number; NaN where it has none."""
+        try:
+            return float(self.parts(text).get(column, "nan"))
+        except ValueError:
+            return float("nan")
+
     @property
     def key(self) -> str:
         """What the values stand for, in their order; "" for a single one, which needs no telling apart."""

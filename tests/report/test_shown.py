@@ -1,0 +1,138 @@
+import numpy as np
+import numpy.testing as npt
+import pandas as pd
+import pytest
+from report.made_campaigns import aging_campaign
+from report.made_tables import table
+
+from sealfit.config import Config
+from sealfit.report import facts
+from sealfit.report.drawn import draw
+from sealfit.report.figures_curves import aging
+from sealfit.report.figures_speed import force_speed
+from sealfit.report.page import build_report
+from sealfit.report.parameters import break_away_rows, parameter_tables
+from sealfit.report.shown import condition_misfits, spread, telling
+
+TEMPERATURES = (20, 30, 40, 50, 60, 70, 80)
+
+
+@pytest.fixture(scope="module")
+def large():
+    """Return 14 series of two days, more than a figure shows; the one at 30 °C and 80 % fits worst."""
+    made = aging_campaign(temperatures=TEMPERATURES, days=(1, 4), speeds=(1, 10), bins_per_file=2, trace_points=5)
+    after = made.tables["residuals_after"]
+    worst = (after["temperature_C"] == 30) & (after["compression_ratio_pct"] == 80)
+    made.tables["residuals_after"] = after.assign(residual_N=after["residual_N"].where(~worst, 9.0))
+    return made
+
+
+def test_few_are_all_shown():
+    assert telling(list("abc"), [1.0, 2.0, 3.0], [1.0, 2.0, 3.0], "series") == (["a", "b", "c"], "")
+
+
+def test_many_show_the_worst_the_hottest_and_the_rest_spread():
+    misfit, heat = np.zeros(100), np.repeat(np.arange(10.0), 10)
+    misfit[[3, 50, 51, 52]] = [4.0, 3.0, 2.0, 1.0]
+    picked, words = telling(range(100), misfit, heat, "series")
+    assert set(picked) >= {3, 50, 51, 52, 90, 91, 92, 93, 0, 99}
+    assert len(picked) == 12
+    assert picked == sorted(picked)
+    assert words == (
+        "12 of 100 series are drawn: the 4 with the largest misfit, the 4 hottest and 4 spread over the others."
+    )
+
+
+def test_without_misfit_or_heat_the_shown_are_spread_evenly():
+    picked, words = telling(range(23), [np.nan] * 23, [60.0] * 23, "series")
+    assert picked == list(range(0, 23, 2))
+    assert words == "12 of 23 series are drawn: spread evenly."
+    assert spread(range(23), 12) == picked
+
+
+def test_the_misfit_is_that_of_the_loop_else_that_of_the_fit():
+    residuals = pd.DataFrame({"condition": ["a", "a", "b"], "residual_N": [3.0, 4.0, 1.0]})
+    fit = pd.DataFrame({"condition": ["a", "b"], "parameter": ["rmse_N", "mu_s"], "value": [0.3, 0.9]})
+    found = condition_misfits({"residuals_after": residuals, "steady_fit": fit})
+    npt.assert_allclose([found["a"], found["b"]], [np.sqrt(12.5), 1.0])
+    assert condition_misfits({"residuals_after": residuals.iloc[:0], "steady_fit": fit}) == {"a": 0.3}
+
+
+@pytest.mark.parametrize("figure", [force_speed, aging])
+def test_a_large_campaign_shows_twelve_panels_and_says_of_how_many(figure, large):
+    plot = figure(large.tables, large.config)
+    assert len(plot.panels) == 12
+    assert plot.note.startswith("12 of 14 ")
+    assert ".parquet" in plot.note
+    titles = [panel.title for panel in plot.panels]
+    assert {"30 °C · 80 %"} <= set(titles) or figure is aging
+    assert {"80 °C · 80 %", "80 °C · 100 %"} <= set(titles)
+    assert titles == sorted(titles, key=lambda title: [int(word) for word in title.split() if word.isdigit()])
+
+
+def test_the_page_says_what_is_not_drawn(large):
+    html = build_report(*large.arguments).html
+    assert "12 of 14 panels are drawn" in html
+    assert "12 of 14 series are drawn" in html
+
+
+def steady_rows(days, runs=1):
+    names = [f"temperature_C=60, compression_ratio_pct={p}, aging_days={d}" for p in range(70, 84) for d in days]
+    rows = pd.DataFrame({"condition": np.repeat(names, runs), "rubber": "rubber", "direction": 1, "used": True})
+    rows = rows.assign(run_id=[f"r{k}" for k in range(len(rows))], force_N=10.0, load_N=1.0)
+    return rows.assign(speed_mm_s=1.0 + np.arange(len(rows)) % runs, file=rows["run_id"])
+
+
+def drawn_of(rows):
+    names = ("curves", "steady_fit", "residuals_after")
+    return force_speed({**facts.complete({}, names), "steady": rows}, Config())
+
+
+def test_many_days_of_a_series_are_thinned():
+    plot = drawn_of(steady_rows(range(1, 21)))
+    assert len(plot.panels) == 12
+    assert "Of 280 conditions 120 are in them." in plot.note
+    assert len(plot.legend) < 20
+
+
+def test_many_points_are_drawn_as_pixels():
+    few, many = draw(drawn_of(steady_rows((1, 2)))), draw(drawn_of(steady_rows((1, 2), runs=200)))
+    assert "<image" not in few.panels[0].svg
+    assert "<image" in many.panels[0].svg
+    assert len(many.svg) < 4 * len(few.svg)
+
+
+# ---------------------------------------------------------------- tables
+def fits(n, quantity="steady"):
+    rows = [{"temperature_C": 20.0 + k, "compression_ratio_pct": 80.0, "aging_days": 1.0, "quantity": quantity,
+             "parameter": "mu_s", "value": 0.9, "unit": "", "identified": True} for k in range(n)]  # fmt: skip
+    frame = pd.DataFrame(rows)
+    names = [f"temperature_C={t:g}, compression_ratio_pct=80, aging_days=1" for t in frame["temperature_C"]]
+    return table("steady_fit", frame.assign(condition=names))
+
+
+def test_long_parameter_tables_are_cut_and_say_where_the_rest_is():
+    (found,) = parameter_tables(fits(301), "condition", Config())
+    assert len(found.rows) == 200
+    assert found.rows[0][0] == ("20 °C · 80 % · 1 d",)
+    assert found.rows[-1][0] == ("320 °C · 80 % · 1 d",)
+    assert found.note.startswith("200 of 301 conditions")
+    assert "steady_fit.parquet" in found.note
+    assert parameter_tables(fits(200), "condition", Config())[0].note == ""
+
+
+def test_break_aways_are_cut_and_counted():
+    one = {"quantity": "break_away", "direction": 1, "unit": "", "identified": True, "lo95": 1.0, "hi95": 2.0}
+    rows = [{**one, "condition": f"c{k}", "parameter": p, "value": 1.5} for k in range(700) for p in ("F_ba", "F_ba/F")]
+    frame = pd.DataFrame(rows).assign(speed_set_mm_s=5.0, u_sys=np.nan, reason="")
+    rows, in_all = break_away_rows(frame, Config())
+    assert (len(rows), in_all) == (600, 700)
+    assert (rows[0]["share"], rows[0]["share_interval"]) == ("50", "[0, 100]")
+
+
+def test_inputs_are_cut_and_counted():
+    every = [{"file": f"{k}.csv", "size": 10, "sha256": "ab"} for k in range(2500)]
+    found = facts.provenance_facts({"inputs": every})
+    assert (len(found["inputs"]), found["inputs_in_all"], found["bytes"]) == (2000, 2500, 25000)
+    html = build_report({}, None, {"inputs": every}, Config()).html
+    assert "The first 2000 of 2500; all of them stand in inputs.parquet." in html
