@@ -84,8 +84,10 @@ def close_loop(
             grown = grow(coarse, samples, config, effects, fine=fine, on_found=heldout.begin, on_progress=say)
         say("before and after on all rows")
         with timed("before and after", rows=rows.force.size, of="bins"):
-            before, after = (_on_all(rows, grown, f) if merged else f for f in (grown.before, grown.after))
-            after = after if grown.added else before
+            before = _on_all(rows, grown, grown.before) if merged else grown.before
+            after = before
+            if grown.added:
+                after = _on_all(rows, grown, grown.after) if merged else grown.after
         say(f"held out by {heldout.level}: the search repeated without each fold")
         with timed("held out", rows=len(heldout.masks), of="folds"):
             held_before, held_after = heldout.forces(grown, say)

@@ -8,6 +8,9 @@ from sealfit.fit.declared import SAME_SPEED, JointParameter, declare
 from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows
 
+GRID = 80  # values of v_s
+RANK = 1e-10  # of the largest singular value, below which columns are as good as dependent
+
 
 def start_model(rows: Rows, *, together: bool = False) -> Model:
     """Return the declared model with v_s and b from a global search and the rest from exact least squares.
@@ -64,24 +67,72 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
 
 def _per_condition(speed, load, size, condition, full: bool):
     """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of one series by a grid over v_s, the rest exact."""
-    own = np.unique(condition)
-    inside = (condition[:, None] == own[None, :]).astype(float) * load[:, None]
-    grid = np.geomspace(*stribeck_range(speed), 80) if full else np.array([1.0])
+    own, code = np.unique(condition, return_inverse=True)
+    grid = np.geomspace(*stribeck_range(speed), GRID) if full else np.array([1.0])
     best, answer = np.inf, None
     for v_s in grid:
         decay = np.exp(-((speed / v_s) ** 2)) if full else np.zeros_like(speed)
-        parts = [inside * (1 - decay)[:, None], speed[:, None]]
-        if full:
-            parts.insert(0, inside * decay[:, None])
-        columns = np.column_stack(parts)
-        solution, *_ = np.linalg.lstsq(columns, size, rcond=1e-10)
-        cost = float(((size - columns @ solution) ** 2).sum())
+        pairs, sigma_2 = pairs_and_shared(np.column_stack([load * decay, load * (1 - decay)]), code, speed, size)
+        fitted = load * (decay * pairs[code, 0] + (1 - decay) * pairs[code, 1]) + sigma_2 * speed
+        cost = float(((size - fitted) ** 2).sum())
         if cost < best:
-            best, answer = cost, (solution, v_s)
-    solution, v_s = answer
-    mu_s = solution[: own.size]
-    mu_c = solution[own.size : 2 * own.size] if full else solution[: own.size]
-    return {int(c): (s, k) for c, s, k in zip(own, mu_s, mu_c, strict=True)}, float(solution[-1]), float(v_s)
+            best, answer = cost, (pairs, sigma_2, v_s)
+    pairs, sigma_2, v_s = answer
+    mu_s, mu_c = pairs.T if full else (pairs[:, 1], pairs[:, 1])
+    return {int(c): (s, k) for c, s, k in zip(own, mu_s, mu_c, strict=True)}, float(sigma_2), float(v_s)
+
+
+def pairs_and_shared(
+    columns: np.ndarray, code: np.ndarray, shared: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the least squares of two numbers per group and one that all share, the smallest where many fit.
+
+    Each group's two columns are made orthogonal and taken out, which leaves one equation for the shared number.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (n, 2)
+        What a group's own numbers multiply.
+    code : ndarray, shape (n,)
+        Group of each value, from 0 on.
+    shared, values : ndarray, shape (n,)
+        What the shared number multiplies; the values.
+
+    Returns
+    -------
+    tuple
+        Pairs, shape (groups, 2), and the shared number.
+    """
+    one, length = _unit(columns[:, 0], code)
+    along = np.bincount(code, one * columns[:, 1])
+    two, rest = _unit(columns[:, 1] - along[code] * one, code)
+    triangle = np.zeros((length.size, 2, 2))
+    triangle[:, 0, 0], triangle[:, 0, 1], triangle[:, 1, 1] = length, along, rest
+    left, spread, right = np.linalg.svd(triangle)
+    least = RANK * max(float(spread.max()), float(np.linalg.norm(shared)), 1e-300)
+    inverse = np.divide(1.0, spread, out=np.zeros_like(spread), where=spread > least)
+
+    def taken(column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a column's coefficients on the groups' own, shape (groups, 2), and what is left of it."""
+        inside = np.column_stack([np.bincount(code, one * column), np.bincount(code, two * column)])
+        kept = np.einsum("gji,gj->gi", left, inside) * (inverse > 0)
+        pairs = np.einsum("gji,gj->gi", right, kept * inverse)
+        return pairs, column - (pairs[code] * columns).sum(axis=1)
+
+    of_shared, shared_left = taken(shared)
+    of_values, values_left = taken(values)
+    square = float(shared_left @ shared_left)
+    if np.sqrt(square) > least:
+        number = float(shared_left @ values_left) / square
+    else:
+        number = float((of_values * of_shared).sum()) / (1.0 + float((of_shared**2).sum()))
+    return of_values - number * of_shared, number
+
+
+def _unit(column: np.ndarray, code: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a column made of length 1 in each group, and its lengths; zeros stay."""
+    length = np.sqrt(np.bincount(code, column**2))
+    return column * np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)[code], length
 
 
 def stribeck_range(speeds: np.ndarray) -> tuple[float, float]:
