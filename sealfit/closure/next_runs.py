@@ -20,6 +20,7 @@ from sealfit.fit.rows import POWER, Rows, sliding_power
 
 BEYOND = 0.5  # of a channel's range by which a run may go beyond what was tested
 SHOWN = 0.5  # of its size by which a run must show an effect to be worth making for it
+TIE = 1e-9  # relative: closer than that, only rounding tells runs apart
 ROWS = 4  # of each stroke at which forces are compared
 
 
@@ -118,8 +119,8 @@ def where_apart(
         moved = _moved(rows, changes)
         apart = np.abs(evaluate(chosen, moved, jacobian=False)[0] - evaluate(rival, moved, jacobian=False)[0])
         apart = np.where(np.isfinite(apart), apart, 0.0)
-        k = int(np.argmax(apart))
-        if apart[k] > (0.0 if best is None else best[1]):
+        k = int(np.argmax(apart >= apart.max() * (1 - TIE)))  # the first of those that only rounding tells apart
+        if apart[k] > (0.0 if best is None else best[1] * (1 + TIE)):
             names = dict.fromkeys((*config.condition, "speed_mm_s", *channels))
             where = {name: _plain(moved.table[name].iloc[k]) for name in names if name in moved.table}
             best = (where, float(apart[k]))
