@@ -19,6 +19,7 @@ from sealfit.closure.few import FewUnits
 from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge, Judgement, log_p_of, wald
 
 FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
+MOST_SIGNS = 1 << 22  # drawn at once: 34 MB
 SEARCHES = 2  # single channels and pairs of them: each search has half of the error
 
 
@@ -43,19 +44,32 @@ def adjust(
 
     Those of one level are flipped with the same signs, so that what they share counts once.
     """
-    alike = defaultdict(list)
+    alike = defaultdict(lambda: defaultdict(list))
     for judgement, level in zip(judgements, levels, strict=True):
-        alike[level, judgement.units, judgement.scores.shape[1]].append(judgement.scores)
-    signs = {
-        place: rng.choice([-1.0, 1.0], size=(flips, place[1])) for place in dict.fromkeys(key[:2] for key in alike)
-    }
+        alike[level, judgement.units][judgement.scores.shape[1]].append(judgement.scores)
     least = np.zeros(flips)
-    for (level, units, df), scores in alike.items():
-        most = np.zeros(flips)  # the largest T has the smallest p-value where units and df are the same
-        for own in scores:
-            most = np.maximum(most, wald(signs[level, units] @ own, own))
-        least = np.minimum(least, log_p_of(most, df, units))
+    for (_, units), by_df in alike.items():
+        scores = np.column_stack([own for scores in by_df.values() for own in scores])
+        totals = _flipped(scores, flips, rng)
+        first = 0
+        for df, scores in by_df.items():
+            most = np.zeros(flips)  # the largest T has the smallest p-value where units and df are the same
+            for own in scores:
+                most = np.maximum(most, wald(totals[:, first : first + df], own))
+                first += df
+            least = np.minimum(least, log_p_of(most, df, units))
     return _adjusted([j.log_p for j in judgements], least)
+
+
+def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the sums of scores, shape (units, m), under random signs -> (flips, m); a few flips at a time."""
+    part = max(1, MOST_SIGNS // scores.shape[0])
+    return np.concatenate(
+        [
+            rng.choice([-1.0, 1.0], size=(min(part, flips - first), scores.shape[0])) @ scores
+            for first in range(0, flips, part)
+        ]
+    )
 
 
 def adjust_few(
