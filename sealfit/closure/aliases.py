@@ -81,7 +81,7 @@ def _at_grid(
             if np.isfinite(shape).all() and np.sqrt((shape**2).mean()) > NEGLIGIBLE:
                 column = slope * shape
                 white = fitted.whitening(column[:, None])[:, 0]
-                left = white - fitted.basis @ (fitted.basis.T @ white)
+                left = fitted.basis.freed(white)
                 amplitudes = {n: float(n == name) for n in effect.linear}
                 yield term, {**at, **amplitudes}, column, float(left @ left / (white @ white))
 
@@ -90,7 +90,7 @@ def _alias(fitted: Fitted, term: Term, values: Mapping[str, float], column: np.n
     size = SIZE * float(np.sqrt((fitted.rows.force**2).mean()))
     scale = size / float(np.sqrt((column**2).mean()))
     white = fitted.whitening(scale * column[:, None])[:, 0]
-    change = fitted.covariance @ (fitted.white_jacobian.T @ white)
+    change = fitted.covariance @ fitted.white_jacobian.against(white)
     scaled = {name: value * (scale if name in term.effect.linear else 1.0) for name, value in values.items()}
     chosen = {p.name: scaled[p.name] for p in term.effect.parameters}
     model = fitted.model

@@ -15,6 +15,7 @@ from sealfit.effects.contract import SECOND
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import point_rows
+from sealfit.fit.tangent import Tangent
 from sealfit.fit.terms import Term, term_derivatives
 from sealfit.tables import CHANNELS, CURVES, SHAPES
 
@@ -64,7 +65,7 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
         inputs, x, labels = _along(term, after)
         value = np.asarray(term.effect.shape(inputs, **values), dtype=float)
         tangent = np.column_stack([np.broadcast_to(d, value.shape) for d in term_derivatives(term, values, inputs)])
-        se = mean_se(tangent, covariance)
+        se = mean_se(Tangent.dense(tangent), covariance)
         free = _free_shape(after, number, x)
         unit = parameter_unit("{y}", term, config.units)
         for k in range(value.size):

@@ -23,8 +23,10 @@ from scipy.special import fdtrc
 
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.reml import orthonormal
+from sealfit.fit.tangent import Tangent
 from sealfit.fit.whitening import Whitening
 
+MANY = 100  # units from which their covariance is not made as a matrix
 LEAST_LEFT = 0.01  # of a number's variance: what the model has taken out beyond that is no number any more
 KNOWN = 8.0  # degrees of freedom that a variance counts for which runs and files explain
 LEAST_KNOWN = 0.5  # of these degrees of freedom; with fewer the scale is free and no draw depends on it
@@ -47,10 +49,46 @@ class Numbers(NamedTuple):
     """One number per specimen along the direction of one quantity."""
 
     direction: np.ndarray  # (n,) whitened slope, of length 1 in each specimen
-    taken: np.ndarray  # (units, p) of the model's basis along it
-    root: np.ndarray  # (d, units) makes the numbers independent, with variance 1
-    values: np.ndarray  # (d,)
+    taken: Tangent  # (units, p) of the model's basis along it
+    root: np.ndarray | Root  # (d, units) makes the numbers independent, with variance 1
+    values: np.ndarray  # (d,), or (units,) with zeros in the other directions
+    df: int  # d
     known: float  # degrees of freedom that the variance components count for
+
+
+class Root:
+    r"""A root of the inverse covariance, 1 - T T', of many units' numbers.
+
+    With :math:`T^T T = V S^2 V^T` it is :math:`1 + T V [(1 - S^2)^{-1/2} - 1] S^{-2} V^T T^T`, without the directions
+    of which next to nothing is left; only matrices of the size of the model are made.
+
+    Parameters
+    ----------
+    taken : Tangent, shape (units, p)
+        T, which is nothing where `moved` is false.
+    moved : ndarray of bool, shape (units,)
+        Which units the quantity moves.
+    """
+
+    def __init__(self, taken: Tangent, moved: np.ndarray) -> None:
+        share, axes = np.linalg.eigh(taken.gram())
+        kept = 1 - share > LEAST_LEFT
+        grown = np.where(kept, 1 / np.sqrt(np.where(kept, 1 - share, 1.0)) - 1, -1.0)
+        self.taken, self.moved, self.df = taken, moved, int(moved.sum() - (~kept).sum())
+        small = share < 1e-9  # the limit of the quotient
+        self.core = (axes * np.where(small, 0.5, grown / np.where(small, 1.0, share))) @ axes.T
+
+    def __matmul__(self, numbers: np.ndarray) -> np.ndarray:
+        """Return numbers of the units, shape (units,) or (units, k), made independent."""
+        return (numbers.T * self.moved).T + self.taken @ (self.core @ self.taken.against(numbers))
+
+
+def small_root(taken: Tangent, moved: np.ndarray) -> np.ndarray:
+    """Return the same for few units as a matrix of d rows, in the covariance's own axes, shape (d, units)."""
+    dense = taken.toarray()
+    share, axes = np.linalg.eigh(np.diag(moved.astype(float)) - dense @ dense.T)
+    kept = share > LEAST_LEFT
+    return axes[:, kept].T / np.sqrt(share[kept])[:, None]
 
 
 class FewUnits:
@@ -71,8 +109,7 @@ class FewUnits:
     @cached_property
     def _residual(self) -> np.ndarray:
         """Whitened residual less what priors and bounds have kept the fit from taking out of it, shape (n,)."""
-        basis, residual = self.fitted.basis, self.fitted.white_residual
-        return residual - basis @ (basis.T @ residual)
+        return self.fitted.basis.freed(self.fitted.white_residual)
 
     @cached_property
     def _finer(self) -> Whitening:
@@ -88,14 +125,13 @@ class FewUnits:
             white = fitted.whitening(fitted.slope(*target)[:, None])[:, 0]
             size = np.sqrt(groups.sums(white**2, self.level))
             direction = white * np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)[groups.codes[self.level]]
-            taken = groups.sums(direction[:, None] * fitted.basis, self.level)
-            share, axes = np.linalg.eigh(np.diag((size > 0).astype(float)) - taken @ taken.T)
-            kept = share > LEAST_LEFT
-            root = axes[:, kept].T / np.sqrt(share[kept])[:, None]
+            taken = fitted.basis.sums(groups, self.level, direction)
+            root = (Root if size.size > MANY else small_root)(taken, size > 0)
             values = root @ groups.sums(direction * self._residual, self.level)
+            df = root.df if isinstance(root, Root) else values.size
             finer = groups.sums(self._finer(fitted.slope(*target)[:, None])[:, 0] ** 2, self.level)
             explained = float(np.mean((size**2)[finer > 0] / finer[finer > 0]))
-            self._numbers[target] = Numbers(direction, taken, root, values, KNOWN * min(explained, 1.0))
+            self._numbers[target] = Numbers(direction, taken, root, values, df, KNOWN * min(explained, 1.0))
         return self._numbers[target]
 
     def test(self, left: np.ndarray, target: tuple[str, str]) -> FewTest | None:
@@ -103,26 +139,23 @@ class FewUnits:
         numbers = self.numbers(target)
         columns = self.fitted.rows.groups.sums(numbers.direction[:, None] * left, self.level)
         basis = orthonormal(numbers.root @ columns, 1e-3)
-        d, k = basis.shape
+        d, k = numbers.df, basis.shape[1]
         if k == 0 or d == k:
             return None
         chi2 = float(((numbers.values @ basis) ** 2).sum())
-        log_p = float(log_p_of(numbers.values[None, :], basis, numbers.known)[0])
+        log_p = float(log_p_of(numbers.values[None, :], basis, numbers.known, d)[0])
         share = float((columns**2).sum() / max((left**2).sum(), 1e-300))
         return FewTest(target, basis, numbers.known, chi2, log_p, share, d - k)
 
     def draws(self, count: int, rng: np.random.Generator) -> dict[tuple[str, str], np.ndarray]:
         """Return numbers as chance alone would give them, for each quantity of shape (count, d), correlated as here."""
         groups, known = self.fitted.rows.groups, list(self._numbers.values())
-        blocks = [
-            [
-                one.root
-                @ (np.diag(groups.sums(one.direction * other.direction, self.level)) - one.taken @ other.taken.T)
-                @ other.root.T
-                for other in known
-            ]
-            for one in known
-        ]
+
+        def covariance(one: Numbers, other: Numbers) -> np.ndarray:
+            alike = np.diag(groups.sums(one.direction * other.direction, self.level))
+            return one.root @ (alike - one.taken @ other.taken.toarray().T) @ other.root.T
+
+        blocks = [[covariance(one, other) for other in known] for one in known]
         size, axes = np.linalg.eigh(np.block(blocks))
         drawn = rng.standard_normal((count, size.size)) @ (axes * np.sqrt(np.maximum(size, 0.0))).T
         ends = np.cumsum([len(n.values) for n in known])[:-1]
@@ -134,9 +167,12 @@ class FewUnits:
         return found
 
 
-def log_p_of(values: np.ndarray, basis: np.ndarray, known: float) -> np.ndarray:
-    """Return the log p-value of F for rows of independent numbers, shape (m, d), against columns (d, k) -> (m,)."""
-    d, k = basis.shape
+def log_p_of(values: np.ndarray, basis: np.ndarray, known: float, d: int | None = None) -> np.ndarray:
+    """Return the log p-value of F for rows of d independent numbers, shape (m, d), against columns (d, k) -> (m,).
+
+    Both may have more places than d, in which neither holds anything.
+    """
+    d, k = d or basis.shape[0], basis.shape[1]
     explained = ((values @ basis) ** 2).sum(axis=1)
     left = np.maximum((values**2).sum(axis=1) - explained, 1e-300)
     df = known + d - k

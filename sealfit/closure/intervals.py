@@ -7,6 +7,7 @@ from scipy import stats
 
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import LEVELS
+from sealfit.fit.tangent import Tangent
 
 
 def degrees_of_freedom(fitted: Fitted) -> float:
@@ -25,8 +26,8 @@ def t_quantile(df: float) -> float:
 
 def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
     """Return the sandwich covariance from whole groups of a level (CR2), shape (p, p)."""
-    scores = fitted.rows.groups.sums(fitted.white_jacobian * fitted.unit_residual(level)[:, None], level)
-    return fitted.covariance @ (scores.T @ scores) @ fitted.covariance
+    scores = fitted.white_jacobian.sums(fitted.rows.groups, level, fitted.unit_residual(level))
+    return fitted.covariance @ scores.gram() @ fitted.covariance
 
 
 def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, tuple[float, float, float]]:
@@ -51,6 +52,6 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, tuple
     return result
 
 
-def mean_se(tangent: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the standard error of the model's force from its tangent, shape (n, p), and covariance -> (n,)."""
-    return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", tangent, covariance, tangent), 0.0))
+def mean_se(tangent: Tangent, covariance: np.ndarray) -> np.ndarray:
+    """Return the standard error of the model's force from its tangent, of shape (n, p), and covariance -> (n,)."""
+    return np.sqrt(np.maximum(tangent.squares(covariance), 0.0))

@@ -30,13 +30,14 @@ from scipy.special import betainc, chdtrc, fdtrc
 from sealfit.closure.channels import FINER
 from sealfit.closure.few import LEAST_ERROR, FewTest, FewUnits
 from sealfit.fit.estimate import Fitted
-from sealfit.fit.reml import orthonormal
+from sealfit.fit.tangent import OwnColumns, Tangent
 
 JACKKNIFE_UNITS = 30  # from which the jackknife is tried
 PROMISING = 1e-3  # p-value of what columns explain, not adjusted, below which it is
 WORTH_A_LOOK = 0.05  # as above, below which columns that are constant in a run are held against the runs' own scatter
 CONSTANT = 0.9  # share of columns that is one number a run
 OWN = 1e-6  # eigenvalue of what is left without a unit, below which the unit alone determines it
+RANK = 1e-9  # singular value of what specimens do not hold of the tangent space, below which that is nothing
 LEAST_LEFT = 0.01  # share of a column's variance that must survive projection to be identifiable here
 
 
@@ -88,12 +89,12 @@ class Candidate:
 
 def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
     """Return columns of the force, whitened and freed of the current model's tangent space, shape (n, k)."""
-    return _freed(fitted.whitening(columns), fitted.basis)
+    white = fitted.whitening(columns)
+    return _distinct(fitted.basis.freed(white), white)
 
 
-def _freed(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return columns less what an orthonormal basis holds of them; zeros where next to nothing is left."""
-    left = columns - basis @ (basis.T @ columns)
+def _distinct(left: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return what is left of columns, shape (n, k) both, with zeros for those of which next to nothing is."""
     left[:, _squares(left) < LEAST_LEFT * _squares(columns)] = 0.0
     return left
 
@@ -127,17 +128,24 @@ class Judge:
         left = project(self.fitted, columns)
         if self._specimens is None or FINER[unit] >= FINER["specimen"]:
             return (left,)
-        return left, _freed(left, self._specimens)
+        own, basis = self._specimens
+        return left, _distinct(basis.freed(own.freed(left)), left)
 
     @cached_property
-    def _specimens(self) -> np.ndarray | None:
-        """Basis of what tells specimens apart, shape (n, k); None where their scatter is known or nothing can be."""
+    def _specimens(self) -> tuple[OwnColumns, Tangent] | None:
+        """What tells specimens apart: their friction, and the tangent space less that; None where that cannot be had.
+
+        It cannot where their scatter is known, or where each specimen is one run."""
         rows = self.fitted.rows
         starts = rows.groups.starts
         if self.fitted.scatter.knows("specimen") or not 1 < starts["specimen"].size < starts["run"].size:
             return None
-        own = rows.codes("specimen")[:, None] == np.arange(starts["specimen"].size)[None, :]
-        return orthonormal(project(self.fitted, own * self.fitted.friction[:, None]))
+        white, basis = self.fitted.whitening(self.fitted.friction[:, None])[:, 0], self.fitted.basis
+        size = rows.groups.sums(white**2, "specimen")
+        taken = (basis.sums(rows.groups, "specimen", white).values ** 2).sum(axis=1)
+        told = size - taken >= LEAST_LEFT * size
+        own = OwnColumns(rows.codes("specimen"), white * told[rows.codes("specimen")])
+        return own, basis.orthonormal(RANK, freed=own.freed)
 
     def __call__(self, variants: Sequence[np.ndarray], level: str, target: tuple[str, str]) -> Judgement | None:
         """Return the judgement that says least of all variants of some columns; None where one cannot be judged.
@@ -199,7 +207,7 @@ class Judge:
         parts = np.split(left, start[1:])
         inverse, product = self._without(level)
         own = np.add.reduceat(left * fitted.white_residual[:, None], start)
-        mixed = np.stack([b.T @ c for b, c in zip(np.split(fitted.basis, start[1:]), parts, strict=True)])
+        mixed = np.stack([b.T @ c for b, c in zip(np.split(fitted.basis.values, start[1:]), parts, strict=True)])
         through = mixed.transpose(0, 2, 1) @ inverse
         square = np.eye(k) - np.stack([c.T @ c for c in parts]) - through @ mixed
         total = left.T @ fitted.white_residual
@@ -210,12 +218,12 @@ class Judge:
         return _log(fdtrc(k, units - k, t * (units - k) / (k * (units - 1))))
 
     def _without(self, level: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return per unit the inverse of 1 - B'B, shape (units, p, p), and B'r, shape (units, p)."""
+        """Return per unit the inverse of 1 - B'B, shape (units, k, k), and B'r, shape (units, k), in its block."""
         if level not in self._kept:
             fitted = self.fitted
             share, axes = fitted.unit_shares(level)
             inverse = _inverse_of(1 - share, axes)
-            product = fitted.rows.groups.sums(fitted.basis * fitted.white_residual[:, None], level)
+            product = fitted.basis.sums(fitted.rows.groups, level, fitted.white_residual).values
             self._kept[level] = (inverse, product)
         return self._kept[level]
 

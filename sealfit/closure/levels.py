@@ -10,8 +10,10 @@ from scipy import stats
 
 from sealfit.closure.judge import Candidate
 from sealfit.fit.estimate import Fitted
-from sealfit.fit.reml import orthonormal
 from sealfit.fit.rows import LEVELS, Rows
+from sealfit.fit.tangent import OwnColumns, Tangent
+
+RANK = 1e-9  # of the largest singular value of a tangent, below which it holds nothing
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def lack_of_fit(fitted: Fitted) -> float | None:
     spread = np.sqrt(fitted.scatter.level_variance("file", files["force"].to_numpy()) + 1e-300)
     noise = fitted.scatter.noise_sd(files["force"].to_numpy())
     per_file = len(rows.table) / len(files)
-    scale = np.sqrt(spread**2 + noise**2 * fitted.scatter.alike / per_file)
+    scale = np.asarray(np.sqrt(spread**2 + noise**2 * fitted.scatter.alike / per_file))
     files["z"] = files["residual"] / scale
     by_run = files.groupby("run_id")["z"]
     count = by_run.transform("count").to_numpy()
@@ -102,27 +104,43 @@ def lack_of_fit(fitted: Fitted) -> float | None:
     mean = by_run.transform("mean").to_numpy()
     first = ~files["run_id"].duplicated().to_numpy()
     root = np.sqrt(count[first])
-    tangent = _file_tangent(fitted, files)[first] * (root / np.asarray(scale)[first])[:, None]
-    basis = orthonormal(tangent / np.maximum(np.linalg.norm(tangent, axis=0), 1e-300))
     size = mean[first] * root
-    left = size - basis @ (basis.T @ size)
-    df_fit = float(runs - basis.shape[1])
+    left, rank = _left_of_model(fitted, files["force"].to_numpy(), size, np.flatnonzero(first), root / scale[first])
+    df_fit = float(runs - rank)
     if df_pure < 1 or df_fit < 1:
         return None
     return float(stats.f.sf((left @ left / df_fit) / max(pure / df_pure, 1e-300), df_fit, df_pure))
 
 
-def _file_tangent(fitted: Fitted, files: pd.DataFrame) -> np.ndarray:
-    """Return the model's tangent at each file, and one column per specimen that scatters, shape (files, p)."""
-    number = fitted.rows.table.groupby(["run_id", "file"], sort=False).ngroup().to_numpy()
+def _left_of_model(
+    fitted: Fitted, force: np.ndarray, size: np.ndarray, chosen: np.ndarray, factor: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """Return what a model, and every specimen that scatters, leave of one number per run; and how many they take out.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The model; its tangent at a file is the mean over the file's rows.
+    force : ndarray, shape (files,)
+        The model's mean force at each file of a run.
+    size, factor : ndarray, shape (runs,)
+        The numbers, and what a file's tangent is multiplied by there.
+    chosen : ndarray, shape (runs,)
+        Number of a file of each run.
+    """
+    rows = fitted.rows
+    number = rows.table.groupby(["run_id", "file"], sort=False).ngroup().to_numpy()
     order = np.argsort(number, kind="stable")
     start = np.flatnonzero(np.r_[True, np.diff(number[order]) > 0])
-    tangent = np.add.reduceat(fitted.jacobian[order], start, axis=0) / np.bincount(number)[:, None]
+    means = np.add.reduceat(fitted.jacobian.values[order], start, axis=0) / np.bincount(number)[:, None]
+    place = order[start][chosen]  # a row of each run
+    tangent = Tangent(fitted.jacobian.layout.of(place), means[chosen] * factor[:, None])
     if not any(c.level == "specimen" and c.variance > 0 for c in fitted.scatter.components):
-        return tangent
-    specimen = fitted.rows.codes("specimen")[order][start]
-    own = (specimen[:, None] == np.unique(specimen)[None, :]) * files["force"].to_numpy()[:, None]
-    return np.column_stack([tangent, own])
+        basis = tangent.orthonormal(RANK)
+        return basis.freed(size), basis.shape[1]
+    own = OwnColumns(rows.codes("specimen")[place], force[chosen] * factor)
+    basis = tangent.orthonormal(RANK, freed=own.freed)
+    return basis.freed(own.freed(size)), basis.shape[1] + own.count
 
 
 def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.DataFrame:

@@ -168,7 +168,7 @@ def _explained(fitted: Fitted, columns: np.ndarray, count: int) -> np.ndarray:
     """Return the sum of squares that each `count` neighbouring columns of the force explain, shape (points,)."""
     good = np.isfinite(columns).all(axis=0)
     white = fitted.whitening(np.where(good, columns, 0.0))
-    taken = fitted.basis.T @ white
+    taken = fitted.basis.against(white)
     white, taken = (a.reshape(a.shape[0], -1, count) for a in (white, taken))
     whole = np.einsum("npi,npj->pij", white, white)
     gram = whole - np.einsum("npi,npj->pij", taken, taken)

@@ -136,7 +136,7 @@ def _linear_solved(
     vector = model.vector()
     force, jacobian = evaluate(model, rows)
     residual = whitening((rows.force - force)[:, None])[:, 0]
-    normal, gradient = whitening.normal(jacobian[:, linear], residual)
+    normal, gradient = whitening.normal(jacobian.columns(linear), residual)
     away = vector[linear] - centre
     gradient = gradient - precision @ away
     step, *_ = np.linalg.lstsq(normal + precision, gradient, rcond=1e-10)

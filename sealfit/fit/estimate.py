@@ -18,6 +18,7 @@ from sealfit.fit.prior import centre_of, covariance_of, free_of_others, penalise
 from sealfit.fit.rows import Rows
 from sealfit.fit.scatter import estimate_components, estimate_scatter
 from sealfit.fit.start import start_model
+from sealfit.fit.tangent import Tangent
 from sealfit.fit.whitening import Scatter, Whitening
 
 COMPARED = 1e-2  # of the whitened sum of squares, where fits are only compared: rivals are several units apart
@@ -34,9 +35,9 @@ class Fitted:
     rows: Rows
     force: np.ndarray  # (n,)
     friction: np.ndarray  # (n,) that noise and gains load on: the force less what is added to it
-    jacobian: np.ndarray  # (n, p)
+    jacobian: Tangent  # (n, p)
     white_residual: np.ndarray  # (n,)
-    white_jacobian: np.ndarray  # (n, p)
+    white_jacobian: Tangent  # (n, p)
     deviance: float  # whitened sum of squares + log det: twice the negative log likelihood, constants left out
     whitening: Whitening  # of columns on the rows, at this scatter and friction
 
@@ -46,11 +47,9 @@ class Fitted:
         return self.rows.force - self.force
 
     @cached_property
-    def basis(self) -> np.ndarray:
-        """Orthonormal basis of the whitened tangent space, shape (n, rank)."""
-        scale = np.maximum(np.linalg.norm(self.white_jacobian, axis=0), 1e-300)
-        q, r = np.linalg.qr(self.white_jacobian / scale)
-        return q[:, np.abs(np.diag(r)) > 1e-8]
+    def basis(self) -> Tangent:
+        """Orthonormal basis of the whitened tangent space, of shape (n, rank)."""
+        return self.white_jacobian.orthonormal(1e-8)
 
     @cached_property
     def _widened(self) -> dict[str, np.ndarray]:
@@ -71,10 +70,13 @@ class Fitted:
         return self._slopes[acts_on, operation]
 
     def unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return eigenvalues, shape (g, p), and axes, shape (g, p, p), of what the fit took out of each group."""
+        """Return eigenvalues, shape (g, k), and axes, shape (g, k, k), of what the fit took out of each group.
+
+        The axes are those of the basis's places in the block of the group.
+        """
         if level not in self._shares:
             starts = self.rows.groups.starts[level]
-            self._shares[level] = np.linalg.eigh(np.stack([b.T @ b for b in np.split(self.basis, starts[1:])]))
+            self._shares[level] = np.linalg.eigh(np.stack([b.T @ b for b in np.split(self.basis.values, starts[1:])]))
         return self._shares[level]
 
     def unit_residual(self, level: str) -> np.ndarray:
@@ -88,16 +90,16 @@ class Fitted:
             size, axes = self.unit_shares(level)
             size = np.clip(size, 0.0, 0.98)  # a group that the fit owns whole has nothing left to widen
             grow = np.where(size > 1e-12, (1 / np.sqrt(1 - size) - 1) / np.maximum(size, 1e-12), 0.0)
-            inner = self.rows.groups.sums(self.basis * self.white_residual[:, None], level)
+            inner = self.basis.sums(self.rows.groups, level, self.white_residual).values
             rotated = np.einsum("gji,gj->gi", axes, inner) * grow
             back = np.einsum("gij,gj->gi", axes, rotated)
-            self._widened[level] = self.white_residual + (self.basis * back[code]).sum(axis=1)
+            self._widened[level] = self.white_residual + (self.basis.values * back[code]).sum(axis=1)
         return self._widened[level]
 
     @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance of all fitted numbers (v_s and b as logarithms), shape (p, p)."""
-        return covariance_of(self.white_jacobian, precision_of(self.model))
+        return covariance_of(self.white_jacobian.gram(), precision_of(self.model))
 
 
 def fit_declared(rows: Rows) -> Fitted:
@@ -155,7 +157,7 @@ def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray |
     force, jacobian = evaluate(model, rows)
     friction = friction_of(model, rows) if friction is None else friction
     whitening = Whitening(scatter, friction, rows.groups)
-    residual, white = whitening((rows.force - force)[:, None])[:, 0], whitening(jacobian)
+    residual, white = whitening((rows.force - force)[:, None])[:, 0], whitening.of(jacobian)
     deviance = float(residual @ residual) + whitening.logdet
     return Fitted(model, scatter, rows, force, friction, jacobian, residual, white, deviance, whitening)
 
@@ -182,7 +184,7 @@ def worth(fitted: Fitted, number: int) -> float:
     """Return how many numbers a term's free shape is worth, held as smooth as it is."""
     model, white = fitted.model, fitted.white_jacobian
     place = model.place(number)
-    own, pull = free_of_others(model, white.T @ white, white.T @ fitted.white_residual, place)
+    own, pull = free_of_others(model, white.gram(), white.against(fitted.white_residual), place)
     return penalised(own, pull, precision_of(model)[place, place])[1]
 
 
@@ -191,4 +193,4 @@ def as_smooth_as_wanted(model: Model, rows: Rows, scatter: Scatter, friction: np
     if all(term.smoothness is None for term in model.terms):
         return model
     at = fitted_at(model, rows, scatter, friction)
-    return smoothed(model, at.white_jacobian.T @ at.white_jacobian, at.white_jacobian.T @ at.white_residual)
+    return smoothed(model, at.white_jacobian.gram(), at.white_jacobian.against(at.white_residual))

@@ -20,6 +20,7 @@ import numpy as np
 
 from sealfit.fit.declared import QUANTITIES, Declared
 from sealfit.fit.rows import Rows
+from sealfit.fit.tangent import Layout, Tangent, blocks_of
 from sealfit.fit.terms import Term, derivatives_of, shape_of
 
 LOGARITHMIC = ("b_s", "b_c", "v_s")
@@ -74,26 +75,50 @@ class Model:
         return replace(self, terms=tuple(self.terms[k] for k in keep), values=tuple(self.values[k] for k in keep))
 
 
-def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the model's force, shape (n,), and its tangent, shape (n, model.size), at every row."""
+def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.ndarray, Tangent | None]:
+    """Return the model's force, shape (n,), and its tangent, of shape (n, model.size), at every row."""
     state = _state(model, rows, slopes=jacobian)
     if not jacobian:
         return state["force"], None
     slopes = state["slopes"]
-    n = rows.force.size
-    tangent = np.zeros((n, model.size))
+    layout = _layout(model, rows)
+    values = np.zeros((rows.force.size, layout.index.shape[1]))
     for quantity in QUANTITIES:
         number = model.declared.index[quantity][rows.condition]
         has = np.flatnonzero(number >= 0)
         if has.size:
             base = state["base"][quantity] if quantity in LOGARITHMIC else 1.0
-            tangent[has, number[has]] = (slopes[quantity] * state["through"].get(quantity, 1.0) * base)[has]
-    column = model.theta.size
-    for term, values, slope in zip(model.terms, model.values, state["term_slopes"], strict=True):
-        for derivative in derivatives_of(term, values, rows):
-            tangent[:, column] = slope * derivative
+            place = layout.places[layout.block[has], number[has]]
+            values[has, place] = (slopes[quantity] * state["through"].get(quantity, 1.0) * base)[has]
+    column = layout.index.shape[1] - (model.size - model.theta.size)
+    for term, numbers, slope in zip(model.terms, model.values, state["term_slopes"], strict=True):
+        for derivative in derivatives_of(term, numbers, rows):
+            values[:, column] = slope * derivative
             column += 1
-    return state["force"], tangent
+    return state["force"], Tangent(layout, values)
+
+
+def _layout(model: Model, rows: Rows) -> Layout:
+    """Return the blocks of the model's tangent: the numbers of a specimen's conditions, then those of all terms."""
+    declared, size = model.declared, model.theta.size
+    key, whole = ("blocks",), ("layout", model.size)
+    if whole in rows.cache and rows.cache[whole][0] is declared:
+        return rows.cache[whole][1]
+    if key not in rows.cache or rows.cache[key][0] is not declared:
+        used = np.stack([declared.index[quantity] for quantity in QUANTITIES], axis=1)
+        of_condition = [frozenset(numbers[numbers >= 0].tolist()) for numbers in used]
+        specimen, conditions = rows.codes("specimen"), len(used)
+        touched: dict[int, frozenset[int]] = {}
+        for pair in np.unique(specimen * conditions + rows.condition).tolist():
+            number, condition = divmod(pair, conditions)
+            touched[number] = touched.get(number, frozenset()) | of_condition[condition]
+        index, block = blocks_of(list(touched.values()), size)
+        rows.cache[key] = (declared, index, block[specimen])
+    _, index, block = rows.cache[key]
+    added = np.arange(size, model.size)
+    index = np.column_stack([np.where(index == size, model.size, index), np.tile(added, (len(index), 1))])
+    rows.cache[whole] = (declared, Layout(model.size, index, block))
+    return rows.cache[whole][1]
 
 
 def friction_of(model: Model, rows: Rows) -> np.ndarray:

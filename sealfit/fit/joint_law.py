@@ -154,7 +154,7 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
     white = np.linalg.solve(root, np.column_stack([aged.value - empty.at(aged, x), empty.slope(aged, x)]))
     criterion = float(white[:, 0] @ white[:, 0] + 2 * np.log(np.diag(root)).sum())
     criterion += len(names) * np.log(aged.value.size)
-    covariance = covariance_of(white[:, 1:], np.zeros((len(names),) * 2))
+    covariance = covariance_of(white[:, 1:].T @ white[:, 1:], np.zeros((len(names),) * 2))
     return replace(empty, x=x, covariance=covariance, scatter=scatter, criterion=criterion)
 
 

@@ -58,9 +58,9 @@ def centre_of(model: Model) -> np.ndarray:
     return centre
 
 
-def covariance_of(white_jacobian: np.ndarray, precision: np.ndarray) -> np.ndarray:
-    """Return the covariance of parameters from a whitened tangent, shape (n, p), and the prior's precision, (p, p)."""
-    normal = white_jacobian.T @ white_jacobian + precision
+def covariance_of(normal: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """Return the covariance of parameters from the normal matrix and the prior's precision, shape (p, p) each."""
+    normal = normal + precision
     size = np.sqrt(np.diag(normal))
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # 0: a number that nothing here moves
     return scale[:, None] * np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale

@@ -19,8 +19,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
+from scipy.sparse import csr_array
 
 from sealfit.fit.groups import Groups
+from sealfit.fit.tangent import Tangent
 from sealfit.fit.whitening import Component
 
 REVIVED = 0.03  # share at which a component starts though it was nothing before: from zero it could not come back
@@ -30,7 +32,7 @@ KINDS = ("offset", "gain")
 
 def reml(
     residual: np.ndarray,
-    jacobian: np.ndarray,
+    jacobian: Tangent,
     variance: np.ndarray,
     force: np.ndarray,
     groups: Groups,
@@ -43,7 +45,7 @@ def reml(
     ----------
     residual : ndarray, shape (m,)
         Mean residual of each finest group, at the fitted model.
-    jacobian : ndarray, shape (m, p)
+    jacobian : Tangent, shape (m, p)
         Mean tangent of the model; the degrees of freedom it takes are accounted for.
     variance : ndarray, shape (m,)
         Variance of each mean from the rows' own noise.
@@ -61,7 +63,7 @@ def reml(
     scale_force = max(float(np.sqrt(np.mean(force**2))), 1e-12)
     total = max(float(np.var(residual)), float(np.mean(variance)), 1e-20)
     unit = np.array([total / (scale_force**2 if kind == "gain" else 1.0) for _, kind in kinds])
-    basis = orthonormal(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300))
+    basis = jacobian.orthonormal(1e-9)
     likelihood = RestrictedLikelihood(residual, basis, variance, force, groups, kinds)
 
     def objective(log_share: np.ndarray) -> tuple[float, np.ndarray]:
@@ -94,8 +96,8 @@ class RestrictedLikelihood:
     ----------
     residual, variance, force : ndarray, shape (m,)
         As for `reml`.
-    basis : ndarray, shape (m, p)
-        Columns of full rank that span the model's tangent.
+    basis : Tangent, shape (m, p)
+        Orthonormal columns that span the model's tangent.
     groups : Groups
         Groups of the m means.
     kinds : sequence of (level, kind)
@@ -105,24 +107,28 @@ class RestrictedLikelihood:
     def __init__(
         self,
         residual: np.ndarray,
-        basis: np.ndarray,
+        basis: Tangent,
         variance: np.ndarray,
         force: np.ndarray,
         groups: Groups,
         kinds: Sequence[tuple[str, str]],
     ) -> None:
         self.variance = variance
-        self.columns = np.column_stack([basis, residual])
+        every = basis.beside(residual)
+        self.columns = every.values
         self.loads = np.column_stack([np.ones_like(force), force])
         self.places = [(level, KINDS.index(kind)) for level, kind in kinds]
         self.finest = next(iter(groups.starts))
         self.above = list(dict.fromkeys(level for level, _ in kinds if level != self.finest))
-        self.groups = {}  # level -> (first finer group in each group, group of each finer group)
+        self.groups = {}  # level -> (what sums the finer groups in each group, group of each finer group)
+        self.layout = {self.finest: every.layout}
         finer = groups.starts[self.finest]
         for level in self.above:
             own = np.searchsorted(finer, groups.starts[level])
-            self.groups[level] = (own, groups.codes[level][finer])
+            summing = csr_array((np.ones(finer.size), np.arange(finer.size), np.r_[own, finer.size]))
+            self.groups[level] = (summing, groups.codes[level][finer])
             finer = groups.starts[level]
+            self.layout[level] = every.layout.of(finer)
 
     def __call__(self, variances: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the value and its derivative with respect to each variance, shape (kinds,)."""
@@ -133,18 +139,18 @@ class RestrictedLikelihood:
         loads, columns = self.loads / own[:, None], self.columns / own[:, None]
         square = (loads[:, 0], loads[:, 1], loads[:, 1] * self.loads[:, 1])  # B' V^-1 B: 11, 12 and 22, each (groups,)
         cross = (columns, columns * self.loads[:, 1:])  # B' V^-1 [X r], a row of each, (groups, p + 1)
-        gram = self.columns.T @ columns
+        gram = self.layout[self.finest].gram(self.columns, columns)
         value = float(np.log(own).sum())
         steps = [(square, cross)]
         inner = []
         for level in self.above:
-            start, _ = self.groups[level]
-            q = tuple(np.add.reduceat(part, start) for part in square)
-            t = tuple(np.add.reduceat(part, start) for part in cross)
+            summing, _ = self.groups[level]
+            q = tuple(summing @ part for part in square)
+            t = tuple(summing @ part for part in cross)
             m, logdet = _shrinkage(q, size[level])
             mt = _applied(m, t)
             value += float(logdet.sum())
-            gram -= t[0].T @ mt[0] + t[1].T @ mt[1]
+            gram -= self.layout[level].gram(t[0], mt[0]) + self.layout[level].gram(t[1], mt[1])
             mq = _product(m, q)
             left = (1.0 - mq[0], -mq[1], -mq[2], 1.0 - mq[3])
             inner.append((m, mt, left))
@@ -159,6 +165,7 @@ class RestrictedLikelihood:
         turn = np.zeros_like(gram)
         turn[:-1, :-1] = solve_triangular(chol, np.eye(half.size), lower=True).T
         turn[:-1, -1], turn[-1, -1] = -turn[:-1, :-1] @ half, 1.0
+        turned = turn @ turn.T  # whose product with a Gram matrix is the sum of squares of the turned columns
         slope = {}
         n = y = None
         for k in reversed(range(len(steps))):
@@ -180,9 +187,10 @@ class RestrictedLikelihood:
                 taken = _sandwich((square[0], square[1], square[1], square[2]), tuple(x[code] for x in n))
                 square = tuple(x - z for x, z in zip(square, taken, strict=True))
             level = self.above[k - 1] if k else self.finest
-            turned = [part @ turn for part in cross]
-            slope[level] = [float(square[0].sum()) - _sum(turned[0]), float(square[2].sum()) - _sum(turned[1])]
-        return 0.5 * value, 0.5 * np.array([slope[level][k] for level, k in self.places])
+            for kind in (kind for place, kind in self.places if place == level):
+                taken = np.vdot(self.layout[level].gram(cross[kind], cross[kind]), turned)
+                slope[level, kind] = float(square[2 * kind].sum()) - float(taken)
+        return 0.5 * value, 0.5 * np.array([slope[place] for place in self.places])
 
 
 Symmetric = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -218,10 +226,6 @@ def _sandwich(left: Sequence[np.ndarray], n: Symmetric) -> Symmetric:
     first, second = a * n[0] + b * n[1], a * n[1] + b * n[2]
     third, fourth = c * n[0] + d * n[1], c * n[1] + d * n[2]
     return first * a + second * b, first * c + second * d, third * c + fourth * d
-
-
-def _sum(columns: np.ndarray) -> float:
-    return float(np.vdot(columns, columns))
 
 
 def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:

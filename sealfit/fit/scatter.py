@@ -10,6 +10,7 @@ from scipy.optimize import nnls
 from sealfit.fit.declared import declare
 from sealfit.fit.reml import reml
 from sealfit.fit.rows import LEVELS, Rows
+from sealfit.fit.tangent import Tangent
 from sealfit.fit.whitening import Component, Scatter
 
 LEAST_NOISE = 1e-6  # of the force: below what any sensor resolves; keeps noise-free data from weights without end
@@ -17,7 +18,7 @@ LEAST_FILES = 6  # from which files can be compared in shape
 
 
 def estimate_scatter(
-    rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: np.ndarray, start: Scatter | None = None
+    rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: Tangent, start: Scatter | None = None
 ) -> Scatter:
     """Return row noise and variance components of the residual at a model, its degrees of freedom taken out.
 
@@ -27,8 +28,8 @@ def estimate_scatter(
         The rows.
     residual, friction : ndarray, shape (n,)
         Measured minus model, and the model's friction, which noise and gains load on.
-    jacobian : ndarray, shape (n, p)
-        The model's tangent.
+    jacobian : Tangent, shape (n, p)
+        The model's.
     start : Scatter, optional
         An earlier estimate, to start from.
     """
@@ -39,7 +40,7 @@ def estimate_scatter(
 
 
 def estimate_components(
-    rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: np.ndarray, scatter: Scatter
+    rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: Tangent, scatter: Scatter
 ) -> Scatter:
     """Return a scatter with its components estimated anew and its row noise as it is.
 
@@ -49,20 +50,20 @@ def estimate_components(
         The rows.
     residual, friction : ndarray, shape (n,)
         Measured minus model, and the model's friction.
-    jacobian : ndarray, shape (n, p)
-        The model's tangent, whose degrees of freedom are taken out.
+    jacobian : Tangent, shape (n, p)
+        The model's, whose degrees of freedom are taken out.
     scatter : Scatter
         Row noise, and where the components start.
     """
     groups, level = rows.groups, "stroke"
-    means = groups.means(np.column_stack([residual, friction, jacobian]), level)
+    means = groups.means(np.column_stack([residual, friction]), level)
     noise = groups.means(scatter.noise_sd(friction) ** 2, level)
     count = np.diff(np.r_[groups.starts[level], residual.size])
     kinds = usable_components(rows)
     known = {(c.level, c.kind): c.variance for c in scatter.components}
     components = reml(
         means[:, 0],
-        means[:, 2:],
+        jacobian.means(groups, level),
         noise * scatter.alike / count,
         means[:, 1],
         groups.at(level),

@@ -23,6 +23,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from sealfit.fit.groups import Groups
+from sealfit.fit.tangent import Tangent
 
 FLAT = 1e-9  # of the mean: a force that varies less within a stroke does not vary
 
@@ -101,7 +102,9 @@ class Between:
             square = np.add.reduceat(load**2, start)
             self.logdet += float(np.log1p(square).sum())
             shrink = (1.0 - 1.0 / np.sqrt(1.0 + square)) / np.maximum(square, 1e-300)
-            self.steps.append((start, code, load, shrink))
+            # Sums over groups by a sparse product: ten times as fast as reduceat.
+            inner = csr_array((load * shrink[code], np.arange(load.size), np.r_[start, load.size]))
+            self.steps.append((inner, code, load))
             left = self._step(left, *self.steps[-1])
 
     def __call__(self, numbers: np.ndarray) -> np.ndarray:
@@ -112,11 +115,8 @@ class Between:
         return white
 
     @staticmethod
-    def _step(
-        columns: np.ndarray, start: np.ndarray, code: np.ndarray, load: np.ndarray, shrink: np.ndarray
-    ) -> np.ndarray:
-        inner = np.add.reduceat(load[:, None] * columns, start, axis=0) * shrink[:, None]
-        return columns - load[:, None] * inner[code]
+    def _step(columns: np.ndarray, inner: csr_array, code: np.ndarray, load: np.ndarray) -> np.ndarray:
+        return columns - load[:, None] * (inner @ columns)[code]
 
 
 class Whitening:
@@ -141,6 +141,7 @@ class Whitening:
         finest = next(iter(groups.starts))
         start, code = groups.starts[finest], groups.codes[finest]
         n, m = friction.size, start.size
+        self.twice = np.repeat(start, 2)  # a row of the stroke that each of the two numbers is of
         sd = scatter.noise_sd(friction) * np.sqrt(scatter.alike)
         size = np.sqrt(np.bincount(code, sd**-2.0))
         mean = 1 / (sd * size[code])  # unit vector along a stroke's mean, in units of the rows' noise
@@ -167,15 +168,21 @@ class Whitening:
         )
         self.logdet = self.between.logdet + float(2 * np.log(sd).sum() + (n - 2 * m) * np.log(scatter.shape))
 
-    def normal(self, columns: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return C' V^-1 C, shape (k, k), and C' V^-1 r of columns on the rows, shape (n, k): no column is whitened.
+    def normal(self, tangent: Tangent, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return C' V^-1 C, shape (p, p), and C' V^-1 r of a tangent on the rows: no column is whitened.
 
         `residual`, shape (n,), is white already.
         """
-        scaled, numbers = columns * self.unit[:, None], self.take @ columns
+        scaled, numbers = tangent.values * self.unit[:, None], self.take @ tangent.values
         between, kept = self.between(numbers), numbers / self.root
-        square = scaled.T @ scaled + between.T @ between - kept.T @ kept
-        return square, residual @ scaled + (residual @ self.back) @ (between - kept)
+        rows, strokes = tangent.layout, tangent.layout.of(self.twice)
+        square = rows.gram(scaled, scaled) + strokes.gram(between, between) - strokes.gram(kept, kept)
+        pull = Tangent(strokes, between - kept).against(residual @ self.back)
+        return square, tangent.holding(scaled).against(residual) + pull
+
+    def of(self, tangent: Tangent) -> Tangent:
+        """Return a tangent on the rows, whitened."""
+        return tangent.holding(self(tangent.values))
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
         """Return columns on the rows, shape (n, k), in coordinates where rows are independent, of unit variance."""

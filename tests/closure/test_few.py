@@ -4,11 +4,12 @@ from bins_helpers import make_bins
 from scipy import stats
 
 from sealfit.closure.channels import find_channels
-from sealfit.closure.few import FewUnits, log_p_of
+from sealfit.closure.few import FewUnits, Root, log_p_of, small_root
 from sealfit.closure.judge import Judge
 from sealfit.closure.search import search
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
+from sealfit.fit.tangent import Tangent
 
 DAYS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 
@@ -36,6 +37,18 @@ def test_draws_have_the_covariance_of_the_numbers():
     assert np.cov(drawn[mu].T) == pytest.approx(np.eye(d), abs=0.05)
     between = np.corrcoef(drawn[mu].T, drawn[force].T)[:d, d:]
     assert np.abs(between).max() > 0.8  # both scale the friction of a specimen
+
+
+def test_many_units_are_made_independent_as_few_are():
+    rng = np.random.default_rng(5)
+    moved = np.arange(40) != 7
+    taken = np.linalg.qr(rng.normal(size=(40, 6)))[0] * np.array([1.0, 1.0, 0.9, 0.5, 1e-3, 0.0]) * moved[:, None]
+    numbers = rng.normal(size=(40, 3))
+    few, many = small_root(Tangent.dense(taken), moved), Root(Tangent.dense(taken), moved)
+    assert many.df == few.shape[0]
+    expected, found = few @ numbers, many @ numbers
+    assert found.T @ found == pytest.approx(expected.T @ expected, rel=1e-9)  # one is the other turned
+    assert many @ numbers[:, 0] == pytest.approx(found[:, 0], rel=1e-12)
 
 
 def test_p_values_along_a_dozen_specimens_are_not_too_small():

@@ -41,6 +41,7 @@ def test_tangent_agrees_with_differences(acts_on, operation):
     model = start_model(rows).with_term(term, {"A": 0.02, "k": 0.3})
     vector = model.vector()
     _, tangent = evaluate(model, rows)
+    tangent = tangent.toarray()
     for k in range(vector.size):
         step = np.zeros(vector.size)
         step[k] = 1e-6

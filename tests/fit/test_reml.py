@@ -4,6 +4,7 @@ import pytest
 
 from sealfit.fit.groups import Groups
 from sealfit.fit.reml import RestrictedLikelihood, orthonormal, reml
+from sealfit.fit.tangent import Tangent
 
 
 def nested(files_per_run, runs_per_specimen, specimens):
@@ -22,7 +23,7 @@ def test_the_likelihood_is_that_of_the_dense_covariance_and_its_gradient_is_exac
     residual, variance = rng.normal(size=72), rng.uniform(0.1, 0.3, 72)
     kinds = [(level, kind) for level in codes for kind in ("offset", "gain")]
     sizes = rng.uniform(0.5, 2.0, 8) * np.tile([0.1, 1e-4], 4)
-    likelihood = RestrictedLikelihood(residual, tangent, variance, force, Groups.of(codes), kinds)
+    likelihood = RestrictedLikelihood(residual, Tangent.dense(tangent), variance, force, Groups.of(codes), kinds)
 
     def dense(at):
         covariance = np.diag(variance)
@@ -55,7 +56,7 @@ def test_reml_recovers_scatter_of_files_runs_and_specimens():
         )
         tangent = np.column_stack([np.ones(force.size), force])
         kinds = [("file", "gain"), ("run", "offset"), ("specimen", "gain")]
-        parts = reml(residual, tangent, np.full(force.size, 0.05**2), force, Groups.of(codes), kinds)
+        parts = reml(residual, Tangent.dense(tangent), np.full(force.size, 0.05**2), force, Groups.of(codes), kinds)
         found.append([np.sqrt(p.variance) for p in parts])
     npt.assert_allclose(np.mean(found, axis=0), [0.01, 0.2, 0.02], rtol=0.15)
 
@@ -69,6 +70,8 @@ def test_reml_counts_the_degrees_of_freedom_that_the_model_took():
         tangent = rng.normal(0, 1, (40, 20))
         error = rng.normal(0, 1.0, 40)
         residual = error - tangent @ np.linalg.lstsq(tangent, error, rcond=None)[0]
-        (part,) = reml(residual, tangent, np.full(40, 1e-6), np.ones(40), Groups.of(codes), [("file", "offset")])
+        (part,) = reml(
+            residual, Tangent.dense(tangent), np.full(40, 1e-6), np.ones(40), Groups.of(codes), [("file", "offset")]
+        )
         found.append(part.variance)
     assert np.mean(found) == pytest.approx(1.0, abs=0.08)  # SE of the mean: sqrt(2/20/200) = 0.022

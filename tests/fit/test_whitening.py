@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sealfit.fit.groups import Groups
+from sealfit.fit.tangent import Tangent
 from sealfit.fit.whitening import Component, Scatter, Whitening
 
 CODES = {
@@ -45,7 +46,7 @@ def test_whitening_is_a_root_of_the_inverse_covariance(seed, offset, gain, run, 
     scatter = Scatter(0.4, 0.1, parts, alike, shape)
     whitening = Whitening(scatter, force, Groups.of(CODES))
     root, dense = whitening(np.eye(30)), covariance(scatter, force)
-    normal, gradient = whitening.normal(np.eye(30), root[:, 0])
+    normal, gradient = whitening.normal(Tangent.dense(np.eye(30)), root[:, 0])
     npt.assert_allclose(normal, root.T @ root, atol=1e-8)
     npt.assert_allclose(gradient, normal[0], atol=1e-8)
     npt.assert_allclose(root.T @ root @ dense, np.eye(30), atol=1e-8)
