@@ -14,6 +14,7 @@ import typer
 
 from sealfit import __version__
 from sealfit.errors import SealfitError
+from sealfit.options import Campaign, ConfigFile, Force, Json, Out, Profile, Results, Scheduler, Strict, Workers
 from sealfit.threads import one_thread
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -25,20 +26,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # plain help: rich takes longer to load than all the rest
 )
-
-Campaign = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder: runs.csv and the trace files.")]
-Results = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results that `ingest` or `run` made.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder of results; made if it is not there.")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="Rig config (TOML); default: as the README's table.")]
-Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Processes to use. [default: all cores]")]
-Scheduler = Annotated[
-    str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on: tcp://host:port, or its file."),
-]
-Force = Annotated[bool, typer.Option("--force", help="Do it again even if it is current.")]
-Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
-Profile = Annotated[bool, typer.Option("--profile", help="Print seconds and rows per step.")]
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
 
 
 def _print_version(wanted: bool) -> None:
