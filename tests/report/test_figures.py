@@ -111,10 +111,11 @@ def test_many_conditions_of_one_kind_get_panels_of_their_own():
         condition="batch=" + rows["batch"], series="batch=" + rows["batch"], rubber="rubber", direction=1,
         run_id=rows["batch"], file=[f"{k}.csv" for k in range(28)], speed_mm_s=5.0, force_N=10.0, load_N=1.0, used=True,
     )  # fmt: skip
-    tables = {"steady": rows, "curves": empty("curves"), "steady_fit": empty("steady_fit")}
+    tables = {"steady": rows} | {name: empty(name) for name in ("curves", "steady_fit", "residuals_after")}
     plot = force_speed(tables, Config(condition=["batch"]))
     assert [panel.title for panel in plot.panels][:3] == ["b0", "b1", "b10"]
-    assert len(plot.panels) == 14
+    assert len(plot.panels) == 12
+    assert plot.note.startswith("12 of 14 panels are drawn: spread evenly.")
 
 
 # ---------------------------------------------------------------- aging and traces
