@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import pandas as pd
@@ -17,7 +18,7 @@ from scipy import stats
 from scipy.fft import next_fast_len
 
 from sealfit.closure.background import LOBE, alike, background, smooth_background, tops
-from sealfit.closure.waves import freed_of_trend, strokes_of
+from sealfit.closure.waves import strokes_of
 
 SHARED = 1e-3  # p-value below which the phase is taken to be common to all files
 ABOVE_BACKGROUND = 4.0  # a peak's power over the median of its neighbours: a smooth trend has no peak
@@ -131,7 +132,7 @@ def spectrum_along(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()
         for side in np.unique(direction[strokes_of_unit]):
             total, weight = np.zeros(frequency.size, dtype=complex), np.zeros(frequency.size)
             for k in strokes_of_unit[direction[strokes_of_unit] == side]:
-                wave = _transform(good[k][1], good[k][2], longest, points[k])[: reach[k]]
+                wave = _transform(good[k][1], good[k][2], longest, points[k], reach[k])
                 total[: wave.size] += wave
                 weight[: wave.size] += 1
             passes[side] = (total[use] / np.maximum(weight[use], 1), weight[use] > 0)
@@ -142,13 +143,26 @@ def spectrum_along(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()
     return sums.spectrum(frequency[use], near)
 
 
-def _transform(place: np.ndarray, residual: np.ndarray, longest: float, points: int) -> np.ndarray:
-    """Return a stroke's complex amplitudes at the multiples of 1 / `longest`, phases counted from place 0."""
+def _transform(place: np.ndarray, residual: np.ndarray, longest: float, points: int, reach: int) -> np.ndarray:
+    """Return a stroke's complex amplitudes at the first multiples of 1 / `longest`, phases counted from place 0."""
     grid = np.arange(place[0], place[-1], longest / points)
-    value = freed_of_trend(grid, np.interp(grid, place, residual))
-    taper = np.hanning(grid.size + 2)[1:-1]
-    wave = np.fft.rfft(value * taper, points) * (2 / taper.sum())
-    return wave * np.exp(-2j * np.pi * np.arange(wave.size) / longest * grid[0])
+    trend, taper = _on_grid(grid.size)
+    value = np.interp(grid, place, residual)
+    value -= trend @ (value @ trend)
+    wave = np.fft.rfft(value * taper, points)[:reach]
+    return wave * np.exp(-2j * np.pi / longest * grid[0] * np.arange(wave.size))
+
+
+@lru_cache(maxsize=512)  # strokes of one speed share their grids: one each for hundreds of thousands
+def _on_grid(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return an orthonormal basis of parabolas on an even grid, shape (size, 3), and the Hann taper, shape (size,)."""
+    trend, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, size), 3))
+    taper = np.hanning(size + 2)[1:-1]
+    return trend, taper * (2 / taper.sum())
+
+
+def _power(wave: np.ndarray) -> np.ndarray:
+    return wave.real**2 + wave.imag**2
 
 
 class _Sums:
@@ -161,7 +175,7 @@ class _Sums:
     def add(self, passes: dict[float, tuple[np.ndarray, np.ndarray]]) -> None:
         """Add one unit: per direction its amplitudes and which frequencies it reaches, each of shape (f,)."""
         for wave, known in passes.values():
-            power = np.abs(wave) ** 2
+            power = _power(wave)
             self.count += known
             self.square += power
             self.power += power / max(power.sum() / max(known.sum(), 1), 1e-300)
@@ -169,11 +183,12 @@ class _Sums:
         for way, sums in self.common.items():
             own = sum(wave * (1.0 if way else side) for side, (wave, _) in passes.items())
             # Each unit weighs by its own spread, so that one noisy file does not decide.
-            spread = np.sqrt(np.median(np.abs(own[reached]) ** 2)) if reached.any() else 0.0
-            white = own / spread if spread > 0 else np.zeros_like(own)
-            sums[0] += white
-            sums[1] += np.abs(white) ** 2
-            sums[2] += bool(np.abs(own).any())
+            power = _power(own)
+            square = np.median(power[reached]) if reached.any() else 0.0
+            if square > 0:
+                sums[0] += own / np.sqrt(square)
+                sums[1] += power / square
+            sums[2] += bool(own.any())
             sums[3] += own
 
     def spectrum(self, frequency: np.ndarray, taken: np.ndarray) -> Spectrum:
