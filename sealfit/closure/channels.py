@@ -20,6 +20,9 @@ FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 MANY_UNITS = 20  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up
 LEAST_UNITS = 6  # below six runs whole files are held out, below six files strokes (design: held-out unit)
 CALENDAR = ("run_order", "elapsed_h")  # conditions are tested one after the other, so the calendar follows them
+MOST_LEVELS = (
+    100  # of a category; one with more is a label (a time as text, a file), and each level a column of all rows
+)
 FEW_DF = 2  # of a free shape along a dozen specimens: a line and a bend
 FREE_DF = 4  # columns of a free shape: enough for a peak, an approach or a step; more only costs power
 FINE_DF = 9  # of a second, finer shape, for two humps or a narrow one
@@ -44,7 +47,7 @@ class Channel:
 def find_channels(
     rows: Rows, ignore: Iterable[str] = (), *, conditions: Iterable[str] = (), rig_position: bool = True
 ) -> list[Channel]:
-    """Return every channel of the rows that varies and is not a grouping.
+    """Return every channel of the rows that varies and is not a grouping, nor a text with hundreds of values.
 
     A condition's own column is kept though it may be a grouping: an offset between directions may differ from one
     condition to the next, and that is seen inside each of them.
@@ -72,7 +75,7 @@ def find_channels(
                 continue
             if name == "speed_mm_s" and values.max() <= SAME_SPEED * values.min():
                 continue  # one setting: what is left of the speed tells directions apart, or strokes
-        elif np.unique(values).size < 2:
+        elif not 2 <= np.unique(values).size <= MOST_LEVELS:
             continue
         unit = unit_of(values, rows)
         channel = Channel(name, values, unit)

@@ -35,6 +35,7 @@ TARGETS = (
     ("a", "multiply"),
     ("b", "multiply"),
 )
+MOST_NUMBERS = 1 << 22  # of columns on all rows that are projected at once: 34 MB
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 
 
@@ -93,9 +94,12 @@ def _of_shapes(
         places.append((acts_on, operation, own))
     if not slopes:
         return
-    variants = judge.variants(np.column_stack(slopes), channel.unit)
+    together = max(1, MOST_NUMBERS // shapes.size)
+    variants: tuple[np.ndarray, ...] = ()
     for number, (acts_on, operation, own) in enumerate(places):
-        first = number * own.shape[1]
+        if number % together == 0:
+            variants = judge.variants(np.column_stack(slopes[number : number + together]), channel.unit)
+        first = number % together * own.shape[1]
         unit = channel.unit
         names = (channel.name,)
         unsigned = both_ways and (acts_on, operation) == ("force", "add") and channel.name != "direction"
