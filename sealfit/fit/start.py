@@ -72,9 +72,11 @@ def _per_condition(speed, load, size, condition, full: bool):
     best, answer = np.inf, None
     for v_s in grid:
         decay = np.exp(-((speed / v_s) ** 2)) if full else np.zeros_like(speed)
-        pairs, sigma_2 = pairs_and_shared(np.column_stack([load * decay, load * (1 - decay)]), code, speed, size)
-        fitted = load * (decay * pairs[code, 0] + (1 - decay) * pairs[code, 1]) + sigma_2 * speed
-        cost = float(((size - fitted) ** 2).sum())
+        columns = (load * decay, load * (1 - decay))
+        pairs, sigma_2 = pairs_and_shared(columns, code, speed, size)
+        first, second = pairs.T
+        left = size - first[code] * columns[0] - second[code] * columns[1] - sigma_2 * speed
+        cost = float(left @ left)
         if cost < best:
             best, answer = cost, (pairs, sigma_2, v_s)
     pairs, sigma_2, v_s = answer
@@ -83,7 +85,7 @@ def _per_condition(speed, load, size, condition, full: bool):
 
 
 def pairs_and_shared(
-    columns: np.ndarray, code: np.ndarray, shared: np.ndarray, values: np.ndarray
+    columns: tuple[np.ndarray, np.ndarray], code: np.ndarray, shared: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Return the least squares of two numbers per group and one that all share, the smallest where many fit.
 
@@ -91,7 +93,7 @@ def pairs_and_shared(
 
     Parameters
     ----------
-    columns : ndarray, shape (n, 2)
+    columns : tuple of ndarray, shape (n,) each
         What a group's own numbers multiply.
     code : ndarray, shape (n,)
         Group of each value, from 0 on.
@@ -103,9 +105,9 @@ def pairs_and_shared(
     tuple
         Pairs, shape (groups, 2), and the shared number.
     """
-    one, length = _unit(columns[:, 0], code)
-    along = np.bincount(code, one * columns[:, 1])
-    two, rest = _unit(columns[:, 1] - along[code] * one, code)
+    one, length = _unit(columns[0], code)
+    along = np.bincount(code, one * columns[1])
+    two, rest = _unit(columns[1] - along[code] * one, code)
     triangle = np.zeros((length.size, 2, 2))
     triangle[:, 0, 0], triangle[:, 0, 1], triangle[:, 1, 1] = length, along, rest
     left, spread, right = np.linalg.svd(triangle)
@@ -115,9 +117,9 @@ def pairs_and_shared(
     def taken(column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a column's coefficients on the groups' own, shape (groups, 2), and what is left of it."""
         inside = np.column_stack([np.bincount(code, one * column), np.bincount(code, two * column)])
-        kept = np.einsum("gji,gj->gi", left, inside) * (inverse > 0)
-        pairs = np.einsum("gji,gj->gi", right, kept * inverse)
-        return pairs, column - (pairs[code] * columns).sum(axis=1)
+        pairs = np.einsum("gji,gj->gi", right, np.einsum("gji,gj->gi", left, inside) * inverse)
+        first, second = pairs.T
+        return pairs, column - first[code] * columns[0] - second[code] * columns[1]
 
     of_shared, shared_left = taken(shared)
     of_values, values_left = taken(values)

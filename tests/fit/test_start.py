@@ -10,7 +10,7 @@ from sealfit.fit.start import pairs_and_shared
 def _dense(columns, code, shared, values):
     own = np.zeros((code.size, 2 * (code.max() + 1)))
     rows = np.arange(code.size)
-    own[rows, 2 * code], own[rows, 2 * code + 1] = columns.T
+    own[rows, 2 * code], own[rows, 2 * code + 1] = columns
     solved, *_ = np.linalg.lstsq(np.column_stack([own, shared]), values, rcond=1e-10)
     return solved[:-1].reshape(-1, 2), solved[-1]
 
@@ -32,7 +32,7 @@ def test_two_numbers_per_condition_and_a_shared_one_are_those_of_the_whole_probl
     for condition, only in (speed_of or {}).items():
         speed[code == condition] = only
     load, decay = rng.choice([49.0, 98.0], code.size), np.exp(-((speed / v_s) ** 2))
-    columns = load[:, None] * np.column_stack([decay, 1 - decay])
+    columns = (load * decay, load * (1 - decay))
     values = rng.normal(30.0, 1.0, code.size)
     pairs, shared = pairs_and_shared(columns, code, speed, values)
     expected, expected_shared = _dense(columns, code, speed, values)
