@@ -135,6 +135,8 @@ def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
 def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     """Return force against speed per condition, before and after, other channels at their means."""
     rows = after.rows
+    channels = {name for term in (*before.model.terms, *after.model.terms) for name in term.channels}
+    read = [name for name in rows.table.columns if name in {*CURVES.names(), *channels}]
     tables, codes = [], []
     for number in range(len(rows.conditions)):
         inside = rows.condition == number
@@ -144,7 +146,7 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
                 continue
             speeds = np.abs(rows.speed[chosen])
             count = POINTS if speeds.max() > 1.02 * speeds.min() else 1
-            table = _typical(rows.table[chosen], count)
+            table = _typical(rows.table.loc[chosen, read], count)
             table["speed_mm_s"] = sign * np.geomspace(speeds.min(), speeds.max(), count)
             table["direction"] = sign
             tables.append(table)
@@ -167,8 +169,10 @@ def _typical(table: pd.DataFrame, count: int) -> pd.DataFrame:
     one = {}
     for name in table.columns:
         column = table[name]
-        one[name] = column.mean() if pd.api.types.is_float_dtype(column) else column.mode().iloc[0]
-        if name in ("repeat", "stroke"):
-            one[name] = float(column.mean())
+        one[name] = (
+            float(column.mean())
+            if pd.api.types.is_float_dtype(column) or name in ("repeat", "stroke")
+            else column.mode().iloc[0]
+        )
     one["file"] = ""
     return pd.DataFrame([one] * count)

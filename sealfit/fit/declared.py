@@ -46,8 +46,14 @@ def declare(rows: Rows) -> Declared:
 
     A series needs four speeds in one direction for Eq. 14, two for the viscous term; Eq. 15 needs three days, the
     unaged day included. What cannot be fitted is left out, not guessed. Speeds are counted within one direction, as an
-    offset between directions would otherwise pass for a Stribeck curve.
+    offset between directions would otherwise pass for a Stribeck curve. Made once for the same rows.
     """
+    if ("declared",) not in rows.cache:
+        rows.cache["declared",] = _declare(rows)
+    return rows.cache["declared",]
+
+
+def _declare(rows: Rows) -> Declared:
     conditions = rows.conditions
     names = tuple(conditions["condition"])
     aging = rows.has_aging

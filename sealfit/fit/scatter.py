@@ -96,10 +96,7 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
 
 def _specimens_free(rows: Rows) -> bool:
     """Whether specimens scatter about something: replicate specimens of a condition, or a law across conditions."""
-    key = ("declared",)
-    if key not in rows.cache:
-        rows.cache[key] = declare(rows)
-    return rows.groups.starts["specimen"].size - rows.cache[key].numbers_of_mu >= 2
+    return rows.groups.starts["specimen"].size - declare(rows).numbers_of_mu >= 2
 
 
 def _df(rows: Rows, component: Component) -> float:
