@@ -24,6 +24,7 @@ from sealfit.fit.tangent import Layout, Tangent, blocks_of
 from sealfit.fit.terms import Term, derivatives_of, shape_of
 
 LOGARITHMIC = ("b_s", "b_c", "v_s")
+FEW = 24  # declared numbers, of two or three series, which are as quickly held whole as by blocks
 
 
 @dataclass(frozen=True)
@@ -101,9 +102,9 @@ def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.nda
 def _layout(model: Model, rows: Rows) -> Layout:
     """Return the blocks of the model's tangent: the numbers of a specimen's conditions, then those of all terms."""
     declared, size = model.declared, model.theta.size
-    key, whole = ("blocks",), ("layout", model.size)
-    if whole in rows.cache and rows.cache[whole][0] is declared:
-        return rows.cache[whole][1]
+    key, made = ("blocks",), ("layout", model.size)
+    if made in rows.cache and rows.cache[made][0] is declared:
+        return rows.cache[made][1]
     if key not in rows.cache or rows.cache[key][0] is not declared:
         used = np.stack([declared.index[quantity] for quantity in QUANTITIES], axis=1)
         of_condition = [frozenset(numbers[numbers >= 0].tolist()) for numbers in used]
@@ -112,13 +113,14 @@ def _layout(model: Model, rows: Rows) -> Layout:
         for pair in np.unique(specimen * conditions + rows.condition).tolist():
             number, condition = divmod(pair, conditions)
             touched[number] = touched.get(number, frozenset()) | of_condition[condition]
-        index, block = blocks_of(list(touched.values()), size)
+        whole = [frozenset(range(size))]
+        index, block = blocks_of(whole * len(touched) if size <= FEW else list(touched.values()), size)
         rows.cache[key] = (declared, index, block[specimen])
     _, index, block = rows.cache[key]
     added = np.arange(size, model.size)
     index = np.column_stack([np.where(index == size, model.size, index), np.tile(added, (len(index), 1))])
-    rows.cache[whole] = (declared, Layout(model.size, index, block))
-    return rows.cache[whole][1]
+    rows.cache[made] = (declared, Layout(model.size, index, block))
+    return rows.cache[made][1]
 
 
 def friction_of(model: Model, rows: Rows) -> np.ndarray:
