@@ -24,6 +24,15 @@ def test_units_of_evidence():
     assert units["aging_days"] == "specimen"
 
 
+def test_a_text_of_more_than_a_hundred_values_is_no_channel():
+    bins = make_bins(days=(1.0, 2.0, 4.0, 8.0, 16.0, 32.0), bins=2)
+    number = bins["file"].factorize()[0]
+    bins["noted_at"], bins["tray"] = (number % 150).astype(str), (number % 90).astype(str)  # neither is a file's own
+    names = {c.name for c in find_channels(make_rows(bins, has_aging=True))}
+    assert "tray" in names
+    assert "noted_at" not in names
+
+
 def test_a_serial_number_is_a_grouping_and_not_a_channel():
     bins = make_bins(repeats=2, bins=4)
     bins["serial"] = "no " + bins["file"]
