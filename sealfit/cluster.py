@@ -123,6 +123,8 @@ class Cluster:
                 mend="If memory ran out, give the workers more of it; their logs say more.",
             ) from error
         except (CancelledError, OSError) as error:
+            if sent and sent[0].status == "error":  # the work's own
+                raise
             raise WorkerError(
                 f"the cluster {self.scheduler} went away.", mend="Look at the scheduler, and run the command again."
             ) from error
@@ -137,7 +139,7 @@ class Cluster:
             try:
                 return future.result(timeout=LOOK_S)
             except TimeoutError:
-                if future.done():  # the work itself ended with one
+                if future.status == "error":  # the work itself ended with one
                     raise
                 alone = alone + LOOK_S if not self.threads() else 0.0
         raise WorkerError(

@@ -48,6 +48,15 @@ def wrong(number):
     raise RequestError(f"{number} is wrong.", mend="Use another.")
 
 
+def timed_out(number):
+    raise TimeoutError("too slow")
+
+
+def answer_late(number):
+    time.sleep(0.02 * (number % 7))
+    return number
+
+
 def fatal(number):
     os._exit(1)
 
@@ -63,6 +72,14 @@ def test_a_map_runs_on_the_cluster_in_order(dask):
 
 def process_id(_):
     return os.getpid()
+
+
+def test_an_answer_that_comes_as_the_wait_ends_is_taken(dask, monkeypatch):
+    monkeypatch.setattr("sealfit.cluster.LOOK_S", 0.02)
+    with on_cluster(str(dask.file)):
+        assert list(run_map(answer_late, range(120), together=1)) == list(range(120))
+        with pytest.raises(TimeoutError, match="too slow"):
+            list(run_map(timed_out, range(2)))
 
 
 def test_a_map_survives_a_killed_worker(dask):
