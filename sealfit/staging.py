@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sealfit.report.drawn import Drawn
 
 STAGING = ".staging-"
+PARQUET = ".parquet"
 
 
 class Staged:
@@ -38,7 +39,7 @@ class Staged:
         """Write table `name` of `tables.SCHEMAS`; ValueError if the frame does not have its columns and types."""
         from sealfit import parquet
 
-        self._write(f"{name}.parquet", lambda path: parquet.write(frame, SCHEMAS[name], self._units, path))
+        self._write(f"{name}{PARQUET}", lambda path: parquet.write(frame, SCHEMAS[name], self._units, path))
 
     def json(self, name: str, document: Mapping) -> None:
         """Write `document` as `<name>.json`; numbers that are not finite become null."""

@@ -18,7 +18,7 @@ from sealfit.errors import ConfigError, OutError, StaleError
 from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, fingerprints, seen_config, step_keys
 from sealfit.lock import LOCK, only_writer
 from sealfit.provenance import provenance
-from sealfit.staging import STAGING, Staged, disk, sync, undisturbed
+from sealfit.staging import PARQUET, STAGING, Staged, disk, sync, undisturbed
 from sealfit.state import STATE, ConfigCopy, Done, State, to_json
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from sealfit.samples import StoredTraces
 
 PROVENANCE = "provenance.json"
-PARQUET = ".parquet"
 
 
 class Store:

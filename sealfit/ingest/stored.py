@@ -23,11 +23,11 @@ from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.part import SAMPLED, Asked, FileFound, read_part
-from sealfit.staging import disk
+from sealfit.staging import PARQUET, disk
 from sealfit.tables import SCHEMAS
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
-PARQUET, ARROW = ".parquet", ".arrow"
+ARROW = ".arrow"
 _ABOUT = b"part"
 
 Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each column, as Arrow spells it
