@@ -55,7 +55,11 @@ def read_files(refs: Sequence[TraceRef], campaign: Path, config: Config) -> list
     Parameters
     ----------
     refs : sequence of TraceRef
-        Some 32 or 64 files; more gain nothing. See `read_strokes` for the others.
+        Some 32 or 64 files; more gain nothing.
+    campaign : Path
+        Campaign folder.
+    config : Config
+        The rig.
     """
     folder = Folder(campaign)
     made: list[FileStrokes] = []
