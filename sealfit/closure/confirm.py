@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from sealfit.closure.channels import CALENDAR, FINER, LEAST_UNITS, unit_of
 from sealfit.closure.forms import describe
@@ -167,8 +166,10 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
         weight = rows.weight[out]
         squares += weight @ old**2, weight @ new**2
     # Files differ in how strong their ripple is, so each is asked whether it is there at all, in both halves alike.
+    from scipy.stats import wilcoxon  # here, as scipy.stats takes half a second to load
+
     both = agreement(samples, sample_first, length, axis)
-    there = both.size > 1 and stats.wilcoxon(both, alternative="greater").pvalue < SURE
+    there = both.size > 1 and wilcoxon(both, alternative="greater").pvalue < SURE
     rmse = np.sqrt(squares)
     return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(squares[0] - squares[1]) if there else -1.0)
 

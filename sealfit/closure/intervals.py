@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import LEVELS
@@ -21,7 +21,7 @@ def degrees_of_freedom(fitted: Fitted) -> float:
 
 def t_quantile(df: float) -> float:
     """Return the two-sided 95 % quantile of Student's t."""
-    return float(stats.t.ppf(0.975, df))
+    return float(stdtrit(df, 0.975))
 
 
 def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:

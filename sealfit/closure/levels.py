@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy.special import fdtrc
 
 from sealfit.closure.judge import Candidate
 from sealfit.fit.estimate import Fitted
@@ -109,7 +109,7 @@ def lack_of_fit(fitted: Fitted) -> float | None:
     df_fit = float(runs - rank)
     if df_pure < 1 or df_fit < 1:
         return None
-    return float(stats.f.sf((left @ left / df_fit) / max(pure / df_pure, 1e-300), df_fit, df_pure))
+    return float(fdtrc(df_fit, df_pure, (left @ left / df_fit) / max(pure / df_pure, 1e-300)))
 
 
 def _left_of_model(

@@ -14,8 +14,8 @@ from functools import lru_cache
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 from scipy.fft import next_fast_len
+from scipy.special import betaincc, gammaincc
 
 from sealfit.closure.background import LOBE, alike, background, smooth_background, tops
 from sealfit.closure.waves import strokes_of
@@ -219,7 +219,7 @@ def _coherent(spectrum: Spectrum, axis: str) -> list[Peak]:
 
 def _coherence_p(statistic: float, units: int) -> float:
     """Return P(R >= statistic) for random phases: R/n is Beta(1, n - 1) where amplitudes are alike."""
-    return float(stats.beta.sf(min(statistic / units, 1.0), 1, max(units - 1, 1)))
+    return float(betaincc(1, max(units - 1, 1), min(statistic / units, 1.0)))
 
 
 def _incoherent(spectrum: Spectrum, axis: str) -> Peak:
@@ -231,7 +231,8 @@ def _incoherent(spectrum: Spectrum, axis: str) -> Peak:
     open_power = np.where(spectrum.taken, np.nan, spectrum.power)
     ratio = spectrum.power / smooth_background(open_power, spectrum.frequency, spectrum.count)
     count = np.minimum(spectrum.count, alike(np.where(spectrum.taken, np.nan, ratio)))
-    own = stats.gamma.logsf(ratio * count, count)
+    with np.errstate(divide="ignore"):  # -inf: beyond doubt
+        own = np.log(gammaincc(count, ratio * count))
     peaks = tops(spectrum.power) & ~spectrum.taken
     k = int(np.argmin(np.where(peaks, own, 1.0)))
     p = float(np.exp(own[k])) * spectrum.frequency.size

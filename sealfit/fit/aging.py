@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy.special import ndtri, stdtrit
 
 from sealfit.config import Config
 from sealfit.fit.condition import FULL
@@ -183,7 +183,7 @@ def _rubber_rows(values, curves, fitted, used, own, unit, found) -> Iterator[dic
     for part, fit in plain.values():
         model[part] = fit.model
     joint = fit_law(_with_specimens(values, taus, model))
-    t = np.array([stats.t.ppf(0.975, df) if df > 0 else stats.norm.ppf(0.975) for df in dfs])
+    t = np.array([stdtrit(df, 0.975) if df > 0 else ndtri(0.975) for df in dfs])
     intervals = curve_intervals(joint, t**2)
     shift = _shift(joint, used, own)
     for curve in curves:
@@ -250,7 +250,7 @@ def _curve(own: pd.DataFrame, quantity: str, days: np.ndarray | None) -> pd.Data
             value = numbers[f"{names[j]},{names[i]}"]
             covariance[i, j] = covariance[j, i] = value if np.isfinite(value) else 0.0
     df = numbers[f"{quantity}:error_df"]
-    t = stats.t.ppf(0.975, df) if df > 0 else stats.norm.ppf(0.975)
+    t = stdtrit(df, 0.975) if df > 0 else ndtri(0.975)
     if days is None:
         days = numbers[f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
     days = np.asarray(days, float)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy.special import stdtrit
 
 from sealfit.config import Config
 from sealfit.fit.cells import Cells
@@ -114,7 +114,7 @@ def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: C
     n, places, mean = table.size().to_numpy(), float(table[PLACES].first().sum()), table.mean()
     setup = max(widened[0] - 1, 0.0) * spread[SLIDING] ** 2
     error = spread[TOP] * mean[NOISE].to_numpy() / np.sqrt(n)
-    at_least = stats.t.isf(FAMILY / max(places, 1.0), np.maximum(df, 1))
+    at_least = -stdtrit(np.maximum(df, 1), FAMILY / max(places, 1.0))
     peak = (df >= 1) & (mean[TOP].to_numpy() > at_least * error)
     reason = np.where(peak, "", np.where(df >= 1, NO_PEAK, FEW))
     above = spread[RATIO] * mean[NOISE].to_numpy() / mean[FORCE].to_numpy()
@@ -126,7 +126,7 @@ def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: C
     ):
         value = np.exp(mean[f"log {name}"].to_numpy())
         error = np.where(peak, np.sqrt(variance / n), np.nan)
-        half = stats.t.ppf(0.975, error_df) * error
+        half = stdtrit(error_df, 0.975) * error
         row = {"quantity": "break_away", "parameter": name, "value": value, "se": value * error}
         row |= {"lo95": value * np.exp(-half), "hi95": value * np.exp(half), "u_sys": u_sys, "unit": unit}
         both.append(pd.DataFrame({**row, "identified": peak, "reason": reason}))

@@ -17,8 +17,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 from scipy.optimize import brentq
+from scipy.special import stdtrit
 
 from sealfit.errors import FitError
 from sealfit.fit.aged import Aged
@@ -72,7 +72,7 @@ class JointLaw:
     @property
     def t(self) -> float:
         """Student's quantile of 95 % intervals."""
-        return float(stats.t.ppf(0.975, max(self.df, 1)))
+        return float(stdtrit(max(self.df, 1), 0.975))
 
     def at(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
         """Return the law at other conditions, shape (n,), or (..., n) for x of shape (..., p).

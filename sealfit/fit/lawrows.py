@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc
 
 from sealfit.fit.law import LawFit
 from sealfit.fit.lawprofile import CurveInterval
@@ -120,7 +120,7 @@ def statistics_rows(curve, joint, plain, values, q, tau, df, share, unit) -> Ite
     own_df = float(own.sum() - 2 + (unaged.sum() - 1) / share)
     shown = own | unaged
     error = joint.model[shown] / values.value[shown] - 1
-    p = float(stats.chi2.sf(chi2, own_df)) if own_df > 0 else np.nan
+    p = float(chdtrc(own_df, chi2)) if own_df > 0 else np.nan
     reason = ""
     if not own_df > 0:
         reason = "as many parameters as days: the law cannot disagree with them."

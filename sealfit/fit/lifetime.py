@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 from scipy.optimize import brentq
+from scipy.special import ndtri, stdtr
 
 from sealfit.errors import RequestError
 from sealfit.fit.aged import DRIVERS, Aged
@@ -126,7 +126,7 @@ def over_laws(
             if 0 < life.days < FOREVER:
                 error = np.log(life.days / max(life.low, 1e-300)) / law.t
                 away = log_days - np.log(life.days)
-                total += weight * (stats.t.cdf(away / error, max(law.df, 1)) if error > 0 else float(away >= 0))
+                total += weight * (stdtr(max(law.df, 1), away / error) if error > 0 else float(away >= 0))
             else:
                 total += weight * (life.days == 0)
         return total
@@ -217,7 +217,7 @@ def resampled(
     covariance = law.aged.covariance(law.scatter, mean)
     drawn = mean + rng.standard_normal((draws, mean.size)) @ np.linalg.cholesky(covariance).T
     found = [_days(law, x, goal, place) for x in solved_many(law, covariance, drawn)]
-    days, wider = _days(law, law.x, goal, place), law.t / stats.norm.ppf(0.975)
+    days, wider = _days(law, law.x, goal, place), law.t / ndtri(0.975)
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.log(np.quantile(found, [0.025, 0.975], method="inverted_cdf") / days)
     low, high = days * np.exp(np.clip(ends * wider, -700, 700))

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 from scipy.linalg import block_diag
 from scipy.optimize import minimize_scalar
+from scipy.special import fdtrc
 
 from sealfit.fit.aging import PAIRS, steady_covariance
 from sealfit.fit.condition import FULL, Condition, stacked
@@ -126,7 +126,7 @@ def _shared(
 
 def _worse(rise: float, more: int, df: float) -> bool:
     """Return whether a sum of squares rises by more than its degrees of freedom explain."""
-    return more > 0 and bool(stats.f.sf(rise / more, more, df) < SHARED_P)
+    return more > 0 and bool(fdtrc(more, df, rise / more) < SHARED_P)
 
 
 def _usual_df(variance: UnitVariance) -> float:

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from sealfit.fit.polish import SHRINKS
 from sealfit.fit.rises import Curve, Rises, Stroke, Tangent
@@ -82,7 +82,7 @@ class Stiffness:
     @property
     def quantile(self) -> np.ndarray:
         """Student's quantile of the 95 % intervals of the two, shape (2,)."""
-        return stats.t.ppf(0.975, np.maximum(self.df, 1.0))
+        return stdtrit(np.maximum(self.df, 1.0), 0.975)
 
     def log_half_width(self) -> float:
         """Return half of the 95 % interval of log sigma_0."""

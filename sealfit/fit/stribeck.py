@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtr
 
 from sealfit.fit.batch import at_edge, check, profile
 from sealfit.fit.interval import constrained_ends
@@ -250,5 +250,5 @@ def flat_p_value(speed, load, weight, grid, statistic, df, *, viscous: bool = Tr
     kappa = float(np.sum(2 * np.arcsin(np.minimum(chord / 2, 1.0))))
     c2 = max(float(statistic), 0.0)
     tail = np.exp(-c2 / 2) if not np.isfinite(df) else (1 + c2 / df) ** (-df / 2)
-    alone = 2 * (stats.norm.sf(np.sqrt(c2)) if not np.isfinite(df) else stats.t.sf(np.sqrt(c2), df))
+    alone = 2 * stdtr(df, -np.sqrt(c2))
     return float(min(1.0, kappa / np.pi * tail + alone))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy.special import fdtrc, stdtrit
 
 from sealfit.errors import FitError
 from sealfit.fit.both_ways import BOTH, SAME_SPEED, both_ways_together
@@ -127,7 +127,7 @@ class UnitVariance:
     def rise(self) -> np.ndarray:
         """Return by how much chi-square may exceed its minimum inside a 95 % interval, shape (conditions,)."""
         with np.errstate(invalid="ignore"):
-            return stats.t.ppf(0.975, self.df) ** 2 * self.value
+            return stdtrit(self.df, 0.975) ** 2 * self.value
 
 
 def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
@@ -154,7 +154,7 @@ def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
     ratio = np.divide(chi2, df, out=np.full(chi2.shape, np.nan), where=df > 0)
     pooled = total / total_df if total_df > 0 else np.nan
     repeated = pure_df > 0
-    pooled_p = float(stats.f.sf(pooled, total_df, pure_df)) if repeated and total_df > 0 else np.nan
+    pooled_p = float(fdtrc(total_df, pure_df, pooled)) if repeated and total_df > 0 else np.nan
     if not repeated:
         base, base_df = pooled, total_df
     elif pooled_p <= POOLING_P:
@@ -162,8 +162,8 @@ def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
     else:
         base, base_df = 1.0, pure_df
     with np.errstate(invalid="ignore", divide="ignore"):
-        worse = (ratio > base) & (stats.f.sf(ratio / base, df, base_df) < WORSE_P) & (df < total_df)
-        p = stats.f.sf(ratio, df, pure_df) if repeated else np.full(chi2.shape, np.nan)
+        worse = (ratio > base) & (fdtrc(df, base_df, ratio / base) < WORSE_P) & (df < total_df)
+        p = fdtrc(df, pure_df, ratio) if repeated else np.full(chi2.shape, np.nan)
     return UnitVariance(
         value=np.where(worse, ratio, base),
         df=np.where(worse, df, base_df if base_df > 0 else np.nan),
