@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import json
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,11 +10,8 @@ from typing import Annotated
 import typer
 
 from sealfit import __version__
-from sealfit.errors import SealfitError
+from sealfit.ending import end, exit_code, print_json
 from sealfit.options import Campaign, ConfigFile, Force, Json, Out, Profile, Results, Scheduler, Strict, Workers
-from sealfit.threads import one_thread
-
-INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
 app = typer.Typer(
     help="From a friction rig's CSV files to the LuGre model of an aging rubber seal, and to what that model lacks.",
@@ -146,7 +140,7 @@ def predict(
     from sealfit import progress, requests, summary
 
     made = requests.predict(out, points, output, progress=progress.to_stderr())
-    _end("predict", made, summary.predict_lines, as_json)
+    end("predict", made, summary.predict_lines, as_json)
 
 
 @app.command()
@@ -166,7 +160,7 @@ def lifetime(
 
     asked = {"quantity": quantity, "threshold": threshold, "loss_pct": loss, "law": law}
     asked |= {"temperature_C": temperature, "compression_pct": compression, "years": years}
-    _end("lifetime", requests.lifetime(out, **asked), summary_life.lifetime_lines, as_json)
+    end("lifetime", requests.lifetime(out, **asked), summary_life.lifetime_lines, as_json)
 
 
 @app.command()
@@ -177,7 +171,7 @@ def effects(
     """List the catalogue of effects."""
     from sealfit import requests, summary
 
-    _end("effects", requests.effects(out), summary.effects_lines, as_json)
+    end("effects", requests.effects(out), summary.effects_lines, as_json)
 
 
 @app.command()
@@ -191,7 +185,7 @@ def simulate(
     from sealfit import requests
 
     made = requests.simulate(spec, out, force=force)
-    _end("simulate", made, lambda m: [f"{m['files']} trace files in {m['campaign']}", f"truth: {m['truth']}"], as_json)
+    end("simulate", made, lambda m: [f"{m['files']} trace files in {m['campaign']}", f"truth: {m['truth']}"], as_json)
 
 
 @app.command()
@@ -208,7 +202,7 @@ def check(
 
     found, faults = requests.check(campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr())
     if as_json:
-        _print_json({"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]})
+        print_json({"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]})
     else:
         for fault in faults:
             typer.echo(f"{fault.severity}: {fault}")
@@ -267,7 +261,7 @@ def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
         made = work(steps, progress.to_stderr())
     if profile:
         made["profile"] = profiling.as_dicts(parts)
-    _end(command, made, lambda made: summary.lines(made) + profiling.lines(made.get("profile", ())), as_json)
+    end(command, made, lambda made: summary.lines(made) + profiling.lines(made.get("profile", ())), as_json)
 
 
 def _workers(workers: int | None, scheduler: str | None, *needed: str) -> int:
@@ -282,64 +276,9 @@ def _workers(workers: int | None, scheduler: str | None, *needed: str) -> int:
     return workers
 
 
-def _end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: bool) -> None:
-    if as_json:
-        _print_json({"ok": True, "command": command, **made})
-    else:
-        typer.echo("\n".join(lines(made)))
-
-
-def _print_json(document: dict) -> None:
-    from sealfit.state import to_json
-
-    typer.echo(to_json(document), nl=False)
-
-
-def _fail(message: str, errors: list[dict], code: int) -> int:
-    if "--json" in sys.argv[1:]:
-        print(json.dumps({"ok": False, "errors": errors}, indent=1, ensure_ascii=False, allow_nan=False))
-    print(message, file=sys.stderr)
-    return code
-
-
-def _interrupted() -> int:
-    text = "interrupted; what was complete before is kept."
-    return _fail(f"sealfit: {text}", [_error(text)], INTERRUPTED)
-
-
-def _error(reason: str) -> dict:
-    return {"file": None, "line": None, "column": None, "value": None, "mend": "", "reason": reason}
-
-
 def main() -> None:
     """Run the command line; the exit code is 0, 1 (input or request), 2 (usage) or 130 (Ctrl-C)."""
-    sys.exit(_exit_code())
-
-
-def _exit_code() -> int:
-    one_thread()
-    gc.set_threshold(100_000, 20, 20)  # a campaign is many objects and no cycles: looking for them takes a fifth
-    try:
-        code = app(standalone_mode=False, prog_name="sealfit") or 0
-        return _interrupted() if code == INTERRUPTED else code
-    except SealfitError as error:
-        return _fail(f"sealfit: {error}", error.as_dicts(), 1)
-    except (KeyboardInterrupt, typer.Abort):  # typer hands on a Ctrl-C as one of these or as the code, by version
-        return _interrupted()
-    except BrokenPipeError:  # `sealfit effects | head`: the reader has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except Exception as error:
-        # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they can do.
-        if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):
-            raise
-        text = error.format_message()
-        if "NoArgs" in type(error).__name__:  # `sealfit` alone: its message is the help
-            return _fail(text, [_error("no command was given.")], error.exit_code)
-        usage = error.ctx.get_usage() if getattr(error, "ctx", None) else ""
-        hint = f"Try: {error.ctx.command_path} --help" if usage else ""
-        shown = "\n".join(part for part in (usage, hint, f"sealfit: {text}") if part)
-        return _fail(shown, [_error(text)], error.exit_code)
+    sys.exit(exit_code(app))
 
 
 if __name__ == "__main__":
