@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import socket
+import threading
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -134,14 +135,16 @@ class Cluster:
 
     def _result(self, future: Future) -> list:
         """Return a chunk's answer; WorkerError where no worker is left for a while to give one."""
-        alone = 0.0
+        ended, alone = threading.Event(), 0.0
+        future.add_done_callback(lambda _: ended.set())  # a wait of Dask's own may lose an answer that comes as it ends
         while alone < ALONE_S:
-            try:
-                return future.result(timeout=LOOK_S)
-            except TimeoutError:
-                if future.status == "error":  # the work itself ended with one
-                    raise
-                alone = alone + LOOK_S if not self.threads() else 0.0
+            if ended.wait(LOOK_S):
+                try:
+                    return future.result(timeout=ALONE_S)  # not at once if its worker has died since
+                except TimeoutError:
+                    if future.status == "error":  # the work itself ended with one
+                        raise
+            alone = alone + LOOK_S if not self.threads() else 0.0
         raise WorkerError(
             f"the cluster {self.scheduler} has no workers left.",
             mend="If memory ran out, give them more of it; start them again, then run the command again.",
