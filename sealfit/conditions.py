@@ -94,8 +94,6 @@ def _joined(parts: list[np.ndarray], n: int) -> np.ndarray:
     """Return the parts of each row joined by ", "; None where any part is."""
     if not parts:
         return np.full(n, "", object)
-    codes, rows = pd.factorize(
-        pd.MultiIndex.from_arrays([pd.Series(p, dtype=object) for p in parts]), use_na_sentinel=False
-    )
-    texts = np.array([None if any(pd.isna(p) for p in row) else ", ".join(row) for row in rows], object)
-    return texts[codes]
+    rows = list(zip(*parts, strict=True))
+    texts = {row: None if None in row else ", ".join(row) for row in set(rows)}
+    return np.array([texts[row] for row in rows], object)
