@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
 
 from sealfit.config import Bins
-from sealfit.ingest.pieces import Pieces
-from sealfit.tables import TRACES_MEAN
+from sealfit.ingest.pieces import Pieces, median
 
 LAGS = 20  # the sum of correlations ends within so few, unless the noise is slow: then all lags are computed at once
 MAX_CELLS = 2000  # per run, in traces_mean: finer than any screen shows
 SAME_TRAVEL = 2  # cells by which strokes that are averaged before they slide steadily may differ in travel
+Samples = Mapping[str, np.ndarray]  # columns of equal length
 BRIDGED = 3  # empty cells in a row that are filled by a straight line: scarce samples, not a gap
 
 
@@ -70,8 +71,8 @@ def _slow_tau(centred: np.ndarray) -> float:
 
 def mean_by_group(values: np.ndarray, group: np.ndarray, groups: int, count: np.ndarray) -> np.ndarray:
     """Return the mean of `values` in each of `groups` groups, shape (groups,); `count` samples each, NaN for none."""
-    total = np.bincount(group, values, minlength=groups)
-    return np.divide(total, count, out=np.full(groups, np.nan), where=count > 0)
+    with np.errstate(invalid="ignore"):
+        return np.bincount(group, values, minlength=groups) / count
 
 
 def common_by_group(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
@@ -86,7 +87,7 @@ def common_by_group(values: np.ndarray, group: np.ndarray, groups: int) -> np.nd
     return made
 
 
-def bin_table(samples: pd.DataFrame, strokes: pd.DataFrame, settings: Bins) -> pd.DataFrame:
+def bin_table(samples: Samples, strokes: pd.DataFrame, settings: Bins) -> dict[str, np.ndarray]:
     """Return the steady window of every stroke cut along displacement, a row per bin.
 
     All strokes of a run share the edges of their bins, which span the windows of all of them, so a pattern along
@@ -95,9 +96,9 @@ def bin_table(samples: pd.DataFrame, strokes: pd.DataFrame, settings: Bins) -> p
 
     Parameters
     ----------
-    samples : DataFrame
-        Samples of the steady windows: `row` (place in `strokes`), displacement_mm, force_N and further columns,
-        numbers or labels, whose means (or most frequent labels) are wanted.
+    samples : mapping of str to ndarray, shape (n,)
+        Samples of the steady windows, stroke after stroke, at least one: `row` (place in `strokes`), displacement_mm,
+        force_N and further columns, numbers or labels, whose means (or most frequent labels) are wanted.
     strokes : DataFrame
         One row per stroke: `run_id`, `direction`.
     settings : Bins
@@ -105,47 +106,58 @@ def bin_table(samples: pd.DataFrame, strokes: pd.DataFrame, settings: Bins) -> p
 
     Returns
     -------
-    DataFrame
+    dict of str to ndarray
         `row`, `bin` (from 0 in the direction of motion), `n`, `force_sd_N`, and the mean of every column of `samples`.
     """
-    row = samples["row"].to_numpy()
-    run = pd.factorize(strokes["run_id"])[0]
-    place, bins = _bin_of(samples["displacement_mm"].to_numpy(), row, run, strokes["direction"].to_numpy(), settings)
-    width = int(bins.max(initial=1))
-    group, count = _joined(row * width + place, len(strokes), width, settings.min_samples)
-    groups = len(strokes) * width
-    made = {"row": np.arange(groups) // width, "bin": np.arange(groups) % width, "n": count}
-    for name in samples.columns.drop("row"):
-        values = samples[name].to_numpy()
+    row, own = _owners(samples["row"])
+    group, width = _bin_of(np.asarray(samples["displacement_mm"]), own, strokes.iloc[row], settings)
+    group, count = _joined(group, len(own), width, settings.min_samples)
+    groups, shown = len(count), np.flatnonzero(count)
+    made = {"row": row[shown // width], "bin": shown % width, "n": count[shown]}
+    for name in samples:
+        values = np.asarray(samples[name])
+        if name == "row":
+            continue
         if values.dtype.kind in "fiub":
-            made[name] = mean_by_group(values.astype(float), group, groups, count)
+            made[name] = mean_by_group(values.astype(float, copy=False), group, groups, count)[shown]
         else:
-            made[name] = common_by_group(values, group, groups)
-    off = samples["force_N"].to_numpy() - made["force_N"][group]
-    square = np.bincount(group, off * off, minlength=groups)
-    made["force_sd_N"] = np.sqrt(np.divide(square, count - 1.0, out=np.full(groups, np.nan), where=count > 1))
-    return pd.DataFrame(made)[count > 0].reset_index(drop=True)
+            made[name] = common_by_group(values, group, groups)[shown]
+    force = np.asarray(samples["force_N"])
+    off = force - mean_by_group(force, group, groups, count)[group]
+    square, n = np.bincount(group, off * off, minlength=groups)[shown], count[shown]
+    made["force_sd_N"] = np.sqrt(np.divide(square, n - 1.0, out=np.full(len(n), np.nan), where=n > 1))
+    return made
 
 
-def _bin_of(
-    displacement: np.ndarray, row: np.ndarray, run: np.ndarray, direction: np.ndarray, settings: Bins
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bin of every sample, and the number of bins of every run."""
-    runs = int(run.max(initial=-1)) + 1
-    low, high = np.full(runs, np.inf), np.full(runs, -np.inf)
-    np.minimum.at(low, run[row], displacement)
-    np.maximum.at(high, run[row], displacement)
-    per_stroke = np.bincount(row, minlength=len(run)).astype(float)
-    typical = (
-        pd.Series(per_stroke[per_stroke > 0]).groupby(run[per_stroke > 0]).median().reindex(range(runs), fill_value=0)
-    )
+def _owners(row: np.ndarray) -> tuple[np.ndarray, Pieces]:
+    """Return the strokes that have samples, and where those of each lie; `row` says whose every sample is, rising."""
+    count = np.bincount(row)
+    there = np.flatnonzero(count)
+    return there, Pieces(count[there])
+
+
+def _bin_of(x: np.ndarray, own: Pieces, strokes: pd.DataFrame, settings: Bins) -> tuple[np.ndarray, int]:
+    """Return the bin of every sample, counted through all strokes, and how many each stroke has room for."""
+    run, names = pd.factorize(strokes["run_id"])
+    low, high = _range_of_runs(own.min(x), own.max(x), run, len(names))
+    typical = np.array([median(own.size[run == i].astype(float)) for i in range(len(names))])
     # Half as many again as needed on average, since samples do not fall into bins evenly.
-    bins = np.clip(typical.to_numpy() // np.ceil(1.5 * settings.min_samples), 1, settings.per_stroke).astype(int)
-    of = run[row]
-    width = (high[of] - low[of]) / bins[of]
-    place = np.floor(np.divide(displacement - low[of], width, out=np.zeros(len(of)), where=width > 0)).astype(int)
-    place = np.clip(place, 0, bins[of] - 1)
-    return np.where(direction[row] < 0, bins[of] - 1 - place, place), bins
+    bins = np.clip(typical // np.ceil(1.5 * settings.min_samples), 1, settings.per_stroke).astype(int)
+    width = (high - low) / bins
+    width[width <= 0.0] = np.inf  # all in the first bin
+    place = ((x - own.spread(low[run])) / own.spread(width[run])).astype(int)
+    np.minimum(place, own.spread(bins[run] - 1), out=place)
+    room, back = int(bins.max()), strokes["direction"].to_numpy() < 0
+    first = np.arange(len(own)) * room + np.where(back, bins[run] - 1, 0)
+    return own.spread(first) + np.where(own.spread(back), -place, place), room
+
+
+def _range_of_runs(low: np.ndarray, high: np.ndarray, run: np.ndarray, runs: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest value of every run, shape (runs,), from those of its strokes."""
+    least, largest = np.full(runs, np.inf), np.full(runs, -np.inf)
+    np.minimum.at(least, run, low)
+    np.maximum.at(largest, run, high)
+    return least, largest
 
 
 def _joined(group: np.ndarray, strokes: int, width: int, least: int) -> tuple[np.ndarray, np.ndarray]:
@@ -166,139 +178,130 @@ def _joined(group: np.ndarray, strokes: int, width: int, least: int) -> tuple[np
     return group, np.bincount(group, minlength=strokes * width)
 
 
-def mean_traces(samples: pd.DataFrame, strokes: pd.DataFrame) -> pd.DataFrame:
-    """Return table `traces_mean`: the mean over repeats on a displacement grid that the repeats of a run share.
+def mean_traces(samples: Samples, strokes: pd.DataFrame) -> dict[str, np.ndarray]:
+    """Return the mean over repeats on a displacement grid that the repeats of a run share.
 
     Cells are as wide as the usual step between samples, so the pre-sliding rise keeps its shape. The strokes of one
     file are averaged first; mean and standard error are then those of the files of the run, each weighing the same.
 
     Parameters
     ----------
-    samples : DataFrame
-        Samples of sliding: `row` (place in `strokes`), displacement_mm, force_N, steady.
+    samples : mapping of str to ndarray, shape (n,)
+        Samples of sliding, stroke after stroke, at least one: `row` (place in `strokes`), displacement_mm, force_N,
+        steady.
     strokes : DataFrame
-        One row per stroke: file, run_id, direction, condition.
+        One row per stroke: file, run_id, direction.
+
+    Returns
+    -------
+    dict of str to ndarray
+        What table `traces_mean` holds of numbers, and `row`, the first stroke of the run.
     """
-    if not len(samples):
-        return pd.DataFrame({column.name: [] for column in TRACES_MEAN.columns})
-    row, x = samples["row"].to_numpy(), samples["displacement_mm"].to_numpy()
-    run = pd.factorize(strokes["run_id"])[0]
-    low, step, cells = _grid(x, row, run)
-    offset = np.concatenate(([0], np.cumsum(cells[run])))  # of each stroke in one flat array of cells
-    of = run[row]
-    place = np.minimum(((x - low[of]) / step[of]).astype(int), cells[of] - 1)
-    flat, size = offset[row] + place, int(offset[-1])
-    count = np.bincount(flat, minlength=size)
-    force = mean_by_group(samples["force_N"].to_numpy(), flat, size, count)
-    steady = mean_by_group(samples["steady"].to_numpy(float), flat, size, count)
-    owner = np.repeat(np.arange(len(strokes)), cells[run])
-    force, steady = _bridged(force, steady, owner)
-    cell = np.arange(size) - offset[owner]
-    known = np.isfinite(force)
-    travel = _travel(cell, known, owner, strokes["direction"].to_numpy())
-    owner, cell, force, steady = owner[known], cell[known], force[known], steady[known]
-    first_spot = np.concatenate(([0], np.cumsum(cells)))  # of each run in one flat array of the cells of all runs
-    spot, spots = first_spot[run[owner]] + cell, int(first_spot[-1])
-    keep = _comparable(spot, spots, steady, travel)
-    owner, spot, force, steady = owner[keep], spot[keep], force[keep], steady[keep]
-    strokes_there = np.bincount(spot, minlength=spots)
-    spot, force, steady = _one_per_file(spot, pd.factorize(strokes["file"])[0][owner], force, steady)
-    files = np.bincount(spot, minlength=spots)
-    mean = mean_by_group(force, spot, spots, files)
-    square = np.bincount(spot, (force - mean[spot]) ** 2, minlength=spots)
-    error = np.sqrt(np.divide(square, (files - 1.0) * files, out=np.full(spots, np.nan), where=files > 1))
-    lowest = _extreme(np.minimum, np.inf, spot, spots, steady)
+    row, own = _owners(samples["row"])
+    there = strokes.iloc[row]
+    run, names = pd.factorize(there["run_id"])
+    low, step, cells = _grid(np.asarray(samples["displacement_mm"]), own, run, len(names))
+    grid, runs = Pieces(cells[run]), Pieces(cells)  # the cells of every stroke, and of every run, end to end
+    force, steady = _of_cells(samples, own, grid, low[run], step[run])
+    force, steady = _bridged(force, steady, grid)
+    known = np.flatnonzero(np.isfinite(force))
+    owner, force, steady = grid.of[known], force[known], steady[known]
+    cell = known - grid.start[owner]
+    spot = runs.start[run][owner] + cell
+    keep, somewhere = _comparable(spot, runs.rows, steady, _travel(cell, owner, there["direction"].to_numpy()))
+    owner, spot, force = owner[keep], spot[keep], force[keep]
+    strokes_there = np.bincount(spot, minlength=runs.rows)
+    spot, force = _one_per_file(spot, pd.factorize(there["file"])[0][owner], force, len(row))
+    files = np.bincount(spot, minlength=runs.rows)
+    mean = mean_by_group(force, spot, runs.rows, files)
+    square = np.bincount(spot, (force - mean[spot]) ** 2, minlength=runs.rows)
+    error = np.sqrt(np.divide(square, (files - 1.0) * files, out=np.full(runs.rows, np.nan), where=files > 1))
     shown = np.flatnonzero(files)
-    of = np.searchsorted(first_spot, shown, side="right") - 1
-    first = strokes.iloc[np.unique(run, return_index=True)[1]]
-    return pd.DataFrame(
-        {
-            "run_id": first["run_id"].to_numpy()[of],
-            "direction": first["direction"].to_numpy()[of],
-            "condition": first["condition"].to_numpy()[of],
-            "displacement_mm": low[of] + (shown - first_spot[of] + 0.5) * step[of],
-            "force_N": mean[shown],
-            "force_se_N": error[shown],
-            "n": strokes_there[shown],
-            "steady": lowest[shown] >= 1.0,
-        }
-    )
+    of = runs.of[shown]
+    return {
+        "row": row[np.unique(run, return_index=True)[1]][of],
+        "displacement_mm": low[of] + (shown - runs.start[of] + 0.5) * step[of],
+        "force_N": mean[shown],
+        "force_se_N": error[shown],
+        "n": strokes_there[shown],
+        "steady": somewhere[shown],
+    }
 
 
-def _extreme(ufunc: np.ufunc, start: float, group: np.ndarray, groups: int, values: np.ndarray) -> np.ndarray:
-    """Return the least or largest value of each group, shape (groups,); `start` for none."""
-    found = np.full(groups, start)
-    ufunc.at(found, group, values)
-    return found
+def _grid(x: np.ndarray, own: Pieces, run: np.ndarray, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return start, step and number of the cells of every run."""
+    start, stop = own.min(x), own.max(x)
+    low, high = _range_of_runs(start, stop, run, runs)
+    span = np.where(high > low, high - low, 1.0)
+    usual = (stop - start) / np.maximum(own.size - 1.0, 1.0)
+    widest = np.zeros(runs)
+    np.maximum.at(widest, run, usual)
+    step = np.maximum(np.where(widest > 0.0, widest, span), span / MAX_CELLS)
+    cells = np.maximum(np.ceil(span / step * (1.0 - 1e-9)), 1).astype(int)
+    return low, span / cells, cells
 
 
-def _one_per_file(
-    spot: np.ndarray, file: np.ndarray, force: np.ndarray, steady: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return place, mean force and whether all is steady, once for every file at every place."""
-    pair, own, count = np.unique(spot * (int(file.max(initial=0)) + 1) + file, return_inverse=True, return_counts=True)
-    if len(pair) == len(spot):
-        return spot, force, steady
-    place = np.zeros(len(pair), int)
-    place[own] = spot
-    return (
-        place,
-        mean_by_group(force, own, len(pair), count),
-        _extreme(np.minimum, np.inf, own, len(pair), steady),
-    )
+def _of_cells(
+    samples: Samples, own: Pieces, grid: Pieces, low: np.ndarray, step: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean force in every cell of every stroke, NaN in empty ones, and whether all samples are steady."""
+    x = np.asarray(samples["displacement_mm"])
+    cell = ((x - own.spread(low)) / own.spread(step)).astype(int)
+    np.minimum(cell, own.spread(grid.size - 1), out=cell)
+    cell += own.spread(grid.start)
+    force = mean_by_group(np.asarray(samples["force_N"]), cell, grid.rows, np.bincount(cell, minlength=grid.rows))
+    unsteady = cell[~np.asarray(samples["steady"], bool)]
+    return force, np.bincount(unsteady, minlength=grid.rows) == 0
 
 
-def _travel(cell: np.ndarray, known: np.ndarray, owner: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def _bridged(force: np.ndarray, steady: np.ndarray, grid: Pieces) -> tuple[np.ndarray, np.ndarray]:
+    """Return force and steady flag with short runs of empty cells of a stroke filled along a straight line."""
+    full = np.flatnonzero(np.isfinite(force))
+    missing = np.diff(full) - 1
+    short = np.flatnonzero((missing > 0) & (missing <= BRIDGED))
+    short = short[grid.of[full[short]] == grid.of[full[short + 1]]]
+    gaps = Pieces(missing[short])
+    left, right = gaps.spread(full[short]), gaps.spread(full[short + 1])
+    empty = left + 1 + np.arange(gaps.rows) - gaps.spread(gaps.start)
+    share = (empty - left) / (right - left)
+    force, steady = force.copy(), steady.copy()
+    force[empty] = (1.0 - share) * force[left] + share * force[right]
+    steady[empty] = steady[left] & steady[right]
+    return force, steady
+
+
+def _travel(cell: np.ndarray, owner: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Return how many cells each known cell lies behind its stroke's start, along the motion."""
-    first, last = np.full(len(direction), np.iinfo(int).max), np.full(len(direction), -1)
-    np.minimum.at(first, owner[known], cell[known])
-    np.maximum.at(last, owner[known], cell[known])
-    own = owner[known]
-    return np.where(direction[own] > 0, cell[known] - first[own], last[own] - cell[known])
+    own = Pieces(np.bincount(owner))  # every stroke has a cell
+    back = direction < 0
+    turn = own.spread(np.where(back, cell[own.stop - 1], cell[own.start]))
+    return np.where(own.spread(back), turn - cell, cell - turn)
 
 
-def _comparable(spot: np.ndarray, spots: int, steady: np.ndarray, travel: np.ndarray) -> np.ndarray:
-    """Return which cells of which strokes may be averaged with the others at the same place (`spot`) of their run.
+def _comparable(spot: np.ndarray, spots: int, steady: np.ndarray, travel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which cells of which strokes may be averaged with the others at the same place (`spot`) of their run, and
+    the places where these are steady.
 
     Repeats need not start at the same place: where one slides steadily, another may just be starting, and its
     pre-sliding rise would be a dip in the mean. So steady strokes are averaged where there are any, and elsewhere those
     that have come equally far from their own start.
     """
-    somewhere = np.bincount(spot, steady >= 1.0, minlength=spots) > 0
-    furthest = _extreme(np.maximum, -np.inf, spot, spots, travel)
-    return np.where(somewhere[spot], steady >= 1.0, travel >= furthest[spot] - SAME_TRAVEL)
+    somewhere = np.bincount(spot[steady], minlength=spots) > 0
+    keep = steady.copy()
+    others = np.flatnonzero(~somewhere[spot])
+    furthest = np.zeros(spots, int)
+    np.maximum.at(furthest, spot[others], travel[others])
+    keep[others] = travel[others] >= furthest[spot[others]] - SAME_TRAVEL
+    return keep, somewhere
 
 
-def _grid(x: np.ndarray, row: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return start, step and number of the cells of every run."""
-    runs = int(run.max()) + 1
-    low, high = np.full(runs, np.inf), np.full(runs, -np.inf)
-    np.minimum.at(low, run[row], x)
-    np.maximum.at(high, run[row], x)
-    span = np.where(high > low, high - low, 1.0)
-    start, stop = np.full(len(run), np.inf), np.full(len(run), -np.inf)
-    np.minimum.at(start, row, x)
-    np.maximum.at(stop, row, x)
-    count = np.bincount(row, minlength=len(run))
-    usual = np.divide(stop - start, count - 1.0, out=np.zeros(len(run)), where=count > 1)
-    widest = np.zeros(runs)
-    np.maximum.at(widest, run[count > 1], usual[count > 1])
-    step = np.maximum(np.where(widest > 0.0, widest, span), span / MAX_CELLS)
-    cells = np.maximum(np.ceil(span / step * (1.0 - 1e-9)), 1).astype(int)
-    return np.where(np.isfinite(low), low, 0.0), span / cells, cells
-
-
-def _bridged(force: np.ndarray, steady: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return force and steady flag with short runs of empty cells of a stroke filled along a straight line."""
-    places, full = np.arange(len(force)), np.isfinite(force)
-    before = np.maximum.accumulate(np.where(full, places, -1))
-    after = np.minimum.accumulate(np.where(full, places, len(force))[::-1])[::-1]
-    empty = np.flatnonzero(~full & (before >= 0) & (after < len(force)))
-    left, right = before[empty], after[empty]
-    fill = (owner[left] == owner[right]) & (right - left - 1 <= BRIDGED)
-    empty, left, right = empty[fill], left[fill], right[fill]
-    share = (empty - left) / (right - left)
-    force, steady = force.copy(), steady.copy()
-    force[empty] = (1.0 - share) * force[left] + share * force[right]
-    steady[empty] = np.minimum(steady[left], steady[right])
-    return force, steady
+def _one_per_file(spot: np.ndarray, file: np.ndarray, force: np.ndarray, strokes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return place and mean force once for every file at every place."""
+    if file.max(initial=0) + 1 == strokes:  # as many files as strokes
+        return spot, force
+    pair, own, count = np.unique(spot * (int(file.max(initial=0)) + 1) + file, return_inverse=True, return_counts=True)
+    if len(pair) == len(spot):
+        return spot, force
+    place = np.zeros(len(pair), int)
+    place[own] = spot
+    return place, mean_by_group(force, own, len(pair), count)

@@ -26,6 +26,7 @@ from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.shaped import STEADY_ONLY, shaped
 from sealfit.ingest.stored import Made, agrees, common_columns, load_part, make_part, part_key
+from sealfit.parquet import spelled_out
 from sealfit.profiling import timed
 from sealfit.tables import RUNS, STEADY
 
@@ -208,11 +209,14 @@ def strokes_of(parts: Sequence[pa.Table]) -> pd.DataFrame:
     whole = [part for part in parts if part.num_rows]
     if not whole:
         return pd.DataFrame({"file": pd.array([], "str"), "used": np.array([], bool), "by_itself": np.array([], bool)})
-    words = {
-        f.name for part in whole for f in part.schema if pa.types.is_string(f.type) or pa.types.is_large_string(f.type)
-    }
-    table = pa.concat_tables([_worded(part, words) for part in whole], promote_options="permissive").to_pandas()
+    table = joined(whole).to_pandas()
     return table.assign(by_itself=table["used"])
+
+
+def joined(parts: Sequence[pa.Table]) -> pa.Table:
+    """Return all parts in one table; a column that holds words in one part holds words in all."""
+    words = {f.name for part in parts for f in part.schema if _is_text(f.type)}
+    return pa.concat_tables([_worded(part, words) for part in parts], promote_options="permissive")
 
 
 def _is_text(dtype: pa.DataType) -> bool:
@@ -253,8 +257,9 @@ def _still_used(strokes: pd.DataFrame, steady: pd.DataFrame) -> np.ndarray:
     return used
 
 
-def _stacked(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    return tables[0] if len(tables) == 1 else pd.concat(tables, ignore_index=True)
+def _stacked(tables: Sequence[pa.Table]) -> pd.DataFrame:
+    spelled = [table.cast(spelled_out(table.schema)) for table in tables]
+    return joined(spelled).replace_schema_metadata().to_pandas()
 
 
 def _inputs(

@@ -18,7 +18,8 @@ from sealfit.ingest.average import bin_table, mean_traces
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.shaped import STEADY_ONLY, shaped
 from sealfit.ingest.trace_file import FileStrokes, read_files
-from sealfit.tables import BINS
+from sealfit.parquet import as_dictionary, to_arrow
+from sealfit.tables import BINS, TEXT, TRACES, TRACES_MEAN
 
 SAMPLED = ("traces", "traces_mean", "bins")  # tables that are made, and stored, part by part
 
@@ -53,13 +54,14 @@ class Part:
     """What one part gives.
 
     `strokes` has a row per stroke with everything that is known of it, the keys included, and `used` by what the file
-    itself shows; `tables` are those of `SAMPLED`, without the strokes that are not used or were asked to be left out.
+    itself shows; `tables` are those of `SAMPLED` that have rows, without the strokes that are not used or were asked
+    to be left out; their words are dictionaries.
     """
 
     files: tuple[FileFound, ...]
     faults: tuple[Fault, ...]
     strokes: pa.Table
-    tables: dict[str, pd.DataFrame]
+    tables: dict[str, pa.Table]
 
 
 def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
@@ -83,10 +85,11 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
         return Part(found, faults, known, {})
     out = [stroke in asked.unused for stroke in zip(strokes["file"], strokes["stroke"].tolist(), strict=True)]
     strokes = strokes.assign(used=strokes["used"].to_numpy(bool) & ~np.array(out, bool))
-    samples = sample_table(files, strokes)
-    tables = {"traces": samples.drop(columns=["row", "sliding"])}
-    if strokes["used"].any():
-        tables["traces_mean"] = mean_traces(*_sliding(samples, strokes))
+    samples = sample_columns(files, strokes)
+    tables = {"traces": _traces(samples, strokes, config)}
+    if samples["sliding"].any():
+        tables["traces_mean"] = _mean_traces(samples, strokes, config)
+    if samples["steady"].any():
         tables["bins"] = _bins(samples, strokes, config)
     return Part(found, faults, known, tables)
 
@@ -107,12 +110,20 @@ def stroke_table(files: Sequence[FileStrokes], config: Config) -> pd.DataFrame:
 
 
 def _two_runs(table: pd.DataFrame) -> pd.DataFrame:
-    ways = table.groupby(["run_id", "file"])["direction"].transform("nunique")
-    used = table["direction"].where(table["used"]).groupby(table["run_id"]).transform("nunique")
-    both = (ways.groupby(table["run_id"]).transform("max") > 1) | (used > 1)
-    sign = np.where(table["direction"] > 0, "+", "-")
     names = table["run_id"].astype(str)
-    return table.assign(run_id=names.where(~both, names + sign), run=names)
+    run, runs = pd.factorize(names)
+    file = pd.factorize(table["file"])[0]
+    direction, used = table["direction"].to_numpy(), table["used"].to_numpy(bool)
+    both = _both_ways(run[used], direction[used], len(runs))
+    both[run[_both_ways(file, direction, len(table))[file]]] = True
+    sign = np.where(direction > 0, "+", "-")
+    return table.assign(run_id=names.where(~both[run], names + sign), run=names)
+
+
+def _both_ways(group: np.ndarray, direction: np.ndarray, groups: int) -> np.ndarray:
+    """Return, for every group, whether it has strokes both ways."""
+    up, down = (np.bincount(group, chosen, groups) for chosen in (direction > 0, direction < 0))
+    return (up > 0) & (down > 0)
 
 
 def _plain(table: pd.DataFrame) -> pd.DataFrame:
@@ -121,24 +132,20 @@ def _plain(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**{name: values.map(str, na_action="ignore") for name, values in mixed.items()})
 
 
-def sample_table(files: Sequence[FileStrokes], strokes: pd.DataFrame) -> pd.DataFrame:
-    """Return all samples, with `row` (place in `strokes`); `steady` is false throughout a stroke that is not used."""
+def sample_columns(files: Sequence[FileStrokes], strokes: pd.DataFrame) -> dict[str, np.ndarray]:
+    """Return all samples, with `row` (place in `strokes`); `steady` and `sliding` are false throughout a stroke that is
+    not used."""
     parts = [made for made in files if made.samples is not None]
     names = list(dict.fromkeys(name for made in parts for name in made.samples))
     length = [len(made.samples["time_s"]) for made in parts]
     columns = {name: _stacked([made.samples.get(name) for made in parts], length) for name in names}
     first = np.concatenate(([0], np.cumsum([len(made.strokes) for made in parts])[:-1]))
-    row = np.repeat(first, length) + columns["stroke"] - 1
-    columns["steady"] = columns["steady"] & strokes["used"].to_numpy(bool)[row]
-    head = {name: _each(strokes[name], row) for name in ("file", "condition")}
-    head["stroke"] = columns.pop("stroke").astype(np.int64)
-    order = ["time_s", "displacement_mm", "force_N", "steady"]
-    return pd.DataFrame({**head, **{name: columns.pop(name) for name in order}, **columns, "row": row})
-
-
-def _each(labels: pd.Series, row: np.ndarray) -> pd.api.extensions.ExtensionArray:
-    """Return the label of every sample: Arrow repeats words ten times as fast as an array of objects."""
-    return pd.array(pa.array(labels, pa.string(), from_pandas=True).take(pa.array(row)), dtype="str")
+    columns["row"] = np.repeat(first, length) + columns["stroke"] - 1
+    used = strokes["used"].to_numpy(bool)
+    if not used.all():
+        for name in ("steady", "sliding"):
+            columns[name] = columns[name] & used[columns["row"]]
+    return columns
 
 
 def _stacked(parts: list[np.ndarray | None], length: list[int]) -> np.ndarray:
@@ -149,22 +156,39 @@ def _stacked(parts: list[np.ndarray | None], length: list[int]) -> np.ndarray:
     return np.concatenate([np.full(n, None, object) if p is None else p for p, n in zip(parts, length, strict=True)])
 
 
-def _sliding(samples: pd.DataFrame, strokes: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the samples of sliding of the strokes that are used, and these strokes, with places renewed."""
-    used = strokes["used"].to_numpy(bool)
-    place = np.cumsum(used) - 1
-    row = samples["row"].to_numpy()
-    rows = samples.loc[samples["sliding"].to_numpy(bool) & used[row], ["row", "displacement_mm", "force_N", "steady"]]
-    return rows.assign(row=place[rows["row"].to_numpy()]), strokes[used].reset_index(drop=True)
+def _traces(samples: Mapping[str, np.ndarray], strokes: pd.DataFrame, config: Config) -> pa.Table:
+    """Return table `traces`."""
+    measured = {name: values for name, values in samples.items() if name not in ("row", "sliding")}
+    words = {name: as_dictionary(strokes[name], samples["row"]) for name in ("file", "condition")}
+    return to_arrow({**measured, **words}, TRACES, config.units)
 
 
-def _bins(samples: pd.DataFrame, strokes: pd.DataFrame, config: Config) -> pd.DataFrame:
+def _mean_traces(samples: Mapping[str, np.ndarray], strokes: pd.DataFrame, config: Config) -> pa.Table:
+    """Return table `traces_mean`, of the sliding of the strokes that are used."""
+    rows = np.flatnonzero(samples["sliding"])
+    names = ("row", "displacement_mm", "force_N", "steady")
+    made = mean_traces({name: samples[name][rows] for name in names}, strokes)
+    row = made.pop("row")
+    words = {name: as_dictionary(strokes[name], row) for name in ("run_id", "condition")}
+    return to_arrow({**made, "direction": strokes["direction"].to_numpy()[row], **words}, TRACES_MEAN, config.units)
+
+
+def _bins(samples: Mapping[str, np.ndarray], strokes: pd.DataFrame, config: Config) -> pa.Table:
     """Return table `bins`: means of what was measured along the trace, and what is known of the whole stroke."""
-    rows = samples[samples["steady"].to_numpy(bool)].drop(columns=["file", "condition", "stroke", "steady", "sliding"])
-    made = bin_table(rows, strokes, config.bins)
-    measured = [name for name in made.columns if name != "row"]
-    whole = strokes.drop(columns=[name for name in measured if name in strokes.columns])
-    if "load_N" in measured and "load_N" in strokes.columns:  # where some files measure it and others declare it
-        made["load_N"] = made["load_N"].fillna(strokes["load_N"].iloc[made["row"]].reset_index(drop=True))
-    known = whole.iloc[made["row"]].reset_index(drop=True)
-    return shaped(pd.concat([known, made], axis=1), BINS, drop=(*STEADY_ONLY, "used"))
+    rows = np.flatnonzero(samples["steady"])
+    measured = {name: values[rows] for name, values in samples.items() if name not in ("stroke", "steady", "sliding")}
+    made = bin_table(measured, strokes, config.bins)
+    binned, place = np.unique(made.pop("row"), return_inverse=True)
+    strokes = strokes.iloc[binned].reset_index(drop=True)
+    if "load_N" in made and "load_N" in strokes.columns:  # where some files measure it and others declare it
+        made["load_N"] = np.where(np.isnan(made["load_N"]), strokes["load_N"].to_numpy(float)[place], made["load_N"])
+    whole = strokes.drop(columns=[name for name in made if name in strokes.columns]).assign(**dict.fromkeys(made, 0.0))
+    known = to_arrow(shaped(whole, BINS, drop=(*STEADY_ONLY, "used")), BINS, config.units)
+    columns = {name: made[name] if name in made else _spread(known.column(name), place) for name in known.column_names}
+    return to_arrow(columns, BINS, config.units)
+
+
+def _spread(values: pa.ChunkedArray, row: np.ndarray) -> pa.Array:
+    """Return the value of every row, words as dictionaries."""
+    whole = values.combine_chunks()
+    return as_dictionary(whole, row) if whole.type == TEXT else whole.take(pa.array(row))

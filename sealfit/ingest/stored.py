@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import pandas as pd
 import pyarrow as pa
 
 from sealfit import __version__, parquet
@@ -24,7 +23,6 @@ from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.part import SAMPLED, Asked, FileFound, read_part
 from sealfit.staging import PARQUET, disk
-from sealfit.tables import SCHEMAS
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
 ARROW = ".arrow"
@@ -46,7 +44,7 @@ class Made:
     faults: tuple[Fault, ...]
     strokes: pa.Table
     columns: Columns
-    tables: Mapping[str, pd.DataFrame]
+    tables: Mapping[str, pa.Table]
     stored: Mapping[str, int]
 
 
@@ -59,18 +57,19 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         If the disk is full or refuses.
     """
     part = read_part(asked, campaign, config)
-    tables = {name: table for name, table in part.tables.items() if len(table)}
+    tables = part.tables
     if folder is None:
         return Made(asked, part.files, part.faults, part.strokes, {}, tables, {})
-    arrow = {name: parquet.to_arrow(table, SCHEMAS[name], config.units) for name, table in tables.items()}
-    columns = {name: {f.name: str(f.type) for f in table.schema} for name, table in arrow.items()}
+    columns = {name: {f.name: str(f.type) for f in parquet.spelled_out(table.schema)} for name, table in tables.items()}
     if asked.columns is not None:
-        arrow = {name: parquet.with_columns(table, asked.columns[name], config.units) for name, table in arrow.items()}
+        tables = {
+            name: parquet.with_columns(table, asked.columns[name], config.units) for name, table in tables.items()
+        }
     name = _file_name(part_key(asked, {found.file: found.mark for found in part.files}, config), asked)
     with disk(folder.parent):
         stored = {
             (file := f"{of}{PARQUET}/{name}"): _write(table, folder / file, parquet.write_arrow)
-            for of, table in arrow.items()
+            for of, table in tables.items()
         }
         about = {
             "unused": sorted(asked.unused),

@@ -36,7 +36,7 @@ def test_standard_error_of_one_sample_is_unknown_and_of_equal_ones_zero():
 
 def strokes(**columns):
     n = len(columns["run_id"])
-    return pd.DataFrame({"file": [f"f{i}" for i in range(n)], "direction": 1, "condition": "c", **columns})
+    return pd.DataFrame({"file": [f"f{i}" for i in range(n)], "direction": 1, **columns})
 
 
 def samples(*parts):
@@ -51,9 +51,17 @@ def samples(*parts):
     )
 
 
+def binned(*given):
+    return pd.DataFrame(bin_table(*given))
+
+
+def averaged(*given):
+    return pd.DataFrame(mean_traces(*given))
+
+
 def test_bins_of_repeats_share_their_edges_and_hold_their_own_means():
     x = np.linspace(0.0, 40.0, 401)
-    made = bin_table(samples((x, 2 * x), (x[37:], -x[37:])), strokes(run_id=["a", "a"]), Bins(per_stroke=4))
+    made = binned(samples((x, 2 * x), (x[37:], -x[37:])), strokes(run_id=["a", "a"]), Bins(per_stroke=4))
     assert made.groupby("row")["bin"].apply(list).tolist() == [[0, 1, 2, 3], [0, 1, 2, 3]]
     # Bins of 10 mm: 100 samples each (the last has the end too), and 63 of the first are left in the second stroke.
     assert made["n"].tolist() == [100, 100, 100, 101, 63, 100, 100, 101]
@@ -66,14 +74,14 @@ def test_bins_of_repeats_share_their_edges_and_hold_their_own_means():
 
 def test_bins_count_along_the_motion():
     x = np.linspace(40.0, 0.0, 401)
-    made = bin_table(samples((x, x)), strokes(run_id=["a"], direction=[-1]), Bins(per_stroke=4))
+    made = binned(samples((x, x)), strokes(run_id=["a"], direction=[-1]), Bins(per_stroke=4))
     assert made["bin"].tolist() == [0, 1, 2, 3]
     assert (np.diff(made["displacement_mm"]) < 0).all()
 
 
 def test_labels_of_a_bin_are_the_most_frequent_and_further_channels_are_averaged():
     table = samples((np.arange(8.0), np.zeros(8))).assign(oil=list("aaabbbab"), warmth_C=np.arange(8.0))
-    made = bin_table(table, strokes(run_id=["a"]), Bins(per_stroke=2, min_samples=1))
+    made = binned(table, strokes(run_id=["a"]), Bins(per_stroke=2, min_samples=1))
     assert made["oil"].tolist() == ["a", "b"]
     npt.assert_allclose(made["warmth_C"], [1.5, 5.5])
     assert common_by_group(np.array(["x", "y", "y", None], object), np.array([0, 0, 0, 1]), 3).tolist() == [
@@ -92,7 +100,7 @@ def test_labels_of_a_bin_are_the_most_frequent_and_further_channels_are_averaged
 def test_no_sample_is_lost_in_the_bins_and_none_is_thin(lengths, per_stroke, least, seed):
     rng = np.random.default_rng(seed)
     table = samples(*[(np.sort(rng.uniform(0, 40, n)), rng.normal(size=n)) for n in lengths])
-    made = bin_table(table, strokes(run_id=["a"] * len(lengths)), Bins(per_stroke=per_stroke, min_samples=least))
+    made = binned(table, strokes(run_id=["a"] * len(lengths)), Bins(per_stroke=per_stroke, min_samples=least))
     assert made.groupby("row")["n"].sum().tolist() == lengths
     total = (made["n"] * made["force_N"]).sum()
     npt.assert_allclose(total, table["force_N"].sum(), atol=1e-9)
@@ -104,7 +112,7 @@ def test_no_sample_is_lost_in_the_bins_and_none_is_thin(lengths, per_stroke, lea
 def test_mean_trace_of_repeats_has_their_mean_and_standard_error():
     x = np.linspace(0.0, 10.0, 101)
     force = 20.0 * (1.0 - np.exp(-x / 0.5))
-    made = mean_traces(samples((x, force - 1), (x, force), (x, force + 1)), strokes(run_id=["a"] * 3))
+    made = averaged(samples((x, force - 1), (x, force), (x, force + 1)), strokes(run_id=["a"] * 3))
     # Three repeats 1 N apart: SD 1, SE 1 / sqrt(3).
     npt.assert_allclose(made["force_se_N"], 1.0 / np.sqrt(3.0))
     assert (made["n"] == 3).all()
@@ -115,7 +123,7 @@ def test_mean_trace_of_repeats_has_their_mean_and_standard_error():
 
 def test_one_repeat_has_no_standard_error_and_strokes_of_one_file_are_no_repeats():
     x = np.linspace(0.0, 10.0, 101)
-    one = mean_traces(samples((x, x), (x, x + 2)), strokes(run_id=["a", "a"], file=["f", "f"]))
+    one = averaged(samples((x, x), (x, x + 2)), strokes(run_id=["a", "a"], file=["f", "f"]))
     assert one["force_se_N"].isna().all()
     assert (one["n"] == 2).all()
     npt.assert_allclose(one["force_N"].iloc[10], 1.0 + 1.05, atol=0.06)
@@ -126,7 +134,7 @@ def test_a_gap_stays_a_gap_and_steady_strokes_are_averaged_with_steady_ones_only
     table = samples((np.delete(x, slice(40, 60)), np.zeros(81)), (x, np.ones(101)))
     table.loc[table["displacement_mm"] < 2.0, "steady"] = False
     table.loc[(table["row"] == 1) & (table["displacement_mm"] > 8.0), "steady"] = False
-    made = mean_traces(table, strokes(run_id=["a", "a"]))
+    made = averaged(table, strokes(run_id=["a", "a"]))
     gap = made[(made["displacement_mm"] > 4.3) & (made["displacement_mm"] < 5.7)]
     assert (gap["n"] == 1).all()
     assert (gap["force_N"] == 1.0).all()
@@ -144,7 +152,7 @@ def test_a_repeat_that_starts_later_makes_no_dip_in_the_mean():
     rise = 20.0 * (1.0 - np.exp(-x / 0.3))
     table = samples((x, rise), (x + 5.0, rise))
     travel = table["displacement_mm"] - np.where(table["row"] == 1, 5.0, 0.0)
-    made = mean_traces(table.assign(steady=travel > 2.0), strokes(run_id=["a", "a"]))
+    made = averaged(table.assign(steady=travel > 2.0), strokes(run_id=["a", "a"]))
     inside = made[made["displacement_mm"] > 2.5]
     assert inside["force_N"].min() > 19.9
     assert (inside.loc[inside["displacement_mm"].between(7.5, 19.5), "n"] == 2).all()
@@ -152,6 +160,7 @@ def test_a_repeat_that_starts_later_makes_no_dip_in_the_mean():
 
 def test_runs_are_averaged_apart():
     x = np.linspace(0.0, 10.0, 101)
-    made = mean_traces(samples((x, x), (-x, -x)), strokes(run_id=["a", "b"], direction=[1, -1], condition=["c", "d"]))
-    assert made.groupby("run_id")["condition"].unique().map(list).to_dict() == {"a": ["c"], "b": ["d"]}
+    made = averaged(samples((x, x), (-x, -x)), strokes(run_id=["a", "b"], direction=[1, -1]))
+    assert made.groupby("row").size().tolist() == [100, 100]
+    assert np.sign(made["displacement_mm"]).tolist() == np.where(made["row"] == 0, 1, -1).tolist()
     npt.assert_allclose(made["force_N"], made["displacement_mm"], atol=0.11)
