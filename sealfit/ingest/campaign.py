@@ -17,12 +17,11 @@ from sealfit.config import Config
 from sealfit.engine import run_map
 from sealfit.errors import CampaignError, Fault
 from sealfit.fingerprint import Fingerprint, fingerprint
-from sealfit.ingest.derive import condition_keys
 from sealfit.ingest.part import SAMPLED, Asked
 from sealfit.ingest.parts import plan_parts
 from sealfit.ingest.peers import constant_strokes, outlying_files, reversed_strokes
 from sealfit.ingest.quality import quality_table
-from sealfit.ingest.refs import TraceRef
+from sealfit.ingest.refs import Listing
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.shaped import STEADY_ONLY, shaped
 from sealfit.ingest.stored import Made, agrees, common_columns, load_part, make_part, part_key
@@ -89,21 +88,21 @@ def ingest_campaign(
     """
     campaign = Path(campaign)
     with timed("listing trace files") as part:
-        refs, faults = list_traces(campaign, config)
-        planned = _planned(campaign, refs, config, place.marks if place else {})
-        part.rows, part.of = len(refs), "files"
+        listing, faults = list_traces(campaign, config)
+        planned = _planned(campaign, listing, place.marks if place else {})
+        part.rows, part.of = len(listing), "files"
     make = _Maker(campaign, config, workers, on_file, place)
     with timed("reading trace files") as part:
         parts = make.parts(planned)
         part.rows, part.of = make.reread, "files"
-    order = {ref.file: i for i, ref in enumerate(refs)}
+    order = {file: i for i, file in enumerate(listing.files)}
     faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: order[fault.file])
     strokes = _in_order(strokes_of([part.strokes for part in parts]), order)
     parts = [replace(part, strokes=part.strokes.slice(0, 0)) for part in parts]  # they are in one table now
     strokes, found = judged(strokes)
     faults += found
     if not strokes["used"].any():
-        raise CampaignError(_nothing_left(faults, len(refs)))
+        raise CampaignError(_nothing_left(faults, len(listing)))
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
     strokes = strokes.assign(used=_still_used(strokes, steady))
@@ -121,14 +120,14 @@ def ingest_campaign(
     return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY], marks, stored)
 
 
-def _planned(campaign: Path, refs: Sequence[TraceRef], config: Config, marks: Mapping[str, Fingerprint]) -> list[Asked]:
-    conditions = condition_keys([ref.channels for ref in refs], config)
-    known = (marks[ref.file].size if ref.file in marks else None for ref in refs)
+def _planned(campaign: Path, listing: Listing, marks: Mapping[str, Fingerprint]) -> list[Asked]:
+    known = (marks[file].size if file in marks else None for file in listing.files)
     sizes = [
-        _size(os.path.join(campaign, ref.file)) if size is None else size for ref, size in zip(refs, known, strict=True)
+        _size(os.path.join(campaign, file)) if size is None else size
+        for file, size in zip(listing.files, known, strict=True)
     ]
-    plan = plan_parts(conditions, [str(ref.channels["run_id"]) for ref in refs], sizes)
-    return [Asked(tuple(refs[i] for i in files)) for files in plan]
+    plan = plan_parts(listing.conditions.cells(), listing.columns["run_id"].cells(), sizes)
+    return [Asked(tuple(listing[i] for i in files)) for files in plan]
 
 
 def _size(path: str) -> int:

@@ -10,109 +10,116 @@ from collections import defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
+import numpy as np
 import pandas as pd
 
 from sealfit.conditions import add_keys, condition_columns
 from sealfit.config import Config
 from sealfit.errors import Fault
-from sealfit.ingest.runs_csv import Entry
+from sealfit.ingest.coded import Coded, Columns, nothing
+from sealfit.ingest.runs_csv import Entries, Entry
 
-Channels = dict[str, float | str]
 SAME_SPEED = 0.05  # measured speeds closer than this share are one commanded speed; rigs repeat within a few percent
 
 
-def condition_keys(files: Sequence[Channels], config: Config) -> list[str]:
-    """Return the condition of each file in words, as `conditions.add_keys` spells it.
+def condition_keys(columns: Columns, files: int, config: Config) -> Coded:
+    """Return the condition of each of so many files in words, as `conditions.add_keys` spells it.
 
     Examples
     --------
-    >>> condition_keys([{"temperature_C": 60.0, "compression_ratio_pct": 80.0, "aging_days": 4.0}], Config())
+    >>> sixty, eighty, four = (Coded.of([value]) for value in (60.0, 80.0, 4.0))
+    >>> campaign = {"temperature_C": sixty, "compression_ratio_pct": eighty, "aging_days": four}
+    >>> condition_keys(campaign, 1, Config()).values
     ['temperature_C=60, compression_ratio_pct=80, aging_days=4']
-    >>> condition_keys([{"aging_days": 0.0}], Config())
+    >>> condition_keys({"aging_days": Coded.of([0.0])}, 1, Config()).values
     ['unaged']
     """
     names = condition_columns(config)
-    own = [tuple([channels.get(name) for name in names]) for channels in files]
-    different = dict.fromkeys(own)  # far fewer than there are files
-    columns = zip(*different, strict=True) if different else [()] * len(names)
-    table = pd.DataFrame({name: pd.Series(list(c), dtype=object) for name, c in zip(names, columns, strict=True)})
-    words = dict(zip(different, add_keys(table, config)["condition"].tolist(), strict=True))
-    return [words[key] for key in own]
+    own = [columns.get(name, nothing(files)) for name in names]
+    different, of = np.unique(np.stack([column.codes for column in own], axis=1), axis=0, return_inverse=True)
+    cells = [Coded(codes, column.values).cells() for codes, column in zip(different.T, own, strict=True)]
+    table = pd.DataFrame({name: pd.Series(column, dtype=object) for name, column in zip(names, cells, strict=True)})
+    words = Coded.of(add_keys(table, config)["condition"].tolist())
+    return Coded(words.codes[of.ravel()], words.values)
 
 
 def _text(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
-def add_order(entries: Sequence[Entry], files: Sequence[Channels]) -> tuple[list[Channels], list[Fault]]:
-    """Return the files with `run_order` and `elapsed_h` where they say when they were started, and faults of bad times.
+def add_order(entries: Entries, columns: Columns) -> tuple[Columns, list[Fault]]:
+    """Return the columns with `run_order` and `elapsed_h` where files say when they were started; faults of bad times.
 
     Equal times share the order of the first of them. A time without a zone is taken as UTC, so that one campaign
     with and without zones keeps one order.
     """
-    faults, times = [], {}
-    for i, (entry, channels) in enumerate(zip(entries, files, strict=True)):
-        if "started_at" not in channels:
-            continue
-        text = str(channels["started_at"]).strip()
-        try:
-            times[i] = datetime.fromisoformat(text)
-        except ValueError:
-            mend = "Write it as 2024-03-01T09:30:00."
-            faults.append(entry.fault("not_a_time", "is no ISO 8601 time.", "started_at", value=text, mend=mend))
-    if any(time.tzinfo for time in times.values()):
-        times = {i: time if time.tzinfo else time.replace(tzinfo=UTC) for i, time in times.items()}
-    ordered = sorted(times.values())
-    first: dict[datetime, int] = {}
-    for place, time in enumerate(ordered, start=1):
-        first.setdefault(time, place)
-    added = list(files)
-    for i, time in times.items():
-        hours = (time - ordered[0]).total_seconds() / 3600
-        added[i] = {**files[i], "run_order": float(first[time]), "elapsed_h": hours}
-    return added, faults
-
-
-def add_specimens(files: Sequence[Channels], conditions: Sequence[str]) -> list[Channels]:
-    """Return the files with a `specimen_id`: one per condition where none is named."""
-    return [
-        channels if "specimen_id" in channels else {"specimen_id": condition, **channels}
-        for channels, condition in zip(files, conditions, strict=True)
+    if "started_at" not in columns:
+        return columns, []
+    started = columns["started_at"]
+    texts = [str(value).strip() for value in started.values]
+    times = [_time(text) for text in texts]
+    mend = "Write it as 2024-03-01T09:30:00."
+    bad = np.array([*(time is None for time in times), False], bool)[started.codes]
+    faults = [
+        entries[i].fault("not_a_time", "is no ISO 8601 time.", "started_at", value=texts[started.codes[i]], mend=mend)
+        for i in np.flatnonzero(bad).tolist()
     ]
+    if any(time.tzinfo for time in times if time is not None):
+        zoned = [time if time is None or time.tzinfo else time.replace(tzinfo=UTC) for time in times]
+        times = [None if time is None else time.astimezone(UTC).replace(tzinfo=None) for time in zoned]
+    moment = np.array([*times, None], "datetime64[us]")[started.codes]
+    known = ~np.isnat(moment)
+    if not known.any():
+        return columns, faults
+    different, of, count = np.unique(moment[known], return_inverse=True, return_counts=True)
+    codes = np.full(len(entries), -1, np.int32)
+    codes[known] = of
+    place = 1.0 + np.cumsum(count) - count
+    hours = (different - different[0]).astype(np.int64) / 1e6 / 3600
+    return {**columns, "run_order": Coded(codes, place.tolist()), "elapsed_h": Coded(codes, hours.tolist())}, faults
 
 
-def add_runs(
-    files: Sequence[Channels],
-    conditions: Sequence[str],
-    speeds: Sequence[float | None],
-    measured: Sequence[float],
-    unit: str,
-) -> tuple[list[Channels], list[Fault]]:
-    """Return the files with a `run_id`, and what is to be said of it.
+def _time(text: str) -> datetime | None:
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError:
+        return None
+
+
+def add_specimens(columns: Columns, conditions: Coded) -> Columns:
+    """Return the columns with `specimen_id`: one per condition where none is named."""
+    if "specimen_id" not in columns:
+        return {"specimen_id": conditions, **columns}
+    return {**columns, "specimen_id": columns["specimen_id"].over(conditions)}
+
+
+def add_runs(columns: Columns, conditions: Coded, measured: Sequence[float], unit: str) -> tuple[Columns, list[Fault]]:
+    """Return the columns with a `run_id` for every file, and what is to be said of it.
 
     Where none is given there is one per condition, commanded speed and (named) specimen.
 
     Parameters
     ----------
-    files : sequence of dict
-        Channels of each file.
-    conditions : sequence of str
+    columns : dict of str to Coded
+        What is known of the files; `speed_mm_s` is signed where a sign was given.
+    conditions : Coded
         Condition of each file in words.
-    speeds : sequence of float or None
-        Commanded speeds, signed where a sign was given.
     measured : sequence of float
         Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run.
     unit : str
         Unit of the speeds.
     """
-    run_ids = {i: channels["run_id"] for i, channels in enumerate(files) if "run_id" in channels}
+    none = nothing(len(conditions.codes))
+    given = columns.get("run_id", none)
+    if given.known.all():
+        return columns, []
+    run_ids: dict[int, str] = {}
     groups = defaultdict(list)
-    for i in range(len(files)):
-        if i in run_ids:
-            continue
+    specimens, speeds = columns.get("specimen_id", none), columns.get("speed_mm_s", none)
+    for i in np.flatnonzero(~given.known).tolist():
         words = [conditions[i]]
-        if "specimen_id" in files[i]:
-            words.append(str(files[i]["specimen_id"]))
+        if specimens[i] is not None:
+            words.append(str(specimens[i]))
         if speeds[i] is not None:
             run_ids[i] = ", ".join([*words, f"{speeds[i]:g} {unit}"])
         else:
@@ -128,7 +135,7 @@ def add_runs(
                 name = words if math.isnan(middle) else f"{words}, about {middle:.3g} {unit}"
                 run_ids.update(dict.fromkeys(cluster, name))
                 cluster = []
-    added = [c if "run_id" in c else {**c, "run_id": run_ids[i]} for i, c in enumerate(files)]
+    added = {**columns, "run_id": given.put(run_ids)}
     if not groups:
         return added, []
     reason = "neither run_id nor a commanded speed is given; files of one condition share a run within 5 % of speed."
@@ -136,58 +143,63 @@ def add_runs(
     return added, [said]
 
 
-def add_repeats(files: Sequence[Channels]) -> list[Channels]:
-    """Return the files with a `repeat`: where missing by `started_at` if the whole run has it, else by file order."""
-    if all("repeat" in channels for channels in files):
-        return list(files)
+def add_repeats(columns: Columns) -> Columns:
+    """Return the columns with a `repeat`: where missing by `started_at` if the whole run has it, else by file order."""
+    run = columns["run_id"]
+    none = nothing(len(run.codes))
+    given, hours = columns.get("repeat", none), columns.get("elapsed_h", none)
+    if given.known.all():
+        return columns
     runs = defaultdict(list)
-    for i, channels in enumerate(files):
-        runs[channels["run_id"]].append(i)
-    numbers = {}
+    for i, code in enumerate(run.codes.tolist()):
+        runs[code].append(i)
+    numbers: dict[int, int] = {}
     for members in runs.values():
-        if all("elapsed_h" in files[i] for i in members):
-            members.sort(key=lambda i: (files[i]["elapsed_h"], i))
-        used = {files[i]["repeat"] for i in members if "repeat" in files[i]}
+        if all(hours[i] is not None for i in members):
+            members.sort(key=lambda i: (hours[i], i))
+        used = {given[i] for i in members if given[i] is not None}
         free = (number for number in range(1, len(members) + len(used) + 1) if number not in used)
-        numbers.update({i: next(free) for i in members if "repeat" not in files[i]})
-    return [{**channels, "repeat": channels.get("repeat", numbers.get(i))} for i, channels in enumerate(files)]
+        numbers.update({i: next(free) for i in members if given[i] is None})
+    return {**columns, "repeat": given.put(numbers)}
 
 
-def disagreements(
-    entries: Sequence[Entry], files: Sequence[Channels], conditions: Sequence[str], speeds: Sequence[float | None]
-) -> list[Fault]:
+def disagreements(entries: Entries, columns: Columns, conditions: Coded) -> list[Fault]:
     """Return faults of runs: a repeat that stands twice, or differs from its run in condition, speed or load."""
+    none = nothing(len(entries))
+    run, repeat, specimen = (columns[name] for name in ("run_id", "repeat", "specimen_id"))
+    told = {"speed_mm_s": columns.get("speed_mm_s", none), "load_N": columns.get("load_N", none)}
+    told["condition"] = conditions
+    first = _first(run.codes)
+    same_repeat = _first(run.codes.astype(np.int64) * (len(repeat.values) + 1) + repeat.codes)
+    odd = same_repeat != np.arange(len(entries))
+    for column in (*told.values(), specimen):
+        odd |= column.codes != column.codes[first]
     faults = []
-    first: dict[object, int] = {}
-    seen: dict[tuple, int] = {}
-    for i, (entry, channels) in enumerate(zip(entries, files, strict=True)):
-        run, repeat = channels["run_id"], channels["repeat"]
-        if (run, repeat) in seen:
-            other = entries[seen[run, repeat]]
-            reason = f"repeat {repeat} of run '{run}' is there already: {_place(other)}."
+    for i in np.flatnonzero(odd).tolist():
+        entry, j, other = entries[i], int(first[i]), int(same_repeat[i])
+        if other != i:
+            reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
             mend = "Give every file of a run its own repeat number."
-            faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat, mend=mend))
-        seen.setdefault((run, repeat), i)
-        j = first.setdefault(run, i)
-        if i == j:
-            continue
-        pairs = (
-            ("speed_mm_s", speeds[i], speeds[j]),
-            ("load_N", channels.get("load_N"), files[j].get("load_N")),
-            ("condition", conditions[i], conditions[j]),
-        )
-        for column, mine, theirs in pairs:
+            faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], mend=mend))
+        for name, column in told.items():
+            mine, theirs = column[i], column[j]
             if mine != theirs and not _same(mine, theirs):
                 there = "none" if theirs is None else _text(theirs)
-                reason = f"differs from the other repeats of run '{run}', {_place(entries[j])}: {there}."
+                reason = f"differs from the other repeats of run '{run[i]}', {_place(entries[j])}: {there}."
                 mend = "One run is one condition, speed and load: give it another run_id, or correct the cell."
                 value = "none" if mine is None else mine
-                faults.append(entry.fault("run_disagrees", reason, column, value=value, mend=mend))
-        if channels["specimen_id"] != files[j]["specimen_id"] and _same(speeds[i], speeds[j]):
-            reason = f"run '{run}' has repeats on several specimens; their scatter counts as that of repeats."
+                faults.append(entry.fault("run_disagrees", reason, name, value=value, mend=mend))
+        if specimen[i] != specimen[j] and _same(told["speed_mm_s"][i], told["speed_mm_s"][j]):
+            reason = f"run '{run[i]}' has repeats on several specimens; their scatter counts as that of repeats."
             place = {"severity": "warning", "action": "kept", "mend": "Give each specimen a run_id of its own."}
-            faults.append(entry.fault("run_specimens", reason, "specimen_id", value=channels["specimen_id"], **place))
+            faults.append(entry.fault("run_specimens", reason, "specimen_id", value=specimen[i], **place))
     return faults
+
+
+def _first(groups: np.ndarray) -> np.ndarray:
+    """Return for every file the first one of its group, shape (files,)."""
+    _, first, of = np.unique(groups, return_index=True, return_inverse=True)
+    return first[of]
 
 
 def _place(entry: Entry) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -31,16 +31,20 @@ class Folders:
                 return True
         return inside(self.campaign, file) is not None
 
-    def beside(self, files: Collection[str]) -> set[str]:
+    def outside(self, files: Iterable[str]) -> set[str]:
+        """Return those of the paths that do not lie inside the campaign: as `hold`, a folder at a time."""
+        odd: set[str] = set()
+        for folder, names in _by_folder(files).items():
+            plain = self._names(folder).plain
+            odd |= {file for name, file in names.items() if name not in plain or ":" in file or "\\" in file}
+        return {file for file in odd if not self.hold(file)}
+
+    def beside(self, files: Iterable[str]) -> set[str]:
         """Return the files that lie beside `files`, in the same folders and with one of their endings; not `files`."""
-        names: dict[str, set[str]] = {}
-        for file in files:
-            folder, _, name = file.rpartition("/")
-            names.setdefault(folder, set()).add(name)
         others = {
             f"{folder}/{name}" if folder else name
-            for folder, own in names.items()
-            for name in self._names(folder).all - own
+            for folder, own in _by_folder(files).items()
+            for name in self._names(folder).all - own.keys()
         }
         if not others:
             return others
@@ -58,6 +62,15 @@ class Folders:
             plain = (name for name, is_link in link.items() if within and not is_link)
             self._seen[folder] = _Names(frozenset(plain), frozenset(link))
         return self._seen[folder]
+
+
+def _by_folder(files: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return the paths by their folder and their name in it."""
+    found: dict[str, dict[str, str]] = {}
+    for file in files:
+        folder, _, name = file.rpartition("/")
+        found.setdefault(folder, {})[name] = file
+    return found
 
 
 def _ending(file: str) -> str:

@@ -31,6 +31,11 @@ class NameParts:
 SAYS_NOTHING = NameParts(True, {})
 
 
+def names_speak(settings: Files) -> bool:
+    """Whether names of files say anything under the config's `files`."""
+    return bool(settings.name_pattern is not None or settings.compute or settings.columns)
+
+
 def name_parts(file: str, settings: Files) -> NameParts:
     """Return what the relative path `file` says under the config's `files`.
 
@@ -49,7 +54,7 @@ def name_parts(file: str, settings: Files) -> NameParts:
     >>> name_parts("n120.csv", rig).channels
     {'speed_mm_s': -120.0, 'run_id': '120 rpm'}
     """
-    if settings.name_pattern is None and not settings.compute and not settings.columns:
+    if not names_speak(settings):
         return SAYS_NOTHING
     texts: dict[str, str] = {}
     values: dict[str, float | str] = {}

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
+
+from sealfit.ingest.coded import Coded, Columns
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,3 +22,28 @@ class TraceRef:
 
     file: str
     channels: Mapping[str, float | str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Listing(Sequence[TraceRef]):
+    """The trace files of a campaign, or some of them, in order; column by column, as they are many.
+
+    `columns` hold the channels; `conditions` the condition of each file in words.
+    """
+
+    files: list[str]
+    columns: Columns
+    conditions: Coded
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, i: int) -> TraceRef:
+        known = ((name, column[i]) for name, column in self.columns.items())
+        return TraceRef(self.files[i], {name: value for name, value in known if value is not None})
+
+    def take(self, files: np.ndarray) -> Listing:
+        """Return some of the files, by their numbers, with the columns in which any of them has a value."""
+        taken = {name: column.take(files) for name, column in self.columns.items()}
+        filled = {name: column for name, column in taken.items() if column.values}
+        return Listing([self.files[i] for i in files.tolist()], filled, self.conditions.take(files))

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import codecs
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from sealfit.conditions import condition_columns
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, ConfigError, Fault
+from sealfit.ingest.coded import Columns, columns_of, in_order, nothing, overlaid
 from sealfit.ingest.columns import RESERVED, beside, suggestion
 from sealfit.ingest.derive import (
-    Channels,
     add_order,
     add_repeats,
     add_runs,
@@ -26,19 +28,17 @@ from sealfit.ingest.derive import (
     disagreements,
 )
 from sealfit.ingest.folder import read_bytes
-from sealfit.ingest.names import TEXT_COLUMNS, NameParts, name_parts
+from sealfit.ingest.names import TEXT_COLUMNS, name_parts, names_speak
 from sealfit.ingest.read import read_trace
-from sealfit.ingest.refs import TraceRef
-from sealfit.ingest.run_values import MISSING, out_of_range, to_values
-from sealfit.ingest.runs_csv import Entry, list_entries
+from sealfit.ingest.refs import Listing, TraceRef
+from sealfit.ingest.run_values import out_of_range, to_values
+from sealfit.ingest.runs_csv import Entries, list_entries
 from sealfit.ingest.speed_check import measured_speed
 from sealfit.ingest.speed_unit import speed_factor
 from sealfit.ingest.text import as_utf8, find_layout, header_fields
 
-__all__ = ["TraceRef", "list_traces"]
 
-
-def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fault]]:
+def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     """Return every trace file of a campaign with its channels, and what was found that does not stop the run.
 
     Parameters
@@ -56,38 +56,41 @@ def list_traces(campaign: Path, config: Config) -> tuple[list[TraceRef], list[Fa
     """
     if faults := _config_faults(config):
         raise CampaignError(faults)
-    entries, faults = list_entries(campaign, config)
+    entries, cells, faults = list_entries(campaign, config)
     if any(fault.check in ("path_outside", "missing_file") for fault in faults):
         _stop_at_errors(faults)  # nothing can be said of files that are not there, and none outside is opened
     if not entries:
         raise CampaignError([*faults, _nothing_left()])
-    entries, parts, found = _matched(entries, config)
+    kept, named, found = _named(entries, config)
     faults += found
-    files = [
-        {**_header(campaign, entry.file, config), **named.channels, **_cells(entry)}
-        for entry, named in zip(entries, parts, strict=True)
-    ]
-    entries = [entry.place() for entry in entries]  # their cells are not needed any more, and are much memory
-    files, found = to_values(entries, files, config)
+    entries, cells = _kept(kept, entries, cells)
+    columns = in_order(overlaid(_headers(campaign, entries, config), named, cells))
+    columns, found = to_values(entries, columns, config)
     faults += found
     needed = _Needed.of(config)
-    files, measured, left_out, found = _from_traces(campaign, entries, files, config, needed)
-    keep = [i for i in range(len(entries)) if i not in left_out]
-    if not keep:
+    columns, measured, left_out, found = _from_traces(campaign, entries, columns, config, needed)
+    kept = np.flatnonzero([i not in left_out for i in range(len(entries))])
+    if not len(kept):
         raise CampaignError([*faults, *found, _nothing_left()])
-    entries, files, measured = ([rows[i] for i in keep] for rows in (entries, files, measured))
-    faults += found + _missing(entries, files, needed) + out_of_range(entries, files)
-    files, found = add_order(entries, files)
+    entries, columns = _kept(kept, entries, columns)
+    columns, measured = in_order(columns), [measured[i] for i in kept.tolist()]
+    faults += found + _missing(entries, columns, needed) + out_of_range(entries, columns)
+    columns, found = add_order(entries, columns)
     faults += found
     _stop_at_errors(faults)
-    speeds = [channels.get("speed_mm_s") for channels in files]
-    conditions = condition_keys(files, config)
-    files, found = add_runs(files, conditions, speeds, measured, config.units.unit("speed"))
+    conditions = condition_keys(columns, len(entries), config)
+    columns, found = add_runs(columns, conditions, measured, config.units.unit("speed"))
     faults += found
-    files = add_repeats(add_specimens(files, conditions))
-    faults += disagreements(entries, files, conditions, speeds)
+    columns = add_repeats(add_specimens(columns, conditions))
+    faults += disagreements(entries, columns, conditions)
     _stop_at_errors(faults)
-    return [TraceRef(entry.file, _set_speed(channels)) for entry, channels in zip(entries, files, strict=True)], faults
+    return Listing(entries.files, _set_speed(columns), conditions), faults
+
+
+def _kept(files: np.ndarray, entries: Entries, columns: Columns) -> tuple[Entries, Columns]:
+    if len(files) == len(entries):
+        return entries, columns
+    return entries.take(files), {name: column.take(files) for name, column in columns.items()}
 
 
 def _nothing_left() -> Fault:
@@ -95,12 +98,12 @@ def _nothing_left() -> Fault:
     return Fault("nothing_left", "no trace file can be used.", mend=mend)
 
 
-def _set_speed(channels: Channels) -> Channels:
-    """Return the channels with the commanded speed under its own name, as a magnitude."""
-    if "speed_mm_s" not in channels:
-        return channels
-    renamed = dict(channels)
-    renamed["speed_set_mm_s"] = abs(renamed.pop("speed_mm_s"))
+def _set_speed(columns: Columns) -> Columns:
+    """Return the columns with the commanded speed under its own name, as a magnitude."""
+    if "speed_mm_s" not in columns:
+        return columns
+    renamed = dict(columns)
+    renamed["speed_set_mm_s"] = renamed.pop("speed_mm_s").map(abs)
     return renamed
 
 
@@ -147,10 +150,15 @@ def _config_faults(config: Config) -> list[Fault]:
     return faults
 
 
-def _matched(entries: list[Entry], config: Config) -> tuple[list[Entry], list[NameParts], list[Fault]]:
-    """Return the entries and what their names say; a file found by the glob whose name says nothing is left out."""
+def _named(entries: Entries, config: Config) -> tuple[np.ndarray, Columns, list[Fault]]:
+    """Return which files to keep, by their numbers, what their names say, and findings.
+
+    A file found by the glob whose name says nothing is left out.
+    """
+    if not names_speak(config.files):
+        return np.arange(len(entries)), {}, []
     kept, parts, faults = [], [], []
-    for entry in entries:
+    for i, entry in enumerate(entries):
         try:
             named = name_parts(entry.file, config.files)
         except ConfigError as error:
@@ -163,31 +171,30 @@ def _matched(entries: list[Entry], config: Config) -> tuple[list[Entry], list[Na
             faults.append(Fault("not_matched", reason, file=entry.file, **place))
             if not listed:
                 continue
-        kept.append(entry)
-        parts.append(named)
-    if entries and not kept:
+        kept.append(i)
+        parts.append(named.channels)
+    if not kept:
         mend = "Check files.name_pattern in the rig config."
         reason = f"none of {len(entries)} file names is matched."
         raise CampaignError([*faults[:3], Fault("not_matched", reason, mend=mend)])
-    return kept, parts, faults
+    return np.array(kept), columns_of(parts), faults
 
 
-def _header(campaign: Path, file: str, config: Config) -> Channels:
-    """Return what the header lines say; nothing of a file that cannot be read: reading it will say why."""
+def _headers(campaign: Path, entries: Entries, config: Config) -> Columns:
+    """Return what header lines say."""
     if not config.trace.header_fields:
         return {}
+    return columns_of([_header(campaign, file, config) for file in entries.files])
+
+
+def _header(campaign: Path, file: str, config: Config) -> Mapping[str, float | str]:
+    """Return what the header lines say; nothing of a file that cannot be read: reading it will say why."""
     try:
         text = as_utf8(read_bytes(campaign, file, head=True), config.trace.encoding, file, head=True)
         found = header_fields(find_layout(text, config.trace, file).header, config.trace)
     except BadFile:
         return {}
     return {name: value for name, value in found.items() if not name.startswith("_") and value != ""}
-
-
-def _cells(entry: Entry) -> Channels:
-    if MISSING.isdisjoint(map(str.lower, entry.cells.values())):
-        return entry.cells
-    return {name: cell for name, cell in entry.cells.items() if cell.lower() not in MISSING}
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,28 +209,31 @@ class _Needed:
         aged = tuple(condition_columns(config))
         return cls(aged, ("aging_days", *config.rubber) if config.aging else aged)
 
-    def missing(self, channels: Channels) -> list[str]:
-        """Return those that a file lacks."""
-        needed = self.unaged if channels.get("aging_days") == 0 else self.aged
-        return [name for name in needed if name not in channels]
+    def missing(self, columns: Columns, files: int) -> dict[str, np.ndarray]:
+        """Return which of so many files lack each of them, shape (files,)."""
+        none = nothing(files)
+        unaged = columns.get("aging_days", none).where(lambda days: days == 0)
+        return {name: ~columns.get(name, none).known & (~unaged | (name in self.unaged)) for name in self.aged}
 
 
 def _from_traces(
-    campaign: Path, entries: Sequence[Entry], files: Sequence[Channels], config: Config, needed: _Needed
-) -> tuple[list[Channels], list[float], set[int], list[Fault]]:
-    """Return the files with what constant columns of their traces add, reading only files that lack something.
+    campaign: Path, entries: Entries, columns: Columns, config: Config, needed: _Needed
+) -> tuple[Columns, list[float], set[int], list[Fault]]:
+    """Return the columns with what constant columns of traces add, reading only files that lack something.
 
     Also the measured speed of each file read (nan of the others), the files to leave out, and their faults.
     """
-    added, measured = list(files), [math.nan] * len(files)
+    none = nothing(len(entries))
+    lacking = needed.missing(columns, len(entries))
+    runs = columns.get("run_id", none).known | columns.get("speed_mm_s", none).known
+    added: dict[str, dict[int, float | str]] = {}
+    measured = [math.nan] * len(entries)
     left_out: set[int] = set()
     faults: list[Fault] = []
-    for i, (entry, channels) in enumerate(zip(entries, files, strict=True)):
-        wanted = needed.missing(channels)
-        if not wanted and ("run_id" in channels or "speed_mm_s" in channels):
-            continue
+    for i in np.flatnonzero(np.any([~runs, *lacking.values()], axis=0)).tolist():
+        wanted, file = [name for name, lack in lacking.items() if lack[i]], entries.files[i]
         try:
-            table = read_trace(campaign, TraceRef(entry.file, {}), config).table
+            table = read_trace(campaign, TraceRef(file, {}), config).table
         except BadFile as error:
             if wanted:  # otherwise it is left out, and said why, when it is read for good
                 left_out.add(i)
@@ -236,18 +246,19 @@ def _from_traces(
         }
         sources |= {name: name for name in wanted}
         for name, column in sources.items():
-            if name in channels or column not in table:
+            if columns.get(name, none)[i] is not None or column not in table:
                 continue
             values = table[column]
             if (values == values.iloc[0]).all():
-                added[i] = {**added[i], name: _constant(name, values.iloc[0])}
+                added.setdefault(name, {})[i] = _constant(name, values.iloc[0])
             elif name in wanted:
                 reason = f"varies within the file, {values.min()} to {values.max()}; a condition is one value."
                 mend = "Write the value that was set into runs.csv."
-                place = {"file": entry.file, "column": name, "action": "file left out", "mend": mend}
+                place = {"file": file, "column": name, "action": "file left out", "mend": mend}
                 faults.append(Fault("condition_varies", reason, **place))
                 left_out.add(i)
-    return added, measured, left_out, faults
+    whole = {**columns, **{name: columns.get(name, none).put(values) for name, values in added.items()}}
+    return whole, measured, left_out, faults
 
 
 def _constant(name: str, value: float | str) -> float | str:
@@ -258,24 +269,18 @@ def _constant(name: str, value: float | str) -> float | str:
     return value if isinstance(value, str) else float(value)
 
 
-def _missing(entries: Sequence[Entry], files: Sequence[Channels], needed: _Needed) -> list[Fault]:
+def _missing(entries: Entries, columns: Columns, needed: _Needed) -> list[Fault]:
     """Return faults of condition columns that no source gives: one per column, or one per cell."""
     faults = []
-    lacking: dict[str, list[int]] = {}
-    for i, channels in enumerate(files):
-        for name in needed.missing(channels):
-            lacking.setdefault(name, []).append(i)
-    if not lacking:
-        return []
-    known = list(dict.fromkeys(name for channels in files for name in channels))
-    for name, rows in lacking.items():
-        if any(name in channels for channels in files):
-            for i in rows:
+    lacking = {name: np.flatnonzero(lack) for name, lack in needed.missing(columns, len(entries)).items()}
+    for name, rows in sorted(lacking.items(), key=lambda one: one[1][:1].tolist()):
+        if name in columns:
+            for i in rows.tolist():
                 mend = "Fill it: it is one of the config's condition columns."
                 faults.append(entries[i].fault("empty_cell", "the cell is empty.", name, value="", mend=mend))
-        else:
+        elif len(rows):
             reason = "there is no such column in runs.csv, file names, header lines or traces."
-            mend = suggestion(name, known) + " Add it, or take it out of the config's condition."
-            place = {"file": "runs.csv" if entries[0].line is not None else None, "column": name, "mend": mend.strip()}
+            mend = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."
+            place = {"file": "runs.csv" if entries.lines is not None else None, "column": name, "mend": mend.strip()}
             faults.append(Fault("missing_column", reason, **place))
     return faults

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from difflib import SequenceMatcher
 from fnmatch import fnmatchcase
+from itertools import islice
 from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
 
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, Fault
+from sealfit.ingest.coded import Coded, Columns
 from sealfit.ingest.columns import nearest, suggestion
 from sealfit.ingest.folder import read_bytes
 from sealfit.ingest.listing import Folders
@@ -30,17 +38,16 @@ KNOWN = (
 )
 
 
+MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
+_BLANK = b" \t,;\n"  # a line of nothing else is none
+
+
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One trace file as it is listed: its place (for messages) and its cells as text, empty ones left out."""
+    """The place of one trace file in the list, for messages."""
 
     file: str
     line: int | None = None  # in runs.csv; None where the file was found by the glob
-    cells: dict[str, str] = field(default_factory=dict)
-
-    def place(self) -> Entry:
-        """Return the entry without its cells."""
-        return Entry(self.file, self.line)
 
     def fault(self, check: str, reason: str, column: str | None = None, **rest) -> Fault:
         """Return a fault at this entry's place: its line in runs.csv, or the file itself."""
@@ -48,8 +55,28 @@ class Entry:
         return Fault(check, reason, column=column, **place, **rest)
 
 
-def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
-    """Return the trace files of a campaign in order, and what was found amiss (errors stop the run).
+@dataclass(frozen=True, slots=True, eq=False)
+class Entries(Sequence[Entry]):
+    """The trace files of a campaign in order, and their lines in runs.csv, shape (files,), where there is one."""
+
+    files: list[str]
+    lines: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, i: int) -> Entry:
+        return Entry(self.files[i], None if self.lines is None else int(self.lines[i]))
+
+    def take(self, files: np.ndarray) -> Entries:
+        """Return some of the files, by their numbers."""
+        return Entries([self.files[i] for i in files.tolist()], None if self.lines is None else self.lines[files])
+
+
+def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list[Fault]]:
+    """Return the trace files of a campaign in order, what runs.csv says of them, and what was found amiss.
+
+    Cells are text, those that say that there is nothing left out; errors stop the run.
 
     runs.csv is read where there is one; otherwise the config's glob finds the files, in natural order (2 before 10).
 
@@ -61,8 +88,9 @@ def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], list[Faul
     if not campaign.is_dir():
         what = "is no folder." if campaign.exists() else "does not exist."
         raise _stop("missing_folder", f"the campaign folder '{campaign}' {what}", "Check the path.")
+    cells: Columns = {}
     if (campaign / RUNS_CSV).exists() or (campaign / RUNS_CSV).is_symlink():
-        entries, faults = _read_runs(campaign, config)
+        entries, cells, faults = _read_runs(campaign, config)
     elif config.files.glob is not None:
         entries, faults = _by_glob(campaign, config)
     else:
@@ -70,8 +98,9 @@ def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], list[Faul
         mend = f"Write one (the folder holds {count} CSV files), or give a config with files.glob."
         raise _stop("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", mend, file=RUNS_CSV)
     folders = Folders(campaign)
-    outside = {entry.file for entry in entries if not folders.hold(entry.file)}
-    return entries, faults + _paths(campaign, entries, outside) + _unlisted(folders, entries, outside, config)
+    outside = folders.outside(entries.files)
+    faults = faults + _paths(campaign, entries, outside) + _unlisted(folders, entries, outside, config)
+    return entries, cells, faults
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
@@ -83,41 +112,87 @@ def _stop(check: str, reason: str, mend: str, **place) -> CampaignError:
     return CampaignError([Fault(check, reason, mend=mend, **place)])
 
 
-def _read_runs(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
+def _read_runs(campaign: Path, config: Config) -> tuple[Entries, Columns, list[Fault]]:
     try:
-        text = as_utf8(read_bytes(campaign, RUNS_CSV), "auto", RUNS_CSV).decode()
+        text = as_utf8(read_bytes(campaign, RUNS_CSV), "auto", RUNS_CSV)
     except BadFile as error:
         raise _stop(error.fault.check, error.fault.reason, error.fault.mend, file=RUNS_CSV) from error
-    lines = [(number, line) for number, line in enumerate(text.split("\n"), start=1) if line.strip(" \t,;")]
-    delimiter = max(",;\t", key=lines[0][1].count) if lines else ","
-    mark = "tab" if delimiter == "\t" else delimiter
-    header = [cell.strip() for cell in split_line(lines[0][1], mark)] if lines else []
-    names, faults = _our_names(header, config)
+    first, head = next(_lines(text), (1, ""))
+    delimiter = max(",;\t", key=head.count)
+    names, faults = _our_names(_cells(head, delimiter) if head else [], config)
     if "file" not in names:
-        mend = suggestion("file", header)
+        mend = suggestion("file", _cells(head, delimiter) if head else [])
         raise _stop("missing_column", "there is no such column.", mend, file=RUNS_CSV, line=1, column="file")
-    entries, unnamed = [], "" in names
-    for number, line in lines[1:]:
-        cells = [cell.strip() for cell in split_line(line, mark)]
+    lines, columns = _plain_table(text, names, delimiter, first) or _line_by_line(text, names, delimiter, faults)
+    if delimiter != ",":  # decimal commas are plain here: no cell of a table of ; or tabs can be split by them
+        columns = {name: column.map(_decimal_point) for name, column in columns.items()}
+    files = [_posix(campaign, file) for file in columns.pop("file").cells()]
+    if not files and not any(fault.severity == "error" for fault in faults):
+        raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=RUNS_CSV)
+    return Entries(files, lines), {name: column.map(_said) for name, column in columns.items()}, faults
+
+
+def _lines(text: bytes) -> Iterator[tuple[int, str]]:
+    """Yield number and text of every line that is not blank."""
+    for number, line in enumerate(io.BytesIO(text), start=1):
+        if line.strip(_BLANK):
+            yield number, line.decode().removesuffix("\n")
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    return [cell.strip() for cell in split_line(line, delimiter)]
+
+
+def _said(cell: str) -> str | None:
+    return None if cell.lower() in MISSING else cell
+
+
+def _decimal_point(cell: str) -> str:
+    return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
+
+
+def _plain_table(text: bytes, names: list[str], delimiter: str, first: int) -> tuple[np.ndarray, Columns] | None:
+    """Return what `_line_by_line` would, at once; None unless every line has a cell for every name, none in quotes."""
+    if first > 1 or b'"' in text or len(set(names)) < len(names):
+        return None
+    places = [str(i) for i in range(len(names))]
+    try:
+        table = pa_csv.read_csv(
+            pa.BufferReader(text),
+            pa_csv.ReadOptions(column_names=places, skip_rows=1, block_size=len(text) + 1, use_threads=False),
+            pa_csv.ParseOptions(delimiter=delimiter, quote_char=False, ignore_empty_lines=False),
+            pa_csv.ConvertOptions(column_types=dict.fromkeys(places, pa.dictionary(pa.int32(), pa.string()))),
+        )
+    except pa.ArrowInvalid:
+        return None
+    columns: Columns = {}
+    for name, found in zip(names, table.unify_dictionaries().columns, strict=True):
+        cells = found.combine_chunks()
+        coded = Coded(cells.indices.to_numpy(), cells.dictionary.to_pylist()).map(lambda cell: cell.strip() or None)
+        if name == "file" and not coded.known.all():
+            return None
+        if name:
+            columns[name] = coded
+    return np.arange(2, len(table) + 2), columns
+
+
+def _line_by_line(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) -> tuple[np.ndarray, Columns]:
+    """Return the line of every trace file, shape (files,), and the columns that have a name; adds to `faults`."""
+    lines, rows = [], []
+    for number, line in islice(_lines(text), 1, None):
+        cells = _cells(line, delimiter)
         if any(cells[len(names) :]):
             reason = f"the line has {len(cells)} cells where {len(names)} are named."
             faults.append(Fault("too_many_cells", reason, file=RUNS_CSV, line=number, mend="Quote cells with commas."))
             continue
-        if unnamed or "" in cells:
-            named = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
-        else:
-            named = dict(zip(names, cells, strict=False))
-        if mark != ",":  # decimal commas are plain here: no cell of a table of ; or tabs can be split by them
-            named = {n: c.replace(",", ".") if as_number(c, ",") is not None else c for n, c in named.items()}
-        file = named.pop("file", "")
-        if not file:
+        row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
+        if "file" not in row:
             reason = "no trace file is named."
             faults.append(Fault("empty_cell", reason, file=RUNS_CSV, line=number, column="file", mend="Name it."))
             continue
-        entries.append(Entry(_posix(campaign, file), number, named))
-    if not entries and not any(fault.severity == "error" for fault in faults):
-        raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=RUNS_CSV)
-    return entries, faults
+        lines.append(number)
+        rows.append(row)
+    return np.array(lines, int), {name: Coded.of(row.get(name) for row in rows) for name in names if name}
 
 
 def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault]]:
@@ -152,7 +227,7 @@ def _posix(campaign: Path, file: str) -> str:
     return os.path.normpath(file) if file else file
 
 
-def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
+def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
     glob = config.files.glob
     if PurePosixPath(glob).is_absolute() or ".." in PurePosixPath(glob).parts or not glob:
         raise _stop("path_outside", f"files.glob = {glob!r} leads outside the campaign folder.", "Make it relative.")
@@ -160,20 +235,21 @@ def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
     if not files:
         mend = "Check the folder, or files.glob in the rig config."
         raise _stop("missing_file", f"no file in '{campaign}' matches files.glob = {glob!r}.", mend)
-    faults, entries = [], []
+    faults, kept = [], []
     for file in files:
         if pattern := next((p for p in config.files.exclude if fnmatchcase(file, p)), None):
             reason = f"excluded by files.exclude = {pattern!r}."
             faults.append(Fault("excluded", reason, file=file, severity="info", action="file left out"))
         else:
-            entries.append(Entry(file))
-    return entries, faults
+            kept.append(file)
+    return Entries(kept), faults
 
 
-def _paths(campaign: Path, entries: list[Entry], outside: set[str]) -> list[Fault]:
+def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:
     """Return faults of the listed paths: outside the campaign, listed twice, or none of them there."""
     faults, lines = [], {}
-    for entry in entries:
+    fine = not outside and len(set(entries.files)) == len(entries)
+    for entry in () if fine else entries:
         if entry.file in outside:
             reason = "the trace file lies outside the campaign folder."
             mend = "Copy it into the folder of runs.csv and write its path relative to it."
@@ -182,18 +258,18 @@ def _paths(campaign: Path, entries: list[Entry], outside: set[str]) -> list[Faul
             reason = f"the trace file is listed already on line {lines[entry.file]}."
             faults.append(entry.fault("duplicate_file", reason, "file", value=entry.file, mend="Delete one line."))
         lines.setdefault(entry.file, entry.line)
-    if entries and not faults and not any((campaign / entry.file).is_file() for entry in entries):
+    if entries and not faults and not any((campaign / file).is_file() for file in entries.files):
         reason = f"none of the {len(entries)} trace files listed exists."
         mend = "Paths are relative to the folder of runs.csv."
         faults.append(entries[0].fault("missing_file", reason, "file", value=entries[0].file, mend=mend))
     return faults
 
 
-def _unlisted(folders: Folders, entries: list[Entry], outside: set[str], config: Config) -> list[Fault]:
+def _unlisted(folders: Folders, entries: Entries, outside: set[str], config: Config) -> list[Fault]:
     """Return files that runs.csv does not list: beside the traces and of the same ending, or matched by the glob."""
-    if not entries or entries[0].line is None:
+    if not entries or entries.lines is None:
         return []
-    listed = {entry.file for entry in entries}
+    listed = set(entries.files)
     there = folders.beside(listed - outside)
     if config.files.glob and ".." not in config.files.glob and not config.files.glob.startswith("/"):
         found = (p for p in folders.campaign.glob(config.files.glob) if p.is_file())

@@ -4,6 +4,7 @@ from hypothesis import strategies as st
 from trace_helpers import DAYS, campaign, channels, config, faults, trace
 
 from sealfit.errors import CampaignError
+from sealfit.ingest.coded import Coded
 from sealfit.ingest.derive import condition_keys
 from sealfit.ingest.runs import list_traces
 
@@ -37,6 +38,20 @@ def test_full_table_reads_as_written(tmp_path):
     assert refs[1].channels["elapsed_h"] == 2.5
     assert refs[2].channels["run_order"] == 1.0
     assert "humidity_pct" not in refs[1].channels
+
+
+@pytest.mark.parametrize("change", [("a.csv", '"a.csv"'), ("B,42.5", "B,42.5,"), ("b.csv", " b.csv")])
+def test_a_table_that_must_be_read_line_by_line_says_what_a_plain_one_does(tmp_path, change):
+    (tmp_path / "d").mkdir()
+    plain, _ = list_traces(campaign(tmp_path, FULL), config())
+    table = FULL.replace(*change)
+    refs, found = list_traces(campaign(tmp_path / "d", table), config())
+    assert (list(refs), found) == (list(plain), [])
+
+
+def test_blank_lines_count(tmp_path):
+    found = faults(campaign(tmp_path, FULL.replace("b.csv,r1,2", "  \n,,;\nb.csv,r1,two")))
+    assert [(fault.line, fault.value) for fault in found] == [(5, "two")]
 
 
 def test_semicolons_decimal_commas_and_other_names_of_columns(tmp_path):
@@ -105,7 +120,8 @@ def test_unaged_rows_are_one_condition_whatever_their_other_cells_say(tmp_path):
 
 def test_unaged_rubbers_are_told_apart():
     rubbers = config(DAYS + 'rubber = ["compound"]')
-    assert condition_keys([{"aging_days": 0.0, "compound": "NBR"}], rubbers) == ["unaged, NBR"]
+    columns = {"aging_days": Coded.of([0.0]), "compound": Coded.of(["NBR"])}
+    assert condition_keys(columns, 1, rubbers).values == ["unaged, NBR"]
 
 
 @pytest.mark.parametrize(
