@@ -10,15 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import pandas as pd
-from scipy.fft import next_fast_len
 from scipy.special import betaincc, gammaincc
 
 from sealfit.closure.background import LOBE, alike, background, smooth_background, tops
-from sealfit.closure.waves import strokes_of
+from sealfit.closure.spectrum import Spectrum, spectrum_along
 
 SHARED = 1e-3  # p-value below which the phase is taken to be common to all files
 ABOVE_BACKGROUND = 4.0  # a peak's power over the median of its neighbours: a smooth trend has no peak
@@ -36,29 +34,6 @@ class Peak:
     p_value: float  # adjusted over the frequencies, axes and ways of acting looked at
     amplitude: float  # in force units, mean over units
     energy: float  # squared amplitudes, all passes that reach the frequency: of the largest sure wave along the axis
-
-
-@dataclass(frozen=True)
-class Common:
-    """Sums over units of amplitudes that keep their phase, for one way of acting."""
-
-    symmetric: bool  # True: the same force both ways; False: it follows the direction
-    total: np.ndarray  # (f,) complex, each unit on its own scale
-    square: np.ndarray  # (f,) of the units' powers, each on its own scale
-    units: int
-    amplitude: np.ndarray  # (f,) complex, mean over the passes that reach the frequency
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Sums over passes (units in one direction) at f frequencies; no pass is kept, so that memory stays small."""
-
-    frequency: np.ndarray  # (f,)
-    count: np.ndarray  # (f,) passes that reach each frequency
-    power: np.ndarray  # (f,) mean of the passes' powers, each on its own scale
-    amplitude: np.ndarray  # (f,) root mean square of the passes' amplitudes
-    common: tuple[Common, ...]
-    taken: np.ndarray  # (f,) within a main lobe of a component already in the model
 
 
 def find_ripple(
@@ -101,103 +76,6 @@ def find_ripple(
     shared = [p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED]
     best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
-
-
-def spectrum_along(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -> Spectrum | None:
-    """Return the spectrum along one axis, summed over units and directions; None where there is too little.
-
-    A stroke is freed of a parabola, tapered (Hann) and transformed on a grid that divides twice the longest stroke, so
-    that every stroke has the same frequencies whatever its sampling; the wavelength is at most half a usual stroke.
-    """
-    good = list(strokes_of(samples, axis))
-    if len(good) < 3:
-        return None
-    spans = np.array([place[-1] - place[0] for _, place, _ in good])
-    steps = spans / (np.array([place.size for _, place, _ in good]) - 1)
-    longest = 2 * spans.max()
-    points = np.array([next_fast_len(int(n), real=True) for n in np.clip(np.ceil(longest / steps), 8, 2**15)])
-    frequency = np.arange(min(2**15, int(np.ceil(longest / np.quantile(steps, 0.1)))) // 2 + 1) / longest
-    reach = np.minimum(points // 2 + 1, np.searchsorted(frequency, 0.5 / steps, side="right"))
-    strokes = np.bincount(reach, minlength=frequency.size + 1)[::-1].cumsum()[::-1][1:]  # that reach each frequency
-    use = (frequency >= 2 / np.median(spans)) & (strokes[: frequency.size] >= 0.25 * len(good))
-    if use.sum() < 4:
-        return None
-    first = [a for a, *_ in good]
-    direction = samples["direction"].to_numpy()[first]
-    unit = samples["unit"].to_numpy()[first]
-    sums = _Sums(int(use.sum()), (True, False) if np.unique(direction).size == 2 else (True,))
-    order = np.argsort(unit, kind="stable")
-    for strokes_of_unit in np.split(order, np.flatnonzero(np.diff(unit[order])) + 1):
-        passes = {}
-        for side in np.unique(direction[strokes_of_unit]):
-            total, weight = np.zeros(frequency.size, dtype=complex), np.zeros(frequency.size)
-            for k in strokes_of_unit[direction[strokes_of_unit] == side]:
-                wave = _transform(good[k][1], good[k][2], longest, points[k], reach[k])
-                total[: wave.size] += wave
-                weight[: wave.size] += 1
-            passes[side] = (total[use] / np.maximum(weight[use], 1), weight[use] > 0)
-        sums.add(passes)
-    near = np.zeros(int(use.sum()), dtype=bool)
-    for wavelength in known:
-        near |= np.abs(frequency[use] - 1 / wavelength) <= LOBE / longest
-    return sums.spectrum(frequency[use], near)
-
-
-def _transform(place: np.ndarray, residual: np.ndarray, longest: float, points: int, reach: int) -> np.ndarray:
-    """Return a stroke's complex amplitudes at the first multiples of 1 / `longest`, phases counted from place 0."""
-    grid = np.arange(place[0], place[-1], longest / points)
-    trend, taper = _on_grid(grid.size)
-    value = np.interp(grid, place, residual)
-    value -= trend @ (value @ trend)
-    wave = np.fft.rfft(value * taper, points)[:reach]
-    return wave * np.exp(-2j * np.pi / longest * grid[0] * np.arange(wave.size))
-
-
-@lru_cache(maxsize=512)  # strokes of one speed share their grids: one each for hundreds of thousands
-def _on_grid(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return an orthonormal basis of parabolas on an even grid, shape (size, 3), and the Hann taper, shape (size,)."""
-    trend, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, size), 3))
-    taper = np.hanning(size + 2)[1:-1]
-    return trend, taper * (2 / taper.sum())
-
-
-def _power(wave: np.ndarray) -> np.ndarray:
-    return wave.real**2 + wave.imag**2
-
-
-class _Sums:
-    """A spectrum in the making: what is kept of each unit."""
-
-    def __init__(self, size: int, ways: tuple[bool, ...]) -> None:
-        self.count, self.power, self.square = np.zeros(size), np.zeros(size), np.zeros(size)
-        self.common = {way: [np.zeros(size, complex), np.zeros(size), 0, np.zeros(size, complex)] for way in ways}
-
-    def add(self, passes: dict[float, tuple[np.ndarray, np.ndarray]]) -> None:
-        """Add one unit: per direction its amplitudes and which frequencies it reaches, each of shape (f,)."""
-        for wave, known in passes.values():
-            power = _power(wave)
-            self.count += known
-            self.square += power
-            self.power += power / max(power.sum() / max(known.sum(), 1), 1e-300)
-        reached = np.any([known for _, known in passes.values()], axis=0)
-        for way, sums in self.common.items():
-            own = sum(wave * (1.0 if way else side) for side, (wave, _) in passes.items())
-            # Each unit weighs by its own spread, so that one noisy file does not decide.
-            power = _power(own)
-            square = np.median(power[reached]) if reached.any() else 0.0
-            if square > 0:
-                sums[0] += own / np.sqrt(square)
-                sums[1] += power / square
-            sums[2] += bool(own.any())
-            sums[3] += own
-
-    def spectrum(self, frequency: np.ndarray, taken: np.ndarray) -> Spectrum:
-        """Return the spectrum of all units added."""
-        count = np.maximum(self.count, 1)
-        common = tuple(
-            Common(way, total, square, units, own / count) for way, (total, square, units, own) in self.common.items()
-        )
-        return Spectrum(frequency, self.count, self.power / count, np.sqrt(self.square / count), common, taken)
 
 
 def _coherent(spectrum: Spectrum, axis: str) -> list[Peak]:
