@@ -29,12 +29,15 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
     level = np.zeros((len(declared.conditions), 2))  # mu_s, mu_c of each condition
     chosen = np.zeros(len(declared.conditions), dtype=bool)
     curved = declared.index["v_s"] >= 0
+    solved: dict[bytes, tuple] = {}  # together, all series of a kind ask the same
     for name in series:
         k = number.get(JointParameter("sigma_2", name), number.get(JointParameter("v_s", name)))
         full = JointParameter("v_s", name) in number
         uses = curved if together and full else (declared.index["sigma_2"] == k) | (declared.index["v_s"] == k)
-        mine = uses[condition]
-        values, sigma_2, v_s = _per_condition(speeds[mine], load[mine], size[mine], condition[mine], full)
+        if uses.tobytes() not in solved:
+            mine = uses[condition]
+            solved[uses.tobytes()] = _per_condition(speeds[mine], load[mine], size[mine], condition[mine], full)
+        values, sigma_2, v_s = solved[uses.tobytes()]
         for c, pair in values.items():
             level[c], chosen[c] = pair, True
         theta[k if not full else number[JointParameter("sigma_2", name)]] = sigma_2

@@ -1,10 +1,13 @@
 """The start's least squares of two numbers per condition and one shared, against the whole problem as one matrix."""
 
+import bins_helpers
 import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.fit.start import pairs_and_shared
+from sealfit.fit import start
+from sealfit.fit.rows import make_rows
+from sealfit.fit.start import pairs_and_shared, start_model
 
 
 def _dense(columns, code, shared, values):
@@ -38,3 +41,20 @@ def test_two_numbers_per_condition_and_a_shared_one_are_those_of_the_whole_probl
     expected, expected_shared = _dense(columns, code, speed, values)
     npt.assert_allclose(pairs, expected, rtol=1e-9, atol=1e-12)
     npt.assert_allclose(shared, expected_shared, rtol=1e-9)
+
+
+def test_series_that_start_together_are_solved_once(monkeypatch):
+    rows = make_rows(bins_helpers.make_bins(temperatures=(40.0, 60.0, 80.0), bins=4), has_aging=True)
+    one_by_one = start_model(rows)
+    solved = []
+    whole = start._per_condition
+    monkeypatch.setattr(start, "_per_condition", lambda *given: solved.append(given[3]) or whole(*given))
+    together = start_model(rows, together=True)
+    assert [np.unique(conditions).size for conditions in solved] == [13]  # unaged, and three series of four days
+    own, shared = (
+        {p: m.theta[k] for k, p in enumerate(m.declared.parameters) if p.quantity == "v_s"}
+        for m in (one_by_one, together)
+    )
+    assert len(own) == 4  # of the unaged rubber, too
+    assert len(set(shared.values())) == 1
+    assert max(shared.values()) == pytest.approx(np.mean(list(own.values())), abs=0.2)  # logarithms
