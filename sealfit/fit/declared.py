@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 from sealfit.fit.both_ways import SAME_SPEED
 from sealfit.fit.rows import Rows
@@ -58,7 +60,7 @@ def _declare(rows: Rows) -> Declared:
     names = tuple(conditions["condition"])
     aging = rows.has_aging
     series_of = series_of_curve(conditions, aging)
-    stribeck = {s: _speed_form(rows, series_of == s) for s in dict.fromkeys(series_of)}
+    stribeck = _speed_forms(rows, series_of)
     law = {}
     for s in stribeck:
         own = conditions[series_of == s]
@@ -110,27 +112,27 @@ def series_of_curve(conditions, aging: bool) -> np.ndarray:
     return series
 
 
-def _speed_form(rows: Rows, of_condition: np.ndarray) -> str:
-    mask = of_condition[rows.condition]
-    most = 0
-    for sign in (1.0, -1.0):
-        chosen = mask & (np.sign(rows.speed) == sign)
-        if chosen.any():
-            most = max(most, speed_levels(rows, chosen))
-    if most >= SPEEDS_FOR_STRIBECK:
-        return "full"
-    return "viscous" if most >= SPEEDS_FOR_VISCOUS else "constant"
+def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
+    """Return what the speeds of each series can carry, from the series of each condition."""
+    number, names = pd.factorize(series_of)
+    key = 2 * number[rows.condition] + (rows.speed > 0)
+    order = np.argsort(key, kind="stable")
+    ends = np.searchsorted(key[order], np.arange(2 * names.size + 1))
+    levels = [speed_levels(rows, order[first:last]) for first, last in itertools.pairwise(ends)]
+    most = np.reshape(levels, (names.size, 2)).max(axis=1)  # of the two directions
+    return {
+        name: "full" if m >= SPEEDS_FOR_STRIBECK else "viscous" if m >= SPEEDS_FOR_VISCOUS else "constant"
+        for name, m in zip(names, most, strict=True)
+    }
 
 
-def speed_levels(rows: Rows, mask: np.ndarray) -> int:
-    """Return how many speeds were set: commanded ones, or measured ones that differ by more than 25 %."""
-    commanded = rows.table.loc[mask, "speed_set_mm_s"]
-    if commanded.notna().all():
-        return commanded.abs().round(9).nunique()
-    stroke = rows.codes("stroke")[mask]
-    total = np.bincount(stroke, np.abs(rows.speed[mask]))
-    count = np.bincount(stroke)
-    return levels_of(np.sort(total[count > 0] / count[count > 0]))
+def speed_levels(rows: Rows, chosen: np.ndarray) -> int:
+    """Return how many speeds chosen rows have: commanded ones, or measured ones that differ by more than 25 %."""
+    commanded = rows.values("speed_set_mm_s")[chosen]
+    if np.isfinite(commanded).all():
+        return np.unique(np.round(np.abs(commanded), 9)).size
+    _, stroke = np.unique(rows.codes("stroke")[chosen], return_inverse=True)
+    return levels_of(np.sort(np.bincount(stroke, np.abs(rows.speed[chosen])) / np.bincount(stroke)))
 
 
 def levels_of(speeds: np.ndarray) -> int:
