@@ -137,22 +137,20 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     rows = after.rows
     channels = {name for term in (*before.model.terms, *after.model.terms) for name in term.channels}
     read = [name for name in rows.table.columns if name in {*CURVES.names(), *channels}]
-    tables, codes = [], []
-    for number in range(len(rows.conditions)):
-        inside = rows.condition == number
-        for sign in (1.0, -1.0):
-            chosen = inside & (np.sign(rows.speed) == sign)
-            if not chosen.any():
-                continue
-            speeds = np.abs(rows.speed[chosen])
-            count = POINTS if speeds.max() > 1.02 * speeds.min() else 1
-            table = _typical(rows.table.loc[chosen, read], count)
-            table["speed_mm_s"] = sign * np.geomspace(speeds.min(), speeds.max(), count)
-            table["direction"] = sign
-            tables.append(table)
-            codes.append(np.full(count, number))
-    points = pd.concat(tables, ignore_index=True)
-    at = point_rows(points, np.concatenate(codes), rows.conditions, has_load=rows.has_load, has_aging=rows.has_aging)
+    way = np.sign(rows.speed)
+    moving = np.flatnonzero(way != 0)
+    order = moving[np.lexsort((-way[moving], rows.condition[moving]))]  # of a condition, what moves forwards first
+    cuts = np.flatnonzero(np.diff(rows.condition[order]) | (np.diff(way[order]) != 0)) + 1
+    columns = {name: _averaged(rows.table[name], np.split(order, cuts)) for name in read}
+    speeds = [np.abs(rows.speed[chosen]) for chosen in np.split(order, cuts)]
+    counts = [POINTS if own.max() > 1.02 * own.min() else 1 for own in speeds]
+    first = order[np.r_[0, cuts]]
+    points = pd.DataFrame({**columns, "direction": way[first]}).loc[np.repeat(np.arange(first.size), counts)]
+    along = [np.geomspace(own.min(), own.max(), count) for own, count in zip(speeds, counts, strict=True)]
+    points = points.assign(speed_mm_s=points["direction"].to_numpy() * np.concatenate(along), file="")
+    points = points.reset_index(drop=True)
+    codes = np.repeat(rows.condition[first], counts)
+    at = point_rows(points, codes, rows.conditions, has_load=rows.has_load, has_aging=rows.has_aging)
     mean, tangent = evaluate(after.model, at)
     reach = t_quantile(degrees_of_freedom(after)) * mean_se(tangent, after.covariance)
     points = points.assign(
@@ -164,15 +162,9 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     return points[CURVES.names()]
 
 
-def _typical(table: pd.DataFrame, count: int) -> pd.DataFrame:
-    """Return `count` rows with every numeric channel at its mean and every category at its commonest."""
-    one = {}
-    for name in table.columns:
-        column = table[name]
-        one[name] = (
-            float(column.mean())
-            if pd.api.types.is_float_dtype(column) or name in ("repeat", "stroke")
-            else column.mode().iloc[0]
-        )
-    one["file"] = ""
-    return pd.DataFrame([one] * count)
+def _averaged(column: pd.Series, groups: list[np.ndarray]) -> list:
+    """Return the mean of a numeric channel in each group of rows, or the commonest of a category."""
+    if pd.api.types.is_float_dtype(column) or column.name in ("repeat", "stroke"):
+        return [float(column.iloc[rows].mean()) for rows in groups]
+    number, names = pd.factorize(column, sort=True)
+    return [names[np.bincount(number[rows]).argmax()] for rows in groups]
