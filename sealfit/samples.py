@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,22 +49,36 @@ def by_conditions(parts: Mapping[Path, Iterable[str]]) -> list[StoredTraces]:
     return sorted(groups, key=lambda group: min(group.conditions, default=""))
 
 
-def strokes_of(traces: pd.DataFrame, strokes: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each stroke's samples begin, the end of the last added, and which row of `strokes` each is.
+def a_part_at_a_time(traces: pd.DataFrame | Sequence[StoredTraces], columns: list[str]) -> Iterator[pd.DataFrame]:
+    """Yield table `traces`, or each part of where it lies: these columns of it, files as categories there."""
+    if isinstance(traces, pd.DataFrame):
+        yield traces[columns]
+        return
+    for path in (path for group in traces for path in group.paths):
+        yield parquet.read(path, columns, coded=["file"])
+
+
+def stroke_index(table: pd.DataFrame) -> pd.MultiIndex:
+    """Return the file and stroke of each row, for `strokes_of`."""
+    return pd.MultiIndex.from_frame(table[["file", "stroke"]])
+
+
+def strokes_of(traces: pd.DataFrame, strokes: pd.MultiIndex) -> tuple[np.ndarray, np.ndarray]:
+    """Return where each stroke's samples begin, the end of the last added, and which of `strokes` each is.
 
     Parameters
     ----------
     traces : DataFrame
         Rows of table `traces`.
-    strokes : DataFrame
-        Columns `file` and `stroke`, a row per stroke.
+    strokes : MultiIndex
+        File and stroke of each.
 
     Returns
     -------
     edges : ndarray of int, shape (n + 1,)
         Samples edges[k] to edges[k + 1] are one stroke.
     own : ndarray of int, shape (n,)
-        Its row in `strokes`; -1 where it is not among them.
+        Its place in `strokes`; -1 where it is not among them.
     """
     file = traces["file"]
     if isinstance(file.dtype, pd.CategoricalDtype):
@@ -73,9 +87,7 @@ def strokes_of(traces: pd.DataFrame, strokes: pd.DataFrame) -> tuple[np.ndarray,
         file, names = pd.factorize(file)
     stroke = traces["stroke"].to_numpy()
     first = np.flatnonzero(np.r_[True, (file[1:] != file[:-1]) | (stroke[1:] != stroke[:-1])])
-    own = pd.MultiIndex.from_frame(strokes[["file", "stroke"]]).get_indexer(
-        pd.MultiIndex.from_arrays([np.asarray(names, object)[file[first]], stroke[first]])
-    )
+    own = strokes.get_indexer(pd.MultiIndex.from_arrays([np.asarray(names, object)[file[first]], stroke[first]]))
     return np.r_[first, file.size], own
 
 

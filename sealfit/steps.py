@@ -209,16 +209,15 @@ def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) ->
 
     with timed("reading tables"):
         bins = store.read("bins")
-        traces = store.read("traces", ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"])
-    count = len(bins)
-    closure = close_loop(bins, traces, store.seen_config("close-loop"), workers=workers, on_progress=progress.say)
+    config = store.seen_config("close-loop")
+    closure = close_loop(bins, store.traces(), config, workers=workers, on_progress=progress.say)
     with timed("writing tables"):
         for name in CLOSED:
             staged.table(name, closure.tables[name])
     started = store.read("runs", ["started_at"])["started_at"].dropna()
     staged.json("model", {**closure.model, "first_started_at": min(started) if len(started) else None})
     staged.json("closure", closure.document)
-    return count, "bins"
+    return len(bins), "bins"
 
 
 def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,8 +24,9 @@ from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import Rows
-from sealfit.samples import strokes_of
+from sealfit.samples import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
 
+SAMPLED = ("displacement_mm", "time_s", "force_N")  # what the ripple search reads of a sample
 DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at: a far surer one may show in it
 
 
@@ -200,13 +201,13 @@ def numbered(bins: pd.DataFrame) -> pd.DataFrame:
     return bins.assign(stroke_id=bins.groupby(["file", "stroke"], sort=False).ngroup().to_numpy())
 
 
-def steady_samples(traces: pd.DataFrame, rows: Rows) -> pd.DataFrame:
+def steady_samples(traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows) -> pd.DataFrame:
     """Return the steady samples of the strokes in `rows`, for the ripple search.
 
     Parameters
     ----------
-    traces : DataFrame
-        Table `traces`, the samples of a stroke one after the other.
+    traces : DataFrame or sequence of StoredTraces
+        Table `traces`, the samples of a stroke one after the other, or where it lies: then it is read part by part.
     rows : Rows
         Rows made from `numbered` bins.
 
@@ -217,21 +218,19 @@ def steady_samples(traces: pd.DataFrame, rows: Rows) -> pd.DataFrame:
     """
     first = rows.groups.starts["stroke"]
     strokes = rows.table.iloc[first]
-    steady = traces[traces["steady"].to_numpy(dtype=bool)]
-    edges, own = strokes_of(steady, strokes)
-    place = np.repeat(own, np.diff(edges))
-    known = place >= 0
-    place = place[known]
-    table = {name: steady[name].to_numpy()[known] for name in ("displacement_mm", "time_s", "force_N")}
-    return pd.DataFrame(
-        {
-            "stroke_id": strokes["stroke_id"].to_numpy()[place],
-            "stroke": strokes["stroke"].to_numpy()[place],
-            "direction": strokes["direction"].to_numpy()[place],
-            "unit": rows.codes("file")[first][place],
-            **table,
-        }
-    )
+    index = stroke_index(strokes)
+    about = {name: strokes[name].to_numpy() for name in ("stroke_id", "stroke", "direction")}
+    about["unit"] = rows.codes("file")[first]
+    parts = []
+    for part in a_part_at_a_time(traces, ["file", "stroke", "steady", *SAMPLED]):
+        steady = part[part["steady"].to_numpy(dtype=bool)]
+        edges, own = strokes_of(steady, index)
+        place = np.repeat(own, np.diff(edges))
+        known = place >= 0
+        parts.append((place[known].astype(np.int32), *(steady[name].to_numpy()[known] for name in SAMPLED)))
+    place, *values = map(np.concatenate, zip(*parts, strict=True)) if parts else [np.zeros(0, int)] * (1 + len(SAMPLED))
+    about = {name: own.astype(np.int32)[place] for name, own in about.items()}
+    return pd.DataFrame({**about, **dict(zip(SAMPLED, values, strict=True))})
 
 
 def predict_rows(fitted: Fitted, rows: Rows) -> np.ndarray:

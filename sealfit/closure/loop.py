@@ -24,6 +24,7 @@ from sealfit.engine import begin_map, many_workers
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.rows import Rows, make_rows, thin
 from sealfit.profiling import timed
+from sealfit.samples import StoredTraces
 from sealfit.verdict import predicts_worse
 
 ROWS = 4_000  # that the search works on; more are merged along their strokes,
@@ -42,7 +43,7 @@ class Closure:
 
 def close_loop(
     bins: pd.DataFrame,
-    traces: pd.DataFrame,
+    traces: pd.DataFrame | Sequence[StoredTraces],
     config: Config,
     *,
     workers: int = 1,
@@ -54,8 +55,8 @@ def close_loop(
     ----------
     bins : DataFrame
         Table `bins`.
-    traces : DataFrame
-        Table `traces`: the raw samples, for what is finer than the bins.
+    traces : DataFrame or sequence of StoredTraces
+        Table `traces`, or where it lies: the raw samples, for what is finer than the bins.
     config : Config
         The rig.
     workers : int

@@ -12,7 +12,7 @@ import pandas as pd
 
 from sealfit.fit.ramps import Ramp, fit_ramps
 from sealfit.ingest.pieces import median
-from sealfit.samples import noise_from_bends, strokes_of
+from sealfit.samples import noise_from_bends, stroke_index, strokes_of
 
 STANDSTILL = 0.05  # slower than this share of the steady speed: not moving yet
 ROUGH = 0.1  # wanted noise of the local speed, as a share of the steady speed
@@ -135,7 +135,7 @@ def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
     steady : DataFrame
         Table `steady`: the strokes.
     """
-    edges, own = strokes_of(traces, steady)
+    edges, own = strokes_of(traces, stroke_index(steady))
     time, along, force = (traces[name].to_numpy(float) for name in ("time_s", "displacement_mm", "force_N"))
     sliding, sign = traces["steady"].to_numpy(bool), steady["direction"].to_numpy().tolist()
     pace = np.abs(steady["speed_mm_s"].to_numpy(float)).tolist()
