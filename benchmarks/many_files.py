@@ -1,11 +1,13 @@
 """Write a campaign of as many files as wanted, quickly: for measuring how ingest and fits grow with the campaign.
 
     python benchmarks/many_files.py --files 100000 --out DIR [--rows 80] [--seed 1]     (100,000 files: half a minute)
+                                    [--effect conditioning] [--strength 1]
 
 Every file is a ramp, a pre-sliding rise and steady sliding with noise; forces follow Eq. 14 and 15 of
 `sealfit.physics`, so that fits make sense. Eight speeds and three repeats a condition; with the number of files grow
 the temperatures, the compressions, the days, the loads and the specimens, as they do in laboratories. At most 1,000
-files a folder.
+files a folder. With --effect something that nobody declared is in all of them, of the size that `effect_kinds.py` gives
+it at that strength.
 
 Text is put together from cells that are formatted once: positions and times per speed and starting point, forces in
 steps of 0.01 N. `sealfit simulate` knows far more and is some fifty times slower.
@@ -33,6 +35,7 @@ SCATTER = 0.005  # of specimen, set-up and repeat each, relative
 NOISE_N, POSITION_NOISE_MM = 0.1, 0.002
 MU_S, MU_C = {"mu_0": 0.935, "b": 0.08}, {"mu_0": 0.61, "b": 0.13}
 V_S, SIGMA_2 = 5.0, 0.05
+EFFECTS = ("conditioning", "warming_distance", "ripple")
 BEGIN = datetime(2024, 1, 8, 8)
 HEADER = "time_s,displacement_mm,force_N\n"
 RUNS = "file,run_id,repeat,specimen_id,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s,started_at\n"
@@ -77,8 +80,10 @@ def design_for(files: int) -> Design:
     )
 
 
-def write_campaign(folder: Path, files: int, *, rows: int = 80, seed: int = 1) -> Design:
-    """Write runs.csv and the trace files into `folder`; the design they follow."""
+def write_campaign(
+    folder: Path, files: int, *, rows: int = 80, seed: int = 1, effect: str | None = None, strength: float = 1.0
+) -> Design:
+    """Write runs.csv and the trace files into `folder`, one of EFFECTS in them; the design they follow."""
     rng = np.random.default_rng(seed)
     design = design_for(files)
     runs = _Runs.of(design, files, rng)
@@ -87,7 +92,7 @@ def write_campaign(folder: Path, files: int, *, rows: int = 80, seed: int = 1) -
         place = folder / "traces" / f"{first // PER_FOLDER:04d}"
         place.mkdir(parents=True, exist_ok=True)
         block = slice(first, min(first + PER_FOLDER, files))
-        for path, text in zip(runs.path[block], motions.texts(runs, block, rng), strict=True):
+        for path, text in zip(runs.path[block], motions.texts(runs, block, rng, effect, strength), strict=True):
             (folder / path).write_text(text, "ascii")
     (folder / "runs.csv").write_text(RUNS + "".join(runs.lines()), "ascii")
     return design
@@ -182,11 +187,13 @@ class _Motions:
 
     cells: list[list[list[str]]]  # "time,displacement," of every row
     speed_mm_s: np.ndarray  # shape (speeds, rows)
+    slid_mm: np.ndarray  # from the start of the stroke, shape (speeds, rows)
+    start_mm: np.ndarray  # of the starting points
     risen: np.ndarray  # share of the steady force that the bristles have reached, shape (speeds, rows)
 
     @classmethod
     def make(cls, rows: int, rng: np.random.Generator) -> _Motions:
-        cells, speeds, risen = [], [], []
+        cells, speeds, distances = [], [], []
         starts = rng.uniform(0.0, 4.0, STARTS)
         for speed in SPEEDS:
             ramp = min(RAMP_S, 0.1 * STROKE_MM / speed)
@@ -201,7 +208,7 @@ class _Motions:
             )
             # At rest after the stop the bristles stay bent, so the speed ends at next to nothing.
             speeds.append(np.where(since > 0.0, np.maximum(np.interp(since, fine, now), 1e-3), 0.0))
-            risen.append(-np.expm1(-slid / RISE_MM))
+            distances.append(slid)
             clock = [f"{second:.5f}," for second in time]
             cells.append(
                 [
@@ -212,17 +219,25 @@ class _Motions:
                     for start, noise in zip(starts, rng.standard_normal((STARTS, rows)), strict=True)
                 ]
             )
-        return cls(cells, np.array(speeds), np.array(risen))
+        slid = np.array(distances)
+        return cls(cells, np.array(speeds), slid, starts, -np.expm1(-slid / RISE_MM))
 
-    def texts(self, runs: _Runs, block: slice, rng: np.random.Generator) -> list[str]:
+    def texts(
+        self, runs: _Runs, block: slice, rng: np.random.Generator, effect: str | None = None, strength: float = 1.0
+    ) -> list[str]:
         """Return the text of every file of a block."""
         kind = runs.speed[block]
         force = _force_N(runs, block, self.speed_mm_s[kind]) * self.risen[kind]
-        force += NOISE_N * rng.standard_normal(force.shape)
+        noise = NOISE_N * rng.standard_normal(force.shape)
+        start = rng.integers(STARTS, size=len(kind))
+        slid = self.slid_mm[kind]
+        force += self.risen[kind] * _hidden_N(
+            effect, strength, force, runs.repeat[block][:, None], slid, self.start_mm[start][:, None] + slid
+        )
+        force += noise
         hundredths = np.rint(100.0 * force).astype(int)
         low = int(hundredths.min())
         words = np.array([f"{k / 100:.2f}\n" for k in range(low, int(hundredths.max()) + 1)], object)
-        start = rng.integers(STARTS, size=len(kind))
         return [
             HEADER + "".join(map(add, self.cells[speed][place], words[row - low]))
             for speed, place, row in zip(kind, start, hundredths, strict=True)
@@ -239,14 +254,38 @@ def _force_N(runs: _Runs, block: slice, speed_mm_s: np.ndarray) -> np.ndarray:
     return stribeck_force(speed_mm_s, runs.load_N[block][:, None], **laws) * runs.gain[block][:, None]
 
 
+def _hidden_N(
+    effect: str | None,
+    strength: float,
+    force_N: np.ndarray,
+    repeat: np.ndarray,
+    slid_mm: np.ndarray,
+    place_mm: np.ndarray,
+) -> np.ndarray | float:
+    """Return what an effect adds to the force, shape (files, rows)."""
+    match effect:
+        case None:
+            return 0.0
+        case "conditioning":
+            return -0.01 * strength * -np.expm1(1.0 - repeat) * force_N
+        case "warming_distance":
+            return 0.01 * strength * -np.expm1(-slid_mm / 10.0) * force_N
+        case "ripple":
+            return 0.1 * strength * np.sin(2 * np.pi * place_mm / 5.0 + 0.7)
+    raise ValueError(f"{effect!r} is none of {EFFECTS}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--files", type=int, required=True)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--rows", type=int, default=80, help="of every file")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--effect", choices=EFFECTS, help="in all of them, which nobody declared")
+    parser.add_argument("--strength", type=float, default=1.0)
     given = parser.parse_args()
-    design = write_campaign(given.out, given.files, rows=given.rows, seed=given.seed)
+    hidden = {"effect": given.effect, "strength": given.strength}
+    design = write_campaign(given.out, given.files, rows=given.rows, seed=given.seed, **hidden)
     used = -(-given.files // design.files_per_condition)
     print(f"{given.files} files of {given.rows} rows, {used} conditions -> {given.out}")
 

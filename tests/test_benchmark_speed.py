@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import many_files
 import numpy as np
+import numpy.testing as npt
 import pandas as pd
 import pandas_script
 import pytest
@@ -47,6 +48,32 @@ def test_many_files_fill_folders_and_designs_grow(tmp_path, monkeypatch):
     for files in (1, 24, 1_000, 10_000, 100_000):
         design = design_for(files)
         assert len(design.conditions) * design.files_per_condition >= files
+
+
+def forces_of(folder):
+    """Forces of the files of runs.csv, and its rows and the places, shapes (files, rows)."""
+    runs = pd.read_csv(folder / "runs.csv")
+    traces = [pd.read_csv(folder / file) for file in runs["file"]]
+    return runs, *(np.array([trace[name] for trace in traces]) for name in ("force_N", "displacement_mm"))
+
+
+@pytest.mark.parametrize("effect", many_files.EFFECTS)
+def test_an_effect_is_in_the_files_and_nothing_else_is_changed(short, tmp_path, effect):
+    write_campaign(tmp_path, 60, rows=80, effect=effect, strength=5.0)
+    runs, with_it, place = forces_of(tmp_path)
+    start = place[:, :1]
+    _, without, same_place = forces_of(short)
+    npt.assert_array_equal(place, same_place)
+    middle = slice(30, 60)  # at rest nothing is added, and the force rises at first
+    added, force, place = (with_it - without)[:, middle], without[:, middle], place[:, middle]
+    if effect == "conditioning":
+        wanted = -0.05 * (1 - np.exp(1.0 - runs["repeat"].to_numpy()))[:, None] * force
+    elif effect == "warming_distance":
+        slid = place - start
+        wanted = 0.05 * (1 - np.exp(-slid / 10.0)) * force
+    else:
+        wanted = 0.5 * np.sin(2 * np.pi * place / 5.0 + 0.7)
+    npt.assert_allclose(added, wanted, atol=0.03)  # rounded to 0.01 N; noise of force and place is in what is compared
 
 
 def test_added_files_are_a_new_run_of_a_condition_that_was_there(tmp_path):
