@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -79,10 +80,15 @@ class Aged:
                 found.append(name)
         return tuple(found)
 
-    def away(self, name: str, tested: Aged) -> np.ndarray:
-        """Return what a coefficient multiplies in ln k, counted from the middle of what was tested, shape (n,)."""
+    @cached_property
+    def middle(self) -> dict[str, float]:
+        """The middle of the tested temperatures and compressions, by the name of the coefficient."""
+        there = ((name, getattr(self, column)) for name, column, _ in DRIVERS)
+        return {name: reference_of(at[self.days > 0]) for name, at in there if at is not None}
+
+    def away(self, name: str, middle: float) -> np.ndarray:
+        """Return what a coefficient multiplies in ln k, counted from a temperature or compression, shape (n,)."""
         column, of = next((column, of) for own, column, of in DRIVERS if own == name)
-        middle = reference_of(getattr(tested, column)[tested.days > 0])
         return np.where(self.days > 0, of(middle) - of(getattr(self, column)), 0.0)
 
     def series(self) -> np.ndarray:

@@ -151,7 +151,7 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
     middle = (None if c is None else np.full(days.size, reference_of(c[aged.days > 0])) for c in tested)
     at = Aged(days, np.zeros(days.size), *middle)
     slope = law.slope(at)
-    half = law.t * np.sqrt(np.einsum("ni,ij,nj->n", slope, law.covariance, slope))
+    half = law.t * np.sqrt(np.einsum("in,ij,jn->n", slope, law.covariance, slope))
     value = law.at(at)
     curve = {"kind": "law", "scaled_days": days, "value": value, "lo95": value - half, "hi95": value + half}
     return pd.concat([pd.DataFrame(points), pd.DataFrame(curve)], ignore_index=True)

@@ -22,8 +22,7 @@ from scipy.special import stdtrit
 
 from sealfit.errors import FitError
 from sealfit.fit.aged import Aged
-from sealfit.fit.joint_solve import solved
-from sealfit.fit.polish import central_jacobian
+from sealfit.fit.joint_solve import solved, solved_without
 from sealfit.fit.prior import covariance_of
 from sealfit.physics.losses import LOSSES, Loss
 
@@ -92,13 +91,26 @@ class JointLaw:
     def rate(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
         """Return k at some conditions, shape (..., n)."""
         x, logarithm = self.x if x is None else x, np.zeros(aged.days.size)
-        for name in (name for name in self.names if name in ("E", "kappa")):
-            logarithm = logarithm + x[..., self.names.index(name), None] * aged.away(name, self.aged)
+        for name, away in self.away(aged).items():
+            logarithm = logarithm + x[..., self.names.index(name), None] * away
         return np.exp(np.clip(logarithm, -50, 50))
 
+    def away(self, aged: Aged) -> dict[str, np.ndarray]:
+        """Return what E and kappa, those that there are, multiply in ln k at some conditions, shape (n,) each."""
+        return {name: aged.away(name, self.aged.middle[name]) for name in self.names[2 + len(self.loss.parameters) :]}
+
     def slope(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
-        """Return the derivative of the law along its parameters, shape (n, p), or (..., n, p) for many x."""
-        return central_jacobian(lambda many: self.at(aged, many), self.x if x is None else x, together=True)
+        """Return the derivative of the law along its parameters, shape (p, n), or (..., p, n) for many x."""
+        x = self.x if x is None else x
+        k, own, a = self.rate(aged, x), self.own(x), x[..., 1:2]
+        if self.way == "rate":
+            lost = self.loss.value(aged.days * k, *own)
+            along_k, *along_own = self.loss.slopes(aged.days * k, *own)
+        else:
+            lost = along_k = k * self.loss.value(aged.days, *own)
+            along_own = [k * slope for slope in self.loss.slopes(aged.days, *own)[1:]]
+        along = [*along_own, *(along_k * away for away in self.away(aged).values())]
+        return np.stack([np.ones_like(lost), -lost, *(-a * slope for slope in along)], axis=-2)
 
     def tested_days(self) -> np.ndarray:
         """Return the days of the tests, in the master curve's time where there is one, shape (n,)."""
@@ -151,7 +163,7 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
         if abs(scatter - before) <= SETTLED * before:
             break
     root = np.linalg.cholesky(aged.covariance(scatter))
-    white = np.linalg.solve(root, np.column_stack([aged.value - empty.at(aged, x), empty.slope(aged, x)]))
+    white = np.linalg.solve(root, np.column_stack([aged.value - empty.at(aged, x), empty.slope(aged, x).T]))
     criterion = float(white[:, 0] @ white[:, 0] + 2 * np.log(np.diag(root)).sum())
     criterion += len(names) * np.log(aged.value.size)
     covariance = covariance_of(white[:, 1:].T @ white[:, 1:], np.zeros((len(names),) * 2))
@@ -208,11 +220,7 @@ def left_out(law: JointLaw) -> dict[str, float]:
     aged, covariance = law.aged, law.aged.covariance(law.scatter)
     whole, found = aged.whole_series(), {}
     for name, masks in (("series", whole if len(whole) > 2 else []), ("last_day", aged.last_days())):
-        squares = []
-        for out in masks:
-            part = aged.part(~out)
-            if part.drivers() == aged.drivers():
-                x = solved(law, covariance[np.ix_(~out, ~out)], law.x, part)
-                squares += list((law.at(aged.part(out), x) - aged.value[out]) ** 2)
-        found[name] = float(np.sqrt(np.mean(squares))) if squares else np.nan
+        held = np.array([out for out in masks if aged.part(~out).drivers() == aged.drivers()])
+        errors = (law.at(aged, solved_without(law, covariance, held)) - aged.value)[held] if len(held) else held
+        found[name] = float(np.sqrt(np.mean(errors**2))) if errors.size else np.nan
     return found

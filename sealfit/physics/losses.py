@@ -37,6 +37,8 @@ class Loss:
         (days, own numbers) -> phi, broadcast.
     time : callable
         (phi, own numbers) -> days until the loss is phi; inf where it is never reached.
+    slopes : callable
+        (days, own numbers) -> derivative of phi along ln t, and along the logarithm of each own number; broadcast.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Loss:
     units: tuple[str, ...]
     value: Callable
     time: Callable
+    slopes: Callable
 
 
 def _log(days, b):
@@ -53,6 +56,11 @@ def _log(days, b):
 
 def _log_time(phi, b):
     return b * np.expm1(phi)
+
+
+def _log_slopes(days, b):
+    share = np.asarray(days, float) / (b + days)
+    return share, -share
 
 
 def _stretched(days, tau, beta):
@@ -65,12 +73,25 @@ def _stretched_time(phi, tau, beta):
         return np.where(phi < 1, tau * (-np.log1p(-np.minimum(phi, 1.0))) ** (1 / beta), np.inf)
 
 
+def _stretched_slopes(days, tau, beta):
+    ratio = np.asarray(days, float) / tau
+    power = ratio**beta
+    bend = beta * power * np.exp(-power)
+    return bend, -bend, bend * np.log(np.where(ratio > 0, ratio, 1.0))
+
+
 def _power(days, n):
     return np.asarray(days, float) ** n
 
 
 def _power_time(phi, n):
     return np.asarray(phi, float) ** (1 / n)
+
+
+def _power_slopes(days, n):
+    days = np.asarray(days, float)
+    bend = n * days**n
+    return bend, bend * np.log(np.where(days > 0, days, 1.0))
 
 
 def _induction(days, b, t_i):
@@ -81,13 +102,25 @@ def _induction_time(phi, b, t_i):
     return t_i + b * np.expm1(phi)
 
 
+def _induction_slopes(days, b, t_i):
+    late = np.maximum(np.asarray(days, float) - t_i, 0.0)
+    per_day = (late > 0) / (b + late)
+    return days * per_day, -late * per_day, -t_i * per_day
+
+
 LOSSES = {
     loss.name: loss
     for loss in (
-        Loss("log", "mu_0 - a ln(1 + t/b)", ("b",), ("d",), _log, _log_time),
-        Loss("stretched", "mu_0 - a (1 - exp(-(t/tau)^beta))", ("tau", "beta"), ("d", ""), _stretched, _stretched_time),
-        Loss("power", "mu_0 - a t^n", ("n",), ("",), _power, _power_time),
-        Loss("induction", "mu_0 - a ln(1 + max(t - t_i, 0)/b)", ("b", "t_i"), ("d", "d"), _induction, _induction_time),
+        Loss("log", "mu_0 - a ln(1 + t/b)", ("b",), ("d",), _log, _log_time, _log_slopes),
+        Loss(
+            "stretched", "mu_0 - a (1 - exp(-(t/tau)^beta))", ("tau", "beta"), ("d", ""),
+            _stretched, _stretched_time, _stretched_slopes,
+        ),
+        Loss("power", "mu_0 - a t^n", ("n",), ("",), _power, _power_time, _power_slopes),
+        Loss(
+            "induction", "mu_0 - a ln(1 + max(t - t_i, 0)/b)", ("b", "t_i"), ("d", "d"),
+            _induction, _induction_time, _induction_slopes,
+        ),
     )
-}
+}  # fmt: skip
 """Every shape by name."""

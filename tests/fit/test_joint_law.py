@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.optimize import least_squares
 
 from sealfit.errors import FitError, RequestError
 from sealfit.fit.aged import Aged
 from sealfit.fit.joint_law import fit_joint_law, fit_laws, left_out, rivals_of
-from sealfit.fit.joint_solve import solved, solved_many
+from sealfit.fit.joint_solve import solved_many, solved_without
 from sealfit.fit.lifetime import DAYS_PER_YEAR, Goal, lifetime, over_laws, resampled, temperature_for
 from sealfit.fit.lifetime_answer import answer, goal_of
+from sealfit.fit.polish import central_jacobian
 from sealfit.physics.losses import LOSSES
 
 MEASURED = os.environ.get("SEALFIT_MEASURED")
@@ -140,14 +142,42 @@ def test_an_end_that_a_likely_law_leaves_open_stays_open():
     assert over_laws(laws, Goal(0.3), 60.0, 80.0)[1] == np.inf
 
 
+def alone(law, covariance, values, keep=slice(None)):
+    """The parameters by scipy, of some values by themselves."""
+    white = np.linalg.inv(np.linalg.cholesky(covariance[keep][:, keep]))
+    return least_squares(
+        lambda x: white @ (law.at(law.aged, x) - values)[keep], law.x, x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15
+    ).x
+
+
 def test_many_draws_at_once_are_fitted_as_each_alone():
     law = fit_joint_law(campaign(scatter=0.01), "log", "rate")
     covariance = law.aged.covariance(law.scatter)
     drawn = np.random.default_rng(2).multivariate_normal(law.at(law.aged), covariance, 6)
-    together = solved_many(law, covariance, drawn)
-    for values, x in zip(drawn, together, strict=True):
-        alone = solved(law, covariance, law.x, replace(law.aged, value=values))
-        assert x == pytest.approx(alone, rel=1e-4, abs=1e-6)
+    for values, x in zip(drawn, solved_many(law, covariance, drawn), strict=True):
+        assert x == pytest.approx(alone(law, covariance, values), rel=1e-5, abs=1e-6)
+
+
+def test_values_left_out_at_once_are_left_out_of_each_fit():
+    """With a common error of a series, so that what is left out is correlated with what stays."""
+    aged = campaign(scatter=0.01)
+    common = 1e-5 * (aged.series()[:, None] == aged.series()) + np.diag(aged.variance)
+    law = fit_joint_law(replace(aged, variance=common), "log", "rate")
+    covariance = law.aged.covariance(law.scatter)
+    masks = np.array([*aged.whole_series(), *aged.last_days()])
+    for out, x in zip(masks, solved_without(law, covariance, masks), strict=True):
+        assert x == pytest.approx(alone(law, covariance, aged.value, ~out), rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize("way", ["rate", "loss"])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_slope_of_a_law_is_that_of_its_values(loss, way):
+    law = replace(fit_joint_law(campaign(scatter=0.01), "log"), loss=LOSSES[loss], way=way)
+    own = len(law.loss.parameters)
+    law = replace(law, names=("mu_0", "a", *law.loss.parameters, "E", "kappa"))
+    x = np.array([[0.9, 0.05, *[0.3, -0.4][:own], 70.0, 0.02], [0.8, 0.1, *[-1.2, 0.2][:own], 20.0, -0.01]])
+    expected = [central_jacobian(lambda at: law.at(law.aged, at), one).T for one in x]
+    assert law.slope(law.aged, x) == pytest.approx(np.array(expected), rel=1e-8, abs=1e-10)
 
 
 def test_correlated_values_weigh_as_their_covariance_says():
