@@ -14,7 +14,8 @@ from scipy.optimize import brentq
 
 from sealfit.fit.batch import BatchFit, at_edge, check
 from sealfit.fit.law_search import search_law
-from sealfit.fit.polish import Polished, polish
+from sealfit.fit.polish import covariance_of
+from sealfit.fit.polish_many import polish_many
 
 SOONEST, LATEST = 1e-9, 1e3  # b is sought from 1e-9 of the first aged day to 1000 times the last
 PROFILED = 17  # points along ln b at which the intervals of a and c are taken
@@ -106,10 +107,22 @@ class LawFit:
 
     values: Values
     x: np.ndarray
-    covariance: np.ndarray
-    jacobian: np.ndarray  # (n, p), of the model, not whitened
     chi2: float
     limits: tuple[np.ndarray, np.ndarray]  # of ln b per curve
+
+    @cached_property
+    def jacobian(self) -> np.ndarray:
+        """Derivative of the model, not whitened, shape (n, p)."""
+        return law_model(self.values, self.x)[1]
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Of the parameters, shape (p, p): see `covariance_of`; none of a ln b at a limit."""
+        free = np.ones(self.x.size, bool)
+        free[-self.values.curves :] = (self.x[-self.values.curves :] > self.limits[0]) & (
+            self.x[-self.values.curves :] < self.limits[1]
+        )
+        return covariance_of(self.values.whitening @ self.jacobian, free)[0]
 
     @property
     def df(self) -> int:
@@ -156,35 +169,30 @@ def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
     m, k = values.origins, values.curves
     whiten = values.whitening
     limits = np.array([search_limits(values.days[values.curve == c]) for c in range(k)]).reshape(k, 2).T
-    bounds = (
-        np.concatenate([np.full(m + k, -np.inf), limits[0]]),
-        np.concatenate([np.full(m + k, np.inf), limits[1]]),
-    )
+    low, high = (np.concatenate([np.full(m + k, end), own]) for end, own in zip((-np.inf, np.inf), limits, strict=True))
 
-    def residual(x):
-        return whiten @ (law_model(values, x)[0] - values.value)
+    def residual(x, _rows):
+        return ((law_model(values, x[0])[0] - values.value) @ whiten.T)[None]
 
-    def jacobian(x):
-        return whiten @ law_model(values, x)[1]
+    def tangent(x, _rows):
+        return (law_model(values, x[0])[1].T @ whiten.T)[None]
+
+    def polished(x):
+        found, rss = polish_many(residual, tangent, x[None], low, high)
+        return LawFit(values, found[0], float(rss[0]), (limits[0], limits[1]))
 
     if start is not None:
-        return _fitted(values, polish(residual, jacobian, start, bounds), limits)
-    x = _each_alone(values)
-    found = polish(residual, jacobian, x, bounds)
+        return polished(start)
+    found = polished(_each_alone(values))
     for _ in range(3):
-        moved = _rescan(values, whiten, found, limits)
+        moved = _rescan(found)
         if moved is None:
             break
-        again = polish(residual, jacobian, moved, bounds)
-        if not again.rss < found.rss * (1 - 1e-9):
+        again = polished(moved)
+        if not again.chi2 < found.chi2 * (1 - 1e-9):
             break
         found = again
-    return _fitted(values, found, limits)
-
-
-def _fitted(values: Values, found: Polished, limits) -> LawFit:
-    jacobian = law_model(values, found.x)[1]
-    return LawFit(values, found.x, found.covariance, jacobian, found.rss, (limits[0], limits[1]))
+    return found
 
 
 def _each_alone(values: Values) -> np.ndarray:
@@ -208,22 +216,23 @@ def _each_alone(values: Values) -> np.ndarray:
     return np.concatenate([start_0, alone.coefficients[:, 1], alone.u])
 
 
-def _rescan(values: Values, whiten, found: Polished, limits) -> np.ndarray | None:
+def _rescan(found: LawFit) -> np.ndarray | None:
     """Search each curve's b over its whole range with everything else held; None where no curve gains."""
+    values, limits, whiten = found.values, found.limits, found.values.whitening
     m, k = values.origins, values.curves
     x, gained = found.x.copy(), False
+    rest = values.value - found.model
     for c in range(k):
-        rows = values.curve == c
+        rows = np.flatnonzero(values.curve == c)
         u = np.linspace(limits[0][c], limits[1][c], 120)
-        columns = np.zeros((u.size, values.value.size))
-        columns[:, rows] = -np.log1p(values.days[rows] * np.exp(-u)[:, None])
-        without = x.copy()
-        without[m + c] = 0.0
-        target = whiten @ (values.value - law_model(values, without)[0])
-        white = columns @ whiten.T
+        columns = -np.log1p(values.days[rows] * np.exp(-u)[:, None])
+        without = rest.copy()
+        without[rows] += x[m + c] * -np.log1p(values.days[rows] * np.exp(-x[m + k + c]))
+        target = whiten @ without
+        white = columns @ whiten[:, rows].T
         gain = (white @ target) ** 2 / np.maximum(np.einsum("gn,gn->g", white, white), 1e-300)
         best = int(np.argmax(gain))
-        if target @ target - gain[best] < found.rss * (1 - 1e-6):
+        if target @ target - gain[best] < found.chi2 * (1 - 1e-6):
             x[m + k + c], x[m + c] = u[best], white[best] @ target / (white[best] @ white[best])
             gained = True
     return x if gained else None
