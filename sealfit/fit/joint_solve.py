@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 ENERGIES = (0.0, 50.0, 100.0)  # kJ/mol, to begin with
 SHAPES = {"b": (0.01, 0.3, 10.0), "tau": (0.5, 5.0, 50.0), "beta": (0.5, 1.0), "n": (0.2, 0.5, 1.0), "t_i": (0.3, 3.0)}
 LIMITS = {"b": (1e-9, 1e4), "tau": (1e-6, 1e6), "beta": (0.05, 5.0), "n": (0.01, 5.0), "t_i": (1e-3, 1e3)}
+LINEAR = 2  # mu_0 and a: the law is linear in them
 POLISHED = 4  # points of the grid
+DEPENDENT = 1e-20  # share of a loss beyond mu_0, squared, below which it is one with it
 
 
 def solved(law: JointLaw, covariance: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
@@ -30,9 +32,9 @@ def solved(law: JointLaw, covariance: np.ndarray, start: np.ndarray | None = Non
     start : ndarray, shape (p,), optional
         Where to begin.
     """
-    white = _whitening(covariance)
-    starts = _best_of_grid(law, white) if start is None else start[None, :]
-    x, rss = _polished(law, white, law.aged.value, starts)
+    problem = _Projected(law, covariance, law.aged.value[None])
+    bent = problem.grid() if start is None else start[None, LINEAR:]
+    x, rss = problem.polished(bent, np.zeros(len(bent), int))
     return x[np.argmin(rss)]
 
 
@@ -48,7 +50,7 @@ def solved_many(law: JointLaw, covariance: np.ndarray, values: np.ndarray) -> np
     values : ndarray, shape (draws, n)
         The draws.
     """
-    return _polished(law, _whitening(covariance), values, np.tile(law.x, (len(values), 1)))[0]
+    return _Projected(law, covariance, values).polished(np.tile(law.x[LINEAR:], (len(values), 1)))[0]
 
 
 def solved_without(law: JointLaw, covariance: np.ndarray, masks: np.ndarray) -> np.ndarray:
@@ -63,50 +65,86 @@ def solved_without(law: JointLaw, covariance: np.ndarray, masks: np.ndarray) -> 
     masks : ndarray of bool, shape (masks, n)
         What is left out.
     """
-    white = _whitening(covariance)
-    # a value with a number of its own that takes it up whole says nothing: what its column reaches is projected out
-    aside = np.zeros((len(masks), masks.sum(axis=1).max(), len(white)))
-    for own, out in zip(aside, masks, strict=True):
-        own[: out.sum()] = np.linalg.qr(white[:, out])[0].T
-    return _polished(law, white, law.aged.value, np.tile(law.x, (len(masks), 1)), aside)[0]
+    values = np.broadcast_to(law.aged.value, masks.shape)
+    return _Projected(law, covariance, values, masks).polished(np.tile(law.x[LINEAR:], (len(masks), 1)))[0]
 
 
-def _whitening(covariance: np.ndarray) -> np.ndarray:
-    return np.linalg.inv(np.linalg.cholesky(covariance))
+class _Projected:
+    """The least squares of a law on sets of values, mu_0 and a solved for: what is left to search bends less.
 
+    Parameters
+    ----------
+    law : JointLaw
+    covariance : ndarray, shape (n, n)
+        Of the values of a set.
+    values : ndarray, shape (sets, n)
+    masks : ndarray of bool, shape (sets, n), optional
+        What is left out of each set.
 
-def _best_of_grid(law: JointLaw, white: np.ndarray) -> np.ndarray:
-    """Return the best few points of a grid, mu_0 and a solved for, shape (POLISHED, p)."""
-    own, value = law.loss.parameters, white @ law.aged.value
-    grids = [[np.log(v) for v in SHAPES[name]] for name in own]
-    grids += [ENERGIES if name == "E" else (0.0,) for name in law.names[2 + len(own) :]]
-    x = np.array([(0.0, 1.0, *point) for point in product(*grids)])
-    basis = white @ np.stack([np.ones((len(x), value.size)), law.at(law.aged, x)], axis=-1)
-    x[:, :2] = np.linalg.pinv(basis, rcond=1e-10) @ value
-    left = ((value - (basis @ x[:, :2, None])[..., 0]) ** 2).sum(axis=1)
-    return x[np.argsort(left, kind="stable")[:POLISHED]]
+    Notes
+    -----
+    Golub & Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036, with the tangent of Kaufman 1975,
+    BIT 15, 49-57, doi:10.1007/BF01932995.
+    """
 
+    def __init__(self, law: JointLaw, covariance: np.ndarray, values: np.ndarray, masks: np.ndarray | None = None):
+        self.law, self.white, self.aside = law, np.linalg.inv(np.linalg.cholesky(covariance)), None
+        if masks is not None:
+            # a value with a number of its own says nothing: what these numbers' columns reach is projected out
+            self.aside = np.zeros((len(masks), masks.sum(axis=1).max(), values.shape[1]))
+            for own, out in zip(self.aside, masks, strict=True):
+                own[: out.sum()] = np.linalg.qr(self.white[:, out])[0].T
+        self.values = self._whitened(values[:, None], np.arange(len(values)))[:, 0]
 
-def _polished(law: JointLaw, white: np.ndarray, values: np.ndarray, start: np.ndarray, aside: np.ndarray | None = None):
-    """Return `polish_many` of the law; `aside`, shape (problems, s, n), are orthonormal rows that are projected out."""
+    def _whitened(self, many: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """Return whitened rows, shape (r, m, n), of the sets `of` (r,)."""
+        many = (many.reshape(-1, len(self.white)) @ self.white.T).reshape(many.shape)
+        return many if self.aside is None else many - (many @ np.swapaxes(self.aside[of], 1, 2)) @ self.aside[of]
 
-    def whitened(rows, many):
-        many = many.reshape(-1, len(white)) @ white.T
-        if aside is None:
-            return many
-        many, out = many.reshape(len(rows), -1, len(white)), aside[rows]
-        return many - (many @ np.swapaxes(out, 1, 2)) @ out
+    def solve(self, bent: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return mu_0 and a, shape (r, 2), the whitened residual, (r, n), and its derivative, (r, p - 2, n).
 
-    def residual(x, rows):
-        measured = values if values.ndim == 1 else values[rows]
-        return whitened(rows, law.at(law.aged, x) - measured).reshape(len(rows), -1)
+        Parameters
+        ----------
+        bent : ndarray, shape (r, p - 2)
+            All other parameters.
+        of : ndarray of int, shape (r,)
+            Which set of values.
+        """
+        law, measured = self.law, self.values[of][:, None]
+        unit = np.concatenate([np.tile([0.0, -1.0], (len(bent), 1)), bent], axis=1)  # mu_0 = 0, a = -1: the loss itself
+        columns = self._whitened(law.slope(law.aged, unit), of)
+        start, loss, slope = columns[:, :1], -columns[:, 1:2], columns[:, 2:]
+        first = start / np.linalg.norm(start, axis=2, keepdims=True)
+        shared = (loss * first).sum(axis=2, keepdims=True)
+        beyond = loss - shared * first
+        square = (beyond**2).sum(axis=2, keepdims=True)
+        sound = square > DEPENDENT * (loss**2).sum(axis=2, keepdims=True)
+        second = beyond * np.sqrt(np.divide(1, square, out=np.zeros(square.shape), where=sound))
+        along = [(measured * column).sum(axis=2, keepdims=True) for column in (first, second)]
+        a = -np.divide(along[1], np.sqrt(square), out=np.zeros(square.shape), where=sound)
+        mu_0 = (along[0] + a * shared) / np.linalg.norm(start, axis=2, keepdims=True)
+        rest = along[0] * first + along[1] * second - measured
+        for column in (first, second):
+            slope = slope - (slope * column).sum(axis=2, keepdims=True) * column
+        return np.concatenate([mu_0, a], axis=2)[:, 0], rest[:, 0], -a * slope
 
-    def tangent(x, rows):
-        return whitened(rows, law.slope(law.aged, x)).reshape(len(rows), x.shape[1], -1)
+    def grid(self) -> np.ndarray:
+        """Return the best few points of a grid, shape (POLISHED, p - 2)."""
+        own = self.law.loss.parameters
+        grids = [[np.log(v) for v in SHAPES[name]] for name in own]
+        grids += [ENERGIES if name == "E" else (0.0,) for name in self.law.names[LINEAR + len(own) :]]
+        bent = np.array(list(product(*grids)))
+        rest = self.solve(bent, np.zeros(len(bent), int))[1]
+        return bent[np.argsort((rest**2).sum(axis=1), kind="stable")[:POLISHED]]
 
-    own = law.loss.parameters
-    low, high = (
-        np.array([np.log(LIMITS[name][end]) if name in own else (-np.inf, np.inf)[end] for name in law.names])
-        for end in (0, 1)
-    )
-    return polish_many(residual, tangent, start, low, high)
+    def polished(self, bent: np.ndarray, of: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return all parameters and the sums of squares, shape (r, p) and (r,), where starts lead to."""
+        of = np.arange(len(bent)) if of is None else of
+        own = self.law.loss.parameters
+        low, high = (
+            np.array([np.log(LIMITS[name][end]) if name in own else endless for name in self.law.names[LINEAR:]])
+            for end, endless in enumerate((-np.inf, np.inf))
+        )
+        bent, rss = polish_many(lambda bent, rows: self.solve(bent, of[rows])[1:], bent, low, high)
+        return np.concatenate([self.solve(bent, of)[0], bent], axis=1), rss

@@ -171,14 +171,12 @@ def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
     limits = np.array([search_limits(values.days[values.curve == c]) for c in range(k)]).reshape(k, 2).T
     low, high = (np.concatenate([np.full(m + k, end), own]) for end, own in zip((-np.inf, np.inf), limits, strict=True))
 
-    def residual(x, _rows):
-        return ((law_model(values, x[0])[0] - values.value) @ whiten.T)[None]
-
-    def tangent(x, _rows):
-        return (law_model(values, x[0])[1].T @ whiten.T)[None]
+    def evaluate(x, _rows):
+        model, slope = law_model(values, x[0])
+        return ((model - values.value) @ whiten.T)[None], (slope.T @ whiten.T)[None]
 
     def polished(x):
-        found, rss = polish_many(residual, tangent, x[None], low, high)
+        found, rss = polish_many(evaluate, x[None], low, high)
         return LawFit(values, found[0], float(rss[0]), (limits[0], limits[1]))
 
     if start is not None:

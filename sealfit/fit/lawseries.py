@@ -52,7 +52,7 @@ class EachSeries:
 
     def chi2_at_optimum(self) -> np.ndarray:
         """Return chi-square of every curve's series at the joint optimum, shape (curves,)."""
-        return (self._residual(self.x, np.arange(len(self.x))) ** 2).sum(axis=1)[self.of]
+        return (self._evaluate(self.x, np.arange(len(self.x)))[0] ** 2).sum(axis=1)[self.of]
 
     def held(self, curves: np.ndarray, log_b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return chi-square, a and its variance with ln b held, of some curves, each of shape (r,).
@@ -66,44 +66,26 @@ class EachSeries:
         x, (low, high) = self.x[series], self.limits[:, series]
         for numbers in (x, low, high):
             numbers[every, at + self.width] = log_b
-        x, chi2 = polish_many(
-            lambda x, rows: self._residual(x, series[rows]),
-            lambda x, rows: self._tangent(x, series[rows]),
-            x,
-            low,
-            high,
-        )
-        tangent = self._tangent(x, series) * ((x > low) & (x < high))[:, :, None]
+        x, chi2 = polish_many(lambda x, rows: self._evaluate(x, series[rows]), x, low, high)
+        tangent = self._evaluate(x, series)[1] * ((x > low) & (x < high))[:, :, None]
         return chi2, x[every, at], _variance(tangent, at)
 
-    def _law(self, x: np.ndarray, series: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return mu_0, a, t/b and ln(1 + t/b) at the values, shape (r, n) each."""
-        origin, curve = self.origin[series], self.curve[series]
-        mu_0, a, log_b = (
-            (numbers[:, None, :] @ which)[:, 0]
-            for numbers, which in zip(
-                np.split(x, (self.m, self.m + self.width), axis=1), (origin, curve, curve), strict=True
-            )
+    def _evaluate(self, x: np.ndarray, series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the whitened residual, then what the others say of mu_0, shape (r, n + m + 1), and its derivative."""
+        origin, curve, white = self.origin[series], self.curve[series], np.swapaxes(self.whiten[series], 1, 2)
+        parts = zip(np.split(x, (self.m, self.m + self.width), axis=1), (origin, curve, curve), strict=True)
+        mu_0, a, log_b = (numbers[:, None, :] @ which for numbers, which in parts)
+        ratio = self.days[series, None] * np.exp(-log_b)
+        loss = np.log1p(ratio)
+        own = (mu_0 - a * loss - self.value[series, None]) @ white
+        slope = np.concatenate([origin, -loss * curve, a * ratio / (1 + ratio) * curve], axis=1) @ white
+        root = np.swapaxes(self.root[series], 1, 2)
+        others = (x - self.x[series])[:, None, : self.m] @ root + self.miss[series, None]
+        held = np.zeros((len(x), 2 * self.width, self.m + 1))
+        return (
+            np.concatenate([own, others], axis=2)[:, 0],
+            np.concatenate([slope, np.concatenate([root, held], axis=1)], axis=2),
         )
-        ratio = self.days[series] * np.exp(-log_b)
-        return mu_0, a, ratio, np.log1p(ratio)
-
-    def _residual(self, x: np.ndarray, series: np.ndarray) -> np.ndarray:
-        """Return the whitened residual, then what the others say of mu_0, shape (r, n + m + 1)."""
-        mu_0, a, _, loss = self._law(x, series)
-        own = self.whiten[series] @ (mu_0 - a * loss - self.value[series])[:, :, None]
-        away = (x - self.x[series])[:, : self.m, None]
-        return np.concatenate([own, self.root[series] @ away + self.miss[series][:, :, None]], axis=1)[..., 0]
-
-    def _tangent(self, x: np.ndarray, series: np.ndarray) -> np.ndarray:
-        """Return the derivative of the residual, shape (r, p, n + m + 1)."""
-        _, a, ratio, loss = self._law(x, series)
-        curve = self.curve[series]
-        along = [self.origin[series], -loss[:, None] * curve, (a * ratio / (1 + ratio))[:, None] * curve]
-        own = np.concatenate(along, axis=1) @ np.swapaxes(self.whiten[series], 1, 2)
-        others = np.zeros((*own.shape[:2], self.m + 1))
-        others[:, : self.m] = np.swapaxes(self.root[series], 1, 2)
-        return np.concatenate([own, others], axis=2)
 
 
 def _linked(values: Values) -> list[list[int]]:

@@ -13,14 +13,11 @@ LOW, HIGH = np.array([-np.inf, 0.0]), np.array([np.inf, 0.8])
 def problems(values):
     """Residual and tangent of a decay a exp(-k t)."""
 
-    def residual(x, rows):
-        return x[:, :1] * np.exp(-x[:, 1:] * T) - values[rows]
-
-    def tangent(x, rows):
+    def evaluate(x, rows):
         decay = np.exp(-x[:, 1:] * T)
-        return np.stack([decay, -x[:, :1] * T * decay], axis=1)
+        return x[:, :1] * decay - values[rows], np.stack([decay, -x[:, :1] * T * decay], axis=1)
 
-    return residual, tangent
+    return evaluate
 
 
 def drawn():
@@ -32,8 +29,7 @@ def drawn():
 
 def test_each_ends_where_one_alone_ends():
     values = drawn()
-    residual, tangent = problems(values)
-    x, rss = polish_many(residual, tangent, np.ones((4, 2)), LOW, HIGH)
+    x, rss = polish_many(problems(values), np.ones((4, 2)), LOW, HIGH)
     for k, own in enumerate(values):
         alone = least_squares(
             lambda p, own=own: p[0] * np.exp(-p[1] * T) - own, [1.0, 0.5], bounds=(LOW, HIGH), xtol=1e-15, ftol=1e-15
@@ -45,11 +41,10 @@ def test_each_ends_where_one_alone_ends():
 
 
 def test_a_number_between_equal_bounds_is_held():
-    residual, tangent = problems(drawn())
     held = np.array([0.1, 0.2, 0.3, 0.4])
     low, high = np.tile(LOW, (4, 1)), np.tile(HIGH, (4, 1))
     low[:, 1] = high[:, 1] = held
-    x, _ = polish_many(residual, tangent, np.ones((4, 2)), low, high)
+    x, _ = polish_many(problems(drawn()), np.ones((4, 2)), low, high)
     npt.assert_array_equal(x[:, 1], held)
     decay = np.exp(-held[:, None] * T)
     npt.assert_allclose(x[:, 0], (decay * drawn()).sum(axis=1) / (decay**2).sum(axis=1), rtol=1e-10)
@@ -58,5 +53,5 @@ def test_a_number_between_equal_bounds_is_held():
 def test_a_problem_without_a_finite_residual_is_infinite_and_alone_in_it():
     values = drawn()
     values[1, 3] = np.inf
-    _, rss = polish_many(*problems(values), np.ones((4, 2)), LOW, HIGH)
+    _, rss = polish_many(problems(values), np.ones((4, 2)), LOW, HIGH)
     npt.assert_array_equal(np.isfinite(rss), [True, False, True, True])
