@@ -78,7 +78,8 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
     found = found.assign(quantity=found["parameter"]).sort_values(["condition", "quantity"], kind="stable")
     aged = own[own["aging_days"].to_numpy(float) > 0]
     quantities = [name for name in pair if (found["quantity"] == name).any()]
-    curves = _curves(found, list(dict.fromkeys(aged["series"])), quantities)
+    unaged = set(found.loc[found["aging_days"] == 0, "quantity"])
+    curves = _curves(found, list(dict.fromkeys(aged["series"])), quantities, unaged)
     place = {(c.series, c.quantity): c.place for c in curves}
     number = np.array(
         [
@@ -93,7 +94,7 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
     number = number[(number >= -1) & found["quantity"].isin(fitted).to_numpy()]
     unit = str(found["unit"].iloc[0])
     if not fitted:
-        return [row for curve in curves for row in without_law(curve, unit, _has_unaged(found, curve.quantity))]
+        return [row for curve in curves for row in without_law(curve, unit, curve.quantity in unaged)]
     values = Values(
         used["aging_days"].to_numpy(float),
         used["value"].to_numpy(float),
@@ -101,7 +102,7 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
         number,
         steady_covariance(used, own),
     )
-    return list(_rubber_rows(values, curves, fitted, used, own, unit, found))
+    return list(_rubber_rows(values, curves, fitted, used, own, unit, unaged))
 
 
 def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
@@ -117,20 +118,17 @@ def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str
     return found[~((found["parameter"] == pair[1]) & found["condition"].isin(few))]
 
 
-def _curves(found: pd.DataFrame, series: list[str], quantities: list[str]) -> list[Curve]:
+def _curves(found: pd.DataFrame, series: list[str], quantities: list[str], unaged: set[str]) -> list[Curve]:
+    aged = found[found["aging_days"] > 0]
+    tested = dict(aged["aging_days"].astype(float).groupby([aged["series"], aged["quantity"]], sort=False).unique())
     curves, place = [], 0
     for name in series:
         for quantity in quantities:
-            rows = found[(found["series"] == name) & (found["quantity"] == quantity) & (found["aging_days"] > 0)]
-            days = np.unique(rows["aging_days"].to_numpy(float))
-            enough = days.size + _has_unaged(found, quantity) >= DAYS_FOR_LAW
+            days = np.sort(tested.get((name, quantity), np.zeros(0)))
+            enough = days.size + (quantity in unaged) >= DAYS_FOR_LAW
             curves.append(Curve(name, quantity, place if enough else -1, days))
             place += enough
     return curves
-
-
-def _has_unaged(found: pd.DataFrame, quantity: str) -> bool:
-    return bool(((found["quantity"] == quantity) & (found["aging_days"] == 0)).any())
 
 
 def steady_covariance(used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:
@@ -171,7 +169,7 @@ def _with_specimens(values: Values, taus: list[float], model: np.ndarray) -> Val
 
 
 # ---------------------------------------------------------------- what the table says
-def _rubber_rows(values, curves, fitted, used, own, unit, found) -> Iterator[dict]:
+def _rubber_rows(values, curves, fitted, used, own, unit, unaged) -> Iterator[dict]:
     taus, plain, dfs = [], {}, []
     for q, name in enumerate(fitted):
         part = np.flatnonzero(values.origin == q)
@@ -188,11 +186,10 @@ def _rubber_rows(values, curves, fitted, used, own, unit, found) -> Iterator[dic
     shift = _shift(joint, used, own)
     for curve in curves:
         if curve.place < 0:
-            yield from without_law(curve, unit, _has_unaged(found, curve.quantity))
+            yield from without_law(curve, unit, curve.quantity in unaged)
             continue
         q = fitted.index(curve.quantity)
-        unaged = _has_unaged(found, curve.quantity)
-        yield from law_rows(curve, joint, q, t[q], intervals[curve.place], shift, unit, unaged)
+        yield from law_rows(curve, joint, q, t[q], intervals[curve.place], shift, unit, curve.quantity in unaged)
         share = len({c.series for c in curves if c.place >= 0 and c.quantity == curve.quantity})
         yield from statistics_rows(curve, joint, plain[curve.quantity], values, q, taus[q], dfs[q], share, unit)
         yield from covariance_rows(curve, joint, q, unit)
@@ -224,38 +221,40 @@ def aging_curves(aging_fit: pd.DataFrame, days: np.ndarray | None = None) -> pd.
     DataFrame
         Table `aging_curves`; the band is that of the law (population mean), from the covariance of mu_0, a and ln b.
     """
-    parts = []
-    if len(aging_fit):
-        for series, own in aging_fit.groupby("series", sort=False):
-            for quantity in own.loc[own["parameter"] == "mu_0", "quantity"]:
-                part = _curve(own, quantity, days)
-                if part is not None:
-                    parts.append(part.assign(series=series, quantity=quantity))
-    columns = AGING_CURVES.names()
-    if not parts:
-        text, number = pd.Series([], dtype="str"), pd.Series([], dtype=float)
-        return pd.DataFrame({name: text if name in ("series", "quantity") else number for name in columns})
-    return pd.concat(parts, ignore_index=True)[columns]
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in AGING_CURVES.names()}
+    for series, own in aging_fit.groupby("series", sort=False) if len(aging_fit) else ():
+        known = dict(zip(zip(own["quantity"], own["parameter"], strict=True), own["value"].tolist(), strict=True))
+        for quantity in [quantity for quantity, parameter in known if parameter == "mu_0"]:
+            curve = _curve(known, quantity, days)
+            for name, values in curve.items():
+                parts[name].append(values)
+            if curve:
+                parts["series"].append(np.full(curve["value"].size, series, object))
+                parts["quantity"].append(np.full(curve["value"].size, quantity, object))
+    texts = {name: "str" if name in ("series", "quantity") else float for name in parts}
+    return pd.DataFrame(
+        {name: pd.Series(np.concatenate(own) if own else [], dtype=texts[name]) for name, own in parts.items()}
+    )
 
 
-def _curve(own: pd.DataFrame, quantity: str, days: np.ndarray | None) -> pd.DataFrame | None:
-    law = own[own["quantity"] == quantity].set_index("parameter")["value"]
-    if law.loc[["mu_0", "a", "b"]].isna().any():
-        return None
-    numbers = own[own["quantity"].isin(("statistics", "covariance"))].set_index("parameter")["value"]
+def _curve(known: dict[tuple[str, str], float], quantity: str, days: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Return the curve of one quantity, none without a law; `known` are a series' values by quantity and parameter."""
+    mu_0, a, b = (known[quantity, name] for name in ("mu_0", "a", "b"))
+    if np.isnan([mu_0, a, b]).any():
+        return {}
     names = [f"{quantity}:{name}" for name in ("mu_0", "a", "ln b")]
     covariance = np.zeros((3, 3))
     for i in range(3):
         for j in range(i + 1):
-            value = numbers[f"{names[j]},{names[i]}"]
+            value = known["covariance", f"{names[j]},{names[i]}"]
             covariance[i, j] = covariance[j, i] = value if np.isfinite(value) else 0.0
-    df = numbers[f"{quantity}:error_df"]
+    df = known["statistics", f"{quantity}:error_df"]
     t = stdtrit(df, 0.975) if df > 0 else ndtri(0.975)
     if days is None:
-        days = numbers[f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
+        days = known["statistics", f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
     days = np.asarray(days, float)
-    ratio = days / law["b"]
-    slope = np.stack([np.ones_like(days), -np.log1p(ratio), law["a"] * ratio / (1 + ratio)], axis=1)
+    ratio = days / b
+    slope = np.stack([np.ones_like(days), -np.log1p(ratio), a * ratio / (1 + ratio)], axis=1)
     half = t * np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", slope, covariance, slope), 0.0))
-    value = aging_law(days, mu_0=law["mu_0"], a=law["a"], b=law["b"])
-    return pd.DataFrame({"aging_days": days, "value": value, "lo95": value - half, "hi95": value + half})
+    value = aging_law(days, mu_0=mu_0, a=a, b=b)
+    return {"aging_days": days, "value": value, "lo95": value - half, "hi95": value + half}

@@ -89,9 +89,9 @@ class Condition:
 
 def make_condition(name: str, runs: pd.DataFrame) -> Condition:
     """Return a condition with the richest model its speed levels can hold; `runs` as `run_means`, with `weight`."""
-    loaded = runs["load"].notna()
+    loaded = runs["load"].notna().to_numpy()
     has_load = bool(loaded.any())
-    kept = runs[loaded] if has_load else runs
+    kept = runs[loaded] if has_load and not loaded.all() else runs
     levels = speed_levels(kept)
     most = max(len(values) for values in levels.values())
     model = FULL if most >= FULL else VISCOUS if most >= VISCOUS else CONSTANT

@@ -181,20 +181,19 @@ def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
     Commanded speeds where every run of the direction has one, else measured speeds grouped within 25 %. Directions are
     kept apart: a direction offset between a slow way out and a fast way back would be taken for a Stribeck curve.
     """
+    ways, commanded, measured = (runs[name].to_numpy() for name in ("direction", "set", "speed"))
     levels = {}
     for direction in (1, -1):
-        rows = runs[runs["direction"].isin([direction, BOTH])]
-        if rows.empty:
+        own = (ways == direction) | (ways == BOTH)
+        if not own.any():
             continue
-        commanded = rows["set"].to_numpy(float)
-        if np.all(np.isfinite(commanded)) and np.all(commanded > 0):
-            codes = np.array([float(f"{speed:.6g}") for speed in commanded])
+        speeds = commanded[own].astype(float)
+        if np.all(np.isfinite(speeds)) and np.all(speeds > 0):
+            codes = [float(f"{speed:.6g}") for speed in np.unique(speeds)]
         else:
-            speed = np.sort(rows["speed"].to_numpy(float))
             codes, start = [], -np.inf
-            for value in speed:
+            for value in np.sort(measured[own].astype(float)):
                 start = value if value > SAME_SPEED * start or start < 0 else start
                 codes.append(start)
-            codes = np.array(codes)
         levels[direction] = np.unique(codes)
     return levels
