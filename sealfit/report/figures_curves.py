@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from sealfit.config import Config
 from sealfit.report.axes import evenly, natural, padded, round_ticks
+from sealfit.report.marks import draw_band, draw_bars
 from sealfit.report.numbers import count, given, number
 from sealfit.report.shown import MOST_PANELS, rms, telling
 from sealfit.report.style import AFTER, CYCLE, FLOOR, QUIET, SKY, Key, Panel, Plot
@@ -39,20 +40,12 @@ def draw_aging(ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Unit
     for k, quantity in enumerate(quantities):
         colour, marker = CYCLE[k % len(CYCLE)], "os^Dv"[k % 5]
         curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
-        ax.fill_between(curve["aging_days"], curve["lo95"], curve["hi95"], color=colour, alpha=0.18, linewidth=0)
+        draw_band(ax, curve["aging_days"], curve["lo95"], curve["hi95"], colour, 0.18)
         ax.plot(curve["aging_days"], curve["value"], color=colour)
         here = points[points["quantity"] == quantity]
-        spread = np.abs(np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float))
-        ax.errorbar(
-            here["aging_days"],
-            here["value"],
-            np.nan_to_num(spread),
-            color=colour,
-            linestyle="",
-            marker=marker,
-            capsize=1.5,
-            elinewidth=0.8,
-        )
+        spread = np.nan_to_num(np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float))
+        draw_bars(ax, here["aging_days"], here["value"], *np.abs(spread), colour=colour, width=0.8, cap=1.5)
+        ax.plot(here["aging_days"], here["value"], color=colour, linestyle="", marker=marker)
     ax.xaxis.set_major_locator(round_ticks(integer=True))
     ax.set_xlabel(plain(units.label("aging_days")))
     ax.set_ylabel(
@@ -137,14 +130,8 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
         Give the labels their true units.
     """
     thin = envelope(along_motion(trace))
-    ax.fill_between(
-        thin["displacement_mm"],
-        thin["force_N"] - thin["force_se_N"].fillna(0),
-        thin["force_N"] + thin["force_se_N"].fillna(0),
-        color=AFTER,
-        alpha=0.25,
-        linewidth=0,
-    )
+    error = thin["force_se_N"].fillna(0)
+    draw_band(ax, thin["displacement_mm"], thin["force_N"] - error, thin["force_N"] + error, AFTER, 0.25)
     whole = thin["n"] == thin["n"].max()  # where a repeat begins later, its own start pulls the mean
     ax.plot(thin["displacement_mm"], thin["force_N"], color=SKY, linewidth=0.8)
     ax.plot(thin["displacement_mm"], thin["force_N"].where(whole), color=AFTER, linewidth=0.9)

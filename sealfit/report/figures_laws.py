@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from sealfit.config import Config
 from sealfit.report.axes import padded
+from sealfit.report.marks import draw_band
 from sealfit.report.numbers import given, number
 from sealfit.report.shown import MOST_KEYS, MOST_PANELS, spread
 from sealfit.report.style import BLACK, FLOOR, Key, Panel, Plot, shades
@@ -37,7 +38,7 @@ def draw_master_curve(ax: Axes, rows: pd.DataFrame, colours: Mapping[float, str]
     values, law = rows[rows["kind"] == "value"], rows[rows["kind"] == "law"].sort_values("scaled_days")
     aged = values[values["scaled_days"] > 0]
     ax.set_xscale("symlog", linthresh=float(aged["scaled_days"].min()), linscale=0.7)
-    ax.fill_between(law["scaled_days"], law["lo95"], law["hi95"], color=FLOOR, alpha=0.2, linewidth=0)
+    draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], FLOOR, 0.2)
     ax.plot(law["scaled_days"], law["value"], color=FLOOR)
     fresh = values[values["scaled_days"] == 0]
     ax.plot(fresh["scaled_days"], fresh["value"], linestyle="", marker="o", color=BLACK, clip_on=False)
