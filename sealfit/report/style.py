@@ -17,6 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import AutoLocator, ScalarFormatter
 
 from sealfit.report.axes import PlainNumbers, round_ticks
+from sealfit.report.frame import Frame
 from sealfit.report.symbols import plain, symbol_math
 
 # Okabe & Ito, Color Universal Design (2008): told apart by all common kinds of colour vision. Yellow is left out: too
@@ -185,6 +186,7 @@ def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> Axes:
     if panel.title:
         # its height is given too, or every drawing measures all tick labels to see whether they are in its way
         ax.set_title(plain(panel.title), x=-(panel.left - _EDGE) / (WIDTH - panel.left - _EDGE), y=1.0)
+    ax.add_artist(Frame(ax))
     return ax
 
 

@@ -1,3 +1,4 @@
+import io
 import re
 import warnings
 from xml.etree import ElementTree
@@ -7,6 +8,7 @@ import numpy.testing as npt
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 from report.made_campaigns import Made, aging_campaign, not_run, paper_sized, torque_campaign
 from report.made_tables import DROP, empty, shapes, table
 
@@ -18,7 +20,7 @@ from sealfit.report.figures_curves import draw_aging, draw_trace, envelope
 from sealfit.report.figures_loop import draw_errors, draw_levels, run_means
 from sealfit.report.figures_residual import channel_order, draw_channel, draw_shape
 from sealfit.report.figures_speed import curve_lines, force_speed, run_points
-from sealfit.report.style import Key, Panel, Plot, compose
+from sealfit.report.style import DPI, WIDTH, Key, Layout, Panel, Plot, compose
 from sealfit.tables import Units
 
 TORQUE = Units({"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")})
@@ -296,14 +298,21 @@ def test_powers_of_ten_beside_an_axis_are_written_out(ax, values, offset):
     assert ax.yaxis.get_offset_text().get_text() == offset
 
 
-def test_text_lies_inside_every_figure():
+def test_every_panel_has_a_white_edge():
     for made in (aging_campaign(), torque_campaign()):
         for name, plot in draw_all(made.tables, made.closure, made.config).items():
-            figure = compose(plot)
-            box = figure.get_tightbbox()  # of all that is drawn, in inches
-            assert min(box.x0, box.y0) >= 0, name
-            assert box.x1 <= figure.get_figwidth(), name
-            assert box.y1 <= figure.get_figheight(), name
+            white = imread(io.BytesIO(draw(plot).png))[::-1].min(axis=2) == 1.0
+            assert edge(white).all(), name
+            layout = Layout.of(plot)
+            for panel, corner in zip(plot.panels, layout.corners, strict=True):
+                left, bottom = (round(DPI * inches) for inches in corner)
+                right, top = left + round(DPI * WIDTH), bottom + round(DPI * panel.height)
+                assert edge(white[bottom:top, left:right]).all(), f"{name}: {panel.title}"
+                assert not white[bottom:top, left:right].all()
+
+
+def edge(image):
+    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
 
 
 @pytest.mark.parametrize("verdict", ["closed", "nothing_missing", "unexplained"])
