@@ -3,7 +3,8 @@ them."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Iterable, Mapping, Sequence
+
 import pandas as pd
 
 from sealfit.config import Config
@@ -52,34 +53,33 @@ def add_keys(table: pd.DataFrame, config: Config) -> pd.DataFrame:
             f"condition column {', '.join(repr(name) for name in missing)} is missing.",
             mend="Add it, or name other columns in the config's condition and rubber.",
         )
-    words = {name: _words(name, table[name]) for name in columns}
-    condition = _joined([words[name] for name in columns], len(table))
-    rubber = _joined([_spelled(table[name]) for name in config.rubber], len(table)) if config.rubber else None
+    keys = keys_of({name: table[name].tolist() for name in columns}, len(table), config)
+    return table.assign(**{key: pd.array(words, dtype="str") for key, words in keys.items()})
+
+
+def keys_of(columns: Mapping[str, Sequence[object]], rows: int, config: Config) -> dict[str, list[str | None]]:
+    """Return `condition`, `series` and `rubber` of every row, as `add_keys`; `columns` has all condition columns."""
+    texts = {name: _spelled(columns[name]) for name in condition_columns(config)}
+    words = {name: [t if t is None else f"{name}={t}" for t in own] for name, own in texts.items()}
+    condition = _joined(words.values(), rows)
+    rubber = _joined([texts[name] for name in config.rubber], rows) if config.rubber else [ONE_RUBBER] * rows
     series = condition
     if config.aging:
-        others = [words[name] for name in columns if name != "aging_days"]
-        series = _joined(others, len(table)) if others else np.full(len(table), ALL, object)
-        unaged = pd.to_numeric(table["aging_days"], errors="coerce").to_numpy(float) == 0.0
-        name = _joined([np.full(len(table), UNAGED, object), rubber], len(table)) if rubber is not None else UNAGED
-        condition, series = np.where(unaged, name, condition), np.where(unaged, name, series)
-    keys = {
-        "condition": condition,
-        "series": series,
-        "rubber": rubber if rubber is not None else np.full(len(table), ONE_RUBBER, object),
-    }
-    return table.assign(**{key: pd.array(value, dtype="str") for key, value in keys.items()})
+        others = [own for name, own in words.items() if name != "aging_days"]
+        series = _joined(others, rows) if others else [ALL] * rows
+        unaged = _joined([[UNAGED] * rows, *([rubber] if config.rubber else [])], rows)
+        aged = [days not in ("0", "-0") for days in texts["aging_days"]]
+        condition, series = (
+            [own if old else new for own, new, old in zip(known, unaged, aged, strict=True)]
+            for known in (condition, series)
+        )
+    return {"condition": condition, "series": series, "rubber": rubber}
 
 
-def _words(name: str, values: pd.Series) -> np.ndarray:
-    spelled = _spelled(values)
-    return np.array([None if value is None else f"{name}={value}" for value in spelled], object)
-
-
-def _spelled(values: pd.Series) -> np.ndarray:
+def _spelled(values: Sequence[object]) -> list[str | None]:
     """Return every value as text: numbers with %g, so 60, 60.0 and "60" are one condition; null as None."""
-    codes, found = pd.factorize(values, use_na_sentinel=True)
-    texts = np.array([*(_spell(value) for value in found), None], object)
-    return texts[codes]
+    texts = {value: None if pd.isna(value) else _spell(value) for value in set(values)}
+    return [texts[value] for value in values]
 
 
 def _spell(value: object) -> str | None:
@@ -90,10 +90,8 @@ def _spell(value: object) -> str | None:
         return text or None
 
 
-def _joined(parts: list[np.ndarray], n: int) -> np.ndarray:
+def _joined(parts: Iterable[Sequence[str | None]], rows: int) -> list[str | None]:
     """Return the parts of each row joined by ", "; None where any part is."""
-    if not parts:
-        return np.full(n, "", object)
-    rows = list(zip(*parts, strict=True))
-    texts = {row: None if None in row else ", ".join(row) for row in set(rows)}
-    return np.array([texts[row] for row in rows], object)
+    each = list(zip(*parts, strict=True)) or [()] * rows
+    texts = {row: None if None in row else ", ".join(row) for row in set(each)}
+    return [texts[row] for row in each]

@@ -87,10 +87,9 @@ def write(frame: pd.DataFrame, schema: Schema, units: Units, path: Path) -> None
     write_arrow(to_arrow(frame, schema, units), path)
 
 
-def as_dictionary(words: pa.Array | pd.Series, row: np.ndarray) -> pa.Array:
+def as_dictionary(words: pa.Array, row: np.ndarray) -> pa.Array:
     """Return the word of every row, of those in `words`, as a dictionary: no word is spelled out for every row."""
-    words = words if isinstance(words, pa.Array) else pa.array(words, TEXT, from_pandas=True)
-    codes = _whole(words).dictionary_encode()
+    codes = words.cast(TEXT).dictionary_encode()
     return pa.DictionaryArray.from_arrays(codes.indices.take(pa.array(row)), codes.dictionary)
 
 
@@ -152,23 +151,25 @@ def read(path: Path | Sequence[Path], columns: list[str] | None = None, coded: S
 
 
 def _array(values: pd.Series | np.ndarray | pa.Array, column: Column, table: str) -> pa.Array:
-    if isinstance(values, pa.Array | pa.ChunkedArray):
-        return _whole(values)
     try:
-        if column.dtype == TEXT and isinstance(values.dtype, pd.StringDtype):
-            return _whole(pa.array(values, from_pandas=True)).cast(TEXT)
-        if column.dtype == TEXT or (column.dtype is None and _mixed(values)):
-            values = pd.Series(values).map(str, na_action="ignore").astype(object)
-            return pa.array(values, type=TEXT, from_pandas=True)
-        array = pa.array(values, type=column.dtype, from_pandas=True)
+        array = _whole(values if isinstance(values, pa.Array) else _of_column(values, column))
     except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError) as error:
         raise ValueError(f"table {table}, column '{column.name}': {error}") from error
-    array = _whole(array)
     if pa.types.is_null(array.type):  # an optional channel without a single value
         return array.cast(pa.float64())
     if pa.types.is_large_string(array.type):
         return array.cast(TEXT)
     return array
+
+
+def _of_column(values: pd.Series | np.ndarray, column: Column) -> pa.Array | pa.ChunkedArray:
+    if column.dtype == TEXT and isinstance(values.dtype, pd.StringDtype):
+        return pa.array(values, from_pandas=True)
+    if column.dtype == TEXT or (column.dtype is None and _mixed(values)):
+        values = pd.Series(values).map(str, na_action="ignore").astype(object)
+        return pa.array(values, type=TEXT, from_pandas=True)
+    missing = values.dtype != float or np.isnan(values).any()  # that none is, is seen faster here
+    return pa.array(values, type=column.dtype, from_pandas=missing)
 
 
 def _whole(array: pa.Array | pa.ChunkedArray) -> pa.Array:

@@ -135,7 +135,10 @@ def test_a_channel_of_words_and_numbers_is_words():
 
 def test_words_by_their_codes_are_written_as_any_others(tmp_path):
     frame = small("bins").assign(batch=["a", None])
-    words = {name: parquet.as_dictionary(frame[name], np.array([0, 1, 0])) for name in ("file", "batch")}
+    words = {
+        name: parquet.as_dictionary(pa.array(frame[name], from_pandas=True), np.array([0, 1, 0]))
+        for name in ("file", "batch")
+    }
     rows = {name: frame[name].to_numpy()[[0, 1, 0]] for name in frame if name not in words}
     table = parquet.to_arrow(rows | words, BINS, Units())
     assert pa.types.is_dictionary(table.schema.field("file").type)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 
 from sealfit.config import Bins
-from sealfit.ingest.pieces import Pieces, median
+from sealfit.ingest.pieces import Pieces, median, numbered
 
 LAGS = 20  # the sum of correlations ends within so few, unless the noise is slow: then all lags are computed at once
 MAX_CELLS = 2000  # per run, in traces_mean: finer than any screen shows
 SAME_TRAVEL = 2  # cells by which strokes that are averaged before they slide steadily may differ in travel
-Samples = Mapping[str, np.ndarray]  # columns of equal length
 BRIDGED = 3  # empty cells in a row that are filled by a straight line: scarce samples, not a gap
+
+Samples = Mapping[str, np.ndarray]  # columns of equal length
+Strokes = Mapping[str, Sequence]
 
 
 def standard_error(values: np.ndarray) -> float:
@@ -87,7 +89,7 @@ def common_by_group(values: np.ndarray, group: np.ndarray, groups: int) -> np.nd
     return made
 
 
-def bin_table(samples: Samples, strokes: pd.DataFrame, settings: Bins) -> dict[str, np.ndarray]:
+def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, np.ndarray]:
     """Return the steady window of every stroke cut along displacement, a row per bin.
 
     All strokes of a run share the edges of their bins, which span the windows of all of them, so a pattern along
@@ -99,8 +101,8 @@ def bin_table(samples: Samples, strokes: pd.DataFrame, settings: Bins) -> dict[s
     samples : mapping of str to ndarray, shape (n,)
         Samples of the steady windows, stroke after stroke, at least one: `row` (place in `strokes`), displacement_mm,
         force_N and further columns, numbers or labels, whose means (or most frequent labels) are wanted.
-    strokes : DataFrame
-        One row per stroke: `run_id`, `direction`.
+    strokes : mapping of str to sequence, one value per stroke
+        `run_id`, `direction`.
     settings : Bins
         The config's `bins`.
 
@@ -110,7 +112,9 @@ def bin_table(samples: Samples, strokes: pd.DataFrame, settings: Bins) -> dict[s
         `row`, `bin` (from 0 in the direction of motion), `n`, `force_sd_N`, and the mean of every column of `samples`.
     """
     row, own = _owners(samples["row"])
-    group, width = _bin_of(np.asarray(samples["displacement_mm"]), own, strokes.iloc[row], settings)
+    run, runs = numbered([strokes["run_id"][i] for i in row.tolist()])
+    back = np.asarray(strokes["direction"])[row] < 0
+    group, width = _bin_of(np.asarray(samples["displacement_mm"]), own, run, runs, back, settings)
     group, count = _joined(group, len(own), width, settings.min_samples)
     groups, shown = len(count), np.flatnonzero(count)
     made = {"row": row[shown // width], "bin": shown % width, "n": count[shown]}
@@ -136,18 +140,19 @@ def _owners(row: np.ndarray) -> tuple[np.ndarray, Pieces]:
     return there, Pieces(count[there])
 
 
-def _bin_of(x: np.ndarray, own: Pieces, strokes: pd.DataFrame, settings: Bins) -> tuple[np.ndarray, int]:
+def _bin_of(
+    x: np.ndarray, own: Pieces, run: np.ndarray, runs: int, back: np.ndarray, settings: Bins
+) -> tuple[np.ndarray, int]:
     """Return the bin of every sample, counted through all strokes, and how many each stroke has room for."""
-    run, names = pd.factorize(strokes["run_id"])
-    low, high = _range_of_runs(own.min(x), own.max(x), run, len(names))
-    typical = np.array([median(own.size[run == i].astype(float)) for i in range(len(names))])
+    low, high = _range_of_runs(own.min(x), own.max(x), run, runs)
+    typical = np.array([median(own.size[run == i].astype(float)) for i in range(runs)])
     # Half as many again as needed on average, since samples do not fall into bins evenly.
     bins = np.clip(typical // np.ceil(1.5 * settings.min_samples), 1, settings.per_stroke).astype(int)
     width = (high - low) / bins
     width[width <= 0.0] = np.inf  # all in the first bin
     place = ((x - own.spread(low[run])) / own.spread(width[run])).astype(int)
     np.minimum(place, own.spread(bins[run] - 1), out=place)
-    room, back = int(bins.max()), strokes["direction"].to_numpy() < 0
+    room = int(bins.max())
     first = np.arange(len(own)) * room + np.where(back, bins[run] - 1, 0)
     return own.spread(first) + np.where(own.spread(back), -place, place), room
 
@@ -178,7 +183,7 @@ def _joined(group: np.ndarray, strokes: int, width: int, least: int) -> tuple[np
     return group, np.bincount(group, minlength=strokes * width)
 
 
-def mean_traces(samples: Samples, strokes: pd.DataFrame) -> dict[str, np.ndarray]:
+def mean_traces(samples: Samples, strokes: Strokes) -> dict[str, np.ndarray]:
     """Return the mean over repeats on a displacement grid that the repeats of a run share.
 
     Cells are as wide as the usual step between samples, so the pre-sliding rise keeps its shape. The strokes of one
@@ -189,8 +194,8 @@ def mean_traces(samples: Samples, strokes: pd.DataFrame) -> dict[str, np.ndarray
     samples : mapping of str to ndarray, shape (n,)
         Samples of sliding, stroke after stroke, at least one: `row` (place in `strokes`), displacement_mm, force_N,
         steady.
-    strokes : DataFrame
-        One row per stroke: file, run_id, direction.
+    strokes : mapping of str to sequence, one value per stroke
+        file, run_id, direction.
 
     Returns
     -------
@@ -198,29 +203,30 @@ def mean_traces(samples: Samples, strokes: pd.DataFrame) -> dict[str, np.ndarray
         What table `traces_mean` holds of numbers, and `row`, the first stroke of the run.
     """
     row, own = _owners(samples["row"])
-    there = strokes.iloc[row]
-    run, names = pd.factorize(there["run_id"])
-    low, step, cells = _grid(np.asarray(samples["displacement_mm"]), own, run, len(names))
-    grid, runs = Pieces(cells[run]), Pieces(cells)  # the cells of every stroke, and of every run, end to end
+    (run, runs), (file, files) = (numbered([strokes[name][i] for i in row.tolist()]) for name in ("run_id", "file"))
+    back = np.asarray(strokes["direction"])[row] < 0
+    low, step, cells = _grid(np.asarray(samples["displacement_mm"]), own, run, runs)
+    grid, places = Pieces(cells[run]), Pieces(cells)  # the cells of every stroke, and of every run, end to end
     force, steady = _of_cells(samples, own, grid, low[run], step[run])
     force, steady = _bridged(force, steady, grid)
     known = np.flatnonzero(np.isfinite(force))
     owner, force, steady = grid.of[known], force[known], steady[known]
     cell = known - grid.start[owner]
-    spot = runs.start[run][owner] + cell
-    keep, somewhere = _comparable(spot, runs.rows, steady, _travel(cell, owner, there["direction"].to_numpy()))
+    spot = places.start[run][owner] + cell
+    keep, somewhere = _comparable(spot, places.rows, steady, _travel(cell, owner, back))
     owner, spot, force = owner[keep], spot[keep], force[keep]
-    strokes_there = np.bincount(spot, minlength=runs.rows)
-    spot, force = _one_per_file(spot, pd.factorize(there["file"])[0][owner], force, len(row))
-    files = np.bincount(spot, minlength=runs.rows)
-    mean = mean_by_group(force, spot, runs.rows, files)
-    square = np.bincount(spot, (force - mean[spot]) ** 2, minlength=runs.rows)
-    error = np.sqrt(np.divide(square, (files - 1.0) * files, out=np.full(runs.rows, np.nan), where=files > 1))
-    shown = np.flatnonzero(files)
-    of = runs.of[shown]
+    strokes_there = np.bincount(spot, minlength=places.rows)
+    if files < len(row):
+        spot, force = _one_per_file(spot, file[owner], files, force)
+    count = np.bincount(spot, minlength=places.rows)
+    mean = mean_by_group(force, spot, places.rows, count)
+    square = np.bincount(spot, (force - mean[spot]) ** 2, minlength=places.rows)
+    error = np.sqrt(np.divide(square, (count - 1.0) * count, out=np.full(places.rows, np.nan), where=count > 1))
+    shown = np.flatnonzero(count)
+    of = places.of[shown]
     return {
         "row": row[np.unique(run, return_index=True)[1]][of],
-        "displacement_mm": low[of] + (shown - runs.start[of] + 0.5) * step[of],
+        "displacement_mm": low[of] + (shown - places.start[of] + 0.5) * step[of],
         "force_N": mean[shown],
         "force_se_N": error[shown],
         "n": strokes_there[shown],
@@ -270,10 +276,9 @@ def _bridged(force: np.ndarray, steady: np.ndarray, grid: Pieces) -> tuple[np.nd
     return force, steady
 
 
-def _travel(cell: np.ndarray, owner: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def _travel(cell: np.ndarray, owner: np.ndarray, back: np.ndarray) -> np.ndarray:
     """Return how many cells each known cell lies behind its stroke's start, along the motion."""
     own = Pieces(np.bincount(owner))  # every stroke has a cell
-    back = direction < 0
     turn = own.spread(np.where(back, cell[own.stop - 1], cell[own.start]))
     return np.where(own.spread(back), turn - cell, cell - turn)
 
@@ -295,11 +300,9 @@ def _comparable(spot: np.ndarray, spots: int, steady: np.ndarray, travel: np.nda
     return keep, somewhere
 
 
-def _one_per_file(spot: np.ndarray, file: np.ndarray, force: np.ndarray, strokes: int) -> tuple[np.ndarray, np.ndarray]:
+def _one_per_file(spot: np.ndarray, file: np.ndarray, files: int, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return place and mean force once for every file at every place."""
-    if file.max(initial=0) + 1 == strokes:  # as many files as strokes
-        return spot, force
-    pair, own, count = np.unique(spot * (int(file.max(initial=0)) + 1) + file, return_inverse=True, return_counts=True)
+    pair, own, count = np.unique(spot * files + file, return_inverse=True, return_counts=True)
     if len(pair) == len(spot):
         return spot, force
     place = np.zeros(len(pair), int)

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 import numpy as np
-import pandas as pd
 
-from sealfit.conditions import add_keys, condition_columns
+from sealfit.conditions import condition_columns, keys_of
 from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.coded import Coded, Columns, nothing
@@ -38,8 +37,7 @@ def condition_keys(columns: Columns, files: int, config: Config) -> Coded:
     own = [columns.get(name, nothing(files)) for name in names]
     different, of = np.unique(np.stack([column.codes for column in own], axis=1), axis=0, return_inverse=True)
     cells = [Coded(codes, column.values).cells() for codes, column in zip(different.T, own, strict=True)]
-    table = pd.DataFrame({name: pd.Series(column, dtype=object) for name, column in zip(names, cells, strict=True)})
-    words = Coded.of(add_keys(table, config)["condition"].tolist())
+    words = Coded.of(keys_of(dict(zip(names, cells, strict=True)), len(different), config)["condition"])
     return Coded(words.codes[of.ravel()], words.values)
 
 

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 
-from sealfit.conditions import add_keys
+from sealfit.conditions import condition_columns, keys_of
 from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.average import bin_table, mean_traces
 from sealfit.ingest.refs import TraceRef
-from sealfit.ingest.shaped import STEADY_ONLY, shaped
+from sealfit.ingest.shaped import INNER, STEADY_ONLY
+from sealfit.ingest.text import as_number
 from sealfit.ingest.trace_file import FileStrokes, read_files
 from sealfit.parquet import as_dictionary, to_arrow
-from sealfit.tables import BINS, TEXT, TRACES, TRACES_MEAN
+from sealfit.tables import BINS, FLOAT, TEXT, TRACES, TRACES_MEAN
 
 SAMPLED = ("traces", "traces_mean", "bins")  # tables that are made, and stored, part by part
 
@@ -77,14 +79,14 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
         The rig.
     """
     files = read_files(asked.refs, campaign, config)
-    strokes = stroke_table(files, config)
-    known = pa.Table.from_pandas(_plain(strokes), preserve_index=False)
+    strokes = stroke_columns(files, config)
+    known = pa.table({name: _array(values) for name, values in strokes.items()})
     found = tuple(FileFound(made.file, made.mark, made.rows, len(made.strokes)) for made in files)
     faults = tuple(fault for made in files for fault in made.faults)
-    if not len(strokes):
+    if not known.num_rows:
         return Part(found, faults, known, {})
-    out = [stroke in asked.unused for stroke in zip(strokes["file"], strokes["stroke"].tolist(), strict=True)]
-    strokes = strokes.assign(used=strokes["used"].to_numpy(bool) & ~np.array(out, bool))
+    each = zip(strokes["used"], strokes["file"], strokes["stroke"], strict=True)
+    strokes["used"] = [used and (file, stroke) not in asked.unused for used, file, stroke in each]
     samples = sample_columns(files, strokes)
     tables = {"traces": _traces(samples, strokes, config)}
     if samples["sliding"].any():
@@ -94,45 +96,42 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
     return Part(found, faults, known, tables)
 
 
-def stroke_table(files: Sequence[FileStrokes], config: Config) -> pd.DataFrame:
-    """Return one row per stroke with everything that is known of it, the keys included; run_id with its direction.
+def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, list]:
+    """Return everything that is known of every stroke, the keys included; run_id with its direction.
 
     A run with strokes both ways is two: `<run_id>+` and `<run_id>-`.
     """
-    table = pd.DataFrame([row for made in files for row in made.strokes])
-    if not len(table):
-        return pd.DataFrame({"used": np.array([], bool)})
-    table = table.infer_objects()
-    for name in (*config.condition, *config.rubber):
-        if name not in table.columns:  # every file is unaged, and none says the rest
-            table[name] = np.nan
-    return _two_runs(add_keys(table, config))
+    rows = [row for made in files for row in made.strokes]
+    names = dict.fromkeys(name for row in rows for name in row)
+    columns = {name: [row.get(name) for row in rows] for name in names}
+    for name in condition_columns(config):
+        columns.setdefault(name, [math.nan] * len(rows))  # every file is unaged, and none says the rest
+    columns |= keys_of(columns, len(rows), config)
+    return columns | _two_runs(columns) if rows else {"used": []}
 
 
-def _two_runs(table: pd.DataFrame) -> pd.DataFrame:
-    names = table["run_id"].astype(str)
-    run, runs = pd.factorize(names)
-    file = pd.factorize(table["file"])[0]
-    direction, used = table["direction"].to_numpy(), table["used"].to_numpy(bool)
-    both = _both_ways(run[used], direction[used], len(runs))
-    both[run[_both_ways(file, direction, len(table))[file]]] = True
-    sign = np.where(direction > 0, "+", "-")
-    return table.assign(run_id=names.where(~both[run], names + sign), run=names)
+def _two_runs(strokes: Mapping[str, list]) -> dict[str, list[str]]:
+    """Return `run_id` with its direction where needed, and `run`, as it was."""
+    names = [str(name) for name in strokes["run_id"]]
+    ways = defaultdict(set)
+    for run, file, way, used in zip(names, strokes["file"], strokes["direction"], strokes["used"], strict=True):
+        ways[run, file].add(way)
+        if used:
+            ways[run, None].add(way)
+    both = {run for (run, _), found in ways.items() if len(found) > 1}
+    signed = (f"{run}{'+' if way > 0 else '-'}" for run, way in zip(names, strokes["direction"], strict=True))
+    return {"run_id": [new if run in both else run for run, new in zip(names, signed, strict=True)], "run": names}
 
 
-def _both_ways(group: np.ndarray, direction: np.ndarray, groups: int) -> np.ndarray:
-    """Return, for every group, whether it has strokes both ways."""
-    up, down = (np.bincount(group, chosen, groups) for chosen in (direction > 0, direction < 0))
-    return (up > 0) & (down > 0)
+def _array(values: Sequence[object]) -> pa.Array:
+    """Return the values as Arrow has them; where they are words and numbers together, as words."""
+    try:
+        return pa.array(values, from_pandas=True)
+    except (pa.ArrowInvalid, pa.ArrowTypeError):
+        return pa.array([value if value is None else str(value) for value in values], TEXT)
 
 
-def _plain(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with every column that holds words and numbers together as words."""
-    mixed = {name: values for name, values in table.items() if values.dtype == object}
-    return table.assign(**{name: values.map(str, na_action="ignore") for name, values in mixed.items()})
-
-
-def sample_columns(files: Sequence[FileStrokes], strokes: pd.DataFrame) -> dict[str, np.ndarray]:
+def sample_columns(files: Sequence[FileStrokes], strokes: Mapping[str, list]) -> dict[str, np.ndarray]:
     """Return all samples, with `row` (place in `strokes`); `steady` and `sliding` are false throughout a stroke that is
     not used."""
     parts = [made for made in files if made.samples is not None]
@@ -141,7 +140,7 @@ def sample_columns(files: Sequence[FileStrokes], strokes: pd.DataFrame) -> dict[
     columns = {name: _stacked([made.samples.get(name) for made in parts], length) for name in names}
     first = np.concatenate(([0], np.cumsum([len(made.strokes) for made in parts])[:-1]))
     columns["row"] = np.repeat(first, length) + columns["stroke"] - 1
-    used = strokes["used"].to_numpy(bool)
+    used = np.array(strokes["used"], bool)
     if not used.all():
         for name in ("steady", "sliding"):
             columns[name] = columns[name] & used[columns["row"]]
@@ -156,39 +155,48 @@ def _stacked(parts: list[np.ndarray | None], length: list[int]) -> np.ndarray:
     return np.concatenate([np.full(n, None, object) if p is None else p for p, n in zip(parts, length, strict=True)])
 
 
-def _traces(samples: Mapping[str, np.ndarray], strokes: pd.DataFrame, config: Config) -> pa.Table:
+def _traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
     """Return table `traces`."""
     measured = {name: values for name, values in samples.items() if name not in ("row", "sliding")}
-    words = {name: as_dictionary(strokes[name], samples["row"]) for name in ("file", "condition")}
+    words = {name: as_dictionary(_array(strokes[name]), samples["row"]) for name in ("file", "condition")}
     return to_arrow({**measured, **words}, TRACES, config.units)
 
 
-def _mean_traces(samples: Mapping[str, np.ndarray], strokes: pd.DataFrame, config: Config) -> pa.Table:
+def _mean_traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
     """Return table `traces_mean`, of the sliding of the strokes that are used."""
     rows = np.flatnonzero(samples["sliding"])
     names = ("row", "displacement_mm", "force_N", "steady")
     made = mean_traces({name: samples[name][rows] for name in names}, strokes)
     row = made.pop("row")
-    words = {name: as_dictionary(strokes[name], row) for name in ("run_id", "condition")}
-    return to_arrow({**made, "direction": strokes["direction"].to_numpy()[row], **words}, TRACES_MEAN, config.units)
+    words = {name: as_dictionary(_array(strokes[name]), row) for name in ("run_id", "condition")}
+    return to_arrow({**made, "direction": np.array(strokes["direction"])[row], **words}, TRACES_MEAN, config.units)
 
 
-def _bins(samples: Mapping[str, np.ndarray], strokes: pd.DataFrame, config: Config) -> pa.Table:
+def _bins(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
     """Return table `bins`: means of what was measured along the trace, and what is known of the whole stroke."""
     rows = np.flatnonzero(samples["steady"])
     measured = {name: values[rows] for name, values in samples.items() if name not in ("stroke", "steady", "sliding")}
     made = bin_table(measured, strokes, config.bins)
     binned, place = np.unique(made.pop("row"), return_inverse=True)
-    strokes = strokes.iloc[binned].reset_index(drop=True)
-    if "load_N" in made and "load_N" in strokes.columns:  # where some files measure it and others declare it
-        made["load_N"] = np.where(np.isnan(made["load_N"]), strokes["load_N"].to_numpy(float)[place], made["load_N"])
-    whole = strokes.drop(columns=[name for name in made if name in strokes.columns]).assign(**dict.fromkeys(made, 0.0))
-    known = to_arrow(shaped(whole, BINS, drop=(*STEADY_ONLY, "used")), BINS, config.units)
-    columns = {name: made[name] if name in made else _spread(known.column(name), place) for name in known.column_names}
-    return to_arrow(columns, BINS, config.units)
+    known = {name: [values[i] for i in binned.tolist()] for name, values in strokes.items()}
+    if "load_N" in made and "load_N" in known:  # where some files measure it and others declare it
+        declared = np.array(known["load_N"], float)[place]
+        made["load_N"] = np.where(np.isnan(made["load_N"]), declared, made["load_N"])
+    kinds = {column.name: column.dtype for column in BINS.columns}
+    left_out = {*INNER, *STEADY_ONLY, "used", *kinds}
+    columns = {name: _typed(known.get(name, [None] * len(binned)), kind) for name, kind in kinds.items()}
+    columns |= {name: _array(values) for name, values in known.items() if name not in left_out}
+    spread = {name: _spread(values, place) for name, values in columns.items() if name not in made}
+    return to_arrow(spread | made, BINS, config.units)
 
 
-def _spread(values: pa.ChunkedArray, row: np.ndarray) -> pa.Array:
+def _typed(values: Sequence[object], kind: pa.DataType) -> pa.Array:
+    """Return the values in the type of their column; null where a word stands for a number."""
+    if kind == FLOAT:
+        values = [as_number(value) if isinstance(value, str) else value for value in values]
+    return _array(values).cast(kind)
+
+
+def _spread(values: pa.Array, row: np.ndarray) -> pa.Array:
     """Return the value of every row, words as dictionaries."""
-    whole = values.combine_chunks()
-    return as_dictionary(whole, row) if whole.type == TEXT else whole.take(pa.array(row))
+    return as_dictionary(values, row) if values.type == TEXT else values.take(pa.array(row))

@@ -79,6 +79,18 @@ class Pieces:
         return [rows[a:b] - start for a, b, start in zip(at, at[1:], self.start.tolist(), strict=False)]
 
 
+def numbered(labels: Sequence[object]) -> tuple[np.ndarray, int]:
+    """Return a number for every label, the first one 0 and every new one the next, and how many labels there are.
+
+    Examples
+    --------
+    >>> numbered(["b", "a", "b"])
+    (array([0, 1, 0]), 2)
+    """
+    numbers: dict[object, int] = {}
+    return np.array([numbers.setdefault(label, len(numbers)) for label in labels], np.int64), len(numbers)
+
+
 def median(values: np.ndarray) -> float:
     """Return the median, as `np.median` does, of an array that holds no nan."""
     half, odd = divmod(len(values), 2)
