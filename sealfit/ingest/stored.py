@@ -22,6 +22,7 @@ from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.part import SAMPLED, Asked, FileFound, read_part
+from sealfit.memory import keep_freed_pages
 from sealfit.staging import PARQUET, disk
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
@@ -56,6 +57,7 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     OutError
         If the disk is full or refuses.
     """
+    keep_freed_pages()
     part = read_part(asked, campaign, config)
     tables = part.tables
     if folder is None:

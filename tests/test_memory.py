@@ -1,0 +1,34 @@
+import ctypes
+import subprocess
+import sys
+
+import pytest
+
+FAULTS = """
+import resource, sys
+import numpy as np
+from sealfit.memory import keep_freed_pages
+if "keep" in sys.argv:
+    keep_freed_pages()
+    keep_freed_pages()
+def faults(turns):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(turns):
+        columns = [np.ones(1_500_000) for _ in range(4)]
+        del columns
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+faults(5)
+print(faults(10))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only glibc gives pages back as it is told")
+def test_arrays_made_again_and_again_take_the_pages_of_those_before():
+    if not hasattr(ctypes.CDLL(None), "mallopt"):
+        pytest.skip("this C library has no mallopt")
+    made = [
+        int(subprocess.run([sys.executable, "-c", FAULTS, word], check=True, capture_output=True, text=True).stdout)
+        for word in ("keep", "leave")
+    ]
+    columns = 10 * 4 * 1_500_000 * 8 // 4096  # pages of all columns made
+    assert made[0] < 0.1 * columns < made[1]
