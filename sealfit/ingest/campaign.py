@@ -184,13 +184,17 @@ class _Maker:
         return load_part(asked, path) if path else None
 
     def _read(self, asked: Sequence[Asked]) -> list[Made]:
-        total, done, made = sum(len(part.refs) for part in asked), 0, []
-        for part in run_map(self._make, asked, workers=self._workers, together=1):
-            made.append(part)
+        """Return the parts; the largest are read first, so that at the end no process has much left alone."""
+        order = sorted(range(len(asked)), key=lambda i: -len(asked[i].refs))
+        total, done, made = sum(len(part.refs) for part in asked), 0, {}
+        for i, part in zip(
+            order, run_map(self._make, [asked[i] for i in order], workers=self._workers, together=1), strict=True
+        ):
+            made[i] = part
             done += len(part.files)
             self._on_file(done, total)
         self.reread += total
-        return made
+        return [made[i] for i in range(len(asked))]
 
 
 def _ruled_out(parts: Sequence[Made], strokes: pd.DataFrame) -> list[frozenset]:

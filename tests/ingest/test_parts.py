@@ -2,6 +2,7 @@
 
 import os
 from collections import Counter
+from itertools import pairwise
 
 import pandas as pd
 import pandas.testing as pdt
@@ -9,7 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sealfit.config import Config
 from sealfit.ingest import parts
+from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.parts import MOST, PART_FILES, plan_parts
 from sealfit.steps import ingest
 from sealfit.store import Store
@@ -110,6 +113,18 @@ def test_a_table_in_parts_is_read_by_pandas_as_one(campaign, tmp_path):
         assert len(whole) == len(tables(tmp_path / "out")[name])
     one = pd.read_parquet(tmp_path / "out" / "traces.parquet", filters=[("condition", "==", "unaged")])
     assert set(one["file"]) == {"day0_r1.csv", "day0_r2.csv", "day0_r3.csv"}
+
+
+def test_the_largest_parts_are_read_first_and_the_tables_keep_their_order(campaign):
+    done = []
+    made = ingest_campaign(campaign, Config(), on_file=lambda files, of: done.append(files))
+    sizes = [after - before for before, after in pairwise([0, *done])]
+    assert len(set(sizes)) > 1
+    assert sizes == sorted(sizes, reverse=True)
+    named = pd.read_csv(campaign / "runs.csv")["file"]
+    assert made.tables["runs"]["file"].tolist() == made.tables["inputs"]["file"].tolist() == named.tolist()
+    edges = made.tables["traces"]["condition"].ne(made.tables["traces"]["condition"].shift())
+    assert edges.sum() == 12
 
 
 def test_three_added_files_leave_the_other_parts_as_they_are(campaign, tmp_path, monkeypatch):
