@@ -61,22 +61,21 @@ def _declare(rows: Rows) -> Declared:
     aging = rows.has_aging
     series_of = series_of_curve(conditions, aging)
     stribeck = _speed_forms(rows, series_of)
-    law = {}
-    for s in stribeck:
-        own = conditions[series_of == s]
-        shared = conditions[(conditions["aging_days"] == 0) & conditions["rubber"].isin(own["rubber"])]
-        days = set(own["aging_days"]) | set(shared["aging_days"])
-        law[s] = bool(aging and len(days) >= DAYS_FOR_LAW and (own["aging_days"] > 0).any())
-    law_rubbers = {conditions["rubber"].iloc[c] for c in range(len(names)) if law[series_of[c]]}
+    rubbers, days = (conditions[name].tolist() for name in ("rubber", "aging_days"))
+    unaged_rubbers = {rubber for rubber, day in zip(rubbers, days, strict=True) if day == 0}
+    days_of: dict[str, set[float]] = {}
+    for s, rubber, day in zip(series_of, rubbers, days, strict=True):
+        days_of.setdefault(s, set()).update({day, 0.0} if rubber in unaged_rubbers else {day})
+    law = {s: bool(aging and len(own) >= DAYS_FOR_LAW and max(own) > 0) for s, own in days_of.items()}
+    law_rubbers = {rubber for s, rubber in zip(series_of, rubbers, strict=True) if law[s]}
     parameters: dict[JointParameter, int] = {}
     index = {quantity: np.full(len(names), -1) for quantity in QUANTITIES}
 
     def use(c: int, quantity: str, owner: str) -> None:
         index[quantity][c] = parameters.setdefault(JointParameter(quantity, owner), len(parameters))
 
-    for c, name in enumerate(names):
-        series, rubber = series_of[c], conditions["rubber"].iloc[c]
-        unaged = aging and conditions["aging_days"].iloc[c] == 0 and rubber in law_rubbers
+    for c, (name, series, rubber) in enumerate(zip(names, series_of, rubbers, strict=True)):
+        unaged = aging and days[c] == 0 and rubber in law_rubbers
         for end in "sc":
             if end == "s" and stribeck[series] != "full":
                 continue
