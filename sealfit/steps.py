@@ -207,17 +207,15 @@ def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -
 def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     from sealfit.closure.loop import close_loop
 
-    with timed("reading tables"):
-        bins = store.read("bins")
     config = store.seen_config("close-loop")
-    closure = close_loop(bins, store.traces(), config, workers=workers, on_progress=progress.say)
+    closure = close_loop(store.read("bins"), store.traces(), config, workers=workers, on_progress=progress.say)
     with timed("writing tables"):
         for name in CLOSED:
             staged.table(name, closure.tables[name])
     started = store.read("runs", ["started_at"])["started_at"].dropna()
     staged.json("model", {**closure.model, "first_started_at": min(started) if len(started) else None})
     staged.json("closure", closure.document)
-    return len(bins), "bins"
+    return len(closure.tables["residuals_before"]), "bins"
 
 
 def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:

@@ -74,9 +74,10 @@ def close_loop(
     counted = numbered(bins)
     rows = make_rows(counted, has_aging=config.aging)
     samples = steady_samples(traces, rows)
-    del traces  # much of the memory, and not read again
     fewer = merged_bins(counted)
     merged = len(fewer) < len(counted)
+    columns = list(bins.columns)
+    del bins, counted  # much of the memory: `rows` holds all of it
     coarse = make_rows(fewer, has_aging=config.aging) if merged else rows
     heldout = _HeldOut(rows, coarse, samples, config, effects, workers)
     with closing(heldout):
@@ -93,6 +94,7 @@ def close_loop(
         with timed("held out", rows=len(heldout.masks), of="folds"):
             held_before, held_after = heldout.forces(grown, say)
     document = _document(config, effects, grown, before, after, held_before, held_after, heldout.level)
+    bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their order again
     tables = {
         "effects": effect_table([e for e in document["effects"] if not e["candidate"]], grown.added),
         "residuals_before": _residual_table(bins, before, held_before),
@@ -250,15 +252,11 @@ def _document(
 
 def _residual_table(bins: pd.DataFrame, fitted: Fitted, held: np.ndarray) -> pd.DataFrame:
     """Return `bins`, in its order, with the model, the residual, their held-out counterparts and the weight."""
-    rows = fitted.rows
-    added = pd.DataFrame(
-        {
-            "model_N": fitted.force,
-            "residual_N": fitted.residual,
-            "heldout_model_N": held,
-            "heldout_residual_N": rows.force - held,
-            "weight": rows.weight,
-        },
-        index=rows.order,
-    )
-    return pd.concat([bins, added.loc[np.arange(len(bins))]], axis=1)
+    rows, own = fitted.rows, np.argsort(fitted.rows.order)
+    return bins.assign(
+        model_N=fitted.force[own],
+        residual_N=fitted.residual[own],
+        heldout_model_N=held[own],
+        heldout_residual_N=(rows.force - held)[own],
+        weight=rows.weight[own],
+    ).reset_index(drop=True)
