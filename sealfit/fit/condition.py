@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -35,7 +36,7 @@ class Condition:
     chi2: float = np.nan
     grid: np.ndarray | None = None
 
-    @property
+    @cached_property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """|v|, N (1 without load), F sgn v and weight of each run, shape (n,)."""
         load = self.runs["load"].to_numpy(float) if self.has_load else np.ones(len(self.runs))

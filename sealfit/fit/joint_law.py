@@ -218,9 +218,16 @@ def rivals_of(laws: Sequence[JointLaw]) -> list[JointLaw]:
 def left_out(law: JointLaw) -> dict[str, float]:
     """Return the RMS error of a law at whole series, and at last days, that it was not fitted to; NaN without any."""
     aged, covariance = law.aged, law.aged.covariance(law.scatter)
-    whole, found = aged.whole_series(), {}
-    for name, masks in (("series", whole if len(whole) > 2 else []), ("last_day", aged.last_days())):
-        held = np.array([out for out in masks if aged.part(~out).drivers() == aged.drivers()])
-        errors = (law.at(aged, solved_without(law, covariance, held)) - aged.value)[held] if len(held) else held
-        found[name] = float(np.sqrt(np.mean(errors**2))) if errors.size else np.nan
+    whole = aged.whole_series()
+    held = {"series": whole if len(whole) > 2 else [], "last_day": aged.last_days()}
+    kept = {name: [out for out in masks if aged.part(~out).drivers() == aged.drivers()] for name, masks in held.items()}
+    masks = np.array([out for own in kept.values() for out in own])
+    if not len(masks):
+        return dict.fromkeys(kept, np.nan)
+    errors = law.at(aged, solved_without(law, covariance, masks)) - aged.value
+    found, start = {}, 0
+    for name, own in kept.items():
+        squares = errors[start : start + len(own)][masks[start : start + len(own)]] ** 2
+        found[name] = float(np.sqrt(np.mean(squares))) if squares.size else np.nan
+        start += len(own)
     return found

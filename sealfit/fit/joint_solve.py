@@ -88,16 +88,25 @@ class _Projected:
     """
 
     def __init__(self, law: JointLaw, covariance: np.ndarray, values: np.ndarray, masks: np.ndarray | None = None):
-        self.law, self.white, self.aside = law, np.linalg.inv(np.linalg.cholesky(covariance)), None
-        if masks is not None:
-            # a value with a number of its own says nothing: what these numbers' columns reach is projected out
-            self.aside = np.zeros((len(masks), masks.sum(axis=1).max(), values.shape[1]))
-            for own, out in zip(self.aside, masks, strict=True):
-                own[: out.sum()] = np.linalg.qr(self.white[:, out])[0].T
-        self.values = self._whitened(values[:, None], np.arange(len(values)))[:, 0]
+        self.law, self.values, self.aside = law, values, None
+        white = np.linalg.inv(np.linalg.cholesky(covariance))
+        level = white.sum(axis=1)  # the column of mu_0
+        if masks is None:
+            self.level = (level @ white / (level @ level))[None]
+            self.white = white - np.outer(level, self.level)
+        else:
+            # a value with a number of its own says nothing: with mu_0, what these numbers' columns reach goes
+            self.white, self.level = white, np.zeros(values.shape)
+            self.aside = np.zeros((len(masks), masks.sum(axis=1).max() + 1, values.shape[1]))
+            for k, out in enumerate(masks):
+                found, upper = np.linalg.qr(np.column_stack([white[:, out], level]))
+                self.aside[k, : out.sum() + 1] = found.T
+                self.level[k] = found[:, -1] @ white / upper[-1, -1]
+        self.measured = self._whitened(values[:, None], np.arange(len(values)))
+        self.reach = float((white**2).sum())
 
     def _whitened(self, many: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return whitened rows, shape (r, m, n), of the sets `of` (r,)."""
+        """Return whitened rows, shape (r, m, n), of the sets `of` (r,), with nothing of mu_0 in them."""
         many = (many.reshape(-1, len(self.white)) @ self.white.T).reshape(many.shape)
         return many if self.aside is None else many - (many @ np.swapaxes(self.aside[of], 1, 2)) @ self.aside[of]
 
@@ -111,23 +120,19 @@ class _Projected:
         of : ndarray of int, shape (r,)
             Which set of values.
         """
-        law, measured = self.law, self.values[of][:, None]
+        law, measured = self.law, self.measured[of]
         unit = np.concatenate([np.tile([0.0, -1.0], (len(bent), 1)), bent], axis=1)  # mu_0 = 0, a = -1: the loss itself
-        columns = self._whitened(law.slope(law.aged, unit), of)
-        start, loss, slope = columns[:, :1], -columns[:, 1:2], columns[:, 2:]
-        first = start / np.linalg.norm(start, axis=2, keepdims=True)
-        shared = (loss * first).sum(axis=2, keepdims=True)
-        beyond = loss - shared * first
-        square = (beyond**2).sum(axis=2, keepdims=True)
-        sound = square > DEPENDENT * (loss**2).sum(axis=2, keepdims=True)
-        second = beyond * np.sqrt(np.divide(1, square, out=np.zeros(square.shape), where=sound))
-        along = [(measured * column).sum(axis=2, keepdims=True) for column in (first, second)]
-        a = -np.divide(along[1], np.sqrt(square), out=np.zeros(square.shape), where=sound)
-        mu_0 = (along[0] + a * shared) / np.linalg.norm(start, axis=2, keepdims=True)
-        rest = along[0] * first + along[1] * second - measured
-        for column in (first, second):
-            slope = slope - (slope * column).sum(axis=2, keepdims=True) * column
-        return np.concatenate([mu_0, a], axis=2)[:, 0], rest[:, 0], -a * slope
+        plain = law.slope(law.aged, unit)[:, 1:]
+        columns = self._whitened(plain, of)
+        square = (columns[:, :1] ** 2).sum(axis=2, keepdims=True)
+        sound = square > DEPENDENT * self.reach * (plain[:, :1] ** 2).max(axis=2, keepdims=True)
+        column = np.divide(columns[:, :1], np.sqrt(square), out=np.zeros(measured.shape), where=sound)
+        along = (measured * column).sum(axis=2, keepdims=True)
+        a = np.divide(along, np.sqrt(square), out=np.zeros(square.shape), where=sound)
+        slope = columns[:, 1:] - (columns[:, 1:] * column).sum(axis=2, keepdims=True) * column
+        level = self.level[of] if len(self.level) > 1 else self.level
+        mu_0 = ((self.values[of] - a[:, 0] * plain[:, 0]) * level).sum(axis=1, keepdims=True)
+        return np.concatenate([mu_0, a[:, 0]], axis=1), (along * column - measured)[:, 0], -a * slope
 
     def grid(self) -> np.ndarray:
         """Return the best few points of a grid, shape (POLISHED, p - 2)."""
