@@ -144,7 +144,7 @@ class Layout:
 
 
 def compose(plot: Plot) -> Figure:
-    """Return all panels of a plot in one figure, with title and legend; panel k is the group "panel_k" of an SVG."""
+    """Return all panels of a plot in one figure, with title and legend."""
     layout = Layout.of(plot)
     width, total = layout.width, layout.height
     with look():
@@ -163,8 +163,8 @@ def compose(plot: Plot) -> Figure:
                 borderpad=0,
                 fontsize=8,
             )
-        for k, (panel, corner) in enumerate(zip(plot.panels, layout.corners, strict=True)):
-            _place(figure, panel, *corner).set_gid(f"panel_{k}")
+        for panel, corner in zip(plot.panels, layout.corners, strict=True):
+            _place(figure, panel, *corner)
         return figure
 
 

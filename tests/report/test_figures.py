@@ -14,7 +14,7 @@ from report.made_tables import DROP, empty, shapes, table
 
 from sealfit.config import Config
 from sealfit.report.axes import PlainNumbers, is_logarithmic, value_ticks
-from sealfit.report.drawn import draw, svg
+from sealfit.report.drawn import draw
 from sealfit.report.figures import draw_all
 from sealfit.report.figures_curves import draw_aging, draw_trace, envelope
 from sealfit.report.figures_loop import draw_errors, draw_levels, run_means
@@ -246,7 +246,8 @@ def test_ticks_stand_at_the_values_where_they_fit(ax):
 def test_any_column_name_can_be_drawn(label):
     rows = [{"channel": label, "label": label, "n": 1, "before_N": 1.0, "after_N": 0.0}] * 2
     panel = Panel(label, "alt", lambda ax: draw_channel(ax, table("channels", rows), label, Units()))
-    text = svg(compose(Plot("p", label, (panel,), (Key(label, "#000000"),))))
+    text = draw(Plot("p", label, (panel,), (Key(label, "#000000"),))).svg
+    ElementTree.fromstring(text)
     assert text.count("<svg") == 1
     assert "<script>" not in text
 
@@ -255,7 +256,7 @@ def test_letters_that_the_font_lacks_become_text():
     panel = Panel("温度", "alt", lambda ax: ax.plot([0, 1], [0, 1]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert "温度" in svg(panel_figure(panel))
+        assert "温度" in draw(Plot("one", "", (panel,))).svg
 
 
 def test_the_same_tables_give_the_same_bytes(made):
@@ -274,8 +275,11 @@ def test_a_panel_of_the_page_holds_all_that_it_uses_and_nothing_of_its_neighbour
         assert len(names) == len(used)
         assert (image.width, image.height) == (341, 245)
         box = [float(number) for number in page.get("viewBox").split()]
-        inside = [float(found) for found in re.findall(r"translate\(([\d.]+) [\d.]+\) (?:rotate|scale)", image.svg)]
-        assert all(box[0] <= x <= box[0] + box[2] for x in inside)
+        drawing = image.svg.split("</defs>")[1]
+        begins = re.findall(r"translate\((\d+) (\d+)\)(?:rotate|scale)|<path d=\"M(\d+) (\d+)l", drawing)
+        places = np.array([[float(number) for number in found if number] for found in begins])
+        assert len(places) > 10
+        assert ((places >= box[:2]) & (places <= np.add(box[:2], box[2:]))).all()
     assert drawn.panels[0].svg != drawn.panels[1].svg
     assert drawn.png.startswith(b"\x89PNG")
 
