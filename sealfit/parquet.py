@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from sealfit import __version__
@@ -135,10 +136,16 @@ def read_ipc(path: Path) -> pa.Table:
         return pa.ipc.open_file(file).read_all()
 
 
-def read(path: Path | Sequence[Path], columns: list[str] | None = None, coded: Sequence[str] = ()) -> pd.DataFrame:
-    """Return the table at `path`, a file or its parts in their order, or those columns of it.
+def read(
+    path: Path | Sequence[Path],
+    columns: list[str] | None = None,
+    coded: Sequence[str] = (),
+    runs: Sequence[str] | None = None,
+) -> pd.DataFrame:
+    """Return the table at `path`, a file or its parts in their order, or those columns of it, or the rows of some runs.
 
-    Columns of words in `coded` come as categories: no word is spelled out for every row.
+    Columns of words in `coded` come as categories: no word is spelled out for every row. With `runs` one of the
+    columns is run_id.
     """
     paths = [path] if isinstance(path, Path) else path
     parts = []
@@ -146,7 +153,8 @@ def read(path: Path | Sequence[Path], columns: list[str] | None = None, coded: S
         with pq.ParquetFile(
             one, read_dictionary=list(coded)
         ) as file:  # a tenth of what read_table takes for a small file
-            parts.append(file.read(columns=columns))
+            part = file.read(columns=columns)
+        parts.append(part if runs is None else part.filter(pc.is_in(part["run_id"], pa.array(runs, TEXT))))
     return pa.concat_tables(parts).to_pandas(self_destruct=True)
 
 

@@ -23,11 +23,11 @@ INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bin
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
 FITTED = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
 UNREPORTED = ("traces", "bins")  # as many rows as samples, and nothing in the report needs them
-REPORTED = {  # of tables with a row per bin or step of a trace, what the report looks at
-    "traces_mean": ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"],
-    **{f"residuals_{stage}": ["condition", "run_id", "file", "residual_N", "heldout_residual_N"]
-       for stage in ("before", "after")},
-}  # fmt: skip
+TRACE = ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"]
+REPORTED = {  # of tables with a row per bin, what the report looks at
+    f"residuals_{stage}": ["condition", "run_id", "file", "residual_N", "heldout_residual_N"]
+    for stage in ("before", "after")
+}
 Counted = tuple[int, str]
 FAULTY = ("warning", "error")  # severities that count as a fault
 
@@ -226,8 +226,9 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
         tables = {
             name: store.read(name, REPORTED.get(name))
             for name in (*INGESTED, *FITTED, *CLOSED)
-            if name not in UNREPORTED
+            if name not in (*UNREPORTED, "traces_mean")
         }
+        tables["traces_mean"] = _example_traces(store, tables["runs"])
     with timed("page"):
         report = build_report(tables, store.read_json("closure"), store.provenance(), store.seen_config("report"))
     with timed("writing plots", rows=len(report.figures), of="plots"):
@@ -235,6 +236,17 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
             staged.figure(name, figure)
     staged.text("report.html", report.html)
     return sum(len(table) for table in tables.values()), "rows of tables"
+
+
+def _example_traces(store: Store, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the averaged traces that the report draws; the table has hundreds of rows for each of all runs."""
+    from sealfit.report.figures_curves import example_runs
+
+    names = ["run_id", "condition"]
+    places = store.read("traces_mean", names, coded=names).drop_duplicates("run_id").astype(object)
+    chosen = example_runs(places, runs)["run_id"].tolist()
+    traces = store.read("traces_mean", TRACE, runs=chosen)
+    return traces.sort_values("run_id", key=lambda names: names.map(chosen.index), kind="stable")
 
 
 _WORK: dict[str, Callable[[Store, Staged, int, Silent], Counted]] = {

@@ -6,7 +6,7 @@ import contextlib
 import shlex
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -175,11 +175,11 @@ class Store:
         return f"sealfit ingest {shlex.quote(str(self.state.campaign))} --out {out}{config}"
 
     # ------------------------------------------------------------ reading
-    def read(self, table: str, columns: list[str] | None = None) -> pd.DataFrame:
-        """Return a table, or those columns of it."""
+    def read(self, table: str, columns: list[str] | None = None, **which: Sequence[str]) -> pd.DataFrame:
+        """Return a table, or those columns of it; `which` as `parquet.read`."""
         from sealfit import parquet
 
-        return parquet.read(self._parts_of(table) or self.out / f"{table}{PARQUET}", columns)
+        return parquet.read(self._parts_of(table) or self.out / f"{table}{PARQUET}", columns, **which)
 
     def _parts_of(self, table: str) -> list[Path]:
         files = (file for done in self.state.steps.values() for file in done.files)

@@ -119,6 +119,17 @@ def test_columns_come_in_the_order_of_the_schema_and_channels_after_them(tmp_pat
     assert list(parquet.read(tmp_path / "bins.parquet").columns) == [*BINS.names(), "batch", "humidity_pct"]
 
 
+@pytest.mark.parametrize("coded", [[], ["run_id"]])
+def test_of_some_runs_only_their_rows_are_read(tmp_path, coded):
+    paths = [tmp_path / name for name in ("one.parquet", "two.parquet")]
+    for path, runs in zip(paths, (["a", "b", "a"], ["c", "d", "b"]), strict=True):
+        parquet.write(small("bins", 3).assign(run_id=runs, load_N=[1.0, 2.0, 3.0]), BINS, Units(), path)
+    rows = parquet.read(paths, ["run_id", "load_N"], coded, runs=["b", "d"])
+    assert rows["run_id"].tolist() == ["b", "d", "b"]
+    assert rows["load_N"].tolist() == [2.0, 2.0, 3.0]
+    assert parquet.read(paths, ["run_id"], runs=[]).empty
+
+
 def test_types_are_those_of_the_schema(tmp_path):
     frame = small("runs").assign(repeat=[1.0, np.nan], run_id=[7, 8], load_N=[49, 50])
     table = parquet.to_arrow(frame, RUNS, Units())

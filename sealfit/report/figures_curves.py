@@ -164,7 +164,7 @@ def envelope(trace: pd.DataFrame, buckets: int = TRACE_BUCKETS) -> pd.DataFrame:
 def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     """Return a few averaged traces, spread over conditions and speeds, or None if there are none."""
     traces = tables["traces_mean"]
-    chosen = _examples(traces, tables["runs"])
+    chosen = example_runs(traces, tables["runs"])
     if chosen.empty:
         return None
     names, units = ConditionNames.of(config), config.units
@@ -195,14 +195,29 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     return Plot("traces_mean", "Averaged traces", tuple(panels), legend)
 
 
-def _examples(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
-    """Return up to six runs: conditions spread evenly, and along them the speeds from slow to fast."""
+def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return up to six runs: conditions spread evenly, and along them the speeds from slow to fast.
+
+    Parameters
+    ----------
+    traces : DataFrame
+        Columns run_id and condition of table `traces_mean`, one row or more of a run.
+    runs : DataFrame
+        Table `runs`, for the speeds.
+
+    Returns
+    -------
+    DataFrame
+        Columns run_id, condition and speed; of six runs or fewer all of them, in their order.
+    """
     if traces.empty:
         return pd.DataFrame(columns=["run_id", "condition", "speed"])
     speed = runs["speed_set_mm_s"].fillna(runs["speed_mm_s"].abs()).astype(float)
     speed = speed.groupby(runs["run_id"]).mean()
     known = traces.drop_duplicates("run_id")[["run_id", "condition"]]
     known = known.assign(speed=known["run_id"].map(speed).astype(float))
+    if len(known) <= MOST_TRACES:
+        return known
     groups = [g.sort_values("speed") for _, g in known.groupby("condition", sort=False)]
     n = min(MOST_TRACES, len(known))
     picked = []

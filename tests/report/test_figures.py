@@ -16,7 +16,7 @@ from sealfit.config import Config
 from sealfit.report.axes import PlainNumbers, is_logarithmic, value_ticks
 from sealfit.report.drawn import draw
 from sealfit.report.figures import draw_all
-from sealfit.report.figures_curves import draw_aging, draw_trace, envelope
+from sealfit.report.figures_curves import draw_aging, draw_trace, envelope, example_runs, traces_mean
 from sealfit.report.figures_loop import draw_errors, draw_levels, run_means
 from sealfit.report.figures_residual import channel_order, draw_channel, draw_shape
 from sealfit.report.figures_speed import curve_lines, force_speed, run_points
@@ -326,3 +326,14 @@ def test_no_panel_is_empty(verdict):
         for panel in plot.panels:
             assert panel_figure(panel).axes[0].has_data(), name
             assert len(panel.alt) > 20
+
+
+def test_the_rows_of_the_example_runs_alone_give_the_same_traces():
+    made = paper_sized()
+    whole, rows = traces_mean(made.tables, made.config), made.tables["traces_mean"]
+    chosen = example_runs(rows[["run_id", "condition"]].drop_duplicates(), made.tables["runs"])
+    assert len(chosen) == 6 < rows["run_id"].nunique()
+    parts = pd.concat([rows[rows["run_id"] == run] for run in chosen["run_id"]])
+    alone = traces_mean({**made.tables, "traces_mean": parts}, made.config)
+    assert [panel.alt for panel in alone.panels] == [panel.alt for panel in whole.panels]
+    assert alone.legend == whole.legend
