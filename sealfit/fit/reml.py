@@ -27,6 +27,8 @@ from sealfit.fit.whitening import Component
 
 REVIVED = 0.03  # share at which a component starts though it was nothing before: from zero it could not come back
 MOST_GAIN = 0.5  # no rig's gain scatters more: a model near zero with gains of any size would fit every force
+LEAST = 1e-5  # share of all scatter below which a component is nothing
+MOST_SHARE = 30.0  # of the residual, of which the model has taken much where it has nearly as many numbers
 KINDS = ("offset", "gain")
 
 
@@ -66,26 +68,24 @@ def reml(
     basis = jacobian.orthonormal(1e-9)
     likelihood = RestrictedLikelihood(residual, basis, variance, force, groups, kinds)
 
-    def objective(log_share: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = likelihood(unit * np.exp(log_share))
-        return value, gradient * unit * np.exp(log_share)
+    def objective(sd: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = likelihood(unit * sd**2)
+        return value, 2.0 * gradient * unit * sd
 
-    low = np.log(1e-7)
-    high = np.log(
-        [min(30.0, MOST_GAIN**2 / u) if kind == "gain" else 30.0 for u, (_, kind) in zip(unit, kinds, strict=True)]
-    )
-    high = np.maximum(high, low + 2.0)
-    first = np.full(len(kinds), np.log(0.2)) if start is None else np.log(np.maximum(np.asarray(start) / unit, REVIVED))
+    most = [MOST_GAIN**2 / u if kind == "gain" else np.inf for u, (_, kind) in zip(unit, kinds, strict=True)]
+    high = np.sqrt(np.clip(most, LEAST, MOST_SHARE))
+    first = np.full(len(kinds), 0.2) if start is None else np.maximum(np.asarray(start) / unit, REVIVED)
+    # Over standard deviations: a component that is nothing is a minimum at 0 there, over logarithms an endless slope.
     best = minimize(
         objective,
-        np.clip(first, low + 1.0, high - 1.0),
+        np.minimum(np.sqrt(first), 0.6 * high),
         jac=True,
         method="L-BFGS-B",
-        bounds=[(low, most) for most in high],
-        options={"maxiter": 40, "ftol": 1e-6},
+        bounds=[(0.0, most) for most in high],
+        options={"maxiter": 200, "ftol": 1e-10},  # far below what rounding in the residual should move
     )
-    share = np.exp(best.x)
-    variances = np.where(share > 1e-5, unit * share, 0.0)
+    share = best.x**2
+    variances = np.where(share > LEAST, unit * share, 0.0)
     return tuple(Component(level, kind, float(v)) for (level, kind), v in zip(kinds, variances, strict=True))
 
 

@@ -75,3 +75,24 @@ def test_reml_counts_the_degrees_of_freedom_that_the_model_took():
         )
         found.append(part.variance)
     assert np.mean(found) == pytest.approx(1.0, abs=0.08)  # SE of the mean: sqrt(2/20/200) = 0.022
+
+
+def test_rounding_moves_no_variance_and_scatter_that_is_not_there_is_nothing():
+    codes = nested(3, 8, 25)
+    rng = np.random.default_rng(11)
+    force = rng.uniform(20, 50, 200)[codes["run"]]
+    tangent = Tangent.dense(np.column_stack([np.ones(force.size), force]))
+    kinds = [("file", "offset"), ("file", "gain"), ("run", "offset"), ("run", "gain"), ("specimen", "gain")]
+    moved, none = [], 0
+    for _ in range(10):
+        residual = rng.normal(0, 0.05, force.size) + rng.normal(0, 0.2, 200)[codes["run"]]
+        near = residual * (1 + 1e-12 * rng.normal(size=residual.size))
+        one, other = (
+            np.array([p.variance for p in reml(r, tangent, np.full(600, 0.05**2), force, Groups.of(codes), kinds)])
+            for r in (residual, near)
+        )
+        npt.assert_array_equal(one > 0, other > 0)
+        moved.append(np.abs(one - other).max() / one.max())
+        none += one[4] == 0
+    assert max(moved) < 1e-5
+    assert none >= 4  # a variance whose best value is at or below zero: half of all, and more beside others
