@@ -52,6 +52,7 @@ def grow(
     *,
     fine: Rows | None = None,
     start: Fitted | None = None,
+    workers: int = 1,
     on_found: Callable[[Fitted], None] | None = None,
     on_progress: Callable[[str], None] | None = None,
 ) -> Grown:
@@ -71,6 +72,8 @@ def grow(
         The bins as they are, to fit ripples to, which merged bins would blur; they are held as found there.
     start : Fitted, optional
         The declared model fitted to more rows: where the fit begins, so that it need not search again.
+    workers : int
+        Processes for what is independent in the search.
     on_found : callable, optional
         Given the declared fit as soon as the first search has found something.
     on_progress : callable, optional
@@ -80,6 +83,7 @@ def grow(
     rng = np.random.default_rng(config.loop.seed)
     rig = config.position_origin == "rig"
     alpha = config.loop.family_error
+    ripples = Ripples(samples, config, effects, say, compare=start is None, workers=workers)
     before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
     channels = {
         c.name: c
@@ -87,7 +91,6 @@ def grow(
     }
     judge = Judge(before)
     last = first = tuple(search(judge, list(channels.values()), rng))
-    ripples = Ripples(samples, config, effects, say, compare=start is None)
     if on_found is not None and (ripples.found or any(c.p_value <= alpha for c in first)):
         on_found(before)
     fitted = ripples.added_to(before, fine)

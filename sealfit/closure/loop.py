@@ -60,7 +60,7 @@ def close_loop(
     config : Config
         The rig.
     workers : int
-        Processes for the folds.
+        Processes for the folds, and for the spectra of many samples.
     on_progress : callable, optional
         Told in words what is being done.
     """
@@ -83,7 +83,9 @@ def close_loop(
     with closing(heldout):
         fine = rows if merged else None
         with timed("search", rows=coarse.force.size, of="bins, merged"):
-            grown = grow(coarse, samples, config, effects, fine=fine, on_found=heldout.begin, on_progress=say)
+            grown = grow(
+                coarse, samples, config, effects, fine=fine, workers=workers, on_found=heldout.begin, on_progress=say
+            )
         say("before and after on all rows")
         with timed("before and after", rows=rows.force.size, of="bins"):
             before = _on_all(rows, grown, grown.before) if merged else grown.before

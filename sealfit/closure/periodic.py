@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,8 @@ import pandas as pd
 
 from sealfit.closure.confirm import Added, confirmed
 from sealfit.closure.naming import propose_ripples
-from sealfit.closure.ripple import Peak, find_ripple
+from sealfit.closure.ripple import AXES, Peak, strongest
+from sealfit.closure.spectrum import Spectrum, begin_spectra
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit
@@ -34,13 +35,13 @@ class Ripples:
         Told in words what is being done.
     compare : bool
         Whether rivals of an accepted ripple are asked for the held-out data too.
+    workers : int
+        Processes for the spectra of many samples: already at work until somebody asks what is found.
 
     Attributes
     ----------
     samples : DataFrame
         The samples with `residual_N`: the force less the ripples added so far.
-    found : Peak or None
-        The significant one that is not in the model yet and may still be.
     added : list of Added
         Those confirmed.
     """
@@ -53,11 +54,22 @@ class Ripples:
         say: Callable[[str], None],
         *,
         compare: bool,
+        workers: int = 1,
     ) -> None:
-        self.config, self.effects, self.say, self.compare = config, effects, say, compare
+        self.config, self.effects, self.say, self.compare, self.workers = config, effects, say, compare, workers
         self.added: list[Added] = []
         self.samples = samples.assign(residual_N=samples["force_N"])
-        self.found = self._strongest()
+        self._found: Peak | None = None
+        self._begun: Iterator[Spectrum] | None = self._begin()
+
+    @property
+    def found(self) -> Peak | None:
+        """The significant one that is not in the model yet and may still be."""
+        if self._begun is not None:
+            peak = strongest(self._begun, common_phase=self.config.position_origin == "rig")
+            self._found = peak if peak is not None and peak.p_value <= self.config.loop.family_error else None
+            self._begun = None
+        return self._found
 
     def added_to(self, fitted: Fitted, fine: Rows | None) -> Fitted:
         """Return a fit with every ripple that is significant and holds on data it was not fitted to.
@@ -77,22 +89,21 @@ class Ripples:
             number = len(self.added) + 1
             accepted = confirmed(own, proposals, self.samples, self.config, number, self.say, compare=self.compare)
             if accepted is None:
-                self.found = None
+                self._found = None
                 break
             self.added.append(accepted)
             own = fit(accepted.proposal.fitted.model, own.rows, own.scatter, turns=2)
             self.samples = without_ripples(self.samples, own)
-            self.found = self._strongest(own.model)
+            self._begun = self._begin(own.model)
         if fine is None:
             return own
         if not self.added:
             return fitted
         return fit(_held(own.model), fitted.rows, own.scatter, turns=2)
 
-    def _strongest(self, model: Model | None = None) -> Peak | None:
+    def _begin(self, model: Model | None = None) -> Iterator[Spectrum]:
         known = [(t.channels[0], v["lambda_"]) for t, v in zip(model.terms, model.values, strict=True)] if model else []
-        peak = find_ripple(self.samples, common_phase=self.config.position_origin == "rig", known=known)
-        return peak if peak is not None and peak.p_value <= self.config.loop.family_error else None
+        return begin_spectra(self.samples, AXES, known, workers=self.workers)
 
 
 def _held(model: Model) -> Model:

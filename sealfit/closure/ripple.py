@@ -8,7 +8,7 @@ Where each file has an origin of its own only the power is shared: it is held ag
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ import pandas as pd
 from scipy.special import betaincc, gammaincc
 
 from sealfit.closure.background import LOBE, alike, background, smooth_background, tops
-from sealfit.closure.spectrum import Spectrum, spectrum_along
+from sealfit.closure.spectrum import Spectrum, begin_spectra
 
 SHARED = 1e-3  # p-value below which the phase is taken to be common to all files
 ABOVE_BACKGROUND = 4.0  # a peak's power over the median of its neighbours: a smooth trend has no peak
@@ -36,12 +36,11 @@ class Peak:
     energy: float  # squared amplitudes, all passes that reach the frequency: of the largest sure wave along the axis
 
 
+AXES = ("displacement_mm", "time_s")  # time is the rival of displacement: mains, servo
+
+
 def find_ripple(
-    samples: pd.DataFrame,
-    *,
-    common_phase: bool,
-    known: Sequence[tuple[str, float]] = (),
-    axes: tuple[str, ...] = ("displacement_mm", "time_s"),
+    samples: pd.DataFrame, *, common_phase: bool, known: Sequence[tuple[str, float]] = (), workers: int = 1
 ) -> Peak | None:
     """Return the strongest periodic component of the samples' residual, or None where there is none to test.
 
@@ -53,19 +52,21 @@ def find_ripple(
         Whether displacement means the same place in every file (`position_origin = "rig"`).
     known : sequence of (axis, wavelength)
         Components already in the model: what is left around them is their own scatter from file to file.
-    axes : tuple of str
-        Axes to look along; time is the rival of displacement (mains, servo).
+    workers : int
+        Processes to use where there are many samples.
     """
+    return strongest(begin_spectra(samples, AXES, known, workers=workers), common_phase=common_phase)
+
+
+def strongest(spectra: Iterable[Spectrum], *, common_phase: bool) -> Peak | None:
+    """Return the strongest periodic component of the spectra along `AXES`, or None; arguments as `find_ripple`."""
     peaks, locked = [], []
-    for axis in axes:
-        spectrum = spectrum_along(samples, axis, [wavelength for place, wavelength in known if place == axis])
-        if spectrum is None:
-            continue
-        if common_phase and axis == "displacement_mm":
-            peaks += _coherent(spectrum, axis)
-        elif axis == "time_s":  # which counts from the start of every stroke: a wave may be locked to that
-            locked = _coherent(spectrum, axis)
-        peaks.append(_incoherent(spectrum, axis))
+    for spectrum in spectra:
+        if common_phase and spectrum.axis == "displacement_mm":
+            peaks += _coherent(spectrum)
+        elif spectrum.axis == "time_s":  # which counts from the start of every stroke: a wave may be locked to that
+            locked = _coherent(spectrum)
+        peaks.append(_incoherent(spectrum))
     if not peaks:
         return None
     # What is periodic in time shows in displacement too, speed by speed, and the other way round: where both are sure,
@@ -78,7 +79,7 @@ def find_ripple(
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
 
 
-def _coherent(spectrum: Spectrum, axis: str) -> list[Peak]:
+def _coherent(spectrum: Spectrum) -> list[Peak]:
     """Return the best peak of each way of acting: the same force both ways, or following the direction."""
     peaks = []
     for common in spectrum.common:
@@ -91,7 +92,7 @@ def _coherent(spectrum: Spectrum, axis: str) -> list[Peak]:
         p = _coherence_p(statistic[k], common.units) * spectrum.frequency.size * len(spectrum.common)
         wavelength, amplitude = _refined(total, spectrum.frequency, k), float(np.abs(common.amplitude[k]))
         energy = amplitude**2 * float(spectrum.count[k])
-        peaks.append(Peak(axis, wavelength, common.symmetric, True, float(statistic[k]), p, amplitude, energy))
+        peaks.append(Peak(spectrum.axis, wavelength, common.symmetric, True, float(statistic[k]), p, amplitude, energy))
     return peaks
 
 
@@ -100,7 +101,7 @@ def _coherence_p(statistic: float, units: int) -> float:
     return float(betaincc(1, max(units - 1, 1), min(statistic / units, 1.0)))
 
 
-def _incoherent(spectrum: Spectrum, axis: str) -> Peak:
+def _incoherent(spectrum: Spectrum) -> Peak:
     """Return the best peak of power shared by all units whatever their phases.
 
     The mean of U units' powers, each on its own scale, is Gamma(U) about the background; where units share a texture
@@ -119,7 +120,14 @@ def _incoherent(spectrum: Spectrum, axis: str) -> Peak:
     sure = peaks & (own < np.log(SHARED / spectrum.frequency.size))
     sure[k] = True
     return Peak(
-        axis, wavelength, True, False, float(ratio[k]), p, float(spectrum.amplitude[k]), float(energy[sure].max())
+        spectrum.axis,
+        wavelength,
+        True,
+        False,
+        float(ratio[k]),
+        p,
+        float(spectrum.amplitude[k]),
+        float(energy[sure].max()),
     )
 
 

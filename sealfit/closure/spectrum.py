@@ -1,13 +1,14 @@
-r"""The spectrum of strokes along an axis, summed over units: no amplitude of a single one is kept.
+"""The spectrum of strokes along an axis, summed over units: no amplitude of a single one is kept.
 
-Strokes that share a grid are transformed together, and the units are added some at a time, so that memory does not grow
-with the campaign.
+Strokes that share a grid are transformed together, and units are added block by block, so that memory does not grow
+with the campaign. Workers may share the blocks: they are the same whoever sums them up, and so are the sums.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import numpy as np
@@ -16,9 +17,14 @@ from scipy.fft import next_fast_len
 from scipy.sparse import csr_array
 
 from sealfit.closure.background import LOBE
-from sealfit.closure.waves import LEAST_SAMPLES
+from sealfit.closure.strokes import Strokes
+from sealfit.engine import begin_map
 
-MOST_NUMBERS = 1 << 20  # of grids that are transformed together: 8 MB
+MOST_NUMBERS = 1 << 19  # of the grids of a block: 4 MB
+WORTHWHILE = 400_000  # samples from which it takes longer to transform them than to start processes and send them
+LEAST_STROKES = 3
+LEAST_FREQUENCIES = 4
+REACHED = 0.25  # share of the strokes that must reach a frequency
 EXPONENTS = 64  # of a stroke's phase factor that are computed; the others are products of these and their powers
 
 
@@ -35,8 +41,9 @@ class Common:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Sums over passes (units in one direction) at f frequencies; no pass is kept, so that memory stays small."""
+    """Sums over passes (units in one direction) at f frequencies."""
 
+    axis: str
     frequency: np.ndarray  # (f,)
     count: np.ndarray  # (f,) passes that reach each frequency
     power: np.ndarray  # (f,) mean of the passes' powers, each on its own scale
@@ -45,76 +52,73 @@ class Spectrum:
     taken: np.ndarray  # (f,) within a main lobe of a component already in the model
 
 
-class Strokes:
-    """Strokes of some samples along an axis, those long enough to say something of a ripple; m of them.
+def begin_spectra(
+    samples: pd.DataFrame, axes: Sequence[str], known: Sequence[tuple[str, float]] = (), *, workers: int = 1
+) -> Iterator[Spectrum]:
+    """Return the spectra along some axes, in their order, without those of which the samples show too little.
+
+    A stroke is freed of a parabola, tapered (Hann) and transformed on a grid that divides twice the longest stroke, so
+    that every stroke has the same frequencies whatever its sampling; the wavelength is at most half a usual stroke.
 
     Parameters
     ----------
     samples : DataFrame
-        Samples of a stroke one after the other: stroke_id, direction, unit, the axis, `residual_N`.
-    axis : str
-        Column along which the wave runs.
-
-    Attributes
-    ----------
-    low, span, step : ndarray, shape (m,)
-        Where each begins, how far it goes, and from one sample to the next, in the unit of the axis.
-    unit, direction : ndarray, shape (m,)
-        Number of its file, and its direction.
+        As for `sealfit.closure.ripple.find_ripple`.
+    axes : sequence of str
+        Columns to look along.
+    known : sequence of (axis, wavelength)
+        Components already in the model.
+    workers : int
+        Processes that transform many samples, already at work while the caller does something else.
     """
-
-    def __init__(self, samples: pd.DataFrame, axis: str) -> None:
-        self._place = samples[axis].to_numpy(dtype=float)
-        self._residual = samples["residual_N"].to_numpy(dtype=float)
-        stroke = samples["stroke_id"].to_numpy()
-        start = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]][: stroke.size])
-        size = np.diff(np.r_[start, stroke.size])
-        low, high = (part.reduceat(self._place, start) if start.size else start for part in (np.minimum, np.maximum))
-        good = (size >= LEAST_SAMPLES) & (high > low)
-        self._start, self._size = start[good], size[good]
-        self.low, self.span = low[good], (high - low)[good]
-        self.step = self.span / (self._size - 1)
-        self.unit, self.direction = (samples[name].to_numpy()[self._start] for name in ("unit", "direction"))
-
-    def on_grids(self, chosen: np.ndarray, step: float, size: int) -> np.ndarray:
-        """Return residuals of chosen strokes on even grids of `size` places from where each begins, (strokes, size)."""
-        grid = step * np.arange(size)
-        found = np.empty((chosen.size, size))
-        for row, k in zip(found, chosen, strict=True):
-            own = slice(self._start[k], self._start[k] + self._size[k])
-            order = np.argsort(self._place[own], kind="stable")
-            row[:] = np.interp(self.low[k] + grid, self._place[own][order], self._residual[own][order])
-        return found
+    surveys = [survey for axis in axes if (survey := _survey(samples, axis)) is not None]
+    made = begin_map(_sums_of, _Blocks(surveys), workers=workers if len(samples) >= WORTHWHILE else 1, together=1)
+    return _summed(surveys, made, known)
 
 
-def spectrum_along(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -> Spectrum | None:
-    """Return the spectrum along one axis, summed over units and directions; None where there is too little.
+@dataclass(frozen=True)
+class _Block:
+    """Strokes of whole units: what is sent to a worker. Frequencies are multiples of 1 / `longest`."""
 
-    A stroke is freed of a parabola, tapered (Hann) and transformed on a grid that divides twice the longest stroke, so
-    that every stroke has the same frequencies whatever its sampling; the wavelength is at most half a usual stroke.
-    """
-    strokes = Strokes(samples, axis)
-    if strokes.span.size < 3:
+    strokes: Strokes
+    points: np.ndarray  # (m,) of the grid of each stroke, if it were as long as `longest`
+    reach: np.ndarray  # (m,) how many of the frequencies each stroke reaches
+    numbers: np.ndarray  # (f,) which multiples the frequencies are
+    longest: float  # length, or time, of which all grids are parts
+    sides: np.ndarray  # directions that there are
+
+    def only(self, chosen: np.ndarray) -> _Block:
+        own = self.strokes.only(chosen), self.points[chosen], self.reach[chosen]
+        return _Block(*own, self.numbers, self.longest, self.sides)
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """All strokes along one axis, and which of them make a block."""
+
+    axis: str
+    whole: _Block
+    blocks: list[np.ndarray]
+
+
+def _survey(samples: pd.DataFrame, axis: str) -> _Survey | None:
+    strokes = Strokes.of(samples, axis)
+    if strokes.span.size < LEAST_STROKES:
         return None
-    longest = 2 * strokes.span.max()
-    points = np.clip(np.ceil(longest / strokes.step), 8, 2**15).astype(int)
-    distinct, number = np.unique(points, return_inverse=True)
+    step = strokes.span / (strokes.size - 1)
+    longest = float(2 * strokes.span.max())
+    distinct, number = np.unique(np.clip(np.ceil(longest / step), 8, 2**15).astype(int), return_inverse=True)
     points = np.array([next_fast_len(int(n), real=True) for n in distinct])[number]
-    frequency = np.arange(min(2**15, int(np.ceil(longest / np.quantile(strokes.step, 0.1)))) // 2 + 1) / longest
-    reach = np.minimum(points // 2 + 1, np.searchsorted(frequency, 0.5 / strokes.step, side="right"))
+    frequency = np.arange(min(2**15, int(np.ceil(longest / np.quantile(step, 0.1)))) // 2 + 1) / longest
+    reach = np.minimum(points // 2 + 1, np.searchsorted(frequency, 0.5 / step, side="right"))
     reaching = np.bincount(reach, minlength=frequency.size + 1)[::-1].cumsum()[::-1][1:]  # strokes, at each frequency
-    use = (frequency >= 2 / np.median(strokes.span)) & (reaching[: frequency.size] >= 0.25 * reach.size)
-    if use.sum() < 4:
+    use = (frequency >= 2 / np.median(strokes.span)) & (reaching[: frequency.size] >= REACHED * reach.size)
+    if use.sum() < LEAST_FREQUENCIES:
         return None
     first, last = np.flatnonzero(use)[[0, -1]]  # with none between them left out, as fewer strokes reach further
-    sums = _Sums(np.arange(first, last + 1), longest, np.unique(strokes.direction))
-    reached = np.clip(reach, first, last + 1) - first
-    for chosen in _parts(strokes.unit, points):
-        sums.add(strokes, chosen, points[chosen], reached[chosen])
-    near = np.zeros(int(use.sum()), dtype=bool)
-    for wavelength in known:
-        near |= np.abs(frequency[use] - 1 / wavelength) <= LOBE / longest
-    return sums.spectrum(near)
+    reached, numbers = np.clip(reach, first, last + 1) - first, np.arange(first, last + 1)
+    whole = _Block(strokes, points, reached, numbers, longest, np.unique(strokes.direction))
+    return _Survey(axis, whole, _parts(strokes.unit, points))
 
 
 def _parts(unit: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
@@ -126,6 +130,91 @@ def _parts(unit: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     begin = np.flatnonzero(np.r_[True, np.diff(code[order]) != 0])
     part = np.cumsum(points[order])[begin] // MOST_NUMBERS
     return np.split(order, begin[1:][np.diff(part) > 0])
+
+
+class _Blocks(Sequence):
+    """The blocks of all surveys, each made when it is asked for."""
+
+    def __init__(self, surveys: Sequence[_Survey]) -> None:
+        self.places = [(survey.whole, chosen) for survey in surveys for chosen in survey.blocks]
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __getitem__(self, number):
+        if isinstance(number, slice):
+            return [whole.only(chosen) for whole, chosen in self.places[number]]
+        whole, chosen = self.places[number]
+        return whole.only(chosen)
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Sums over passes, (f,), and over units for each way of acting, the same both ways first, (ways, f)."""
+
+    count: np.ndarray
+    power: np.ndarray
+    square: np.ndarray
+    total: np.ndarray
+    scaled: np.ndarray
+    units: np.ndarray  # (ways,)
+    amplitude: np.ndarray
+
+    @classmethod
+    def none(cls, f: int, ways: int) -> _Sums:
+        total, amplitude = np.zeros((ways, f), dtype=complex), np.zeros((ways, f), dtype=complex)
+        return cls(*np.zeros((3, f)), total, np.zeros((ways, f)), np.zeros(ways), amplitude)
+
+    def __add__(self, other: _Sums) -> _Sums:
+        return _Sums(*(getattr(self, part.name) + getattr(other, part.name) for part in fields(self)))
+
+
+def _sums_of(block: _Block) -> _Sums:
+    sides, width = block.sides, int(block.reach.max())
+    sums = _Sums.none(block.numbers.size, min(sides.size, 2))
+    units, unit = np.unique(block.strokes.unit, return_inverse=True)
+    passes = unit * sides.size + np.searchsorted(sides, block.strokes.direction)
+    each = np.arange(unit.size)
+    summing = csr_array((np.ones(unit.size), (passes, each)), (units.size * sides.size, unit.size))
+    known = summing @ (np.arange(width) < block.reach[:, None]).astype(float)
+    wave = summing @ _transformed(block) / np.maximum(known, 1)
+    wave, known = (part.reshape(units.size, sides.size, width) for part in (wave, known > 0))
+    power = _power(wave)
+    mean = power.sum(axis=2) / np.maximum(known.sum(axis=2), 1)
+    sums.count[:width] = known.sum(axis=(0, 1))
+    sums.square[:width] = power.sum(axis=(0, 1))
+    sums.power[:width] = (power / np.maximum(mean, 1e-300)[:, :, None]).sum(axis=(0, 1))
+    most = np.zeros(units.size, dtype=int)
+    np.maximum.at(most, unit, block.reach)
+    for way in range(sums.units.size):
+        own = np.einsum("usf,s->uf", wave, sides) if way else wave.sum(axis=1)
+        power = _power(own)
+        square = _medians(power, most)  # each unit weighs by its own spread, so that one noisy file does not decide
+        kept = square > 0
+        sums.total[way, :width] = (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
+        sums.scaled[way, :width] = (power[kept] / square[kept, None]).sum(axis=0)
+        sums.units[way] = own.any(axis=1).sum()
+        sums.amplitude[way, :width] = own.sum(axis=0)
+    return sums
+
+
+def _transformed(block: _Block) -> np.ndarray:
+    """Return complex amplitudes of strokes, phases counted from place 0, 0 beyond reach, (strokes, most)."""
+    strokes, points, reach = block.strokes, block.points, block.reach
+    found = np.zeros((reach.size, int(reach.max())), dtype=complex)
+    size = np.ceil(strokes.span * points / block.longest).astype(int)
+    for length, count in np.unique(np.column_stack([points, size]), axis=0):
+        alike = np.flatnonzero((points == length) & (size == count))
+        trend, taper = _on_grid(count)
+        value = strokes.on_grids(alike, block.longest / length, count)
+        value -= (value @ trend) @ trend.T
+        width = int(reach[alike].max())
+        wave = np.fft.rfft(value * taper, length)[:, block.numbers[0] : block.numbers[0] + width]
+        found[alike, :width] = np.where(np.arange(width) < reach[alike, None], wave, 0.0)
+    turn = -2j * np.pi / block.longest * strokes.low[:, None]
+    many, few = np.divmod(block.numbers[: found.shape[1]], EXPONENTS)  # a product of two costs less than a power
+    found *= np.exp(turn * EXPONENTS * np.arange(many[-1] + 1))[:, many]
+    return found * np.exp(turn * np.arange(EXPONENTS))[:, few]
 
 
 @lru_cache(maxsize=512)  # strokes of one speed share their grids: one each for hundreds of thousands
@@ -140,78 +229,6 @@ def _power(wave: np.ndarray) -> np.ndarray:
     return wave.real**2 + wave.imag**2
 
 
-class _Sums:
-    """A spectrum in the making: what is kept of the units.
-
-    Parameters
-    ----------
-    numbers : ndarray of int, shape (f,)
-        Which multiples of 1 / `longest` the frequencies are.
-    longest : float
-        Length, or time, of which all grids are parts.
-    sides : ndarray
-        Directions that there are.
-    """
-
-    def __init__(self, numbers: np.ndarray, longest: float, sides: np.ndarray) -> None:
-        self.numbers, self.longest, self.sides = numbers, longest, sides
-        size = numbers.size
-        self.count, self.power, self.square = np.zeros(size), np.zeros(size), np.zeros(size)
-        ways = (True, False) if sides.size == 2 else (True,)
-        self.common = {way: [np.zeros(size, complex), np.zeros(size), 0, np.zeros(size, complex)] for way in ways}
-
-    def add(self, strokes: Strokes, chosen: np.ndarray, points: np.ndarray, reach: np.ndarray) -> None:
-        """Add whole units: the points of each chosen stroke's grid, and how many of the frequencies it reaches."""
-        units, unit = np.unique(strokes.unit[chosen], return_inverse=True)
-        passes = unit * self.sides.size + np.searchsorted(self.sides, strokes.direction[chosen])
-        every, width = np.arange(chosen.size), int(reach.max())
-        summing = csr_array((np.ones(chosen.size), (passes, every)), (units.size * self.sides.size, chosen.size))
-        known = summing @ (np.arange(width) < reach[:, None]).astype(float)
-        wave = summing @ self._transformed(strokes, chosen, points, reach) / np.maximum(known, 1)
-        wave, known = (part.reshape(units.size, self.sides.size, width) for part in (wave, known > 0))
-        power = _power(wave)
-        mean = power.sum(axis=2) / np.maximum(known.sum(axis=2), 1)
-        self.count[:width] += known.sum(axis=(0, 1))
-        self.square[:width] += power.sum(axis=(0, 1))
-        self.power[:width] += (power / np.maximum(mean, 1e-300)[:, :, None]).sum(axis=(0, 1))
-        most = np.zeros(units.size, dtype=int)
-        np.maximum.at(most, unit, reach)
-        for way, sums in self.common.items():
-            own = wave.sum(axis=1) if way else np.einsum("usf,s->uf", wave, self.sides)
-            power = _power(own)
-            square = _medians(power, most)  # each unit weighs by its own spread, so that one noisy file does not decide
-            kept = square > 0
-            sums[0][:width] += (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
-            sums[1][:width] += (power[kept] / square[kept, None]).sum(axis=0)
-            sums[2] += int(own.any(axis=1).sum())
-            sums[3][:width] += own.sum(axis=0)
-
-    def _transformed(self, strokes: Strokes, chosen: np.ndarray, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """Return complex amplitudes of strokes, phases counted from place 0, 0 beyond reach, (strokes, most)."""
-        found = np.zeros((chosen.size, int(reach.max())), dtype=complex)
-        size = np.ceil(strokes.span[chosen] * points / self.longest).astype(int)
-        for length, count in np.unique(np.column_stack([points, size]), axis=0):
-            alike = np.flatnonzero((points == length) & (size == count))
-            trend, taper = _on_grid(count)
-            value = strokes.on_grids(chosen[alike], self.longest / length, count)
-            value -= (value @ trend) @ trend.T
-            width = int(reach[alike].max())
-            wave = np.fft.rfft(value * taper, length)[:, self.numbers[0] : self.numbers[0] + width]
-            found[alike, :width] = np.where(np.arange(width) < reach[alike, None], wave, 0.0)
-        turn = -2j * np.pi / self.longest * strokes.low[chosen, None]
-        many, few = np.divmod(self.numbers[: found.shape[1]], EXPONENTS)  # a product of two costs less than a power
-        found *= np.exp(turn * EXPONENTS * np.arange(many[-1] + 1))[:, many]
-        return found * np.exp(turn * np.arange(EXPONENTS))[:, few]
-
-    def spectrum(self, taken: np.ndarray) -> Spectrum:
-        """Return the spectrum of all units added, shape (f,) of `taken`."""
-        count, frequency = np.maximum(self.count, 1), self.numbers / self.longest
-        common = tuple(
-            Common(way, total, square, units, own / count) for way, (total, square, units, own) in self.common.items()
-        )
-        return Spectrum(frequency, self.count, self.power / count, np.sqrt(self.square / count), common, taken)
-
-
 def _medians(values: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Return the median of the first so many values of each row, shape (rows,); 0 of none."""
     found = np.zeros(count.size)
@@ -219,3 +236,24 @@ def _medians(values: np.ndarray, count: np.ndarray) -> np.ndarray:
         alike = count == size
         found[alike] = np.median(values[alike, :size], axis=1)
     return found
+
+
+def _summed(
+    surveys: Sequence[_Survey], made: Iterator[_Sums], known: Sequence[tuple[str, float]]
+) -> Iterator[Spectrum]:
+    with closing(made):
+        for survey in surveys:
+            numbers, longest = survey.whole.numbers, survey.whole.longest
+            sums = next(made)
+            for _ in survey.blocks[1:]:
+                sums = sums + next(made)
+            frequency, count = numbers / longest, np.maximum(sums.count, 1)
+            taken = np.zeros(frequency.size, dtype=bool)
+            for axis, wavelength in known:
+                taken |= (axis == survey.axis) & (np.abs(frequency - 1 / wavelength) <= LOBE / longest)
+            common = tuple(
+                Common(way == 0, sums.total[way], sums.scaled[way], int(units), sums.amplitude[way] / count)
+                for way, units in enumerate(sums.units)
+            )
+            amplitude = np.sqrt(sums.square / count)
+            yield Spectrum(survey.axis, frequency, sums.count, sums.power / count, amplitude, common, taken)

@@ -4,7 +4,8 @@ import pandas as pd
 import pytest
 
 from sealfit.closure import spectrum
-from sealfit.closure.spectrum import spectrum_along
+from sealfit.closure.ripple import AXES
+from sealfit.closure.spectrum import begin_spectra
 
 LENGTH_MM, A_N, PHASE = 2.5, 0.3, 0.8
 
@@ -24,11 +25,16 @@ def samples_of(strokes):
                     "direction": direction,
                     "unit": unit,
                     "displacement_mm": place[::-1] if direction < 0 else place,
+                    "time_s": 0.01 * np.arange(count),
                     "residual_N": wave[::-1] if direction < 0 else wave,
                 }
             )
         )
     return pd.concat(tables, ignore_index=True)
+
+
+def spectrum_along(samples, axis, known=()):
+    return next(begin_spectra(samples, [axis], known), None)
 
 
 def many_strokes():
@@ -76,3 +82,23 @@ def test_strokes_too_few_or_too_short_have_no_spectrum():
     assert spectrum_along(samples_of([(0, 1.0, 0.0, 0.05, 400), (1, 1.0, 0.0, 0.05, 400)]), "displacement_mm") is None
     assert spectrum_along(samples_of([(k, 1.0, 0.0, 0.5, 15) for k in range(5)]), "displacement_mm") is None
     assert spectrum_along(samples_of([(0, 1.0, 0.0, 0.5, 15)]).head(0), "displacement_mm") is None
+
+
+def test_what_is_in_the_model_already_is_taken():
+    found = spectrum_along(samples_of(many_strokes()), "displacement_mm", [("displacement_mm", 5.1), ("time_s", 3.0)])
+    step = found.frequency[1] - found.frequency[0]
+    npt.assert_array_equal(found.taken, np.abs(found.frequency - 1 / 5.1) <= 4 * step)
+
+
+def test_spectra_of_two_workers_are_those_of_one(monkeypatch):
+    monkeypatch.setattr(spectrum, "WORTHWHILE", 0)
+    monkeypatch.setattr(spectrum, "MOST_NUMBERS", 3000)
+    samples = samples_of(many_strokes())
+    one, two = (list(begin_spectra(samples, AXES, workers=workers)) for workers in (1, 2))
+    assert [found.axis for found in one] == list(AXES)
+    for left, right in zip(one, two, strict=True):
+        for name in ("frequency", "count", "power", "amplitude", "taken"):
+            npt.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name)
+        for a, b in zip(left.common, right.common, strict=True):
+            npt.assert_array_equal(a.total, b.total)
+            npt.assert_array_equal(a.amplitude, b.amplitude)

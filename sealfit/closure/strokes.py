@@ -1,0 +1,54 @@
+"""Strokes of some samples along an axis, each to be laid on an even grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.waves import LEAST_SAMPLES
+
+
+@dataclass(frozen=True)
+class Strokes:
+    """Strokes along an axis, m of them with n samples together, and the grids that they are transformed on."""
+
+    place: np.ndarray  # (n,) along the axis, in its unit, as `residual` a stroke after the other
+    residual: np.ndarray  # (n,) in N
+    start: np.ndarray  # (m,) first sample
+    size: np.ndarray  # (m,) samples
+    low: np.ndarray  # (m,) where each begins
+    span: np.ndarray  # (m,) how far it goes
+    unit: np.ndarray  # (m,) number of its file
+    direction: np.ndarray  # (m,)
+
+    @classmethod
+    def of(cls, samples: pd.DataFrame, axis: str) -> Strokes:
+        """Return the strokes of some samples that are long enough to say something of a ripple."""
+        place, residual = (samples[name].to_numpy(dtype=float) for name in (axis, "residual_N"))
+        stroke = samples["stroke_id"].to_numpy()
+        start = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]][: stroke.size])
+        size = np.diff(np.r_[start, stroke.size])
+        low, high = (part.reduceat(place, start) if start.size else place for part in (np.minimum, np.maximum))
+        good = (size >= LEAST_SAMPLES) & (high > low)
+        unit, direction = (samples[name].to_numpy()[start[good]] for name in ("unit", "direction"))
+        return cls(place, residual, start[good], size[good], low[good], (high - low)[good], unit, direction)
+
+    def only(self, chosen: np.ndarray) -> Strokes:
+        """Return some strokes and their samples alone."""
+        size = self.size[chosen]
+        start = np.cumsum(size) - size
+        own = np.repeat(self.start[chosen] - start, size) + np.arange(size.sum())
+        others = (getattr(self, name)[chosen] for name in ("low", "span", "unit", "direction"))
+        return Strokes(self.place[own], self.residual[own], start, size, *others)
+
+    def on_grids(self, chosen: np.ndarray, step: float, size: int) -> np.ndarray:
+        """Return residuals of chosen strokes on even grids of `size` places from where each begins, (strokes, size)."""
+        grid = step * np.arange(size)
+        found = np.empty((chosen.size, size))
+        for row, k in zip(found, chosen, strict=True):
+            own = slice(self.start[k], self.start[k] + self.size[k])
+            order = np.argsort(self.place[own], kind="stable")
+            row[:] = np.interp(self.low[k] + grid, self.place[own][order], self.residual[own][order])
+        return found
