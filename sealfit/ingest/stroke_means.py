@@ -21,7 +21,7 @@ from sealfit.ingest.spikes import displacement_spikes, displacement_suspects, fo
 from sealfit.ingest.strokes import Found, displacement_noises_mm, find_all
 
 OWN_SPEED = "speed_file_mm_s"  # what the reader calls a speed column of the trace itself
-BUNDLE_ROWS = 16_384  # traces computed at once: enough that numpy's calls cost little, few enough for the cache
+BUNDLE_ROWS = 65_536  # traces computed at once: enough that numpy's calls cost little, few enough for the cache
 SLOTS = ("time_s", "displacement_mm", "force_N")
 
 
