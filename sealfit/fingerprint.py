@@ -10,9 +10,9 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import NamedTuple
 
 from sealfit import __version__
 from sealfit.config import Config, Files, Loop, Sensor
@@ -29,8 +29,7 @@ UNSEEN = {
 """Parts of the config that a step is not given, so that a change of them does not make it stale."""
 
 
-@dataclass(frozen=True, slots=True)
-class Fingerprint:
+class Fingerprint(NamedTuple):
     """Size in bytes, time of last change in ns, and SHA-256 of one file; all None for a file that is not there."""
 
     size: int | None = None
@@ -59,7 +58,8 @@ def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
 def fingerprints(folder: Path, known: Mapping[str, Fingerprint], config: Config) -> dict[str, Fingerprint]:
     """Return the fingerprints, now, of every `known` file of the campaign `folder` and of every new trace file."""
     names = sorted({*known, *glob_names(folder, config.files)})
-    return {name: fingerprint(os.path.join(folder, name), known.get(name)) for name in names}
+    place = os.path.join(folder, "")
+    return {name: fingerprint(place + name, known.get(name)) for name in names}
 
 
 def glob_names(folder: Path, files: Files) -> list[str]:
@@ -78,7 +78,8 @@ def seen_config(step: str, config: Config) -> Config:
 def step_keys(inputs: Mapping[str, Fingerprint], config: Config) -> dict[str, str]:
     """Return the key of every step, in order, for these inputs, this config and this version of the program."""
     keys: dict[str, str] = {}
-    before: object = {name: inputs[name].sha256 for name in sorted(inputs)}
+    names = sorted(inputs)
+    before = hashlib.sha256(json.dumps([names, [inputs[name].sha256 for name in names]]).encode()).hexdigest()
     for step in STEPS:
         seen = [__version__, step, seen_config(step, config).model_dump(mode="json"), before]
         if step == "close-loop" and config.loop.effects_folder is not None:

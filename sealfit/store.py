@@ -32,8 +32,9 @@ PROVENANCE = "provenance.json"
 class Store:
     """One OUT folder with the campaign and the config it belongs to; `known` if it holds results already."""
 
-    def __init__(self, out: Path, state: State, *, known: bool):
+    def __init__(self, out: Path, state: State, *, known: bool, kept: State | None = None):
         self.out, self.state = out, state
+        self._kept = kept  # the state as it stands in `out`
         self.config: Config = state.config.parse()
         self.warnings: list[str] = []
         self._keys: dict[str, str] | None = None  # of every step for the campaign as it is now
@@ -61,7 +62,7 @@ class Store:
         if state is None:
             what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
             raise OutError(what, file=out, mend=f"Make them with: sealfit run CAMPAIGN --out {shlex.quote(str(out))}")
-        return cls(out, replace(state, config=state.config.now()), known=True)
+        return cls(out, replace(state, config=state.config.now()), known=True, kept=state)
 
     @classmethod
     @contextlib.contextmanager
@@ -96,7 +97,7 @@ class Store:
     def _of_campaign(cls, out: Path, campaign: Path, source: ConfigCopy) -> Store:
         kept = State.read(out)
         if kept is None or (kept.campaign != campaign and not kept.steps):
-            return cls(out, State(campaign, source), known=False)
+            return cls(out, State(campaign, source), known=False, kept=kept)
         store_inputs, moved = kept.inputs, kept.campaign != campaign
         if moved:
             store_inputs = {name: fingerprint(campaign / name) for name in kept.inputs}
@@ -106,7 +107,8 @@ class Store:
                     file=out,
                     mend="Choose another --out.",
                 )
-        store = cls(out, replace(kept, campaign=campaign, config=source, inputs=store_inputs), known=True)
+        state = replace(kept, campaign=campaign, config=source, inputs=store_inputs)
+        store = cls(out, state, known=True, kept=kept)
         if moved:
             store.warnings.append(
                 f"{out} was made from {kept.campaign}; {campaign} holds the same data and takes over."
@@ -115,7 +117,7 @@ class Store:
 
     def _keep_what_moved(self) -> None:
         """Keep the campaign's new place, new times of unchanged files and a config that says the same, if any."""
-        kept = State.read(self.out)
+        kept = self._kept
         if kept is None:
             return
         same = {n: now if (now := self._now.get(n, m)).sha256 == m.sha256 else m for n, m in self.state.inputs.items()}
@@ -242,8 +244,8 @@ class Store:
         # Until every file is in its place the step counts as not done: a kill in between cannot pass a mixture of old
         # and new tables as current. All is on the disk before the first move, so a full disk changes nothing in OUT.
         earlier = {step: self.state.steps[step] for step in STEPS[: STEPS.index(name)] if step in self.state.steps}
-        begun = replace(self.state, inputs=inputs, steps=earlier)
-        ended = replace(begun, steps={**earlier, name: done})
+        begun = replace(self.state, inputs=inputs if earlier else {}, steps=earlier)  # none are known of steps not done
+        ended = replace(begun, inputs=inputs, steps={**earlier, name: done})
         staged.text("begun.json", to_json(begun.as_dict(), indent=None))
         staged.text("ended.json", to_json(ended.as_dict(), indent=None))
         staged.text(PROVENANCE, to_json(provenance(ended), indent=None))

@@ -17,6 +17,12 @@ if TYPE_CHECKING:
 
 NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift")  # `quantity` of rows about the fit itself
 
+OF_INGEST = {  # columns that its summary counts
+    "inputs": ["status"],
+    "runs": ["used", "run_id"],
+    "quality": ["action", "severity"],
+    "steady": ["condition"],
+}
 EFFECT_KEYS = ("id", "label", "form", "acts_on", "operation", "channels", "named", "candidate", "parameters")
 
 
@@ -24,7 +30,7 @@ EFFECT_KEYS = ("id", "label", "form", "acts_on", "operation", "channels", "named
 def of_steps(store: Store, steps: Iterable[str]) -> dict:
     """Return the summaries of `steps`, all of them current."""
     make = {
-        "ingest": lambda: of_ingest({name: store.read(name) for name in ("inputs", "runs", "quality", "steady")}),
+        "ingest": lambda: of_ingest({name: store.read(name, columns) for name, columns in OF_INGEST.items()}),
         "fit-steady": lambda: of_fit(store.read("steady_fit"), "condition"),
         "fit-aging": lambda: of_fit(store.read("aging_fit"), "series"),
         "fit-dynamic": lambda: of_dynamic(store.read("dynamic_fit")),

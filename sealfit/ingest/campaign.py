@@ -16,7 +16,8 @@ import pyarrow as pa
 from sealfit.config import Config
 from sealfit.engine import run_map
 from sealfit.errors import CampaignError, Fault
-from sealfit.fingerprint import Fingerprint, fingerprint
+from sealfit.fingerprint import Fingerprint
+from sealfit.ingest.inputs import inputs_table
 from sealfit.ingest.part import SAMPLED, Asked
 from sealfit.ingest.parts import plan_parts
 from sealfit.ingest.peers import constant_strokes, outlying_files, reversed_strokes
@@ -87,17 +88,19 @@ def ingest_campaign(
         For faults that concern the whole campaign, or where not one stroke can be used.
     """
     campaign = Path(campaign)
+    marks = place.marks if place else {}
     with timed("listing trace files") as part:
         listing, faults = list_traces(campaign, config)
-        planned = _planned(campaign, listing, place.marks if place else {})
+        plan = _plan(campaign, listing, marks)
         part.rows, part.of = len(listing), "files"
-    make = _Maker(campaign, config, workers, on_file, place)
+    make = _Maker(campaign, config, listing, plan, workers=workers, on_file=on_file, place=place)
     with timed("reading trace files") as part:
-        parts = make.parts(planned)
+        parts = make.parts()
         part.rows, part.of = make.reread, "files"
-    order = {file: i for i, file in enumerate(listing.files)}
-    faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: order[fault.file])
-    strokes = _in_order(strokes_of([part.strokes for part in parts]), order)
+    faults += _by_file([fault for part in parts for fault in part.faults], listing)
+    files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
+    order = np.argsort(files, kind="stable")
+    strokes, files = strokes_of([part.strokes for part in parts]).take(order).reset_index(drop=True), files[order]
     parts = [replace(part, strokes=part.strokes.slice(0, 0)) for part in parts]  # they are in one table now
     strokes, found = judged(strokes)
     faults += found
@@ -106,8 +109,10 @@ def ingest_campaign(
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
     strokes = strokes.assign(used=_still_used(strokes, steady))
-    parts = make.settled(parts, strokes)
-    inputs, marks = _inputs(campaign, parts, order, strokes, faults)
+    parts = make.settled(parts, _ruled_out(plan, strokes, files))
+    used = np.zeros(len(listing), bool)
+    used[files[strokes["used"].to_numpy(bool)]] = True
+    inputs, marks = inputs_table(campaign, listing, plan, parts, used, faults)
     tables = {
         "inputs": inputs,
         "runs": shaped(strokes, RUNS, drop=(*STEADY_ONLY, *OF_SAMPLES)),
@@ -120,14 +125,15 @@ def ingest_campaign(
     return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY], marks, stored)
 
 
-def _planned(campaign: Path, listing: Listing, marks: Mapping[str, Fingerprint]) -> list[Asked]:
+def _plan(campaign: Path, listing: Listing, marks: Mapping[str, Fingerprint]) -> list[np.ndarray]:
+    """Return the files of each part, by their numbers in the listing."""
     known = (marks[file].size if file in marks else None for file in listing.files)
     sizes = [
         _size(os.path.join(campaign, file)) if size is None else size
         for file, size in zip(listing.files, known, strict=True)
     ]
     plan = plan_parts(listing.conditions.cells(), listing.columns["run_id"].cells(), sizes)
-    return [Asked(tuple(listing[i] for i in files)) for files in plan]
+    return [np.array(files) for files in plan]
 
 
 def _size(path: str) -> int:
@@ -138,72 +144,85 @@ def _size(path: str) -> int:
 
 
 class _Maker:
-    """Makes parts: takes those that are stored, reads the others."""
+    """Makes the parts of a plan: takes those that are stored, reads the others."""
 
     def __init__(
         self,
         campaign: Path,
         config: Config,
+        listing: Listing,
+        plan: Sequence[np.ndarray],
+        *,
         workers: int,
         on_file: Callable[[int, int], None] | None,
         place: Place | None,
     ) -> None:
         self._make = partial(make_part, campaign=campaign, config=config, folder=place.folder if place else None)
         self._config, self._workers, self._on_file = config, workers, on_file or (lambda done, total: None)
-        self._place = place
+        self._listing, self._plan, self._place = listing, plan, place
         self.reread = 0
 
-    def parts(self, planned: Sequence[Asked]) -> list[Made]:
+    def parts(self) -> list[Made]:
         """Return every part, by what its own files say."""
-        made: list[Made | None] = [self._known(asked) for asked in planned]
-        fresh = [i for i, part in enumerate(made) if part is None]
-        for i, part in zip(fresh, self._read([planned[i] for i in fresh]), strict=True):
-            made[i] = part
+        made = self._known()
+        made |= self._read(
+            {i: Asked(self._listing.take(self._plan[i])) for i in range(len(self._plan)) if i not in made}
+        )
+        return [made[i] for i in range(len(self._plan))]
+
+    def settled(self, parts: Sequence[Made], unused: Sequence[frozenset]) -> list[Made]:
+        """Return the parts, made again where the whole campaign leaves out other strokes or has other columns."""
+        columns = common_columns(parts)
+        again = {
+            i: Asked(self._listing.take(self._plan[i]), out, columns if part.columns else None)
+            for i, (part, out) in enumerate(zip(parts, unused, strict=True))
+            if part.unused != out or not agrees(part, columns)
+        }
+        made = self._read(again)
+        return [made.get(i, part) for i, part in enumerate(parts)]
+
+    def _known(self) -> dict[int, Made]:
+        """Return the parts that are stored, by their numbers in the plan."""
+        if self._place is None or not self._place.known:
+            return {}
+        words, made = self._listing.words(), {}
+        known = {name: column.known for name, column in self._listing.columns.items()}
+        for i, rows in enumerate(self._plan):
+            files = [self._listing.files[row] for row in rows.tolist()]
+            marks = [self._place.marks.get(file) for file in files]
+            cells = {name: column[rows] for name, column in words.items() if known[name][rows].any()}
+            path = self._place.known.get(part_key(files, cells, marks, self._config) or "")
+            if path is not None:
+                made[i] = load_part(path, marks)
         return made
 
-    def settled(self, parts: Sequence[Made], strokes: pd.DataFrame) -> list[Made]:
-        """Return the parts, made again where the whole campaign leaves out other strokes or has other columns."""
-        unused = _ruled_out(parts, strokes)
-        columns = common_columns(parts)
-        wanted = [
-            part.asked
-            if part.asked.unused == out and agrees(part, columns)
-            else Asked(part.asked.refs, out, columns if part.columns else None)
-            for part, out in zip(parts, unused, strict=True)
-        ]
-        again = [i for i, (part, asked) in enumerate(zip(parts, wanted, strict=True)) if asked != part.asked]
-        settled = list(parts)
-        for i, part in zip(again, self._read([wanted[i] for i in again]), strict=True):
-            settled[i] = part
-        return settled
-
-    def _known(self, asked: Asked) -> Made | None:
-        if self._place is None or not self._place.known:
-            return None
-        path = self._place.known.get(part_key(asked, self._place.marks, self._config) or "")
-        return load_part(asked, path) if path else None
-
-    def _read(self, asked: Sequence[Asked]) -> list[Made]:
+    def _read(self, asked: Mapping[int, Asked]) -> dict[int, Made]:
         """Return the parts; the largest are read first, so that at the end no process has much left alone."""
-        order = sorted(range(len(asked)), key=lambda i: -len(asked[i].refs))
-        total, done, made = sum(len(part.refs) for part in asked), 0, {}
-        for i, part in zip(
-            order, run_map(self._make, [asked[i] for i in order], workers=self._workers, together=1), strict=True
-        ):
+        order = sorted(asked, key=lambda i: -len(asked[i].refs))
+        total, done, made = sum(len(part.refs) for part in asked.values()), 0, {}
+        results = run_map(self._make, [asked[i] for i in order], workers=self._workers, together=1)
+        for i, part in zip(order, results, strict=True):
             made[i] = part
-            done += len(part.files)
+            done += len(part.rows)
             self._on_file(done, total)
         self.reread += total
-        return [made[i] for i in range(len(asked))]
+        return made
 
 
-def _ruled_out(parts: Sequence[Made], strokes: pd.DataFrame) -> list[frozenset]:
+def _by_file(faults: Sequence[Fault], listing: Listing) -> list[Fault]:
+    place = {file: i for i, file in enumerate(listing.files)} if faults else {}
+    return sorted(faults, key=lambda fault: place[fault.file])
+
+
+def _ruled_out(plan: Sequence[np.ndarray], strokes: pd.DataFrame, files: np.ndarray) -> list[frozenset]:
     """Return, per part, its strokes that are not used although their own file shows nothing wrong with them."""
-    of = {found.file: i for i, part in enumerate(parts) for found in part.files}
-    out: list[set] = [set() for _ in parts]
-    gone = strokes[~strokes["used"].to_numpy(bool) & strokes["by_itself"].to_numpy(bool)]
-    for file, stroke in zip(gone["file"], gone["stroke"].tolist(), strict=True):
-        out[of[file]].add((file, stroke))
+    part = np.empty(sum(len(rows) for rows in plan), int)
+    for i, rows in enumerate(plan):
+        part[rows] = i
+    out: list[set] = [set() for _ in plan]
+    gone = ~strokes["used"].to_numpy(bool) & strokes["by_itself"].to_numpy(bool)
+    for i, file, stroke in zip(part[files[gone]], strokes["file"][gone], strokes["stroke"][gone].tolist(), strict=True):
+        out[i].add((file, stroke))
     return [frozenset(strokes) for strokes in out]
 
 
@@ -237,12 +256,6 @@ def _worded(part: pa.Table, words: set[str]) -> pa.Table:
     return part
 
 
-def _in_order(strokes: pd.DataFrame, order: Mapping[str, int]) -> pd.DataFrame:
-    """Return the strokes in the order of their files in the campaign."""
-    place = np.array([order[file] for file in strokes["file"]], int)
-    return strokes.iloc[np.argsort(place, kind="stable")].reset_index(drop=True)
-
-
 def judged(strokes: pd.DataFrame) -> tuple[pd.DataFrame, list[Fault]]:
     """Return the strokes with `used` false for those that a comparison with the others rules out, and findings."""
     faults: list[Fault] = []
@@ -263,27 +276,6 @@ def _still_used(strokes: pd.DataFrame, steady: pd.DataFrame) -> np.ndarray:
 def _stacked(tables: Sequence[pa.Table]) -> pd.DataFrame:
     spelled = [table.cast(spelled_out(table.schema)) for table in tables]
     return joined(spelled).replace_schema_metadata().to_pandas()
-
-
-def _inputs(
-    campaign: Path, parts: Sequence[Made], order: Mapping[str, int], strokes: pd.DataFrame, faults: Sequence[Fault]
-) -> tuple[pd.DataFrame, dict[str, Fingerprint]]:
-    """Return table `inputs`, every trace file of the campaign and those that are not used, and their fingerprints."""
-    used = set(strokes.loc[strokes["used"], "file"])
-    files = sorted((found for part in parts for found in part.files), key=lambda found: order[found.file])
-    rows = [(f.file, f.mark, f.rows, f.strokes, "used" if f.file in used else "left out") for f in files]
-    known = {found.file for found in files}
-    for fault in faults:
-        if fault.file is not None and fault.file not in known and fault.action == "file left out":
-            known.add(fault.file)
-            status = "left out" if fault.severity == "error" else "not matched"
-            rows.append((fault.file, fingerprint(campaign / fault.file), 0, 0, status))
-    table = pd.DataFrame(
-        [(file, m.size, m.mtime_ns, m.sha256, n, count, status) for file, m, n, count, status in rows],
-        columns=["file", "size", "mtime_ns", "sha256", "rows", "strokes", "status"],
-    )
-    types = {"file": "str", "size": "Int64", "mtime_ns": "Int64", "sha256": "str", "status": "str"}
-    return table.astype(types), {file: mark for file, mark, *_ in rows if mark.sha256 is not None}
 
 
 def _nothing_left(faults: Sequence[Fault], files: int) -> list[Fault]:

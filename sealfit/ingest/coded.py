@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import is_
 
 import numpy as np
 import pandas as pd
@@ -56,14 +57,21 @@ class Coded:
         values = [*self.values, None]
         return [values[code] for code in self.codes.tolist()]
 
+    def words(self) -> np.ndarray:
+        """Return the value of every file in words that no other value has, shape (files,); "" where there is none."""
+        words = [f"={value}" if isinstance(value, str) else repr(value) for value in self.values]
+        return np.array([*words, ""], object)[self.codes]
+
     def __getitem__(self, file: int) -> Value | None:
         code = self.codes[file]
         return self.values[code] if code >= 0 else None
 
     def map(self, change: Callable[[Value], Value | None]) -> Coded:
         """Return the column with every value changed; None where there is to be none."""
-        changed = Coded.of(change(value) for value in self.values)
-        return Coded(np.append(changed.codes, np.int32(-1))[self.codes], changed.values)
+        values = [change(value) for value in self.values]
+        if all(map(is_, values, self.values)):
+            return self
+        return Coded(self.codes, values)._merged()
 
     def where(self, holds: Callable[[Value], bool]) -> np.ndarray:
         """Return which files have a value of which `holds` is true, shape (files,)."""
@@ -84,12 +92,16 @@ class Coded:
         added = Coded.of(cells.values())
         codes = self.codes.copy()
         codes[list(cells)] = added.codes + len(self.values)
-        return Coded(codes, [*self.values, *added.values]).map(lambda value: value)
+        return Coded(codes, [*self.values, *added.values])._merged()
 
     def over(self, other: Coded) -> Coded:
         """Return the column with the values of `other` for files that have none."""
         codes = np.where(self.known | ~other.known, self.codes, other.codes + np.int32(len(self.values)))
-        return Coded(codes, [*self.values, *other.values]).map(lambda value: value)
+        return Coded(codes, [*self.values, *other.values])._merged()
+
+    def _merged(self) -> Coded:
+        merged = Coded.of(self.values)
+        return Coded(np.append(merged.codes, np.int32(-1))[self.codes], merged.values)
 
 
 def _key(value: Value | None) -> object:

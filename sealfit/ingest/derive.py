@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 import numpy as np
+import pandas as pd
 
-from sealfit.conditions import condition_columns, keys_of
+from sealfit.conditions import add_keys, condition_columns
 from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.coded import Coded, Columns, nothing
@@ -35,10 +36,15 @@ def condition_keys(columns: Columns, files: int, config: Config) -> Coded:
     """
     names = condition_columns(config)
     own = [columns.get(name, nothing(files)) for name in names]
-    different, of = np.unique(np.stack([column.codes for column in own], axis=1), axis=0, return_inverse=True)
-    cells = [Coded(codes, column.values).cells() for codes, column in zip(different.T, own, strict=True)]
-    words = Coded.of(keys_of(dict(zip(names, cells, strict=True)), len(different), config)["condition"])
-    return Coded(words.codes[of.ravel()], words.values)
+    group = np.zeros(files, np.int64)
+    for column in own:
+        group = pd.factorize(group * (len(column.values) + 1) + column.codes)[0]
+    first = _first(group)
+    one = np.unique(first)  # a file of each condition
+    cells = [Coded(column.codes[one], column.values).cells() for column in own]
+    table = pd.DataFrame({name: pd.Series(column, dtype=object) for name, column in zip(names, cells, strict=True)})
+    words = Coded.of(add_keys(table, config)["condition"].tolist())
+    return Coded(words.codes[np.searchsorted(one, first)], words.values)
 
 
 def _text(value: float | str) -> str:
@@ -196,7 +202,8 @@ def disagreements(entries: Entries, columns: Columns, conditions: Coded) -> list
 
 def _first(groups: np.ndarray) -> np.ndarray:
     """Return for every file the first one of its group, shape (files,)."""
-    _, first, of = np.unique(groups, return_index=True, return_inverse=True)
+    of = pd.factorize(groups)[0]  # numbered as they appear
+    first = np.flatnonzero(np.diff(np.maximum.accumulate(of), prepend=-1))
     return first[of]
 
 

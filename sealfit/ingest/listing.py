@@ -48,7 +48,8 @@ class Folders:
         }
         if not others:
             return others
-        endings = {_ending(file) for file in files}
+        wanted = {_ending(file) for file in others}
+        endings = {ending for ending in wanted if any(_ending(file) == ending for file in files)}  # the first has it
         return {file for file in others if _ending(file) in endings and (self.campaign / file).is_file()}
 
     def _names(self, folder: str) -> _Names:

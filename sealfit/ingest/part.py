@@ -16,7 +16,7 @@ from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.average import bin_table, mean_traces
-from sealfit.ingest.refs import TraceRef
+from sealfit.ingest.refs import Listing
 from sealfit.ingest.shaped import INNER, STEADY_ONLY
 from sealfit.ingest.text import as_number
 from sealfit.ingest.trace_file import FileStrokes, read_files
@@ -36,7 +36,7 @@ class Asked:
     have, and their types, since other parts have them.
     """
 
-    refs: tuple[TraceRef, ...]
+    refs: Listing
     unused: frozenset[Stroke] = frozenset()
     columns: Mapping[str, Mapping[str, str]] | None = None
 

@@ -149,9 +149,10 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
     """
     flagged = outlying_repeats(repeat_means(steady), config.quality.outlier_p)
     outlier, dropped, found = np.zeros(len(steady), bool), np.zeros(len(steady), bool), []
-    places = steady.groupby(["file", "run_id"], sort=False).indices
+    near = np.flatnonzero(steady["file"].isin(flagged["file"]))
+    places = steady.iloc[near].groupby(["file", "run_id"], sort=False).indices
     for row in flagged.itertuples(index=False):
-        rows = places[row.file, row.run_id]
+        rows = near[places[row.file, row.run_id]]
         out = config.quality.drop_outliers and not row.alone
         outlier[rows] = True
         dropped[rows] |= out

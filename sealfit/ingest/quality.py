@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from sealfit.config import Config, Quality
 from sealfit.errors import Fault
@@ -244,16 +245,22 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
         Every trace file of the campaign, in order.
     """
     place = {file: i for i, file in enumerate(files)}
-    silent = place.keys() - {fault.file for fault in faults}
     ordered = sorted(faults, key=lambda fault: (place.get(fault.file or "", -1), fault.stroke or 0, fault.line or 0))
-    at = [place.get(fault.file or "", -1) for fault in ordered] + [place[file] for file in silent]
-    rows = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in ordered]
-    found = pd.DataFrame(rows, columns=QUALITY.names())
-    fine = pd.DataFrame({"file": list(silent), **FINE_FILE}, columns=QUALITY.names())
-    table = pd.concat([part for part in (found, fine) if len(part)] or [found], ignore_index=True)
-    table = table.iloc[np.argsort(at, kind="stable")].reset_index(drop=True)
-    whole = {"stroke": "Int64", "line": "Int64"}
-    return table.astype({**{name: "str" for name in QUALITY.names() if name not in whole}, **whole})
+    told = np.array([place.get(fault.file or "", -1) for fault in ordered], int)
+    silent = np.setdiff1d(np.arange(len(files)), told)
+    order = np.argsort(np.concatenate([told, silent]), kind="stable")
+    found = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in ordered]
+    columns = {}
+    for name in QUALITY.names():
+        whole = name in ("stroke", "line")
+        kind = pa.int64() if whole else pa.large_string()
+        if name == "file":
+            fine = pa.array([files[i] for i in silent.tolist()], kind)
+        else:
+            fine = pa.repeat(pa.scalar(FINE_FILE.get(name), kind), len(silent))
+        column = pa.concat_arrays([pa.array([row[name] for row in found], kind), fine]).take(pa.array(order))
+        columns[name] = pd.array(column.tolist() if whole else column, dtype="Int64" if whole else "str")
+    return pd.DataFrame(columns)
 
 
 def _as_text(value: str | float | None) -> str | None:

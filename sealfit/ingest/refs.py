@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +41,16 @@ class Listing(Sequence[TraceRef]):
     def __getitem__(self, i: int) -> TraceRef:
         known = ((name, column[i]) for name, column in self.columns.items())
         return TraceRef(self.files[i], {name: value for name, value in known if value is not None})
+
+    def __iter__(self) -> Iterator[TraceRef]:
+        cells = (column.cells() for column in self.columns.values())
+        for file, *values in zip(self.files, *cells, strict=True):
+            known = zip(self.columns, values, strict=True)
+            yield TraceRef(file, {name: value for name, value in known if value is not None})
+
+    def words(self) -> dict[str, np.ndarray]:
+        """Return every column in words, shape (files,)."""
+        return {name: column.words() for name, column in self.columns.items()}
 
     def take(self, files: np.ndarray) -> Listing:
         """Return some of the files, by their numbers, with the columns in which any of them has a value."""

@@ -39,6 +39,7 @@ KNOWN = (
 
 
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
+_DETOURS = ("\\", "//", "/./", "/../")
 _BLANK = b" \t,;\n"  # a line of nothing else is none
 
 
@@ -126,7 +127,7 @@ def _read_runs(campaign: Path, config: Config) -> tuple[Entries, Columns, list[F
     lines, columns = _plain_table(text, names, delimiter, first) or _line_by_line(text, names, delimiter, faults)
     if delimiter != ",":  # decimal commas are plain here: no cell of a table of ; or tabs can be split by them
         columns = {name: column.map(_decimal_point) for name, column in columns.items()}
-    files = [_posix(campaign, file) for file in columns.pop("file").cells()]
+    files = _posix_paths(campaign, columns.pop("file").cells())
     if not files and not any(fault.severity == "error" for fault in faults):
         raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=RUNS_CSV)
     return Entries(files, lines), {name: column.map(_said) for name, column in columns.items()}, faults
@@ -218,6 +219,11 @@ def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault
             place = {"file": RUNS_CSV, "line": 1, "column": name}
             faults.append(Fault("column_name", reason, severity="warning", action="kept", mend=mend, **place))
     return names, faults
+
+
+def _posix_paths(campaign: Path, files: list[str]) -> list[str]:
+    text = "/" + "/\n/".join(files) + "/"
+    return [_posix(campaign, file) for file in files] if any(mark in text for mark in _DETOURS) else files
 
 
 def _posix(campaign: Path, file: str) -> str:

@@ -12,16 +12,17 @@ import json
 import os
 import uuid
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 
 from sealfit import __version__, parquet
 from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
-from sealfit.ingest.part import SAMPLED, Asked, FileFound, read_part
+from sealfit.ingest.part import SAMPLED, Asked, read_part
 from sealfit.memory import keep_freed_pages
 from sealfit.staging import PARQUET, disk
 
@@ -36,14 +37,19 @@ Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each col
 class Made:
     """One part as the campaign needs it.
 
-    `columns` are those of its tables; the tables themselves are in `tables`, or on the disk in `stored`: files by their
-    names below OUT, with their sizes in bytes.
+    Of its files, in the order in which they were asked for, `marks` are the fingerprints, `rows` the rows that were
+    read, and `found` the strokes. `unused` and `wanted` are what was asked for (`part.Asked`); `columns` are those of
+    its tables; the tables themselves are in `tables`, or on the disk in `stored`: files by their names below OUT, with
+    their sizes in bytes.
     """
 
-    asked: Asked
-    files: tuple[FileFound, ...]
+    marks: Sequence[Fingerprint]
+    rows: Sequence[int]
+    found: Sequence[int]
     faults: tuple[Fault, ...]
     strokes: pa.Table
+    unused: frozenset
+    wanted: Columns | None
     columns: Columns
     tables: Mapping[str, pa.Table]
     stored: Mapping[str, int]
@@ -59,15 +65,18 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     """
     keep_freed_pages()
     part = read_part(asked, campaign, config)
+    marks = [found.mark for found in part.files]
+    rows, count = [found.rows for found in part.files], [found.strokes for found in part.files]
+    given = (marks, rows, count, part.faults, part.strokes, asked.unused, asked.columns)
     tables = part.tables
     if folder is None:
-        return Made(asked, part.files, part.faults, part.strokes, {}, tables, {})
+        return Made(*given, {}, tables, {})
     columns = {name: {f.name: str(f.type) for f in parquet.spelled_out(table.schema)} for name, table in tables.items()}
     if asked.columns is not None:
         tables = {
             name: parquet.with_columns(table, asked.columns[name], config.units) for name, table in tables.items()
         }
-    name = _file_name(part_key(asked, {found.file: found.mark for found in part.files}, config), asked)
+    name = _file_name(part_key(asked.refs.files, asked.refs.words(), marks, config), asked)
     with disk(folder.parent):
         stored = {
             (file := f"{of}{PARQUET}/{name}"): _write(table, folder / file, parquet.write_arrow)
@@ -77,23 +86,38 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
             "unused": sorted(asked.unused),
             "wanted": asked.columns,
             "columns": columns,
-            "files": [(f.file, f.mark.size, f.mark.mtime_ns, f.mark.sha256, f.rows, f.strokes) for f in part.files],
+            "rows": rows,
+            "found": count,
             "faults": [fault.as_dict() for fault in part.faults],
             "stored": stored,
         }
         metadata = {**(part.strokes.schema.metadata or {}), _ABOUT: json.dumps(about)}
         file = f"{PARTS}/{Path(name).with_suffix(ARROW)}"
         stored[file] = _write(part.strokes.replace_schema_metadata(metadata), folder / file, parquet.write_ipc)
-    return Made(asked, part.files, part.faults, part.strokes, columns, {}, stored)
+    return Made(*given, columns, {}, stored)
 
 
-def part_key(asked: Asked, marks: Mapping[str, Fingerprint], config: Config) -> str | None:
-    """Return a hash of what a part is made from, or None where a file's content is not known."""
-    hashes = [marks[ref.file].sha256 if ref.file in marks else None for ref in asked.refs]
+def part_key(
+    files: Sequence[str], known: Mapping[str, np.ndarray], marks: Sequence[Fingerprint | None], config: Config
+) -> str | None:
+    """Return a hash of what a part is made from, or None where a file's content is not known.
+
+    Parameters
+    ----------
+    files : sequence of str, length n
+        Its files.
+    known : dict of str to ndarray, each of shape (n,)
+        What is known of them, in words: the columns in which any of them has a value.
+    marks : sequence of Fingerprint or None, length n
+        Their fingerprints.
+    config : Config
+        The rig.
+    """
+    hashes = [None if mark is None else mark.sha256 for mark in marks]
     if None in hashes:
         return None
-    known = [(ref.file, list(ref.channels.items())) for ref in asked.refs]
-    seen = [__version__, config.model_dump(mode="json"), known, hashes]
+    cells = {name: words.tolist() for name, words in known.items()}
+    seen = [__version__, config.model_dump(mode="json"), files, cells, hashes]
     return hashlib.sha256(json.dumps(seen).encode()).hexdigest()[:20]
 
 
@@ -120,16 +144,15 @@ def known_parts(out: Path, files: Mapping[str, int]) -> dict[str, Path]:
     return {name.split("-", 1)[0]: path for name, path in whole.items()}
 
 
-def load_part(asked: Asked, path: Path) -> Made:
-    """Return a part that was stored before, without its tables."""
+def load_part(path: Path, marks: Sequence[Fingerprint]) -> Made:
+    """Return a part of these files that was stored before, without its tables."""
     strokes = parquet.read_ipc(path)
     about = json.loads(strokes.schema.metadata[_ABOUT])
     unused = frozenset((file, stroke) for file, stroke in about["unused"])
-    files = tuple(FileFound(file, Fingerprint(*mark), n, count) for file, *mark, n, count in about["files"])
     stored = {**about["stored"], f"{PARTS}/{path.name}": path.stat().st_size}
     faults = tuple(Fault(**fault) for fault in about["faults"])
-    asked = replace(asked, unused=unused, columns=about["wanted"])
-    return Made(asked, files, faults, strokes, about["columns"], {}, stored)
+    given = (marks, about["rows"], about["found"], faults, strokes, unused, about["wanted"])
+    return Made(*given, about["columns"], {}, stored)
 
 
 def common_columns(parts: Sequence[Made]) -> Columns:
@@ -149,7 +172,7 @@ def common_columns(parts: Sequence[Made]) -> Columns:
 
 def agrees(part: Made, columns: Columns) -> bool:
     """Whether the stored tables of a part have these columns, in this order."""
-    has = {table: (part.asked.columns or part.columns)[table] for table in part.columns}
+    has = {table: (part.wanted or part.columns)[table] for table in part.columns}
     return all(list(types.items()) == list(columns[table].items()) for table, types in has.items())
 
 
