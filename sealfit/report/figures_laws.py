@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter
 
 from sealfit.config import Config
 from sealfit.report.axes import padded
@@ -38,6 +39,7 @@ def draw_master_curve(ax: Axes, rows: pd.DataFrame, colours: Mapping[float, str]
     values, law = rows[rows["kind"] == "value"], rows[rows["kind"] == "law"].sort_values("scaled_days")
     aged = values[values["scaled_days"] > 0]
     ax.set_xscale("symlog", linthresh=float(aged["scaled_days"].min()), linscale=0.7)
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], FLOOR, 0.2)
     ax.plot(law["scaled_days"], law["value"], color=FLOOR)
     fresh = values[values["scaled_days"] == 0]

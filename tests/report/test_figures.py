@@ -17,9 +17,11 @@ from sealfit.report.axes import PlainNumbers, is_logarithmic, value_ticks
 from sealfit.report.drawn import draw
 from sealfit.report.figures import draw_all
 from sealfit.report.figures_curves import draw_aging, draw_trace, envelope, example_runs, traces_mean
+from sealfit.report.figures_laws import draw_master_curve
 from sealfit.report.figures_loop import draw_errors, draw_levels, run_means
 from sealfit.report.figures_residual import channel_order, draw_channel, draw_shape
 from sealfit.report.figures_speed import curve_lines, force_speed, run_points
+from sealfit.report.frame import Ticks
 from sealfit.report.style import DPI, WIDTH, Key, Layout, Panel, Plot, compose
 from sealfit.tables import Units
 
@@ -162,6 +164,14 @@ def test_trace_shades_its_steady_window(ax):
     windows = [path.get_extents() for path in ax.collections[-1].get_paths()]
     assert [(window.x0, window.x1) for window in windows] == [(5.0, 12.0), (20.0, 30.0)]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("angle (turn)", "torque (mN m)")
+
+
+def test_scaled_days_are_plain_numbers(ax):
+    known = {"kind": "value", "quantity": "mu_s", "temperature_C": 60.0, "compression_ratio_pct": 80.0}
+    rows = pd.DataFrame({**known, "scaled_days": [0.0, 1.0, 30.0], "value": [0.9, 0.8, 0.7], "lo95": np.nan})
+    rows = rows.assign(hi95=np.nan)
+    draw_master_curve(ax, rows, {60.0: "#0072B2"}, Units())
+    assert Ticks.of(ax.xaxis, 0).labels == ["0", "1", "10"]
 
 
 # ---------------------------------------------------------------- the loop
