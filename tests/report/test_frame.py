@@ -74,9 +74,9 @@ def test_a_frame_looks_as_the_axes_it_stands_for(ax):
     theirs = pixels(ax.figure)
     ax.add_artist(Frame(ax))
     ours = pixels(ax.figure)
-    # letters may move by parts of a pixel, and one that is missing or moved by more is dark where all is white
+    # letters may move by two pixels, by version; one that is missing or moved by more is dark where all is white
     for here, there in ((ours, theirs), (theirs, ours)):
-        near = np.min([np.roll(there, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1)], axis=0)
+        near = np.min([np.roll(there, (y, x), (0, 1)) for y in range(-2, 3) for x in range(-2, 3)], axis=0)
         assert ((here < 0.6) & (near > 0.95)).sum() == 0
     assert np.abs(ours - theirs).mean() < 0.01
 
