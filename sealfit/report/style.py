@@ -64,8 +64,6 @@ RC = {
     "lines.linewidth": 1.4,
     "lines.markersize": 4,
     "legend.frameon": False,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "sealfit",  # the same tables give the same bytes
     "text.parse_math": True,
 }
 
