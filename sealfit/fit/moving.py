@@ -20,6 +20,7 @@ import numpy as np
 from sealfit.fit.batch import DEPENDENT
 
 CLOSE = 3e-7  # a Newton step this short leaves an error of its square; it is taken along the tangent, not evaluated
+CLOSER, THIRD = 1e-5, 1e-11  # so is one this short where the bend times its cube is that share of the sum of squares
 TURNS = 100  # halvings of a cell to the last digit take 50
 SAME = 1e-13  # relative rise of the sum of squares that is rounding: the slope then knows better
 FLAT = 1e-17  # share of the sum of squares: where all that u may still move promises no more, it is over
@@ -169,7 +170,8 @@ def polish(problems: Moving, rows, u, centre, reach: float, *, known=np.inf, bea
         goal = at + step
         goal = np.where((goal > low) & (goal < high), goal, np.where(seen | np.isnan(step), (at + end) / 2, end))
         goal = np.where(np.isnan(slope), at, np.clip(goal, at - reach, at + reach))
-        short = better & (np.abs(step) < CLOSE)
+        length = np.abs(step)
+        short = better & ((length < CLOSE) | ((length < CLOSER) & (curvature * length**3 <= THIRD * rss)))
         done = short | (better & (np.abs(slope) * (high - low) <= FLAT * rss))
         done |= (high - low <= 1e-14 * np.maximum(1.0, np.abs(u))) | ((goal == u) & better)
         if beat is not None:

@@ -29,7 +29,7 @@ class Sums:
     load: np.ndarray  # with R / |R|
     speed: np.ndarray  # with what V has beyond R
     own: np.ndarray  # with itself
-    rest: np.ndarray  # with the residual of R and V
+    rest: np.ndarray | None  # with the residual of R and V; None where `rest_over` takes it from the table
 
 
 @dataclass(frozen=True)
@@ -125,15 +125,33 @@ class Weighted:
 
         E is its own square `SQUARED` steps lower, so the product with itself is |R| times that with R/|R| there.
         """
-        vectors = [self.load * other for other in (self.load_unit, self.beyond[1], self.rest)]
-        if self.square.shape[1] == 1:  # one table for all problems, and sums over points are matrix products
-            u = self.first + STEP * np.arange(-SQUARED, self.points)
-            table = np.exp(-self.square * np.exp(-2 * u))
-            load, speed, rest = (vector.T @ table for vector in vectors)
+        if self.square.shape[1] == 1:  # sums over points are matrix products
+            load, speed = ((self.load * other).T @ self.table for other in (self.load_unit, self.beyond[1]))
+            rest = None
         else:
+            vectors = [self.load * other for other in (self.load_unit, self.beyond[1], self.rest)]
             load, speed, rest = self._sums_of_own_speeds(vectors)
+            rest = rest[:, SQUARED:]
         own = self.load_size[:, None] * load[:, :-SQUARED]
-        return Sums(load[:, SQUARED:], speed[:, SQUARED:], own, rest[:, SQUARED:])
+        return Sums(load[:, SQUARED:], speed[:, SQUARED:], own, rest)
+
+    @cached_property
+    def table(self):
+        """E along the grid and `SQUARED` steps below it, one for all problems, shape (n, SQUARED + g)."""
+        u = self.first + STEP * np.arange(-SQUARED, self.points)
+        return np.exp(-self.square * np.exp(-2 * u))
+
+    def rest_over(self, size):
+        """Inner products of the moving column with the residual of R and V, shape (g, B), over `size`, (g, B or 1)."""
+        if self.sums.rest is not None:
+            return self.sums.rest.T / size
+        table, rest = self.table[:, SQUARED:], (self.load * self.rest).T
+        return (rest @ (table / size.T)).T if size.shape[1] == 1 else (rest @ table).T / size
+
+    def ways(self, size):
+        """Directions of what the moving column has beyond R and V, of length `size`, (g, 1), along the grid: (n, g)."""
+        column = self.load * self.table[:, SQUARED:]
+        return (column - self.load_unit * self.sums.load - self.beyond[1] * self.sums.speed) / size.T
 
     def _sums_of_own_speeds(self, vectors) -> np.ndarray:
         """Inner products of E with three vectors, shape (3, B, points + SQUARED), from the largest v_s down."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from sealfit.fit.batch import DEPENDENT
 from sealfit.fit.moving import Moving, chosen
-from sealfit.fit.moving_grid import BLOCK, ROUNDING, Grid, common, polish_best, polish_peaks
+from sealfit.fit.moving_grid import BLOCK, ROUNDING, Grid, common, keep_memory, polish_best, polish_peaks
 from sealfit.fit.stribeck_columns import STEP, TINY, Weighted, weighted
 
 MISSED = 1e-10  # of |F|^2: that far above what a grid point reaches, an optimum was dropped by mistake
@@ -63,23 +63,23 @@ class Kind:
         grid : Grid
         base : ndarray, shape (B,)
             What the fixed columns explain alone.
-        a : ndarray, shape (B, g)
-            Coefficient of the moving column.
+        size : ndarray, shape (B, g) or (1, g)
+            Of what the moving column has beyond the base: the pull over it is its coefficient.
         inner : tuple of ndarray, shape (B, g) or (1, g)
             Its inner products with the fixed columns.
         """
         s = w.sums
-        load, beyond, own, rest = s.load.T, s.speed.T, s.own.T, s.rest.T  # problems last, as the scalars are
+        load, beyond, own = s.load.T, s.speed.T, s.own.T  # problems last, as the scalars are
         if self.base in ("both", "load"):
             inner = (load, beyond) if self.base == "both" else (load,)
-            product = rest if self.base == "both" else rest + w.by_beyond * beyond
+            product = None if self.base == "both" else w.rest_over(np.ones((1, 1))) + w.by_beyond * beyond
             base = w.by_load**2 + (w.by_beyond**2 if self.base == "both" else 0.0)
             left = own - load * load
             if self.base == "both":
                 left -= beyond * beyond
         else:
             length = np.where(np.isfinite(w.beyond[0]), w.beyond[0], 0.0)
-            product = rest + w.by_load * load + w.by_beyond * beyond
+            product = w.rest_over(np.ones((1, 1))) + w.by_load * load + w.by_beyond * beyond
             along = (w.shared * load + length * beyond) / w.speed_size
             if self.falls:
                 product = product - w.load_size * w.by_load
@@ -90,8 +90,9 @@ class Kind:
                 product, left, inner, base = product - w.by_speed * along, own - along**2, (along,), w.by_speed**2
         share = left / np.maximum(own, TINY)
         size = np.sqrt(np.where(share > DEPENDENT, left, np.inf))
-        pull = product / size
-        return Grid(w.first, STEP, pull.T, share.T, w.total, w.inside), base, pull / size, inner
+        pull = w.rest_over(size) if product is None else product / size
+        ways = w.ways(size) if self.base == "both" and size.shape[1] == 1 else None
+        return Grid(w.first, STEP, pull.T, share.T, w.total, w.inside, ways), base, size, inner
 
     def coefficients(self, w: Weighted, a, inner):
         """Return mu_s, mu_c, sigma_2 from the moving column's coefficient and inner products with the fixed ones."""
@@ -147,8 +148,8 @@ def search_held(w: Weighted, held, *, prune: bool = True) -> Found:
     kinds = [kind for kind in (FREE, *SOME_ZERO) if not np.any(np.array(kind.zero) & ~np.asarray(held))]
     grids, certain = [], by_speed**2
     for kind in kinds:
-        grid, base, a, inner = kind.on_grid(w)
-        allowed = feasible(kind.coefficients(w, a, inner), held).T
+        grid, base, size, inner = kind.on_grid(w)
+        allowed = feasible(kind.coefficients(w, grid.pull.T / size, inner), held).T
         error = ROUNDING * w.total[:, None] / np.maximum(grid.share, DEPENDENT)
         sure = np.where(allowed & w.within, grid.pull**2 - error, -np.inf)
         certain = np.maximum(certain, np.max(sure, axis=1) + base)
@@ -185,6 +186,7 @@ def search(speed, load, force, weight, low, high, held) -> Found:
     """
     parts = [common(x) for x in (speed, load, force, np.sqrt(weight), low[:, None], high[:, None])]
     problems = len(force)
+    keep_memory()
     found = Found(np.empty(problems), np.empty((3, problems)), np.empty(problems))
 
     def fill(rows, solve):

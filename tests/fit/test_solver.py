@@ -6,7 +6,9 @@ import pytest
 from scipy.optimize import curve_fit, least_squares, nnls
 
 from sealfit.fit.law import solve_law
+from sealfit.fit.moving_grid import LEAST_ANGLE, _apart
 from sealfit.fit.stribeck import solve_stribeck
+from sealfit.fit.stribeck_columns import STEP
 
 PROBLEMS = 150
 KINDS = ("plain", "shared", "loads", "limits", "falling", "noisy", "padded", "few")
@@ -125,3 +127,19 @@ def test_no_b_of_a_fine_search_does_better(shared):
         mu_0, a = fit.coefficients[k]
         model_rss = np.sum(weight[k] * (value[k] - mu_0 + a * np.log1p(days[k] / np.exp(fit.u[k]))) ** 2)
         npt.assert_allclose(fit.rss[k], model_rss, rtol=1e-8)
+
+
+def test_no_direction_beside_a_grid_point_is_nearer_than_is_said():
+    """What peaks are left out by, against directions at points ten times as close."""
+    speed, u = np.geomspace(0.5, 60, 8), np.arange(-3, 7, STEP / 10)
+    base = np.linalg.qr(np.stack([np.ones(8), speed], axis=1))[0]
+    column = np.exp(-((speed[:, None] / np.exp(u)) ** 2))
+    beyond = column - base @ (base.T @ column)
+    ways = beyond / np.linalg.norm(beyond, axis=0)
+    ways = ways[:, : (ways.shape[1] - 1) // 10 * 10 + 1]
+    least = _apart(ways[:, ::10])
+    assert (least > 0).mean() > 0.7
+    for k in range(least.shape[1]):
+        beside = ways[:, max(10 * k - 10, 0) : 10 * k + 11]
+        angle = np.arccos(np.minimum(np.abs(ways[:, ::10].T @ beside), 1.0))
+        assert np.all(angle.min(axis=1) >= least[:, k] - LEAST_ANGLE)
