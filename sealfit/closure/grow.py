@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -22,12 +23,20 @@ from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit, fit_declared
-from sealfit.fit.joint import evaluate
+from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import Rows
+from sealfit.fit.whitening import Scatter
 from sealfit.samples import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
 
 SAMPLED = ("displacement_mm", "time_s", "force_N")  # what the ripple search reads of a sample
 DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at: a far surer one may show in it
+
+
+class Start(NamedTuple):
+    """The declared model as it was fitted to more rows, and their scatter."""
+
+    model: Model
+    scatter: Scatter
 
 
 @dataclass(frozen=True)
@@ -51,7 +60,7 @@ def grow(
     effects: Mapping[str, Effect],
     *,
     fine: Rows | None = None,
-    start: Fitted | None = None,
+    start: Start | None = None,
     workers: int = 1,
     on_found: Callable[[Fitted], None] | None = None,
     on_progress: Callable[[str], None] | None = None,
@@ -70,8 +79,8 @@ def grow(
         The catalogue.
     fine : Rows, optional
         The bins as they are, to fit ripples to, which merged bins would blur; they are held as found there.
-    start : Fitted, optional
-        The declared model fitted to more rows: where the fit begins, so that it need not search again.
+    start : Start, optional
+        Where the fit of the declared model begins, so that it need not search again.
     workers : int
         Processes for what is independent in the search.
     on_found : callable, optional

@@ -13,7 +13,7 @@ import pandas as pd
 from sealfit.closure.confirm import folds, heldout_level
 from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import effect_entries, effect_table, left_entry
-from sealfit.closure.grow import Grown, grow, numbered, predict_rows, steady_samples
+from sealfit.closure.grow import Grown, Start, grow, numbered, predict_rows, steady_samples
 from sealfit.closure.levels import errors, lack_of_fit, level_table, noise_floor, scatter_list
 from sealfit.closure.next_runs import next_runs
 from sealfit.closure.record import to_record
@@ -86,28 +86,24 @@ def close_loop(
             grown = grow(
                 coarse, samples, config, effects, fine=fine, workers=workers, on_found=heldout.begin, on_progress=say
             )
+        heldout.settle(grown)
         say("before and after on all rows")
         with timed("before and after", rows=rows.force.size, of="bins"):
             before = _on_all(rows, grown, grown.before) if merged else grown.before
             after = before
             if grown.added:
                 after = _on_all(rows, grown, grown.after) if merged else grown.after
+            drawn = _drawn_tables(grown, before, after, config)
         say(f"held out by {heldout.level}: the search repeated without each fold")
         with timed("held out", rows=len(heldout.masks), of="folds"):
-            held_before, held_after = heldout.forces(grown, say)
+            held_before, held_after = heldout.forces(say)
     document = _document(config, effects, grown, before, after, held_before, held_after, heldout.level)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their order again
     tables = {
         "effects": effect_table([e for e in document["effects"] if not e["candidate"]], grown.added),
         "residuals_before": _residual_table(bins, before, held_before),
         "residuals_after": _residual_table(bins, after, held_after),
-        "levels": pd.concat(
-            [level_table("before", before, list(grown.first)), level_table("after", after, list(grown.last))],
-            ignore_index=True,
-        ),
-        "channels": channel_table(grown, before, after),
-        "shapes": shape_table(after, config),
-        "curves": curve_table(before, after),
+        **drawn,
     }
     return Closure(document, to_record(before, after, config), tables)
 
@@ -121,6 +117,17 @@ def merged_bins(bins: pd.DataFrame) -> pd.DataFrame:
         As `numbered` gives them.
     """
     return thin(bins, int(np.clip(PER_STROKE * bins["stroke_id"].nunique(), ROWS, MOST_ROWS)))
+
+
+def _drawn_tables(grown: Grown, before: Fitted, after: Fitted, config: Config) -> dict[str, pd.DataFrame]:
+    """Return the tables that need no held-out folds, which workers may be at meanwhile."""
+    levels = [level_table("before", before, list(grown.first)), level_table("after", after, list(grown.last))]
+    return {
+        "levels": pd.concat(levels, ignore_index=True),
+        "channels": channel_table(grown, before, after),
+        "shapes": shape_table(after, config),
+        "curves": curve_table(before, after),
+    }
 
 
 def _on_all(rows: Rows, grown: Grown, fitted: Fitted) -> Fitted:
@@ -154,14 +161,17 @@ class _HeldOut:
         if self._begun is not None:
             self._begun.close()
 
-    def forces(self, grown: Grown, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
+    def settle(self, grown: Grown) -> None:
+        """Set processes to work on what is known to be wanted: without a search, unless something was added."""
+        if self._begun is None or not grown.added:
+            self.close()
+            folds = _Folds(self, grown.before, search=bool(grown.added))
+            self._begun = begin_map(_held_out, folds, workers=self.workers)
+
+    def forces(self, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
         """Return each row's force, before and after, by fits that did not see its group; NaN if never held out."""
         before, after = np.full(self.rows.force.size, np.nan), np.full(self.rows.force.size, np.nan)
-        made = self._begun
-        if made is None or not grown.added:
-            self.close()
-            made = begin_map(_held_out, _Folds(self, grown.before, search=bool(grown.added)), workers=self.workers)
-        for k, (out, parts) in enumerate(zip(self.masks, made, strict=True)):
+        for k, (out, parts) in enumerate(zip(self.masks, self._begun, strict=True)):
             say(f"  fold {k + 1} of {len(self.masks)}")
             before[out], after[out] = parts
         return before, after
@@ -177,7 +187,7 @@ class _Fold:
     test: Rows
     config: Config
     effects: dict[str, Effect]
-    start: Fitted
+    start: Start
     search: bool
 
 
@@ -185,7 +195,7 @@ class _Folds(Sequence):
     """The folds of a campaign, each made when it is asked for: it holds most of the campaign."""
 
     def __init__(self, campaign: _HeldOut, before: Fitted, *, search: bool) -> None:
-        self.campaign, self.before, self.search = campaign, before, search
+        self.campaign, self.start, self.search = campaign, Start(before.model, before.scatter), search
 
     def __len__(self) -> int:
         return len(self.campaign.masks)
@@ -194,15 +204,13 @@ class _Folds(Sequence):
         if isinstance(number, slice):
             return [self[k] for k in range(*number.indices(len(self)))]
         own, out = self.campaign, self.campaign.masks[number]
-        samples = own.samples if self.search else own.samples.head(0)
         gone = own.rows.table["stroke_id"].to_numpy()[out]
-        coarse = own.rows.subset(~out)
-        fine = None
-        if own.coarse is not own.rows:
-            fine = coarse
-            coarse = own.coarse.subset(~own.coarse.table["stroke_id"].isin(gone).to_numpy())
-        seen = samples[~samples["stroke_id"].isin(gone)]
-        return _Fold(coarse, fine, seen, own.rows.subset(out), own.config, own.effects, self.before, self.search)
+        coarse = own.coarse.subset(~own.coarse.table["stroke_id"].isin(gone).to_numpy())
+        fine, seen = None, own.samples.head(0)
+        if self.search:  # without one, neither is looked at
+            fine = own.rows.subset(~out) if own.coarse is not own.rows else None
+            seen = own.samples[~own.samples["stroke_id"].isin(gone)]
+        return _Fold(coarse, fine, seen, own.rows.subset(out), own.config, own.effects, self.start, self.search)
 
 
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
