@@ -13,9 +13,11 @@ pytest.importorskip("distributed")
 
 from dask_here import DaskHere
 
+from sealfit.closure import spectrum
 from sealfit.cluster import Cluster
 from sealfit.engine import on_cluster, run_map
 from sealfit.errors import RequestError, WorkerError
+from sealfit.fit.estimate import fit_declared
 from sealfit.ingest import parts
 from sealfit.progress import Silent
 from sealfit.simulate import load_spec, simulate
@@ -159,6 +161,14 @@ def results(out):
     return tables, json.loads((out / "closure.json").read_text("utf-8"))
 
 
+def assert_same_results(out, tables, closure):
+    there, closed = results(out)
+    for name, table in tables.items():
+        pdt.assert_frame_equal(there[name], table, check_exact=True, obj=name)
+    assert closed == closure
+    assert len(there["inputs"]) == there["inputs"]["file"].nunique()
+
+
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
     """Some 50 files with an effect that the loop finds, so that the folds search too."""
@@ -181,8 +191,22 @@ def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
     kills = KillsAt(dask.workers[1], at)
     run(folder, tmp_path / "there", steps=STEPS[:-1], scheduler=str(dask.file), progress=kills)
     assert kills.killed
-    there, closed = results(tmp_path / "there")
-    for name, table in here.items():
-        pdt.assert_frame_equal(there[name], table, check_exact=True, obj=name)
-    assert closed == closure
-    assert len(there["inputs"]) == there["inputs"]["file"].nunique()
+    assert_same_results(tmp_path / "there", here, closure)
+
+
+def test_the_search_on_a_cluster_gives_the_same_although_a_worker_is_killed(campaign, tmp_path, dask, monkeypatch):
+    folder, (here, closure) = campaign
+    monkeypatch.setattr(parts, "PART_FILES", 12)
+    monkeypatch.setattr(spectrum, "WORTHWHILE", 0)
+    killed = []
+
+    def fit_while_spectra_are_made(rows):
+        if not killed:
+            dask.workers[0].send_signal(signal.SIGKILL)
+            killed.append(rows)
+        return fit_declared(rows)
+
+    monkeypatch.setattr("sealfit.closure.grow.fit_declared", fit_while_spectra_are_made)
+    run(folder, tmp_path / "there", steps=STEPS[:-1], scheduler=str(dask.file))
+    assert killed
+    assert_same_results(tmp_path / "there", here, closure)
