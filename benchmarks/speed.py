@@ -5,7 +5,7 @@
     python benchmarks/speed.py run     [--campaign DIR] [--repeats 3]    beside `pandas_script.py`
     python benchmarks/speed.py startup [--repeats 20]                    beside `python -c "import typer"`; imports
     python benchmarks/speed.py cluster [--campaign DIR] [--repeats 3]    a Dask cluster beside processes, both of here
-    python benchmarks/speed.py growth  [--files 1000 10000 100000] [--steps all]
+    python benchmarks/speed.py growth  [--files 1000 10000 100000] [--steps all] [--effect conditioning]
 
 Several parts may be named at once. Without --campaign the paper's own, 1,752 files of 1,000 rows, is simulated first.
 What is written goes to a temporary folder, or to --work DIR, where campaigns are kept for the next time.
@@ -30,6 +30,7 @@ import speed_run
 import speed_startup
 from campaigns import paper_campaign
 from in_turns import heading
+from many_files import EFFECTS
 
 from sealfit.simulate import simulate
 
@@ -67,6 +68,7 @@ def main() -> None:
 def growth(given: argparse.Namespace, sizes: Sequence[int], cores: Sequence[int], work: Path) -> None:
     """Measure every size of campaign, and print what a further file costs."""
     how = {"rows": given.rows or 80, "seed": given.seed, "workers": given.workers, "steps": given.steps}
+    how["effect"] = given.effect
     print(f"\ngrowth, --workers {given.workers}")
     seconds = [(files, speed_growth.measure(files, cores=cores, work=work, **how)) for files in sizes]
     print()
@@ -84,6 +86,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--rows", type=int, help="of a file of memory and growth; default: 1000 and 80")
     parser.add_argument("--workers", type=int, default=2, help="of growth")
     parser.add_argument("--steps", choices=("ingest", "all"), default="ingest", help="of growth: the later steps too")
+    parser.add_argument("--effect", choices=EFFECTS, help="in the files of growth; default: none")
     parser.add_argument("--resamples", type=int, default=200, help="of the script's bootstrap")
     parser.add_argument("--seed", type=int, default=1, help="of the campaigns")
     return parser.parse_args()

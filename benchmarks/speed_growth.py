@@ -3,7 +3,8 @@
 Every campaign is written by `many_files.py` if it is not there. Measured are a first ingest (wall seconds a file, peak
 of the tree's resident sets), the same again with nothing changed, again after three files more (a new run of a
 condition that was there), and reading one condition of table `bins` beside reading all of it: seconds and bytes, in a
-process of its own. With all steps also what each later step takes, on the tables without the three files.
+process of its own. With all steps also what each later step takes, on the tables without the three files; with an
+effect in the files close-loop has something to find, and to find again in every fold.
 """
 
 from __future__ import annotations
@@ -43,18 +44,29 @@ print(json.dumps({"one condition": timed(filters=[("condition", "==", condition)
 """
 
 
-def measure(files: int, *, rows: int, seed: int, workers: int, cores: Sequence[int], work: Path, steps: str) -> float:
+def measure(
+    files: int,
+    *,
+    rows: int,
+    seed: int,
+    workers: int,
+    cores: Sequence[int],
+    work: Path,
+    steps: str,
+    effect: str | None = None,
+) -> float:
     """Measure one size and print its lines; seconds of the first ingest. The campaign stays in `work`."""
-    campaign, out = work / f"files_{files}_rows_{rows}_seed_{seed}", work / "growth_out"
+    name = f"files_{files}_rows_{rows}_seed_{seed}{f'_{effect}' if effect else ''}"
+    campaign, out = work / name, work / "growth_out"
     if not (campaign / "runs.csv").exists():  # written last
-        write_campaign(campaign, files, rows=rows, seed=seed)
+        write_campaign(campaign, files, rows=rows, seed=seed, effect=effect)
     shutil.rmtree(out, ignore_errors=True)
 
     def sealfit(step: str, *words: str | Path) -> Watched:
         asked = ["--workers", str(workers)] if step in TAKES_WORKERS else []
         return watched([sys.executable, "-m", "sealfit", step, *words, *asked], cores=cores)
 
-    print(f"\n{files:,} files of {rows} rows")
+    print(f"\n{files:,} files of {rows} rows{f', {effect}' if effect else ''}")
     runs = (campaign / "runs.csv").read_bytes()
     first = sealfit("ingest", campaign, "--out", out)
     line("ingest", first, f"{1e3 * first.seconds / files:8.3f} ms a file")
