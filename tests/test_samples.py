@@ -1,11 +1,14 @@
 """Samples of traces: the same whether a table is given or read part by part."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 from bins_helpers import make_bins, make_traces
 
 from sealfit.closure.grow import numbered, steady_samples
-from sealfit.fit.rows import make_rows
+from sealfit.closure.loop import _Folds
+from sealfit.fit.rows import make_rows, thin
 from sealfit.samples import StoredTraces, a_part_at_a_time
 
 
@@ -44,3 +47,22 @@ def test_a_campaign_without_traces_has_no_samples():
     samples = steady_samples([], rows)
     assert len(samples) == 0
     assert {"stroke_id", "unit", "direction", "displacement_mm", "time_s", "force_N"} <= set(samples)
+
+
+def test_a_fold_holds_all_bins_and_samples_only_where_it_searches():
+    bins = numbered(make_bins(repeats=1, bins=6))
+    rows, coarse = make_rows(bins, has_aging=True), make_rows(thin(bins, len(bins) // 3), has_aging=True)
+    out = rows.codes("run") % 5 == 0
+    samples = steady_samples(make_traces(bins), rows)
+    campaign = SimpleNamespace(masks=[out], rows=rows, coarse=coarse, samples=samples, config=None, effects={})
+    before = SimpleNamespace(model=None, scatter=None)
+    searching, refitting = (_Folds(campaign, before, search=search)[0] for search in (True, False))
+    kept = set(rows.table["stroke_id"][~out])
+    assert set(searching.seen["stroke_id"]) == kept
+    assert not len(refitting.seen)
+    for fold in (searching, refitting):
+        assert set(fold.train.table["stroke_id"]) == kept
+        assert fold.train.force.size == 2 * len(kept)
+        assert fold.test.force.size == out.sum()
+    assert searching.fine.force.size == 6 * len(kept)
+    assert refitting.fine is None

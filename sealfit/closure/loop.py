@@ -73,18 +73,24 @@ def close_loop(
     bins = bins.reset_index(drop=True)
     counted = numbered(bins)
     rows = make_rows(counted, has_aging=config.aging)
-    samples = steady_samples(traces, rows)
     fewer = merged_bins(counted)
     merged = len(fewer) < len(counted)
     columns = list(bins.columns)
     del bins, counted  # much of the memory: `rows` holds all of it
     coarse = make_rows(fewer, has_aging=config.aging) if merged else rows
-    heldout = _HeldOut(rows, coarse, samples, config, effects, workers)
+    heldout = _HeldOut(rows, coarse, steady_samples(traces, rows), config, effects, workers)
     with closing(heldout):
         fine = rows if merged else None
         with timed("search", rows=coarse.force.size, of="bins, merged"):
             grown = grow(
-                coarse, samples, config, effects, fine=fine, workers=workers, on_found=heldout.begin, on_progress=say
+                coarse,
+                heldout.samples,
+                config,
+                effects,
+                fine=fine,
+                workers=workers,
+                on_found=heldout.begin,
+                on_progress=say,
             )
         heldout.settle(grown)
         say("before and after on all rows")
@@ -165,6 +171,8 @@ class _HeldOut:
         """Set processes to work on what is known to be wanted: without a search, unless something was added."""
         if self._begun is None or not grown.added:
             self.close()
+            if not grown.added:
+                self.samples = self.samples.iloc[[]]  # much of the memory, and nothing is searched again
             folds = _Folds(self, grown.before, search=bool(grown.added))
             self._begun = begin_map(_held_out, folds, workers=self.workers)
 
