@@ -7,10 +7,10 @@ import pytest
 FAULTS = """
 import resource, sys
 import numpy as np
-from sealfit.memory import keep_freed_pages
+from sealfit.memory import keep_freed_memory
 if "keep" in sys.argv:
-    keep_freed_pages()
-    keep_freed_pages()
+    keep_freed_memory()
+    keep_freed_memory()
 def faults(turns):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     for _ in range(turns):

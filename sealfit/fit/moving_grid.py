@@ -19,22 +19,12 @@ RESOLVED = 0.6  # radians from one grid point to the next beyond which the grid 
 LEAST_ANGLE = 1e-5  # radians: rounding of an angle that is nearly none
 TINY = 1e-300
 BLOCK = 4096  # problems at once: numpy takes 1 us a call, and a block takes hundreds
-KEPT = 24 << 20  # bytes; the most that glibc learns from is 32 MB
 TABLE = 500_000  # numbers in one table of moving columns: 4 MB, larger ones leave the cache
 
 
 def common(values) -> np.ndarray:
     """Return one row where all rows are equal, else all of them; shape (1, n) or (problems, n)."""
     return values[:1] if values.strides[0] == 0 or np.all(values == values[0]) else values
-
-
-def keep_memory() -> None:
-    """Let the C library keep the memory that a block of problems leaves for the next.
-
-    glibc gives free memory back above twice the largest mapped piece that was ever freed, and every page that is asked
-    for again costs a fault: a third of all time. Nothing is written here, so it costs nothing.
-    """
-    np.empty(KEPT, np.uint8)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.part import SAMPLED, Asked, read_part
-from sealfit.memory import keep_freed_pages
+from sealfit.memory import keep_freed_memory
 from sealfit.staging import PARQUET, disk
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
@@ -63,7 +63,7 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     OutError
         If the disk is full or refuses.
     """
-    keep_freed_pages()
+    keep_freed_memory()
     part = read_part(asked, campaign, config)
     marks = [found.mark for found in part.files]
     rows, count = [found.rows for found in part.files], [found.strokes for found in part.files]
