@@ -6,8 +6,6 @@ import contextlib
 import multiprocessing
 import os
 import pickle
-import time
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
@@ -21,7 +19,6 @@ Made = TypeVar("Made")
 
 CHUNKS_PER_WORKER = 4  # enough to even out items of different cost, few enough to keep the cost of sending low
 MAX_CHUNK = 32  # so that progress is shown often
-PROCESSES_START_S = 3.0  # until two new processes have loaded numpy, pandas and scipy on two cores: 1.5 to 3 s
 
 _cluster: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
 
@@ -73,12 +70,7 @@ def prepare(*modules: str, workers: int) -> None:
 
 
 def run_map(
-    function: Callable[[Given], Made],
-    items: Iterable[Given],
-    *,
-    workers: int = 1,
-    trial_s: float = 0.0,
-    together: int | None = None,
+    function: Callable[[Given], Made], items: Iterable[Given], *, workers: int = 1, together: int | None = None
 ) -> Iterator[Made]:
     """Yield `function(item)` for every item, in the order of the items.
 
@@ -94,9 +86,6 @@ def run_map(
         What to map over; each item is sent to a process, so keep it small.
     workers : int
         Processes to use, at least 1; has no meaning on a cluster.
-    trial_s : float
-        Work here for this many seconds first, and start processes only if what is left would take longer than they
-        take to start. For items that are usually quick; leave it out where a single item may take long.
     together : int, optional
         Items that are sent to a process at once; by default as many as keep the cost of sending low.
 
@@ -105,18 +94,7 @@ def run_map(
     WorkerError
         If a process dies before it has answered (killed, or out of memory), or the cluster gives up.
     """
-    waiting = deque(items)
-    if _here(workers):
-        yield from map(function, waiting)
-        return
-    began, done = time.monotonic(), 0
-    while waiting and (time.monotonic() - began < trial_s or (len(waiting) == 1 and _cluster.get() is None)):
-        yield function(waiting.popleft())
-        done += 1
-    if waiting and done and (time.monotonic() - began) / done * len(waiting) < PROCESSES_START_S:
-        yield from map(function, waiting)
-    elif waiting:
-        yield from begin_map(function, list(waiting), workers=workers, together=together)
+    yield from begin_map(function, list(items), workers=workers, together=together)
 
 
 def begin_map(

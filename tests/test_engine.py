@@ -25,16 +25,6 @@ def process_id(_):
     return os.getpid()
 
 
-def slow_process_id(_):
-    time.sleep(0.4)
-    return os.getpid()
-
-
-def slow_square(number):
-    time.sleep(0.4)
-    return number * number
-
-
 def nested(number):
     return list(run_map(square, range(number), workers=4))
 
@@ -67,17 +57,6 @@ def test_results_come_in_the_order_of_the_items(workers):
 def test_one_worker_or_one_item_stay_in_this_process():
     assert set(run_map(process_id, range(5), workers=1)) == {os.getpid()}
     assert set(run_map(process_id, [0], workers=2)) == {os.getpid()}
-
-
-def test_quick_items_need_no_processes():
-    assert set(run_map(process_id, range(50), workers=2, trial_s=1.0)) == {os.getpid()}
-
-
-def test_slow_items_go_to_processes_after_the_trial():
-    used = list(run_map(slow_process_id, range(14), workers=2, trial_s=0.5))
-    assert used[0] == os.getpid()
-    assert os.getpid() not in used[-2:]
-    assert list(run_map(slow_square, range(14), workers=2, trial_s=0.5)) == [n * n for n in range(14)]
 
 
 def test_more_items_go_to_other_processes():
