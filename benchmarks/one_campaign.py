@@ -137,7 +137,7 @@ def _rows(bins: pd.DataFrame, spec: Spec, config) -> Rows:
     """Return the rows the loop works on: merged as it does, bins as they are where there is a ripple."""
     counted = numbered(bins.reset_index(drop=True))
     as_they_are = any(e.id == "ripple" for e in spec.effects)  # merged bins would blur it
-    return make_rows(counted if as_they_are else merged_bins(counted), has_aging=config.aging)
+    return make_rows(counted if as_they_are else merged_bins(counted, config.loop.seed), has_aging=config.aging)
 
 
 def _scatter(record: dict) -> Scatter:

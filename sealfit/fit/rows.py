@@ -193,15 +193,25 @@ def sliding_power(load: np.ndarray | pd.Series, speed: np.ndarray | pd.Series) -
 
 
 def thin(bins: pd.DataFrame, most: int) -> pd.DataFrame:
-    """Return `bins` with neighbouring bins of a stroke merged until at most about `most` rows are left.
+    """Return `bins` with neighbouring bins of a stroke merged until at most about `most` rows are left."""
+    merged = int(np.ceil(len(bins) / most))
+    return bins if merged <= 1 else merge(bins, merged)
+
+
+def merge(bins: pd.DataFrame, together: int | np.ndarray) -> pd.DataFrame:
+    """Return `bins` with so many neighbouring bins of a stroke in one row.
 
     Means over all their samples: for shapes that are smooth over a few bins nothing is lost, and the cost no longer
     grows with how finely the strokes were cut. A ripple needs the bins as they are.
+
+    Parameters
+    ----------
+    bins : DataFrame, shape (n, ...)
+        Table `bins`.
+    together : int or ndarray of int, shape (n,)
+        How many bins make a row; the same throughout a stroke.
     """
-    merged = int(np.ceil(len(bins) / most))
-    if merged <= 1:
-        return bins
-    place = bins.groupby(["file", "stroke"], sort=False).cumcount() // merged
+    place = bins.groupby(["file", "stroke"], sort=False).cumcount() // together
     keys = [bins["file"], bins["stroke"], place.rename("place")]
     numeric = [c for c in bins.columns if pd.api.types.is_float_dtype(bins[c])]
     first = [c for c in bins.columns if c not in numeric and c not in ("file", "stroke", "n")]
