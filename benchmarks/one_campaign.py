@@ -19,7 +19,8 @@ from truths import NO_INTERVAL, TrueEffect, test_true_forms, true_effects, truth
 
 from sealfit.closure.grow import numbered
 from sealfit.closure.judge import project
-from sealfit.closure.loop import Closure, close_loop, merged_bins
+from sealfit.closure.loop import Closure, close_loop
+from sealfit.closure.merged import merged_bins
 from sealfit.closure.predict import predict
 from sealfit.closure.record import from_record
 from sealfit.config import load_config

@@ -15,6 +15,7 @@ from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import effect_entries, effect_table, left_entry
 from sealfit.closure.grow import Grown, Start, grow, numbered, predict_rows, steady_samples
 from sealfit.closure.levels import errors, lack_of_fit, level_table, noise_floor, scatter_list
+from sealfit.closure.merged import merged_bins
 from sealfit.closure.next_runs import next_runs
 from sealfit.closure.record import to_record
 from sealfit.config import Config
@@ -22,15 +23,10 @@ from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
 from sealfit.engine import begin_map, many_workers
 from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.rows import Rows, make_rows, merge, thin
+from sealfit.fit.rows import Rows, make_rows
 from sealfit.profiling import timed
 from sealfit.samples import StoredTraces
 from sealfit.verdict import predicts_worse
-
-ROWS = 4_000  # that the search works on; more are merged along their strokes,
-PER_STROKE = 8  # to about so many of each stroke,
-MOST_ROWS = 8_000  # unless there are more than so many then.
-LEAST_PER_STROKE = 4  # where even so many of each are more, some files keep `PER_STROKE`, the others one a stroke
 
 
 @dataclass(frozen=True)
@@ -113,39 +109,6 @@ def close_loop(
         **drawn,
     }
     return Closure(document, to_record(before, after, config), tables)
-
-
-def merged_bins(bins: pd.DataFrame, seed: int) -> pd.DataFrame:
-    """Return the bins that the search works on: neighbours of a stroke merged where there are many.
-
-    Of very many strokes some files, dealt evenly over the campaign, show what happens along a stroke, in `MOST_ROWS`
-    rows; of the others the means are enough.
-
-    Parameters
-    ----------
-    bins : DataFrame
-        As `numbered` gives them.
-    seed : int
-        Of the deal.
-    """
-    strokes = bins["stroke_id"].nunique()
-    if LEAST_PER_STROKE * strokes <= MOST_ROWS:
-        return thin(bins, int(np.clip(PER_STROKE * strokes, ROWS, MOST_ROWS)))
-    finely = _dealt(bins, MOST_ROWS / (PER_STROKE * strokes), seed)
-    together = int(np.ceil(len(bins) / strokes / PER_STROKE))
-    return merge(bins, np.where(finely, together, len(bins)))
-
-
-def _dealt(bins: pd.DataFrame, share: float, seed: int) -> np.ndarray:
-    """Return whether each row's file is of those drawn: one at random of every 1 / `share` beside each other."""
-    file, names = pd.factorize(bins["file"])
-    first = np.flatnonzero(np.diff(np.maximum.accumulate(file), prepend=-1))
-    beside = np.lexsort([pd.factorize(bins[name])[0][first] for name in ("run_id", "condition")])
-    group = np.floor(np.arange(len(names)) * share)
-    shuffled = np.lexsort((np.random.default_rng(seed).random(len(names)), group))
-    drawn = np.zeros(len(names), dtype=bool)
-    drawn[beside[shuffled[np.flatnonzero(np.diff(group, prepend=-1))]]] = True
-    return drawn[file]
 
 
 def _drawn_tables(grown: Grown, before: Fitted, after: Fitted, config: Config) -> dict[str, pd.DataFrame]:

@@ -6,7 +6,8 @@ import pytest
 from bins_helpers import make_bins, make_traces
 
 from sealfit.closure.grow import numbered
-from sealfit.closure.loop import MOST_ROWS, PER_STROKE, ROWS, close_loop, merged_bins
+from sealfit.closure.loop import close_loop
+from sealfit.closure.merged import MOST_ROWS, PER_STROKE, ROWS, merged_bins
 from sealfit.closure.predict import predict
 from sealfit.config import Config
 from sealfit.errors import RequestError
@@ -163,7 +164,7 @@ def test_the_search_works_on_few_rows_but_not_on_too_few_of_a_stroke(bins, repea
 
 
 def test_of_very_many_strokes_a_few_files_all_over_the_campaign_keep_several_bins(monkeypatch):
-    monkeypatch.setattr("sealfit.closure.loop.MOST_ROWS", 160)
+    monkeypatch.setattr("sealfit.closure.merged.MOST_ROWS", 160)
     table = numbered(make_bins(1, bins=20, repeats=3))
     left = merged_bins(table, 1)
     rows = left.groupby(["file", "stroke"]).size()
