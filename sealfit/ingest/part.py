@@ -15,7 +15,8 @@ from sealfit.conditions import condition_columns, keys_of
 from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
-from sealfit.ingest.average import bin_table, mean_traces
+from sealfit.ingest.average import bin_table
+from sealfit.ingest.mean_traces import mean_traces
 from sealfit.ingest.refs import Listing
 from sealfit.ingest.shaped import INNER, STEADY_ONLY
 from sealfit.ingest.text import as_number
