@@ -172,6 +172,8 @@ class _Sums:
 def _sums_of(block: _Block) -> _Sums:
     sides, width = block.sides, int(block.reach.max())
     sums = _Sums.none(block.numbers.size, min(sides.size, 2))
+    if not width:  # strokes too coarse, or too short, for any of the frequencies
+        return sums
     units, unit = np.unique(block.strokes.unit, return_inverse=True)
     passes = unit * sides.size + np.searchsorted(sides, block.strokes.direction)
     each = np.arange(unit.size)

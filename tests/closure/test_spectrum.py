@@ -78,6 +78,16 @@ def test_frequencies_that_a_stroke_cannot_show_are_none_of_it():
     npt.assert_array_equal(found.count[found.frequency > 1.1], 6)
 
 
+def test_a_block_of_strokes_that_reach_no_frequency_adds_nothing(monkeypatch):
+    monkeypatch.setattr(spectrum, "MOST_NUMBERS", 1)
+    fine = [(unit, 1.0, 0.3 * unit, 0.05, 400) for unit in range(12)]
+    coarse = [(unit, 1.0, 0.3 * unit, 18.0, 17) for unit in range(12, 14)]
+    short = [(unit, 1.0, 0.3 * unit, 0.05, 400) for unit in range(12, 14)]
+    found, without = (spectrum_along(samples_of(fine + more), "displacement_mm") for more in (coarse, short))
+    assert found.count.max() == 12
+    assert without.count.max() == 14
+
+
 def test_strokes_too_few_or_too_short_have_no_spectrum():
     assert spectrum_along(samples_of([(0, 1.0, 0.0, 0.05, 400), (1, 1.0, 0.0, 0.05, 400)]), "displacement_mm") is None
     assert spectrum_along(samples_of([(k, 1.0, 0.0, 0.5, 15) for k in range(5)]), "displacement_mm") is None
