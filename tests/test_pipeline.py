@@ -222,6 +222,7 @@ def test_a_second_run_at_the_same_time_is_refused(campaign, tmp_path):
         while not (out / ".lock").exists() and time.monotonic() < until:
             time.sleep(0.02)
         time.sleep(0.1)
+        os.killpg(run.pid, signal.SIGSTOP)  # a small campaign may be done before the second has started
         refused = sealfit("run", campaign, "--out", out, code=1)
         assert f"process {run.pid}) is writing here" in refused.stderr
         assert run.poll() is None
