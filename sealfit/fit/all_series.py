@@ -21,6 +21,7 @@ TEMPERATURE, COMPRESSION = "temperature_C", "compression_ratio_pct"
 SEPARATE = "separate"  # Eq. 15 with a and b of its own for every series
 LIKELY = 3  # laws held against data they were not fitted to
 CURVE_POINTS = 61
+START_POINTS = 20  # more, between day 0 and a third of the first day
 
 
 def aged_values(levels: Levels, rubber: str, quantity: str) -> Aged:
@@ -147,7 +148,9 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
     points = {"kind": "value", "scaled_days": scaled, "value": value, "aging_days": aged.days}
     for name, column in zip((TEMPERATURE, COMPRESSION), tested, strict=True):
         points[name] = np.nan if column is None else np.where(aged.days > 0, column, np.nan)
-    days = np.r_[0.0, np.geomspace(scaled[scaled > 0].min() / 3, scaled.max() * 1.5, CURVE_POINTS)]
+    first = scaled[scaled > 0].min() / 3
+    near = first * np.linspace(0, 1, START_POINTS, endpoint=False) ** 2  # where laws fall fastest
+    days = np.r_[near, np.geomspace(first, scaled.max() * 1.5, CURVE_POINTS)]
     middle = (None if c is None else np.full(days.size, reference_of(c[aged.days > 0])) for c in tested)
     at = Aged(days, np.zeros(days.size), *middle)
     slope = law.slope(at)
