@@ -27,7 +27,6 @@ WORTH_A_LOOK = 0.05  # p-value of a channel by itself, not adjusted for the sear
 EVEN = 0.5  # adjusted p-value from which chance is the likelier explanation
 OFFSET = "zero_offset"
 UNSTEADY = 0.2  # share of an offset by which it may differ from run to run and still be one offset
-QUANTITY_UNIT = {"sigma_2": ("force", "speed"), "v_s": ("speed",), "b": ("days",)}
 
 
 def effect_entries(after: Fitted, grown: Grown, config: Config) -> list[dict]:

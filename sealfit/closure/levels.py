@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 from scipy.special import fdtrc
@@ -14,15 +12,6 @@ from sealfit.fit.rows import LEVELS, Rows
 from sealfit.fit.tangent import OwnColumns, Tangent
 
 RANK = 1e-9  # of the largest singular value of a tangent, below which it holds nothing
-
-
-@dataclass(frozen=True)
-class PureError:
-    """Scatter of files within a run, the common repeat pattern removed; None where no run has repeats."""
-
-    bin_variance: float  # of one bin of one file about the true mean of its run
-    file_sd_N: np.ndarray  # (files,) not used beyond its count
-    df: float
 
 
 def errors(rows: Rows, residual: np.ndarray) -> dict[str, float]:

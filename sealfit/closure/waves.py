@@ -41,13 +41,6 @@ def strokes_of(samples: pd.DataFrame, axis: str) -> Iterator[tuple[int, np.ndarr
             yield int(a), place[a:b][order], residual[a:b][order]
 
 
-def freed_of_trend(place: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Return values less the parabola fitted along their places, shape (n,)."""
-    scaled = 2 * (place - place[0]) / max(place[-1] - place[0], 1e-300) - 1
-    columns = np.column_stack([np.ones_like(scaled), scaled, 1.5 * scaled**2 - 0.5])
-    return value - columns @ np.linalg.solve(columns.T @ columns, columns.T @ value)
-
-
 @dataclass(frozen=True)
 class Wave:
     """Normal equations of a sine and a cosine, summed over strokes, at each of m wavelengths."""
