@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.waves import LEAST_SAMPLES
+LEAST_SAMPLES = 16  # a stroke with fewer steady samples says nothing of a ripple
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,11 @@ class Strokes:
         grid = step * np.arange(size)
         found = np.empty((chosen.size, size))
         for row, k in zip(found, chosen, strict=True):
-            own = slice(self.start[k], self.start[k] + self.size[k])
-            order = np.argsort(self.place[own], kind="stable")
-            row[:] = np.interp(self.low[k] + grid, self.place[own][order], self.residual[own][order])
+            row[:] = np.interp(self.low[k] + grid, *self.along(k))
         return found
+
+    def along(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return places and residuals of one stroke, sorted by place."""
+        own = slice(self.start[k], self.start[k] + self.size[k])
+        order = np.argsort(self.place[own], kind="stable")
+        return self.place[own][order], self.residual[own][order]

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from sealfit.closure.strokes import Strokes
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import passes
 
-LEAST_SAMPLES = 16  # a stroke with fewer steady samples says nothing of a ripple
 AROUND = np.linspace(-0.5, 0.5, 101)  # periods per stroke on each side of a peak that are looked at once more
 
 
@@ -27,18 +27,13 @@ def strokes_of(samples: pd.DataFrame, axis: str) -> Iterator[tuple[int, np.ndarr
     Parameters
     ----------
     samples : DataFrame
-        Samples of a stroke one after the other: stroke_id, the axis, `residual_N`.
+        Samples of a stroke one after the other: stroke_id, unit, direction, the axis, `residual_N`.
     axis : str
         Column along which the wave runs.
     """
-    place = samples[axis].to_numpy(dtype=float)
-    residual = samples["residual_N"].to_numpy(dtype=float)
-    stroke = samples["stroke_id"].to_numpy()
-    starts = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]])
-    for a, b in zip(starts, np.r_[starts[1:], stroke.size], strict=True):
-        if b - a >= LEAST_SAMPLES and np.ptp(place[a:b]) > 0:
-            order = np.argsort(place[a:b], kind="stable")
-            yield int(a), place[a:b][order], residual[a:b][order]
+    strokes = Strokes.of(samples, axis)
+    for k, first in enumerate(strokes.start.tolist()):
+        yield first, *strokes.along(k)
 
 
 @dataclass(frozen=True)
@@ -77,7 +72,7 @@ def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> dict[tupl
     Parameters
     ----------
     samples : DataFrame
-        As for `strokes_of`, with unit and direction.
+        As for `strokes_of`.
     lengths : ndarray, shape (m,)
         Wavelengths in the unit of the axis.
     axis : str
@@ -139,7 +134,7 @@ def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis:
     Parameters
     ----------
     samples : DataFrame
-        As for `strokes_of`, with unit and direction.
+        As for `strokes_of`.
     first : ndarray of bool, shape (n,)
         Which samples make the first half.
     wavelength : float
