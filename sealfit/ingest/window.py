@@ -203,7 +203,7 @@ class _Motion:
         time_s, left = self.time_s, first + fast
         n = len(time_s)
         if left == n - 1:
-            return n
+            return n - 1  # where the stroke ends: it may have stopped since the sample before
         still = _first(self.slow[left:])
         stopped = left + still if still is not None else n - 1
         step = float(time_s[last - 1] - time_s[first]) / max(last - 1 - first, 1)

@@ -57,10 +57,21 @@ def test_the_window_begins_where_the_rise_and_the_ramp_are_over_and_no_later_tha
     first, last = found.rows[[0, -1]]
     # 1/50000 of the rise is left 0.3 mm * ln(50000) = 3.25 mm from the start.
     assert 2.7 < x[first] < 4.2
-    assert last == len(x) - 1
+    assert last == len(x) - 2
     assert found.speed_mm_s == pytest.approx(5.0, rel=1e-3)
     kept = force[found.rows] - level[found.rows]
     assert abs(kept[:50].mean()) < 4 * 0.1 / np.sqrt(50)
+
+
+def test_the_last_sample_is_not_steady_as_the_platform_may_have_stopped_since_the_one_before():
+    time = np.arange(0.0, 40.1, 0.5)
+    since = np.maximum(time - 2.0, 0.0)
+    stops = since[-1] - 0.05  # a ramp far shorter than the step from sample to sample
+    x = 0.5 * np.minimum(since, stops) + np.where(since > stops, 0.0125, 0.0)
+    last = (x[-1] - x[-2]) / (0.5 * 0.5)
+    assert 0.9 < last < 1.0  # of the plateau: slower by less than the tolerance of speed
+    force = 20.0 * -np.expm1(-x / 0.3)
+    assert only(time, x, force).rows[-1] == len(x) - 2
 
 
 @pytest.mark.parametrize("rise", [0.01, 0.05, 0.2, 0.5, 1.0])
@@ -89,7 +100,7 @@ def test_slow_effects_stay_inside_the_window(more, seed):
     time, x, force, _ = stroke(seed=seed, **more)
     found = only(time, x, force)
     assert x[found.rows[0]] < 4.5
-    assert found.rows[-1] == len(x) - 1
+    assert found.rows[-1] == len(x) - 2
     npt.assert_array_equal(np.diff(found.rows), 1)
 
 
@@ -99,7 +110,7 @@ def test_a_file_that_begins_in_steady_sliding_is_steady_from_its_first_row_where
     x = 5.0 * time
     rng = np.random.default_rng(3)
     force = 30.0 + 2.0 * np.sin(2 * np.pi * x / 7.0 + phase) + rng.normal(0.0, 0.1, 800)
-    assert only(time, x, force).steady.all()
+    assert only(time, x, force).steady[:-1].all()
 
 
 @pytest.mark.parametrize(("blur", "step"), [(0.0, 0.0), (0.05, 0.0), (0.2, 0.0), (0.0, 0.1), (0.0, 0.5)])
@@ -146,7 +157,7 @@ def test_a_rest_within_a_stroke_and_the_rise_after_it_are_left_out():
     assert not inside[500:700].any()
     assert not inside[699:730].any()
     assert inside[100:480].all()
-    assert inside[820:].all()
+    assert inside[820:-1].all()
     assert found.speed_mm_s == pytest.approx(5.0, rel=2e-3)
 
 
@@ -246,4 +257,4 @@ def test_a_stroke_hardly_longer_than_its_rise_keeps_its_plateau():
     found = only(time, x, force)
     # Past the bend at 0.1 mm, and no later than where the late plateau begins: 60 % of the way, 0.138 mm, and a margin.
     assert 0.1 < x[found.rows[0]] < 0.147
-    assert found.rows[-1] == 199
+    assert found.rows[-1] == 198
