@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import BSpline
 
+from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.declared import SAME_SPEED
 from sealfit.fit.rows import LEVELS, Rows
@@ -42,6 +43,12 @@ class Channel:
     def numeric(self) -> bool:
         """Whether the channel holds numbers."""
         return self.values.dtype.kind == "f"
+
+
+def channels_of(rows: Rows, config: Config) -> list[Channel]:
+    """Return the channels that a campaign's config lets the loop look at: see `find_channels`."""
+    on_rig = config.position_origin == "rig"
+    return find_channels(rows, config.loop.ignore_channels, conditions=config.condition, rig_position=on_rig)
 
 
 def find_channels(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, Channel, find_channels
+from sealfit.closure.channels import CALENDAR, Channel, channels_of
 from sealfit.closure.confirm import TRIES, Added, confirmed
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.judge import Candidate, Judge
@@ -90,14 +90,10 @@ def grow(
     """
     say = on_progress or (lambda text: None)
     rng = np.random.default_rng(config.loop.seed)
-    rig = config.position_origin == "rig"
     alpha = config.loop.family_error
     ripples = Ripples(samples, config, effects, say, compare=start is None, workers=workers)
     before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
-    channels = {
-        c.name: c
-        for c in find_channels(rows, config.loop.ignore_channels, conditions=config.condition, rig_position=rig)
-    }
+    channels = {c.name: c for c in channels_of(rows, config)}
     judge = Judge(before)
     last = first = tuple(search(judge, list(channels.values()), rng))
     if on_found is not None and (ripples.found or any(c.p_value <= alpha for c in first)):

@@ -15,8 +15,9 @@ from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import effect_entries, effect_table, left_entry
 from sealfit.closure.grow import Grown, Start, grow, numbered, predict_rows, steady_samples
 from sealfit.closure.levels import errors, lack_of_fit, level_table, noise_floor, scatter_list
-from sealfit.closure.merged import merged_bins
+from sealfit.closure.merged import Searched, searched
 from sealfit.closure.next_runs import next_runs
+from sealfit.closure.overlooked import overlooked
 from sealfit.closure.record import to_record
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -67,39 +68,41 @@ def close_loop(
         from sealfit.effects.user import load_user_effects
 
         effects |= load_user_effects(Path(config.loop.effects_folder))
-    bins = bins.reset_index(drop=True)
-    counted = numbered(bins)
+    columns, counted = list(bins.columns), numbered(bins.reset_index(drop=True))
+    del bins
     rows = make_rows(counted, has_aging=config.aging)
-    fewer = merged_bins(counted, config.loop.seed)
-    merged = len(fewer) < len(counted)
-    columns = list(bins.columns)
-    del bins, counted  # much of the memory: `rows` holds all of it
-    coarse = make_rows(fewer, has_aging=config.aging) if merged else rows
-    heldout = _HeldOut(rows, coarse, steady_samples(traces, rows), config, effects, workers)
-    with closing(heldout):
-        fine = rows if merged else None
-        with timed("search", rows=coarse.force.size, of="bins, merged"):
-            grown = grow(
-                coarse,
-                heldout.samples,
-                config,
-                effects,
-                fine=fine,
-                workers=workers,
-                on_found=heldout.begin,
-                on_progress=say,
-            )
-        heldout.settle(grown)
-        say("before and after on all rows")
-        with timed("before and after", rows=rows.force.size, of="bins"):
-            before = _on_all(rows, grown, grown.before) if merged else grown.before
-            after = before
-            if grown.added:
-                after = _on_all(rows, grown, grown.after) if merged else grown.after
+    del counted  # much of the memory: `rows` holds all of it
+    for part in searched(rows, config.loop.seed):
+        heldout = _HeldOut(rows, part, steady_samples(traces, part.rows), config, effects, workers)
+        with closing(heldout):
+            fine = part.rows if part.coarse is not part.rows else None
+            with timed("search", rows=part.coarse.force.size, of="bins, merged"):
+                grown = grow(
+                    part.coarse,
+                    heldout.samples,
+                    config,
+                    effects,
+                    fine=fine,
+                    workers=workers,
+                    on_found=heldout.begin,
+                    on_progress=say,
+                )
+            heldout.settle(grown)
+            say("before and after on all rows")
+            with timed("before and after", rows=rows.force.size, of="bins"):
+                own = part.coarse is rows
+                before = grown.before if own else _on_all(rows, grown, grown.before)
+                after = before
+                if grown.added:
+                    after = grown.after if own else _on_all(rows, grown, grown.after)
+            if not part.whole and (more := overlooked(part.every, grown, after.scatter, config)):
+                say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
+                continue
             drawn = _drawn_tables(grown, before, after, config)
-        say(f"held out by {heldout.level}: the search repeated without each fold")
-        with timed("held out", rows=len(heldout.masks), of="folds"):
-            held_before, held_after = heldout.forces(say)
+            say(f"held out by {heldout.level}: the search repeated without each fold")
+            with timed("held out", rows=len(heldout.masks), of="folds"):
+                held_before, held_after = heldout.forces(say)
+            break
     document = _document(config, effects, grown, before, after, held_before, held_after, heldout.level)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their order again
     tables = {
@@ -135,9 +138,15 @@ class _HeldOut:
     """
 
     def __init__(
-        self, rows: Rows, coarse: Rows, samples: pd.DataFrame, config: Config, effects: dict[str, Effect], workers: int
+        self,
+        rows: Rows,
+        part: Searched,
+        samples: pd.DataFrame,
+        config: Config,
+        effects: dict[str, Effect],
+        workers: int,
     ) -> None:
-        self.rows, self.coarse, self.samples = rows, coarse, samples
+        self.rows, self.part, self.samples = rows, part, samples
         self.config, self.effects, self.workers = config, effects, workers
         self.level = heldout_level(rows)
         self.masks = list(folds(rows, self.level, config.loop.folds, config.loop.seed))
@@ -177,6 +186,7 @@ class _Fold:
 
     train: Rows
     fine: Rows | None
+    every: Rows | None  # where `train` is of some runs only: all the fit may see
     seen: pd.DataFrame
     test: Rows
     config: Config
@@ -198,23 +208,32 @@ class _Folds(Sequence):
         if isinstance(number, slice):
             return [self[k] for k in range(*number.indices(len(self)))]
         own, out = self.campaign, self.campaign.masks[number]
-        gone = own.rows.table["stroke_id"].to_numpy()[out]
-        coarse = own.coarse.subset(~own.coarse.table["stroke_id"].isin(gone).to_numpy())
+        part, gone = own.part, own.rows.table["stroke_id"].to_numpy()[out]
+
+        def kept(rows: Rows) -> Rows:
+            return rows.subset(~rows.table["stroke_id"].isin(gone).to_numpy())
+
         fine, seen = None, own.samples.head(0)
         if self.search:  # without one, neither is looked at
-            fine = own.rows.subset(~out) if own.coarse is not own.rows else None
+            fine = kept(part.rows) if part.coarse is not part.rows else None
             seen = own.samples[~own.samples["stroke_id"].isin(gone)]
-        return _Fold(coarse, fine, seen, own.rows.subset(out), own.config, own.effects, self.start, self.search)
+        every = None if part.whole else kept(part.every)
+        test = own.rows.subset(out)
+        return _Fold(kept(part.coarse), fine, every, seen, test, own.config, own.effects, self.start, self.search)
 
 
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
     """Return the forces before and after at a fold's rows; before twice where the whole campaign lacks nothing."""
-    if not fold.search:
-        kept = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
-        force = predict_rows(kept, fold.test)
-        return force, force
-    part = grow(fold.train, fold.seen, fold.config, fold.effects, fine=fold.fine, start=fold.start)
-    return predict_rows(part.before, fold.test), predict_rows(part.after, fold.test)
+    if fold.search:
+        part = grow(fold.train, fold.seen, fold.config, fold.effects, fine=fold.fine, start=fold.start)
+        before, after = part.before, part.after
+    else:
+        before = after = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
+    forces = []
+    for fitted in (before, after)[: 1 if after is before else 2]:
+        own = fitted if fold.every is None else fit(fitted.model, fold.every, fitted.scatter, turns=0)
+        forces.append(predict_rows(own, fold.test))
+    return forces[0], forces[-1]
 
 
 def _document(

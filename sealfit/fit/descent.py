@@ -121,6 +121,8 @@ def _best_alone(model: Model, rows: Rows, scatter: Scatter, whitening: Whitening
     solved for in it: the cost of all series together is that of one pass over the rows.
     """
     part = _rows_of(model, rows, number)
+    if part.force.size == 0:  # held out, all of them
+        return model
     if part.force.size > ALONE * rows.force.size:
         return _best_on_grid(model, rows, whitening, [number])
     low, high = bounds_of(model, rows)

@@ -129,7 +129,7 @@ class Rows:
         )
 
 
-def make_rows(bins: pd.DataFrame, *, has_aging: bool) -> Rows:
+def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame | None = None) -> Rows:
     """Return `bins` as sorted arrays with nested groups.
 
     Parameters
@@ -138,6 +138,8 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool) -> Rows:
         Table `bins`, shape (n, columns).
     has_aging : bool
         Whether the config's condition has `aging_days`.
+    conditions : DataFrame, optional
+        Conditions of the campaign that these are a part of, as `Rows` holds them: a model of it then fits both.
     """
     table = bins.reset_index(drop=True)
     base_run = nesting_run(table)
@@ -166,9 +168,12 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool) -> Rows:
         table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
     days = table["aging_days"].to_numpy(dtype=float) if has_aging else np.zeros(len(table))
     condition, names = pd.factorize(table["condition"], sort=True)
-    first = table.drop_duplicates("condition").set_index("condition").loc[names]
-    conditions = first[["series", "rubber"]].reset_index()
-    conditions["aging_days"] = first["aging_days"].to_numpy(dtype=float) if has_aging else 0.0
+    if conditions is None:
+        first = table.drop_duplicates("condition").set_index("condition").loc[names]
+        conditions = first[["series", "rubber"]].reset_index()
+        conditions["aging_days"] = first["aging_days"].to_numpy(dtype=float) if has_aging else 0.0
+    else:
+        condition = pd.Index(conditions["condition"]).get_indexer(names)[condition]
     files = groups.codes["file"]
     per_file = np.bincount(files)[files]
     return Rows(

@@ -5,9 +5,7 @@ import numpy.testing as npt
 import pytest
 from bins_helpers import make_bins, make_traces
 
-from sealfit.closure.grow import numbered
 from sealfit.closure.loop import close_loop
-from sealfit.closure.merged import MOST_ROWS, PER_STROKE, ROWS, merged_bins
 from sealfit.closure.predict import predict
 from sealfit.config import Config
 from sealfit.errors import RequestError
@@ -147,36 +145,6 @@ def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
     assert document["after"]["rmse_N"] == document["before"]["rmse_N"]
     assert made.tables["effects"].empty
     assert any("second specimen" in run["why"] for run in document["next_runs"])
-
-
-@pytest.mark.parametrize(("bins", "repeats"), [(20, 1), (60, 3), (200, 6)])
-def test_the_search_works_on_few_rows_but_not_on_too_few_of_a_stroke(bins, repeats):
-    table = numbered(make_bins(1, bins=bins, repeats=repeats))
-    left, strokes = merged_bins(table, 1), table["stroke_id"].nunique()
-    rest = strokes  # what is over in each stroke when whole numbers of bins are merged makes a row of its own
-    assert len(left) <= max(ROWS, min(PER_STROKE * strokes, MOST_ROWS)) + rest
-    assert len(left) == len(table) or len(left) > 0.4 * min(ROWS, PER_STROKE * strokes)
-    together = np.ceil(len(table) / np.clip(PER_STROKE * strokes, ROWS, MOST_ROWS))  # bins merged into one row
-    assert len(left) == np.ceil(table.groupby("stroke_id").size() / together).sum()
-    assert left["n"].sum() == table["n"].sum()
-    whole, merged = (np.average(rows["force_N"], weights=rows["n"]) for rows in (table, left))
-    assert merged == pytest.approx(whole, rel=1e-12)
-
-
-def test_of_very_many_strokes_a_few_files_all_over_the_campaign_keep_several_bins(monkeypatch):
-    monkeypatch.setattr("sealfit.closure.merged.MOST_ROWS", 160)
-    table = numbered(make_bins(1, bins=20, repeats=3))
-    left = merged_bins(table, 1)
-    rows = left.groupby(["file", "stroke"]).size()
-    several = rows.index[rows > 1].get_level_values("file")
-    assert set(rows) == {1, 7}  # 20 bins, three of them in a row
-    assert len(several) == pytest.approx(160 / PER_STROKE, abs=1)
-    kept = table[table["file"].isin(several)]
-    assert set(kept["condition"]) == set(table["condition"])
-    assert kept["repeat"].nunique() == 3
-    assert left["n"].sum() == table["n"].sum()
-    for seed in (1, 2):
-        assert merged_bins(table, seed).equals(left) == (seed == 1)
 
 
 def test_an_effect_of_sliding_power_is_found_and_predicted_from_load_and_speed():

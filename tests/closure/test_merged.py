@@ -1,0 +1,121 @@
+import itertools
+
+import numpy as np
+import numpy.testing as npt
+import pytest
+from bins_helpers import make_bins, make_traces
+
+from sealfit.closure.grow import numbered
+from sealfit.closure.loop import close_loop
+from sealfit.closure.merged import FURTHER, MOST_ROWS, PER_STROKE, ROWS, merged_bins, searched
+from sealfit.config import Config
+from sealfit.fit.declared import declare
+from sealfit.fit.estimate import fit_declared
+from sealfit.fit.joint import evaluate
+from sealfit.fit.rows import make_rows
+
+
+@pytest.mark.parametrize(("bins", "repeats"), [(20, 1), (60, 3), (200, 6)])
+def test_the_search_works_on_few_rows_but_not_on_too_few_of_a_stroke(bins, repeats):
+    table = numbered(make_bins(1, bins=bins, repeats=repeats))
+    left, strokes = merged_bins(table, 1), table["stroke_id"].nunique()
+    rest = strokes  # what is over in each stroke when whole numbers of bins are merged makes a row of its own
+    assert len(left) <= max(ROWS, min(PER_STROKE * strokes, MOST_ROWS)) + rest
+    assert len(left) == len(table) or len(left) > 0.4 * min(ROWS, PER_STROKE * strokes)
+    together = np.ceil(len(table) / np.clip(PER_STROKE * strokes, ROWS, MOST_ROWS))  # bins merged into one row
+    assert len(left) == np.ceil(table.groupby("stroke_id").size() / together).sum()
+    assert left["n"].sum() == table["n"].sum()
+    whole, merged = (np.average(rows["force_N"], weights=rows["n"]) for rows in (table, left))
+    assert merged == pytest.approx(whole, rel=1e-12)
+
+
+def test_of_very_many_strokes_a_few_files_all_over_the_campaign_keep_several_bins(monkeypatch):
+    monkeypatch.setattr("sealfit.closure.merged.MOST_ROWS", 160)
+    table = numbered(make_bins(1, bins=20, repeats=3))
+    left = merged_bins(table, 1)
+    rows = left.groupby(["file", "stroke"]).size()
+    several = rows.index[rows > 1].get_level_values("file")
+    assert set(rows) == {1, 7}  # 20 bins, three of them in a row
+    assert len(several) == pytest.approx(160 / PER_STROKE, abs=1)
+    kept = table[table["file"].isin(several)]
+    assert set(kept["condition"]) == set(table["condition"])
+    assert kept["repeat"].nunique() == 3
+    assert left["n"].sum() == table["n"].sum()
+    for seed in (1, 2):
+        assert merged_bins(table, seed).equals(left) == (seed == 1)
+
+
+MANY_SPEEDS = (1.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 60.0)
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """A search that begins with 40 strokes, whatever the model."""
+    monkeypatch.setattr("sealfit.closure.merged.STROKES", 40)
+    monkeypatch.setattr("sealfit.closure.merged.LEAST_RUNS", 1)
+
+
+def test_more_and_more_whole_runs_all_over_the_campaign_are_searched_and_in_the_end_all(few):
+    rows = make_rows(numbered(make_bins(1, bins=4)), has_aging=True)
+    parts = list(searched(rows, 1))
+    sizes = [part.rows.groups.starts["stroke"].size for part in parts]
+    assert sizes == pytest.approx([40, 40 * FURTHER, 216], abs=5)
+    assert [part.whole for part in parts] == [False] * (len(parts) - 1) + [True]
+    assert parts[-1].rows is rows
+    for part, larger in itertools.pairwise(parts):
+        assert part.rows.force.size < larger.rows.force.size
+        for run in set(part.rows.table["run_id"]):  # with all their repeats
+            assert (part.rows.table["run_id"] == run).sum() == (rows.table["run_id"] == run).sum()
+        assert set(part.rows.condition) == set(rows.condition)
+    drawn = [set(next(searched(rows, seed)).rows.table["run_id"]) for seed in (1, 1, 2)]
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_a_part_has_the_campaigns_model_and_some_run_of_each_condition(few, monkeypatch):
+    monkeypatch.setattr("sealfit.closure.merged.STROKES", 12)
+    monkeypatch.setattr("sealfit.closure.merged.MOST_ROWS", 40)
+    rows = make_rows(numbered(make_bins(1, bins=20, noise_N=0.0, gain=0.0)), has_aging=True)
+    part = next(searched(rows, 1))
+    assert part.coarse.force.size < part.rows.force.size
+    assert set(part.coarse.condition) == set(rows.condition)
+    assert part.rows.groups.starts["run"].size == len(rows.conditions)
+    assert declare(part.coarse) is declare(rows)  # though no series has four speeds there
+    model = fit_declared(rows).model
+    npt.assert_allclose(evaluate(model, part.coarse, jacobian=False)[0], part.coarse.force, rtol=1e-4)
+
+
+def warm(table, force):
+    return force * (1 - 0.05 * (1 - np.exp(-table["time_s"].to_numpy() / 3)))
+
+
+def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(monkeypatch):
+    bins = make_bins(3, effect=warm, setup=0.005, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4)
+    found, said = [], []
+    for strokes in (60, 10_000):
+        monkeypatch.setattr("sealfit.closure.merged.STROKES", strokes)
+        found.append(close_loop(bins, make_traces(bins), Config(), on_progress=said.append))
+    assert not any("show more" in text for text in said)
+    part, whole = (closed.document for closed in found)
+    (one,), (other,) = part["effects"], whole["effects"]
+    assert (one["id"], one["channels"]) == (other["id"], other["channels"])
+    for own, full in zip(one["parameters"], other["parameters"], strict=True):
+        assert own["value"] == pytest.approx(full["value"], rel=1e-4)
+        assert own["ci95"] == pytest.approx(full["ci95"], rel=1e-3)
+    for name in ("before", "after"):
+        assert part[name]["rmse_N"] == pytest.approx(whole[name]["rmse_N"], rel=1e-4)
+        assert part[name]["heldout_rmse_N"] == pytest.approx(whole[name]["heldout_rmse_N"], rel=5e-3)
+    assert not found[0].tables["residuals_after"]["heldout_model_N"].isna().any()
+
+
+def test_what_only_all_strokes_show_has_all_of_them_searched(monkeypatch):
+    monkeypatch.setattr("sealfit.closure.merged.STROKES", 60)
+    rng = np.random.default_rng(5)
+    bins = make_bins(3, setup=0.003, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, noise_N=0.1)
+    humidity = bins["run_id"].map({run: rng.normal() for run in bins["run_id"].unique()})
+    bins["humidity_pct"] = 50 + 5 * humidity
+    bins["force_N"] *= 1 + 0.004 * humidity
+    said = []
+    closed = close_loop(bins, make_traces(bins), Config(), on_progress=said.append)
+    assert f"all {bins['file'].nunique()} strokes show more than those searched: humidity_pct" in said
+    (effect,) = closed.document["effects"]
+    assert effect["channels"] == ["humidity_pct"]
