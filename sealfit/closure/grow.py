@@ -61,6 +61,7 @@ def grow(
     *,
     fine: Rows | None = None,
     start: Start | None = None,
+    compare: bool = True,
     workers: int = 1,
     on_found: Callable[[Fitted], None] | None = None,
     on_progress: Callable[[str], None] | None = None,
@@ -81,6 +82,8 @@ def grow(
         The bins as they are, to fit ripples to, which merged bins would blur; they are held as found there.
     start : Start, optional
         Where the fit of the declared model begins, so that it need not search again.
+    compare : bool
+        Whether rivals of what is accepted are asked for the held-out data too.
     workers : int
         Processes for what is independent in the search.
     on_found : callable, optional
@@ -91,7 +94,7 @@ def grow(
     say = on_progress or (lambda text: None)
     rng = np.random.default_rng(config.loop.seed)
     alpha = config.loop.family_error
-    ripples = Ripples(samples, config, effects, say, compare=start is None, workers=workers)
+    ripples = Ripples(samples, config, effects, say, compare=compare, workers=workers)
     before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
     channels = {c.name: c for c in channels_of(rows, config)}
     judge = Judge(before)
@@ -100,7 +103,7 @@ def grow(
         on_found(before)
     fitted = ripples.added_to(before, fine)
     added = list(ripples.added)
-    revisit = Revisit(channels, effects, ripples.samples, config, say, compare=start is None)
+    revisit = Revisit(channels, effects, ripples.samples, config, say, compare=compare)
     refused: set[tuple] = set()
     left: Candidate | Peak | None = None
     again = False  # whether earlier effects have been asked again
@@ -131,7 +134,7 @@ def grow(
             continue
         open_ += [c for c in _standing_for(open_, last) if c.key not in refused]
         proposals = propose(fitted, open_, channels, effects, [p for _, p in laws])
-        accepted = confirmed(fitted, proposals, ripples.samples, config, number, say, compare=start is None)
+        accepted = confirmed(fitted, proposals, ripples.samples, config, number, say, compare=compare)
         if accepted is None:
             refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
             continue

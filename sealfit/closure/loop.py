@@ -23,7 +23,7 @@ from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
 from sealfit.engine import begin_map, many_workers
-from sealfit.fit.estimate import Fitted, fit
+from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.rows import Rows, make_rows
 from sealfit.profiling import timed
 from sealfit.samples import StoredTraces
@@ -72,7 +72,13 @@ def close_loop(
     del bins
     rows = make_rows(counted, has_aging=config.aging)
     del counted  # much of the memory: `rows` holds all of it
+    start = None
     for part in searched(rows, config.loop.seed):
+        if not part.whole and start is None:  # all strokes tell where to begin better than those that are searched
+            say("the declared model on all strokes")
+            with timed("declared model", rows=part.every.force.size, of="bins, merged"):
+                declared = fit_declared(part.every)
+            start = Start(declared.model, declared.scatter)
         heldout = _HeldOut(rows, part, steady_samples(traces, part.rows), config, effects, workers)
         with closing(heldout):
             fine = part.rows if part.coarse is not part.rows else None
@@ -83,6 +89,7 @@ def close_loop(
                     config,
                     effects,
                     fine=fine,
+                    start=None if part.whole else start,
                     workers=workers,
                     on_found=heldout.begin,
                     on_progress=say,
@@ -225,7 +232,7 @@ class _Folds(Sequence):
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
     """Return the forces before and after at a fold's rows; before twice where the whole campaign lacks nothing."""
     if fold.search:
-        part = grow(fold.train, fold.seen, fold.config, fold.effects, fine=fold.fine, start=fold.start)
+        part = grow(fold.train, fold.seen, fold.config, fold.effects, fine=fold.fine, start=fold.start, compare=False)
         before, after = part.before, part.after
     else:
         before = after = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
