@@ -53,3 +53,9 @@ def test_few_rows_are_looked_at_for_one_series(monkeypatch):
     search_bent(model, rows, SCATTER)
     # Three passes over all rows for each series, 13 each for all series together and for b; the rest on its own rows.
     assert sum(size == rows.sparse(descent.ROWS_FOR_START).force.size for size in seen) <= 3 * curved.size + 2 * 13
+
+
+def test_series_are_searched_though_every_row_of_one_is_held_out():
+    model, rows, curved = astray(one_specimen=False, aging=True)
+    found = search_bent(model, rows.subset(rows.values("temperature_C") != 80.0), SCATTER)
+    npt.assert_allclose(np.exp(found.vector()[curved]), bins_helpers.TRUE["v_s"], rtol=0.4)
