@@ -97,11 +97,7 @@ def close_loop(
             heldout.settle(grown)
             say("before and after on all rows")
             with timed("before and after", rows=rows.force.size, of="bins"):
-                own = part.coarse is rows
-                before = grown.before if own else _on_all(rows, grown, grown.before)
-                after = before
-                if grown.added:
-                    after = grown.after if own else _on_all(rows, grown, grown.after)
+                before, after = _on_all(rows, grown)
             if not part.whole and (more := overlooked(part.every, grown, after.scatter, config)):
                 say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
                 continue
@@ -132,10 +128,15 @@ def _drawn_tables(grown: Grown, before: Fitted, after: Fitted, config: Config) -
     }
 
 
-def _on_all(rows: Rows, grown: Grown, fitted: Fitted) -> Fitted:
-    """Return a model refitted to rows as they are, ripples that were held included."""
-    terms = tuple(a.proposal.term for a in grown.added) if fitted.model.terms else ()
-    return fit(replace(fitted.model, terms=terms), rows, fitted.scatter, turns=2)
+def _on_all(rows: Rows, grown: Grown) -> tuple[Fitted, Fitted]:
+    """Return before and after, refitted to rows as they are, held ripples included; once where nothing was added."""
+    if grown.before.rows is rows:
+        return grown.before, grown.after
+    before = fit(grown.before.model, rows, grown.before.scatter, turns=2)
+    if not grown.added:
+        return before, before
+    model = replace(grown.after.model, terms=tuple(a.proposal.term for a in grown.added))
+    return before, fit(model, rows, grown.after.scatter, turns=2)
 
 
 class _HeldOut:
