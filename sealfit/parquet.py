@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -102,7 +101,7 @@ def spelled_out(schema: pa.Schema) -> pa.Schema:
 
 
 def write_arrow(table: pa.Table, path: Path) -> None:
-    """Write a table as it is, and wait until it is on the disk itself. Raises OSError if the disk refuses."""
+    """Write a table as it is; whoever calls waits until it is on the disk. Raises OSError if the disk refuses."""
     schema = spelled_out(table.schema)
     measured = [field.name for field in schema if pa.types.is_floating(field.type)]  # have no dictionary
     settings = {
@@ -114,20 +113,16 @@ def write_arrow(table: pa.Table, path: Path) -> None:
         "store_schema": False,
     }
     about = {**(schema.metadata or {}), b"ARROW:schema": base64.b64encode(schema.serialize())}
-    with path.open("wb") as file:  # a file of Python's, so that a full disk is an OSError with its number
-        with pq.ParquetWriter(file, table.schema, **settings) as writer:
-            writer.write_table(table)
-            writer.add_key_value_metadata(about)
-        file.flush()
-        os.fsync(file.fileno())
+    # A file of Python's, so that a full disk is an OSError with its number.
+    with path.open("wb") as file, pq.ParquetWriter(file, table.schema, **settings) as writer:
+        writer.write_table(table)
+        writer.add_key_value_metadata(about)
 
 
 def write_ipc(table: pa.Table, path: Path) -> None:
     """Write a table in Arrow's own format, which is read in no time; errors as `write_arrow`."""
     with path.open("wb") as file, pa.ipc.new_file(file, table.schema) as writer:
         writer.write_table(table)
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
 
 
 def read_ipc(path: Path) -> pa.Table:

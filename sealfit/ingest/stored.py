@@ -7,11 +7,13 @@ strokes and findings: with it, the whole campaign can be judged anew without rea
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +26,7 @@ from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.part import SAMPLED, Asked, read_part
 from sealfit.memory import keep_freed_memory
-from sealfit.staging import PARQUET, disk
+from sealfit.staging import PARQUET, disk, sync
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
 ARROW = ".arrow"
@@ -77,10 +79,9 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
             name: parquet.with_columns(table, asked.columns[name], config.units) for name, table in tables.items()
         }
     name = _file_name(part_key(asked.refs.files, asked.refs.words(), marks, config), asked)
-    with disk(folder.parent):
+    with disk(folder.parent), _whole_files(folder) as write:
         stored = {
-            (file := f"{of}{PARQUET}/{name}"): _write(table, folder / file, parquet.write_arrow)
-            for of, table in tables.items()
+            (file := f"{of}{PARQUET}/{name}"): write(file, table, parquet.write_arrow) for of, table in tables.items()
         }
         about = {
             "unused": sorted(asked.unused),
@@ -93,7 +94,7 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         }
         metadata = {**(part.strokes.schema.metadata or {}), _ABOUT: json.dumps(about)}
         file = f"{PARTS}/{Path(name).with_suffix(ARROW)}"
-        stored[file] = _write(part.strokes.replace_schema_metadata(metadata), folder / file, parquet.write_ipc)
+        stored[file] = write(file, part.strokes.replace_schema_metadata(metadata), parquet.write_ipc)
     return Made(*given, columns, {}, stored)
 
 
@@ -176,13 +177,28 @@ def agrees(part: Made, columns: Columns) -> bool:
     return all(list(types.items()) == list(columns[table].items()) for table, types in has.items())
 
 
-def _write(table: pa.Table, path: Path, write: Callable[[pa.Table, Path], None]) -> int:
-    """Write a table, whole or not at all, and return its size; two that write the same do not disturb each other."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+@contextlib.contextmanager
+def _whole_files(folder: Path) -> Iterator[Callable[[str, pa.Table, Callable], int]]:
+    """Give a function that writes a table to a file below `folder` and returns its size.
+
+    All are on the disk and in their places when the block ends, each whole or not there at all; two processes that
+    write the same do not disturb each other.
+    """
+    drafts: dict[Path, Path] = {}
+
+    def write(file: str, table: pa.Table, how: Callable[[pa.Table, Path], None]) -> int:
+        path = folder / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        drafts[path] = draft = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+        how(table, draft)
+        return draft.stat().st_size
+
     try:
-        write(table, draft)
-        os.replace(draft, path)
+        yield write
+        with ThreadPoolExecutor() as pool:  # several files reach the disk in hardly more time than one
+            list(pool.map(sync, drafts.values()))
+        for path, draft in drafts.items():
+            os.replace(draft, path)
     finally:
-        draft.unlink(missing_ok=True)
-    return path.stat().st_size
+        for draft in drafts.values():
+            draft.unlink(missing_ok=True)
