@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +12,8 @@ from sealfit.ingest.folder import inside
 
 
 class _Names(NamedTuple):
+    """What lies in a folder, as paths below the campaign."""
+
     plain: frozenset[str]  # what is no link and lies inside the campaign, as its folder does
     all: frozenset[str]
 
@@ -25,27 +27,20 @@ class Folders:
 
     def hold(self, file: str) -> bool:
         """Return whether a path, there or not, lies inside the campaign, links followed: as `folder.inside`."""
-        if ":" not in file and "\\" not in file:  # these may mean a drive
-            folder, _, name = file.rpartition("/")
-            if name in self._names(folder).plain:
-                return True
+        if not _may_be_a_drive(file) and file in self._names(file.rpartition("/")[0]).plain:
+            return True
         return inside(self.campaign, file) is not None
 
-    def outside(self, files: Iterable[str]) -> set[str]:
+    def outside(self, files: Collection[str]) -> set[str]:
         """Return those of the paths that do not lie inside the campaign: as `hold`, a folder at a time."""
-        odd: set[str] = set()
-        for folder, names in _by_folder(files).items():
-            plain = self._names(folder).plain
-            odd |= {file for name, file in names.items() if name not in plain or ":" in file or "\\" in file}
+        odd = set(files).difference(*(self._names(folder).plain for folder in _folders(files)))
+        if _may_be_a_drive("/".join(files)):
+            odd |= {file for file in files if _may_be_a_drive(file)}
         return {file for file in odd if not self.hold(file)}
 
-    def beside(self, files: Iterable[str]) -> set[str]:
+    def beside(self, files: Collection[str]) -> set[str]:
         """Return the files that lie beside `files`, in the same folders and with one of their endings; not `files`."""
-        others = {
-            f"{folder}/{name}" if folder else name
-            for folder, own in _by_folder(files).items()
-            for name in self._names(folder).all - own.keys()
-        }
+        others = set().union(*(self._names(folder).all for folder in _folders(files))).difference(files)
         if not others:
             return others
         wanted = {_ending(file) for file in others}
@@ -54,24 +49,24 @@ class Folders:
 
     def _names(self, folder: str) -> _Names:
         if folder not in self._seen:
+            below = f"{folder}/" if folder else ""
             try:
                 with os.scandir(self.campaign / folder) as entries:
-                    link = {entry.name: entry.is_symlink() for entry in entries}
+                    link = {below + entry.name: entry.is_symlink() for entry in entries}
             except OSError:  # no folder, or one that may not be read: its files will say so when they are read
                 link = {}
             within = not folder or inside(self.campaign, folder) is not None
-            plain = (name for name, is_link in link.items() if within and not is_link)
+            plain = (file for file, is_link in link.items() if within and not is_link)
             self._seen[folder] = _Names(frozenset(plain), frozenset(link))
         return self._seen[folder]
 
 
-def _by_folder(files: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return the paths by their folder and their name in it."""
-    found: dict[str, dict[str, str]] = {}
-    for file in files:
-        folder, _, name = file.rpartition("/")
-        found.setdefault(folder, {})[name] = file
-    return found
+def _folders(files: Iterable[str]) -> set[str]:
+    return {file.rpartition("/")[0] for file in files}
+
+
+def _may_be_a_drive(path: str) -> bool:
+    return ":" in path or "\\" in path
 
 
 def _ending(file: str) -> str:

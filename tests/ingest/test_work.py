@@ -73,6 +73,8 @@ def test_what_lies_inside_is_told_from_names_as_from_following_every_link(tmp_pa
     found = Folders(place)
     for file in asked:
         assert found.hold(file) == (inside(place, file) is not None), file
+    assert Folders(place).outside(asked) == {file for file in asked if inside(place, file) is None}
+    assert Folders(place).outside(["b.csv", "/b.csv"]) == {"/b.csv"}
 
 
 def test_files_beside_have_an_ending_of_the_listed_and_are_files(tmp_path):
