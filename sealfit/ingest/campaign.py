@@ -25,7 +25,7 @@ from sealfit.ingest.quality import quality_table
 from sealfit.ingest.refs import Listing
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.shaped import STEADY_ONLY, shaped
-from sealfit.ingest.stored import Made, agrees, common_columns, load_part, make_part, part_key
+from sealfit.ingest.stored import Made, agrees, common_columns, load_part, make_part, part_key, seen_by_parts
 from sealfit.parquet import spelled_out
 from sealfit.profiling import timed
 from sealfit.tables import RUNS, STEADY
@@ -185,13 +185,13 @@ class _Maker:
         """Return the parts that are stored, by their numbers in the plan."""
         if self._place is None or not self._place.known:
             return {}
-        words, made = self._listing.words(), {}
+        words, made, seen = self._listing.words(), {}, seen_by_parts(self._config)
         known = {name: column.known for name, column in self._listing.columns.items()}
         for i, rows in enumerate(self._plan):
             files = [self._listing.files[row] for row in rows.tolist()]
             marks = [self._place.marks.get(file) for file in files]
             cells = {name: column[rows] for name, column in words.items() if known[name][rows].any()}
-            path = self._place.known.get(part_key(files, cells, marks, self._config) or "")
+            path = self._place.known.get(part_key(files, cells, marks, seen) or "")
             if path is not None:
                 made[i] = load_part(path, marks)
         return made

@@ -30,6 +30,7 @@ from sealfit.staging import PARQUET, disk, sync
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
 ARROW = ".arrow"
+FORMAT = 2  # of a part's files; those of another one are made again
 _ABOUT = b"part"
 
 Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each column, as Arrow spells it
@@ -78,7 +79,7 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         tables = {
             name: parquet.with_columns(table, asked.columns[name], config.units) for name, table in tables.items()
         }
-    name = _file_name(part_key(asked.refs.files, asked.refs.words(), marks, config), asked)
+    name = _file_name(part_key(asked.refs.files, asked.refs.words(), marks, seen_by_parts(config)), asked)
     with disk(folder.parent), _whole_files(folder) as write:
         stored = {
             (file := f"{of}{PARQUET}/{name}"): write(file, table, parquet.write_arrow) for of, table in tables.items()
@@ -98,8 +99,13 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     return Made(*given, columns, {}, stored)
 
 
+def seen_by_parts(config: Config) -> str:
+    """Return in words what every part is made by, whatever its files: the version of the program and the rig."""
+    return json.dumps([__version__, FORMAT, config.model_dump(mode="json")])
+
+
 def part_key(
-    files: Sequence[str], known: Mapping[str, np.ndarray], marks: Sequence[Fingerprint | None], config: Config
+    files: Sequence[str], known: Mapping[str, np.ndarray], marks: Sequence[Fingerprint | None], seen: str
 ) -> str | None:
     """Return a hash of what a part is made from, or None where a file's content is not known.
 
@@ -111,15 +117,17 @@ def part_key(
         What is known of them, in words: the columns in which any of them has a value.
     marks : sequence of Fingerprint or None, length n
         Their fingerprints.
-    config : Config
-        The rig.
+    seen : str
+        What `seen_by_parts` says.
     """
     hashes = [None if mark is None else mark.sha256 for mark in marks]
     if None in hashes:
         return None
-    cells = {name: words.tolist() for name, words in known.items()}
-    seen = [__version__, config.model_dump(mode="json"), files, cells, hashes]
-    return hashlib.sha256(json.dumps(seen).encode()).hexdigest()[:20]
+    cells = [word for words in known.values() for word in words.tolist()]
+    told = [seen, json.dumps(list(known)), *files, *hashes, *cells]
+    # Words may hold any mark, so that their lengths are told too.
+    lengths = np.fromiter(map(len, told), np.int64, len(told))
+    return hashlib.sha256(lengths.tobytes() + "".join(told).encode("utf-8", "surrogatepass")).hexdigest()[:20]
 
 
 def _file_name(key: str | None, asked: Asked) -> str:
