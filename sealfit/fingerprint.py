@@ -57,9 +57,9 @@ def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
 
 def fingerprints(folder: Path, known: Mapping[str, Fingerprint], config: Config) -> dict[str, Fingerprint]:
     """Return the fingerprints, now, of every `known` file of the campaign `folder` and of every new trace file."""
-    names = sorted({*known, *glob_names(folder, config.files)})
     place = os.path.join(folder, "")
-    return {name: fingerprint(place + name, known.get(name)) for name in names}
+    now = {name: fingerprint(place + name, mark) for name, mark in known.items()}
+    return now | {name: fingerprint(place + name) for name in glob_names(folder, config.files) if name not in now}
 
 
 def glob_names(folder: Path, files: Files) -> list[str]:
@@ -79,7 +79,8 @@ def step_keys(inputs: Mapping[str, Fingerprint], config: Config) -> dict[str, st
     """Return the key of every step, in order, for these inputs, this config and this version of the program."""
     keys: dict[str, str] = {}
     names = sorted(inputs)
-    before = hashlib.sha256(json.dumps([names, [inputs[name].sha256 for name in names]]).encode()).hexdigest()
+    known = "\0".join([*names, *(inputs[name].sha256 or "" for name in names)])  # \0 stands in no path
+    before = hashlib.sha256(os.fsencode(known)).hexdigest()
     for step in STEPS:
         seen = [__version__, step, seen_config(step, config).model_dump(mode="json"), before]
         if step == "close-loop" and config.loop.effects_folder is not None:

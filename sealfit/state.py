@@ -13,7 +13,7 @@ from sealfit.errors import ConfigError, OutError
 from sealfit.fingerprint import Fingerprint
 
 STATE = "state.json"
-FORMAT = 2
+FORMAT = 3
 DEFAULT = "default"
 
 
@@ -108,12 +108,14 @@ class State:
         path = out / STATE
         try:
             kept = json.loads(path.read_text("utf-8"))
-            if kept["program"] != "sealfit" or kept["format"] != FORMAT:
+            if kept["program"] != "sealfit" or kept["format"] > FORMAT:
                 raise ValueError
             at = kept["config"]["path"]
+            belongs = Path(kept["campaign"]), ConfigCopy(Path(at) if at else None, kept["config"]["text"])
+            if kept["format"] < FORMAT:  # of an earlier version: all is to be done again
+                return cls(*belongs)
             return cls(
-                Path(kept["campaign"]),
-                ConfigCopy(Path(at) if at else None, kept["config"]["text"]),
+                *belongs,
                 _fingerprints(kept["inputs"]),
                 {name: Done(**done) for name, done in kept["steps"].items()},
             )
@@ -129,12 +131,17 @@ class State:
 
 def _columns(inputs: Mapping[str, Fingerprint]) -> dict[str, list]:
     """Return fingerprints column by column: of a hundred thousand files, a fifth of the text of names and values."""
-    marks = zip(*inputs.values(), strict=True) if inputs else [()] * len(Fingerprint._fields)
-    return {"file": list(inputs), **dict(zip(Fingerprint._fields, map(list, marks), strict=True))}
+    marks = inputs.values()
+    return {
+        "file": list(inputs),
+        "size": [mark.size for mark in marks],
+        "mtime_ns": [mark.mtime_ns for mark in marks],
+        "sha256": [mark.sha256 for mark in marks],
+    }
 
 
 def _fingerprints(columns: Mapping[str, list]) -> dict[str, Fingerprint]:
-    marks = map(Fingerprint._make, zip(*(columns[name] for name in Fingerprint._fields), strict=True))
+    marks = map(Fingerprint, *(columns[name] for name in Fingerprint._fields))
     return dict(zip(columns["file"], marks, strict=True))
 
 

@@ -120,8 +120,10 @@ class Store:
         kept = self._kept
         if kept is None:
             return
-        same = {n: now if (now := self._now.get(n, m)).sha256 == m.sha256 else m for n, m in self.state.inputs.items()}
-        self.state = replace(self.state, inputs=same)
+        if self._now != self.state.inputs:
+            now = ((name, self._now.get(name, mark), mark) for name, mark in self.state.inputs.items())
+            same = {name: new if new.sha256 == mark.sha256 else mark for name, new, mark in now}
+            self.state = replace(self.state, inputs=same)
         source = self.state.config if _same_config(kept.config, self.config) else kept.config
         tidy = replace(self.state, config=source)
         if tidy != kept:
@@ -155,7 +157,7 @@ class Store:
         if done.version != __version__:
             return f"it was made by sealfit {done.version}, this is {__version__}"
         known = self.state.inputs
-        changed = [name for name, mark in self._now.items() if name not in known or mark.sha256 != known[name].sha256]
+        changed = sorted(n for n, mark in self._now.items() if n not in known or mark.sha256 != known[n].sha256)
         if changed:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             return f"inputs changed ({', '.join(changed[:3])}{more})"

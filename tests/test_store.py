@@ -372,6 +372,16 @@ def test_a_state_that_cannot_be_read_is_refused(out, campaign):
         do_all(out, campaign)
 
 
+def test_results_of_an_earlier_format_are_made_again(out, campaign):
+    do_all(out, campaign)
+    state = json.loads((out / "state.json").read_text())
+    (out / "state.json").write_text(json.dumps({**state, "format": state["format"] - 1, "inputs": "written otherwise"}))
+    assert Store.open(out).why_stale("ingest") == "ingest has not been done"
+    do_all(out, campaign, rows=5)
+    assert stale(out) == []
+    assert len(Store.open(out).read("steady")) == 5
+
+
 def test_a_folder_that_was_made_for_nothing_goes_again(out, campaign):
     def fail():
         with Store.writing(out, campaign, ConfigCopy.at(None)) as store, store.step("ingest") as staged:
