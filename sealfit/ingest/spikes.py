@@ -15,6 +15,7 @@ from sealfit.ingest.strokes import Stroke, displacement_noises_mm
 NEIGHBOURS = 5  # a median over five samples is blind to one or two wrong ones, and exact on any slope
 # A spike stands apart, four times as far off as 95 % of the samples (of noise: 7.8 SDs); else it is one of many bursts.
 APART, USUAL = 4.0, 0.95
+STEPS = 5.0  # a spike of displacement is off by more than so many of the usual steps: see `displacement_spikes`
 MEND = "Correct the cell if the true value is known."
 
 
@@ -23,7 +24,14 @@ def displacement_suspects(
 ) -> np.ndarray:
     """Return which traces may hold a spike of displacement, shape (traces,): of the others none is found."""
     off = np.abs(displacement_mm - running_median(displacement_mm, traces, NEIGHBOURS, "mirror"))
-    return (traces.size >= 4 * NEIGHBOURS) & (traces.max(off) > settings.spike_sigma * noise_mm)
+    farthest = traces.max(off)
+    # Where more than half of the steps are as large as a share of the farthest, so is their median.
+    large = np.abs(traces.steps(displacement_mm)) >= traces.spread(farthest * ((1.0 + 1e-9) / STEPS))
+    return (
+        (traces.size >= 4 * NEIGHBOURS)
+        & (farthest > settings.spike_sigma * noise_mm)
+        & (2 * traces.sum(large) < traces.size + 1)
+    )
 
 
 def force_suspects(force_N: np.ndarray, steady: np.ndarray, traces: Pieces, settings: Quality) -> np.ndarray:
@@ -33,7 +41,27 @@ def force_suspects(force_N: np.ndarray, steady: np.ndarray, traces: Pieces, sett
     noisy = off >= traces.spread(traces.max(off) * ((1.0 + 1e-9) / (1.4826 * settings.spike_sigma)))
     usual = traces.sum(steady)
     usual, noisy = np.where(usual > 0, (usual, traces.sum(noisy & steady)), (traces.size, traces.sum(noisy)))
-    return (traces.size >= 4 * NEIGHBOURS) & (2 * noisy < usual + 2)
+    made = (traces.size >= 4 * NEIGHBOURS) & (2 * noisy < usual + 2)
+    for i in np.flatnonzero(made).tolist():
+        own = traces.slices[i]
+        made[i] = _may_hold_spikes(force_N[own], off[own], steady[own], settings)
+    return made
+
+
+def _may_hold_spikes(force_N: np.ndarray, off_N: np.ndarray, steady: np.ndarray, settings: Quality) -> bool:
+    """Return whether samples of one trace are as far off as its noise asks for, where `force_spikes` looks for them."""
+    usual = off_N[steady]
+    far = off_N > settings.spike_sigma * (1.4826 * median(usual if len(usual) else off_N))
+    if (far & steady).any():
+        return True
+    return bool(_beyond(force_N, far)[far].any())
+
+
+def _beyond(force_N: np.ndarray, suspects: np.ndarray) -> np.ndarray:
+    """Return which samples reach beyond the trace without its suspects by half of its range, shape (n,)."""
+    rest = np.where(suspects, 0.0, force_N)  # at rest the force may be zero
+    low, high = min(float(rest.min()), 0.0), max(float(rest.max()), 0.0)
+    return np.maximum(low - force_N, force_N - high) > 0.5 * (high - low)
 
 
 def displacement_spikes(
@@ -51,7 +79,7 @@ def displacement_spikes(
     # At a turn the median lags by one step of the fastest samples around, never by more than a few of the usual ones.
     step = median(np.abs(np.diff(displacement_mm)))
     (noise,) = displacement_noises_mm(displacement_mm, one)
-    least = max(5.0 * step, APART * quantile(np.abs(off), USUAL), 1e-9 * float(np.ptp(displacement_mm)))
+    least = max(STEPS * step, APART * quantile(np.abs(off), USUAL), 1e-9 * float(np.ptp(displacement_mm)))
     spikes = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, least))
     if len(spikes) > settings.max_bad_rows * len(off):
         return keep, []
@@ -80,13 +108,10 @@ def force_spikes(
     least = max(0.5 * resolution(force_N), 1e-9 * median(np.abs(force_N)), 1e-300)
     noise = max(1.4826 * median(np.abs(usual)), least)
     apart = APART * quantile(np.abs(usual), USUAL)
-    suspects = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, apart))
-    if not len(suspects):
+    suspects = np.abs(off) > max(settings.spike_sigma * noise, apart)
+    if not suspects.any():
         return keep, []
-    rest = np.append(np.delete(force_N, suspects), 0.0)  # at rest the force may be zero
-    low, high = float(rest.min()), float(rest.max())
-    beyond = np.maximum(low - force_N, force_N - high) > 0.5 * (high - low)
-    spikes = suspects[steady[suspects] | beyond[suspects]]
+    spikes = np.flatnonzero(suspects & (steady | _beyond(force_N, suspects)))
     if len(spikes) > settings.max_bad_rows * len(force_N):
         reason = f"{len(spikes)} samples jump away from their neighbours: too many to be single wrong samples."
         mend = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
