@@ -41,27 +41,24 @@ def force_suspects(force_N: np.ndarray, steady: np.ndarray, traces: Pieces, sett
     noisy = off >= traces.spread(traces.max(off) * ((1.0 + 1e-9) / (1.4826 * settings.spike_sigma)))
     usual = traces.sum(steady)
     usual, noisy = np.where(usual > 0, (usual, traces.sum(noisy & steady)), (traces.size, traces.sum(noisy)))
-    made = (traces.size >= 4 * NEIGHBOURS) & (2 * noisy < usual + 2)
-    for i in np.flatnonzero(made).tolist():
-        own = traces.slices[i]
-        made[i] = _may_hold_spikes(force_N[own], off[own], steady[own], settings)
-    return made
+    may = (traces.size >= 4 * NEIGHBOURS) & (2 * noisy < usual + 2)
+    if not may.any():
+        return may
+    limit = np.full(len(traces), np.inf)
+    for i in np.flatnonzero(may).tolist():
+        own = off[traces.slices[i]]
+        inside = own[steady[traces.slices[i]]]
+        limit[i] = settings.spike_sigma * (1.4826 * median(inside if len(inside) else own))
+    far = off > traces.spread(limit)
+    return traces.sum(far & (steady | _beyond(force_N, far, traces))) > 0
 
 
-def _may_hold_spikes(force_N: np.ndarray, off_N: np.ndarray, steady: np.ndarray, settings: Quality) -> bool:
-    """Return whether samples of one trace are as far off as its noise asks for, where `force_spikes` looks for them."""
-    usual = off_N[steady]
-    far = off_N > settings.spike_sigma * (1.4826 * median(usual if len(usual) else off_N))
-    if (far & steady).any():
-        return True
-    return bool(_beyond(force_N, far)[far].any())
-
-
-def _beyond(force_N: np.ndarray, suspects: np.ndarray) -> np.ndarray:
-    """Return which samples reach beyond the trace without its suspects by half of its range, shape (n,)."""
+def _beyond(force_N: np.ndarray, suspects: np.ndarray, traces: Pieces) -> np.ndarray:
+    """Return which samples reach beyond their trace without its suspects by half of its range, shape (n,)."""
     rest = np.where(suspects, 0.0, force_N)  # at rest the force may be zero
-    low, high = min(float(rest.min()), 0.0), max(float(rest.max()), 0.0)
-    return np.maximum(low - force_N, force_N - high) > 0.5 * (high - low)
+    low, high = np.minimum(traces.min(rest), 0.0), np.maximum(traces.max(rest), 0.0)
+    reach = np.maximum(traces.spread(low) - force_N, force_N - traces.spread(high))
+    return reach > traces.spread(0.5 * (high - low))
 
 
 def displacement_spikes(
@@ -100,8 +97,8 @@ def force_spikes(
     keep = np.ones(len(force_N), bool)
     if len(force_N) < 4 * NEIGHBOURS:
         return keep, []
-    off = force_N - running_median(force_N, Pieces([len(force_N)]), NEIGHBOURS, "mirror")
-    steady = np.zeros(len(force_N), bool)
+    one, steady = Pieces([len(force_N)]), np.zeros(len(force_N), bool)
+    off = force_N - running_median(force_N, one, NEIGHBOURS, "mirror")
     for stroke in strokes:
         steady[stroke.rows] = True
     usual = off[steady] if steady.any() else off
@@ -111,7 +108,7 @@ def force_spikes(
     suspects = np.abs(off) > max(settings.spike_sigma * noise, apart)
     if not suspects.any():
         return keep, []
-    spikes = np.flatnonzero(suspects & (steady | _beyond(force_N, suspects)))
+    spikes = np.flatnonzero(suspects & (steady | _beyond(force_N, suspects, one)))
     if len(spikes) > settings.max_bad_rows * len(force_N):
         reason = f"{len(spikes)} samples jump away from their neighbours: too many to be single wrong samples."
         mend = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
