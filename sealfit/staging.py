@@ -7,6 +7,7 @@ import errno
 import os
 import shutil
 import signal
+import stat
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -74,10 +75,9 @@ class Staged:
 
     def move(self, name: str, to: str | None = None) -> None:
         """Move a staged file to its final place in one step of the file system; one that is in OUT already stays."""
-        target = self._out / (to or name)
-        source = self._folder / name
-        if name in self.files and not source.exists():
+        if name in self.files and not os.path.exists(f"{self._folder}/{name}"):
             return
+        target, source = self._out / (to or name), self._folder / name
         if target.parent.is_file():  # a table that was one file
             target.parent.unlink()
         target.parent.mkdir(exist_ok=True)
@@ -99,6 +99,15 @@ def disk(out: Path) -> Iterator[None]:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             mend = "Free some space and run the command again; the results that were there are untouched."
         raise OutError(f"cannot be written ({reason}).", file=out, mend=mend) from error
+
+
+def file_size(path: str) -> int | None:
+    """Return the size of a file in bytes; None where there is no file."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status.st_size if stat.S_ISREG(status.st_mode) else None
 
 
 def sync(path: Path) -> None:

@@ -18,7 +18,7 @@ from sealfit.errors import ConfigError, OutError, StaleError
 from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, fingerprints, seen_config, step_keys
 from sealfit.lock import LOCK, only_writer
 from sealfit.provenance import provenance
-from sealfit.staging import PARQUET, STAGING, Staged, disk, sync, undisturbed
+from sealfit.staging import PARQUET, STAGING, Staged, disk, file_size, sync, undisturbed
 from sealfit.state import STATE, ConfigCopy, Done, State, to_json
 
 if TYPE_CHECKING:
@@ -148,8 +148,7 @@ class Store:
             if done.key != keys[name]:
                 return f"{name} is stale: {self._what_changed(done)}"
             for file, size in done.files.items():
-                path = self.out / file
-                if not path.is_file() or path.stat().st_size != size:
+                if file_size(f"{self.out}/{file}") != size:
                     return f"{name} is stale: its {file} is missing or was changed"
         return ""
 

@@ -26,7 +26,7 @@ from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.part import SAMPLED, Asked, read_part
 from sealfit.memory import keep_freed_memory
-from sealfit.staging import PARQUET, disk, sync
+from sealfit.staging import PARQUET, disk, file_size, sync
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
 ARROW = ".arrow"
@@ -147,9 +147,8 @@ def known_parts(out: Path, files: Mapping[str, int]) -> dict[str, Path]:
     """
     whole = {Path(name).stem: out / name for name in files if name.startswith(f"{PARTS}/")}
     for name, size in files.items():
-        path = out / name
-        if "/" in name and not (path.is_file() and path.stat().st_size == size):
-            whole.pop(path.stem, None)
+        if "/" in name and file_size(f"{out}/{name}") != size:
+            whole.pop(Path(name).stem, None)
     return {name.split("-", 1)[0]: path for name, path in whole.items()}
 
 
