@@ -101,7 +101,7 @@ def ingest_campaign(
     files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
     order = np.argsort(files, kind="stable")
     strokes, files = strokes_of([part.strokes for part in parts]).take(order).reset_index(drop=True), files[order]
-    parts = [replace(part, strokes=part.strokes.slice(0, 0)) for part in parts]  # they are in one table now
+    parts = [replace(part, strokes=part.strokes.schema.empty_table()) for part in parts]  # they are in one table now
     strokes, found = judged(strokes)
     faults += found
     if not strokes["used"].any():
