@@ -8,7 +8,6 @@ its trend.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,85 +17,78 @@ from sealfit.closure.strokes import Strokes
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import passes
 
+MOST_NUMBERS = 1 << 14  # of samples times wavelengths that are computed at once
 AROUND = np.linspace(-0.5, 0.5, 101)  # periods per stroke on each side of a peak that are looked at once more
 
 
-def strokes_of(samples: pd.DataFrame, axis: str) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Yield (row of the first sample, place, residual) of each stroke long enough, sorted by place.
+@dataclass(frozen=True)
+class Waves:
+    """Normal equations of a sine and a cosine at each of m wavelengths, for p passes in order of file and direction."""
+
+    unit: np.ndarray  # (p,) number of the file
+    direction: np.ndarray  # (p,)
+    square: np.ndarray  # (p, m, 2, 2)
+    product: np.ndarray  # (p, m, 2)
+    total: np.ndarray  # (p,) sum of squares of the residual freed of its trend
+    middle: np.ndarray  # (p,) mean of the strokes' mean places
+
+    @property
+    def amplitudes(self) -> np.ndarray:
+        """Amplitudes of sine and cosine, shape (p, m, 2)."""
+        return np.einsum("pmij,pmj->pmi", np.linalg.pinv(self.square, hermitian=True), self.product)
+
+    @property
+    def share(self) -> np.ndarray:
+        """Share of the sum of squares that the wave explains, shape (p, m)."""
+        return np.einsum("pmi,pmi->pm", self.amplitudes, self.product) / np.maximum(self.total, 1e-300)[:, None]
+
+
+def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
+    """Return the wave of each pass at m wavelengths.
 
     Parameters
     ----------
     samples : DataFrame
         Samples of a stroke one after the other: stroke_id, unit, direction, the axis, `residual_N`.
-    axis : str
-        Column along which the wave runs.
-    """
-    strokes = Strokes.of(samples, axis)
-    for k, first in enumerate(strokes.start.tolist()):
-        yield first, *strokes.along(k)
-
-
-@dataclass(frozen=True)
-class Wave:
-    """Normal equations of a sine and a cosine, summed over strokes, at each of m wavelengths."""
-
-    square: np.ndarray  # (m, 2, 2)
-    product: np.ndarray  # (m, 2)
-    total: float  # sum of squares of the residual freed of its trend
-    middle: float  # sum of the strokes' mean places
-    strokes: int = 1
-
-    def __add__(self, other: Wave) -> Wave:
-        return Wave(
-            self.square + other.square,
-            self.product + other.product,
-            self.total + other.total,
-            self.middle + other.middle,
-            self.strokes + other.strokes,
-        )
-
-    @property
-    def amplitudes(self) -> np.ndarray:
-        """Amplitudes of sine and cosine, shape (m, 2)."""
-        return np.einsum("mij,mj->mi", np.linalg.pinv(self.square, hermitian=True), self.product)
-
-    @property
-    def share(self) -> np.ndarray:
-        """Share of the sum of squares that the wave explains, shape (m,)."""
-        return np.einsum("mi,mi->m", self.amplitudes, self.product) / max(self.total, 1e-300)
-
-
-def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> dict[tuple[int, float], Wave]:
-    """Return the wave of each pass, keyed by (number of the file, direction), at m wavelengths.
-
-    Parameters
-    ----------
-    samples : DataFrame
-        As for `strokes_of`.
     lengths : ndarray, shape (m,)
         Wavelengths in the unit of the axis.
     axis : str
         Column along which the wave runs.
     """
-    unit, direction = samples["unit"].to_numpy(), samples["direction"].to_numpy()
-    waves: dict[tuple[int, float], Wave] = {}
-    for a, place, value in strokes_of(samples, axis):
-        key = (unit[a], direction[a])
-        wave = _wave(place, value, lengths)
-        waves[key] = waves[key] + wave if key in waves else wave
-    return waves
+    strokes = Strokes.of(samples, axis)
+    square, product = np.zeros((strokes.size.size, lengths.size, 2, 2)), np.zeros((strokes.size.size, lengths.size, 2))
+    total, middle = np.zeros((2, strokes.size.size))
+    for size in np.unique(strokes.size).tolist():  # those of one size at once, as far as they fit into the cache
+        alike = np.flatnonzero(strokes.size == size)
+        for some in np.array_split(alike, min(alike.size, -(-alike.size * size * lengths.size // MOST_NUMBERS))):
+            place, value = strokes.together(some)
+            square[some], product[some], total[some] = _normal_equations(place, value, lengths)
+            middle[some] = place.mean(axis=1)
+    order = np.lexsort((strokes.direction, strokes.unit))
+    unit, direction = strokes.unit[order], strokes.direction[order]
+    first = np.flatnonzero(np.r_[True, (np.diff(unit) != 0) | (np.diff(direction) != 0)][: order.size])
+    square, product, total, middle = (
+        np.add.reduceat(part[order], first, axis=0) if first.size else part for part in (square, product, total, middle)
+    )
+    return Waves(unit[first], direction[first], square, product, total, middle / np.diff(np.r_[first, order.size]))
 
 
-def _wave(place: np.ndarray, value: np.ndarray, lengths: np.ndarray) -> Wave:
-    root = np.sqrt(np.hanning(place.size + 2)[1:-1])
-    trend, _ = np.linalg.qr(root[:, None] * np.vander(2 * (place - place.mean()) / np.ptp(place), 3))
-    turn = 2 * np.pi * place[:, None] / lengths
-    columns = root[:, None] * np.column_stack([np.sin(turn), np.cos(turn), value])
-    columns -= trend @ (trend.T @ columns)
-    sine, cosine, y = columns[:, : lengths.size], columns[:, lengths.size : -1], columns[:, -1]
-    mixed = (sine * cosine).sum(axis=0)
-    square = np.array([[(sine**2).sum(axis=0), mixed], [mixed, (cosine**2).sum(axis=0)]])
-    return Wave(np.moveaxis(square, 2, 0), np.column_stack([y @ sine, y @ cosine]), float(y @ y), float(place.mean()))
+def _normal_equations(
+    place: np.ndarray, value: np.ndarray, lengths: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `square`, `product` and `total` of strokes of n samples each, shape (s, n), sorted by place."""
+    root = np.sqrt(np.hanning(place.shape[1] + 2)[1:-1])[:, None]
+    even = 2 * (place - place.mean(axis=1, keepdims=True)) / np.ptp(place, axis=1, keepdims=True)
+    trend, _ = np.linalg.qr(root * even[:, :, None] ** [2, 1, 0])
+    turn = 2 * np.pi * place[:, :, None] / lengths
+    columns = root * np.concatenate([np.sin(turn), np.cos(turn), value[:, :, None]], axis=2)
+    columns -= trend @ (trend.transpose(0, 2, 1) @ columns)
+    sine, cosine, y = columns[:, :, : lengths.size], columns[:, :, lengths.size : -1], columns[:, :, -1:]
+    product = np.stack([(sine * y).sum(axis=1), (cosine * y).sum(axis=1)], axis=-1)
+    square = np.empty((*product.shape, 2))
+    square[..., 0, 0], square[..., 1, 1] = (sine * sine).sum(axis=1), (cosine * cosine).sum(axis=1)
+    square[..., 0, 1] = square[..., 1, 0] = (sine * cosine).sum(axis=1)
+    return square, product, (y * y).sum(axis=(1, 2))
 
 
 def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tuple[float, float]:
@@ -104,13 +96,11 @@ def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tu
 
     The error is a jackknife over files.
     """
-    span = np.median([place[-1] - place[0] for _, place, _ in strokes_of(samples, axis)])
-    lengths = 1 / (1 / wavelength + AROUND / span)
+    lengths = 1 / (1 / wavelength + AROUND / np.median(Strokes.of(samples, axis).span))
     waves = waves_of(samples, lengths, axis)
-    files = sorted({file for file, _ in waves})
+    files, file = np.unique(waves.unit, return_inverse=True)
     share = np.zeros((len(files), lengths.size))
-    for (file, _), wave in waves.items():
-        share[files.index(file)] += wave.share
+    np.add.at(share, file, waves.share)
     without = np.array([_top(lengths, share.sum(axis=0) - own) for own in share])
     spread = (len(files) - 1) / len(files) * ((without - without.mean()) ** 2).sum()
     return _top(lengths, share.sum(axis=0)), float(np.sqrt(spread))
@@ -134,7 +124,7 @@ def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis:
     Parameters
     ----------
     samples : DataFrame
-        As for `strokes_of`.
+        As for `waves_of`.
     first : ndarray of bool, shape (n,)
         Which samples make the first half.
     wavelength : float
@@ -143,10 +133,11 @@ def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis:
         Column along which the wave runs.
     """
     one, other = (waves_of(samples[mask], np.array([wavelength]), axis) for mask in (first, ~first))
-    cross: dict[int, float] = {}
-    for key in one.keys() & other.keys():
-        cross[key[0]] = cross.get(key[0], 0.0) + float(one[key].amplitudes[0] @ other[key].amplitudes[0])
-    return np.array([cross[unit] for unit in sorted(cross)])
+    whole = [np.rec.fromarrays([part.unit, part.direction]) for part in (one, other)]
+    _, mine, its = np.intersect1d(*whole, assume_unique=True, return_indices=True)
+    cross = (one.amplitudes[mine, 0] * other.amplitudes[its, 0]).sum(axis=1)
+    _, file = np.unique(one.unit[mine], return_inverse=True)
+    return np.bincount(file, cross)
 
 
 def pass_shifts(samples: pd.DataFrame, rows: Rows, wavelength: float, axis: str) -> dict[str, float]:
@@ -158,10 +149,9 @@ def pass_shifts(samples: pd.DataFrame, rows: Rows, wavelength: float, axis: str)
     strokes = rows.table.iloc[rows.groups.starts["stroke"]]
     names = dict(zip(strokes["stroke_id"], passes(strokes), strict=True))
     first = samples.drop_duplicates(["unit", "direction"]).set_index(["unit", "direction"])["stroke_id"]
-    shifts = {}
-    for key, wave in waves_of(samples, np.array([wavelength]), axis).items():
-        sine, cosine = wave.amplitudes[0]
-        shift = wavelength * np.arctan2(cosine, sine) / (2 * np.pi)
-        middle = wave.middle / wave.strokes
-        shifts[names[first[key]]] = float(shift - wavelength * np.round((middle + shift) / wavelength))
-    return shifts
+    waves = waves_of(samples, np.array([wavelength]), axis)
+    sine, cosine = waves.amplitudes[:, 0].T
+    shift = wavelength * np.arctan2(cosine, sine) / (2 * np.pi)
+    shift -= wavelength * np.round((waves.middle + shift) / wavelength)
+    keys = zip(waves.unit.tolist(), waves.direction.tolist(), strict=True)
+    return {names[first[key]]: own for key, own in zip(keys, shift.tolist(), strict=True)}
