@@ -177,7 +177,8 @@ class _HeldOut:
             if not grown.added:
                 self.samples = self.samples.iloc[[]]  # much of the memory, and nothing is searched again
             folds = _Folds(self, grown.before, search=bool(grown.added))
-            self._begun = begin_map(_held_out, folds, workers=self.workers)
+            # One refit of merged bins takes less than the start of a process and the way of its rows there.
+            self._begun = begin_map(_held_out, folds, workers=self.workers if folds.search else 1)
 
     def forces(self, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
         """Return each row's force, before and after, by fits that did not see its group; NaN if never held out."""
