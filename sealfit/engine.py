@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from sealfit.cluster import Cluster
+    from sealfit.processes import Beside, Say
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
@@ -21,6 +22,7 @@ CHUNKS_PER_WORKER = 4  # enough to even out items of different cost, few enough 
 MAX_CHUNK = 32  # so that progress is shown often
 
 _cluster: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
+_leads: ContextVar[bool] = ContextVar("leads", default=False)  # a process that may use others, although one itself
 
 
 def cores() -> int:
@@ -119,6 +121,32 @@ def begin_map(
     return made
 
 
+def begin_beside(function: Callable[[Given, Say], Made], item: Given, *, workers: int) -> Beside | None:
+    """Let another process of this computer do `function(item, say)`; None where work is done one after the other.
+
+    It may map over `workers` processes in its turn. Close what is returned (`contextlib.closing`).
+
+    Parameters
+    ----------
+    function : callable
+        At the top level of a module; given the item and a function to call with what there is to say.
+    item
+        Sent to the process.
+    workers : int
+        Processes that may be used in all. With one, on a cluster and in a worker there is none to spare.
+    """
+    if _cluster.get() is not None or _here(workers):
+        return None
+    from sealfit.processes import Beside
+
+    return Beside(_lead, pickle.dumps((function, item)))
+
+
+def spare(workers: int) -> int:
+    """Return how many processes are idle: in one begun with `begin_beside`, the process that began it is at work."""
+    return max(workers - 1, 1) if _leads.get() else workers
+
+
 def many_workers(workers: int) -> bool:
     """Whether a map would be done by several workers at once."""
     return not _here(workers)
@@ -126,7 +154,7 @@ def many_workers(workers: int) -> bool:
 
 def _here(workers: int) -> bool:
     """Whether the work is to be done in this process."""
-    if multiprocessing.parent_process() is not None:  # a worker itself
+    if multiprocessing.parent_process() is not None and not _leads.get():  # a worker itself
         return True
     return workers <= 1 and _cluster.get() is None
 
@@ -141,6 +169,8 @@ def _elsewhere(
     if cluster is None:
         from sealfit.processes import in_processes
 
+        if _leads.get():  # its workers come from a server of its own, which then loads once what each would load
+            prepare(function.__module__, workers=workers)
         made = in_processes(_apply, chunks, workers)
     else:
         made = cluster.apply(_apply, chunks)
@@ -154,3 +184,9 @@ def _elsewhere(
 def _apply(pickled: bytes) -> list:
     function, chunk = pickle.loads(pickled)
     return [function(item) for item in chunk]
+
+
+def _lead(pickled: bytes, say: Say) -> object:
+    _leads.set(True)
+    function, item = pickle.loads(pickled)
+    return function(item, say)

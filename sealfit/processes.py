@@ -8,16 +8,22 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
+from multiprocessing.connection import Connection
+from typing import Any
 
-from sealfit.errors import WorkerError
+from sealfit.errors import SealfitError, WorkerError
 from sealfit.threads import one_thread
 
+Say = Callable[[str], None]
+
 WAITING_PER_WORKER = 2  # chunks sent ahead of the one awaited: bounds the memory of results not yet taken
+UNHEARD_S = 5.0  # a process that is told to end may be at a long product of matrices
 # Not fork: it copies the locks of pyarrow's and BLAS's threads without the threads that free them. A fork server has
 # no threads, and has loaded what the workers need before the first of them is wanted.
 START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
@@ -58,10 +64,7 @@ def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], worker
             yield made
         finished = True
     except BrokenProcessPool as error:
-        raise WorkerError(
-            "a worker process died before it had answered.",
-            mend="If memory ran out, use fewer workers (--workers 1).",
-        ) from error
+        raise _died() from error
     finally:
         processes = list((executor._processes or {}).values())
         executor.shutdown(wait=finished, cancel_futures=True)
@@ -70,6 +73,75 @@ def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], worker
                 process.terminate()
             for process in processes:
                 process.join()
+
+
+class Beside:
+    """One piece of work in a process of its own, which may use others.
+
+    Parameters
+    ----------
+    work : callable
+        A function at the top level of a module: given `asked`, and a function to call with what there is to say.
+    asked : bytes
+        What it is to do.
+    """
+
+    def __init__(self, work: Callable[[bytes, Say], Any], asked: bytes) -> None:
+        context = multiprocessing.get_context(START)
+        self._told, tell = context.Pipe(duplex=False)
+        self._process = context.Process(target=_telling, args=(work, asked, tell))
+        with _no_interrupt_for_children():
+            self._process.start()
+        tell.close()
+        self._answered = False
+
+    def result(self, say: Say) -> Any:
+        """Return what the work returns, or raise what it raises; pass on what it said so far, and says until then.
+
+        Raises
+        ------
+        WorkerError
+            If the process dies before.
+        """
+        while True:
+            try:
+                kind, told = self._told.recv()
+            except EOFError as error:
+                raise _died() from error
+            if kind == "said":
+                say(told)
+                continue
+            self._answered = True
+            if kind == "raised":
+                raise told
+            return told
+
+    def close(self) -> None:
+        """End the process, whatever it is at."""
+        if not self._answered:
+            self._process.terminate()
+            self._process.join(UNHEARD_S)
+            self._process.kill()
+        self._process.join()
+        self._told.close()
+
+
+def _telling(work: Callable[[bytes, Say], Any], asked: bytes, tell: Connection) -> None:
+    _start_worker()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends its own processes, and leaves nothing of theirs
+    try:
+        told = "made", work(asked, lambda text: tell.send(("said", text)))
+    except Exception as error:
+        if not isinstance(error, SealfitError):  # a bug: its traceback is here
+            error.add_note(traceback.format_exc())
+        told = "raised", error
+    tell.send(told)
+
+
+def _died() -> WorkerError:
+    return WorkerError(
+        "a worker process died before it had answered.", mend="If memory ran out, use fewer workers (--workers 1)."
+    )
 
 
 @contextlib.contextmanager

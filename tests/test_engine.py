@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sealfit.engine import begin_map, cores, run_map
+from sealfit.engine import begin_beside, begin_map, cores, run_map, spare
 from sealfit.errors import CampaignError, Fault, RequestError, WorkerError
 
 HERE = Path(__file__).resolve().parent
@@ -47,6 +47,38 @@ def die(number):
 
 def wait_long(number):
     time.sleep(60)
+
+
+def square_beside(number, say):
+    say(f"squaring {number}")
+    say("done")
+    return square(number)
+
+
+def map_beside(count, say):
+    return os.getpid(), set(run_map(process_id, range(count), workers=2)), spare(2)
+
+
+def fail_beside(number, say):
+    say("failing")
+    return fail_on_three(number)
+
+
+def bug_beside(number, say):
+    return number / 0
+
+
+def die_beside(number, say):
+    say("dying")
+    die(number)
+
+
+def wait_beside(number, say):
+    list(run_map(wait_long, range(number), workers=2))
+
+
+def nested_beside(number):
+    return begin_beside(square_beside, number, workers=2) is None
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -99,17 +131,24 @@ def test_cores_is_what_this_process_may_use():
 PROGRAM = """
 import sys
 sys.path.insert(0, {tests!r})
-from sealfit.engine import run_map
-from test_engine import wait_long
+from contextlib import closing
+from sealfit.engine import begin_beside, run_map
+from test_engine import wait_beside, wait_long
 
 if __name__ == "__main__":
     print("begun", flush=True)
     try:
-        list(run_map(wait_long, range(4), workers=2))
+        {work}
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
 """
+WORK = {
+    # two workers, the server that starts them, and the resource tracker
+    "a map": ("list(run_map(wait_long, range(4), workers=2))", 4),
+    # the one beside, its two workers, a server for each of the two, and the resource tracker
+    "beside": ("with closing(begin_beside(wait_beside, 4, workers=2)) as beside: beside.result(print)", 6),
+}
 
 
 def descendants_of(pid):
@@ -138,18 +177,19 @@ def alive(pid):
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc to see the processes")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill -9"])
-def test_no_worker_outlives_its_parent(tmp_path, how):
+@pytest.mark.parametrize(("work", "processes"), WORK.values(), ids=WORK)
+def test_no_worker_outlives_its_parent(tmp_path, how, work, processes):
     program = tmp_path / "program.py"
-    program.write_text(PROGRAM.format(tests=str(HERE)))
+    program.write_text(PROGRAM.format(tests=str(HERE), work=work))
     with subprocess.Popen(
         [sys.executable, program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as run:
         assert run.stdout.readline() == "begun\n"
         until = time.monotonic() + 20
-        while len(descendants_of(run.pid)) < 4 and time.monotonic() < until:
+        while len(descendants_of(run.pid)) < processes and time.monotonic() < until:
             time.sleep(0.05)
         children = descendants_of(run.pid)
-        assert len(children) == 4  # two workers, the server that starts them, and the resource tracker
+        assert len(children) == processes
         if how == signal.SIGINT:
             os.killpg(run.pid, how)  # as a terminal does: to the whole group
         else:
@@ -190,3 +230,49 @@ def pickled_by_main(item):
 def test_items_are_pickled_before_the_caller_goes_on_to_change_them():
     with closing(begin_map(pickled_by_main, [PickledBy() for _ in range(6)], workers=2)) as made:
         assert list(made) == [True] * 6
+
+
+def test_work_beside_says_what_it_does_and_answers():
+    said = []
+    with closing(begin_beside(square_beside, 3, workers=2)) as beside:
+        assert beside.result(said.append) == 9
+    assert said == ["squaring 3", "done"]
+
+
+def test_work_beside_may_use_processes_and_leaves_one_to_who_began_it():
+    with closing(begin_beside(map_beside, 5, workers=2)) as beside:
+        own, used, spared = beside.result(print)
+    assert not {own, os.getpid()} & used
+    assert 1 <= len(used) <= 2
+    assert (spared, spare(2)) == (1, 2)
+
+
+def test_nothing_is_begun_beside_with_one_worker_or_by_a_worker():
+    assert begin_beside(square_beside, 3, workers=1) is None
+    assert list(run_map(nested_beside, range(2), workers=2)) == [True, True]
+
+
+def test_an_error_beside_comes_back_whole_and_a_bug_with_its_traceback():
+    said = []
+    with (
+        closing(begin_beside(fail_beside, 3, workers=2)) as beside,
+        pytest.raises(RequestError, match="three is wrong") as caught,
+    ):
+        beside.result(said.append)
+    assert (said, caught.value.mend) == (["failing"], "Use another.")
+    with closing(begin_beside(bug_beside, 3, workers=2)) as beside, pytest.raises(ZeroDivisionError) as caught:
+        beside.result(print)
+    assert "in bug_beside" in caught.value.__notes__[0]
+
+
+def test_a_death_beside_is_a_clear_error():
+    with (
+        closing(begin_beside(die_beside, 2, workers=2)) as beside,
+        pytest.raises(WorkerError, match=r"worker process died.*--workers 1"),
+    ):
+        beside.result(lambda text: None)
+
+
+def test_work_beside_that_is_given_up_ends():
+    begin_beside(wait_beside, 4, workers=2).close()
+    assert not multiprocessing.active_children()

@@ -18,7 +18,7 @@ from scipy.sparse import csr_array
 
 from sealfit.closure.background import LOBE
 from sealfit.closure.strokes import Strokes
-from sealfit.engine import begin_map
+from sealfit.engine import begin_map, spare
 
 MOST_NUMBERS = 1 << 19  # of the grids of a block: 4 MB
 WORTHWHILE = 400_000  # samples from which it takes longer to transform them than to start processes and send them
@@ -72,7 +72,8 @@ def begin_spectra(
         Processes that transform many samples, already at work while the caller does something else.
     """
     surveys = [survey for axis in axes if (survey := _survey(samples, axis)) is not None]
-    made = begin_map(_sums_of, _Blocks(surveys), workers=workers if len(samples) >= WORTHWHILE else 1, together=1)
+    workers = spare(workers) if len(samples) >= WORTHWHILE else 1
+    made = begin_map(_sums_of, _Blocks(surveys), workers=workers, together=1)
     return _summed(surveys, made, known)
 
 
