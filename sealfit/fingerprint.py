@@ -20,6 +20,9 @@ from sealfit.config import Config, Files, Loop, Sensor
 STEPS = ("ingest", "fit-steady", "fit-aging", "fit-dynamic", "close-loop", "report")
 """Every step, each reading what those before it wrote."""
 
+FITS = ("fit-steady", "fit-aging", "fit-dynamic")
+"""Those of which close-loop reads nothing: it fits its own model to the bins."""
+
 UNSEEN = {
     "ingest": {"sensor": Sensor(), "loop": Loop()},
     "fit-steady": {"loop": Loop()},

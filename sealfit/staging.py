@@ -30,9 +30,10 @@ PARQUET = ".parquet"
 class Staged:
     """Files of one step, written beside their final place and moved there together when the step is complete."""
 
-    def __init__(self, out: Path, units: Units):
+    def __init__(self, out: Path, units: Units, step: str):
         self._out, self._units = out, units
-        self._folder = out / f"{STAGING}{os.getpid()}"
+        self._folder = out / f"{STAGING}{os.getpid()}-{step}"
+        self.seconds: float | None = None  # of its work, where that began before the step's turn
         self.files: dict[str, int] = {}
         self.inputs: dict[str, Fingerprint] | None = None  # set by ingest: what it read
 

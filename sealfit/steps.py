@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sealfit.engine import on_cluster
 from sealfit.errors import CampaignError, Fault
 from sealfit.fingerprint import STEPS, fingerprint, glob_names
+from sealfit.order import Counted, Order, Work
 from sealfit.places import RUNS, campaign_folder, existing_out, refuse_effects_in
 from sealfit.profiling import timed
 from sealfit.progress import Silent
@@ -19,6 +23,8 @@ from sealfit.store import Store
 if TYPE_CHECKING:
     import pandas as pd
 
+    from sealfit.report.drawn import Drawn
+
 INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
 FITTED = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
@@ -28,7 +34,6 @@ REPORTED = {  # of tables with a row per bin, what the report looks at
     f"residuals_{stage}": ["condition", "run_id", "file", "residual_N", "heldout_residual_N"]
     for stage in ("before", "after")
 }
-Counted = tuple[int, str]
 FAULTY = ("warning", "error")  # severities that count as a fault
 
 
@@ -110,18 +115,18 @@ def _do_steps(
         progress.warn(warning)
     store.anew = force
     done = []
-    for step in steps:
-        why = store.why_stale(step)
-        if why or force:
-            if why and step in store.state.steps:
-                progress.say(why)
-            with timed(step) as part, store.step(step) as staged:
-                part.rows, part.of = _WORK[step](store, staged, workers, progress)
-            done.append(step)
-        else:
-            progress.say(f"{step}: current, not redone")
-        if step == "ingest" and strict:
-            _refuse_faults(store.read("quality"))
+    with closing(Order(store, steps, _WORK, _early_report, workers=workers, progress=progress)) as order:
+        for step in steps:
+            why = store.why_stale(step)
+            if why or force:
+                if why and step in store.state.steps:
+                    progress.say(why)
+                order.do(step)
+                done.append(step)
+            else:
+                progress.say(f"{step}: current, not redone")
+            if step == "ingest" and strict:
+                _refuse_faults(store.read("quality"))
     with timed("summary"):
         found = summary.of_steps(store, steps)
     return {"out": str(store.out), "done": done, **found}
@@ -218,24 +223,43 @@ def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) ->
     return len(closure.tables["residuals_before"]), "bins"
 
 
-def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+@dataclass(frozen=True)
+class _Early:
+    """What of the report shows nothing of the closed loop: tables, and figures drawn."""
+
+    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    figures: Mapping[str, Drawn] = field(default_factory=dict)
+
+
+def _early_report(store: Store) -> Work:
+    """Do what of the report shows nothing of the closed loop, and return the work that is left."""
+    from sealfit.report.page import figures_of_fits
+
+    tables = _reported(store, (*INGESTED, *FITTED))
+    return partial(_report, early=_Early(tables, figures_of_fits(tables, store.seen_config("report"))))
+
+
+def _report(store: Store, staged: Staged, workers: int, progress: Silent, early: _Early = _Early()) -> Counted:
     from sealfit.report.page import build_report
 
     progress.say("drawing the report")
     with timed("reading tables"):
-        tables = {
-            name: store.read(name, REPORTED.get(name))
-            for name in (*INGESTED, *FITTED, *CLOSED)
-            if name not in (*UNREPORTED, "traces_mean")
-        }
-        tables["traces_mean"] = _example_traces(store, tables["runs"])
+        tables = {**(early.tables or _reported(store, (*INGESTED, *FITTED))), **_reported(store, CLOSED)}
     with timed("page"):
-        report = build_report(tables, store.read_json("closure"), store.provenance(), store.seen_config("report"))
+        about = store.read_json("closure"), store.provenance(), store.seen_config("report")
+        report = build_report(tables, *about, drawn=early.figures)
     with timed("writing plots", rows=len(report.figures), of="plots"):
         for name, figure in report.figures.items():
             staged.figure(name, figure)
     staged.text("report.html", report.html)
     return sum(len(table) for table in tables.values()), "rows of tables"
+
+
+def _reported(store: Store, names: tuple[str, ...]) -> dict[str, pd.DataFrame]:
+    """Return of these tables what the report draws."""
+    read = [name for name in names if name not in (*UNREPORTED, "traces_mean")]
+    tables = {name: store.read(name, REPORTED.get(name)) for name in read}
+    return {**tables, "traces_mean": _example_traces(store, tables["runs"])} if "traces_mean" in names else tables
 
 
 def _example_traces(store: Store, runs: pd.DataFrame) -> pd.DataFrame:
@@ -249,7 +273,7 @@ def _example_traces(store: Store, runs: pd.DataFrame) -> pd.DataFrame:
     return traces.sort_values("run_id", key=lambda names: names.map(chosen.index), kind="stable")
 
 
-_WORK: dict[str, Callable[[Store, Staged, int, Silent], Counted]] = {
+_WORK: dict[str, Work] = {
     "ingest": _ingest,
     "fit-steady": _fit_steady,
     "fit-aging": _fit_aging,

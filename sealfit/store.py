@@ -127,7 +127,7 @@ class Store:
         source = self.state.config if _same_config(kept.config, self.config) else kept.config
         tidy = replace(self.state, config=source)
         if tidy != kept:
-            staged = Staged(self.out, self.config.units)
+            staged = Staged(self.out, self.config.units, "state")
             try:
                 staged.text(STATE, to_json(tidy.as_dict(), indent=None))
                 with disk(self.out):
@@ -215,9 +215,20 @@ class Store:
         return provenance(self.state)
 
     # ------------------------------------------------------------ writing
+    def stage(self, step: str) -> Staged:
+        """Return a place for the files of a step whose work begins before its turn; clear it if that never comes."""
+        return Staged(self.out, self.config.units, step)
+
     @contextlib.contextmanager
-    def step(self, name: str) -> Iterator[Staged]:
+    def step(self, name: str, staged: Staged | None = None) -> Iterator[Staged]:
         """Give a place for the files of step `name`; they all take their places when the block ends without an error.
+
+        Parameters
+        ----------
+        name : str
+            One of `STEPS`.
+        staged : Staged, optional
+            A place that holds some of them already.
 
         Raises
         ------
@@ -225,10 +236,10 @@ class Store:
             If the disk is full or refuses; OUT then holds what it held before.
         """
         began = time.monotonic()
-        staged = Staged(self.out, self.config.units)
+        staged = staged or self.stage(name)
         try:
             yield staged
-            self._commit(name, staged, time.monotonic() - began)
+            self._commit(name, staged, staged.seconds or time.monotonic() - began)
         finally:
             staged.clear()
 

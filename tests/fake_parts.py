@@ -112,7 +112,7 @@ class Parts:
             document=self.closure, model={"ready": True}, tables={name: small(name) for name in names}
         )
 
-    def build_report(self, tables, closure, provenance, config):
+    def build_report(self, tables, closure, provenance, config, *, drawn):
         self._called("report", config)
         assert set(tables) >= {"steady", "steady_fit", "aging_curves", "curves"}
         return SimpleNamespace(
@@ -136,8 +136,9 @@ class Parts:
 
 
 def put_in(monkeypatch):
-    """Put the stand-ins in the place of the computing parts, and return them."""
+    """Put the stand-ins in the place of the computing parts, in this process alone, and return them."""
     parts = Parts()
+    monkeypatch.setattr("sealfit.order.begin_beside", lambda *asked, workers: None)
     places = {
         "sealfit.ingest.campaign": ["ingest_campaign", "Place"],
         "sealfit.fit.steady": ["fit_conditions"],

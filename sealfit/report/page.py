@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
+from types import MappingProxyType
 
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
@@ -14,7 +15,7 @@ from sealfit.config import Config
 from sealfit.profiling import timed
 from sealfit.report import facts
 from sealfit.report.drawn import Drawn, data_uri, draw_plots
-from sealfit.report.figures import draw_all
+from sealfit.report.figures import draw_all, draw_fits
 from sealfit.report.figures_residual import MOST_CHANNELS
 from sealfit.report.law_tables import law_rows
 from sealfit.report.loop_tables import channel_tests, effect_cards, error_rows, next_runs, scatter_rows
@@ -29,6 +30,7 @@ TABLES = (
     "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves", "effects",
     "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves",
 )  # fmt: skip
+EMPTY: Mapping[str, Drawn] = MappingProxyType({})
 VERDICTS = {
     "closed": "Closed",
     "nothing_missing": "Nothing missing",
@@ -45,8 +47,17 @@ class Report:
     figures: dict[str, Drawn]
 
 
+def figures_of_fits(tables: Mapping[str, pd.DataFrame], config: Config) -> dict[str, Drawn]:
+    """Return the figures that show nothing of the closed loop, drawn; arguments as `build_report`."""
+    return draw_plots(draw_fits(facts.complete(tables, TABLES), config))
+
+
 def build_report(
-    tables: Mapping[str, pd.DataFrame], closure: Mapping | None, provenance: Mapping, config: Config
+    tables: Mapping[str, pd.DataFrame],
+    closure: Mapping | None,
+    provenance: Mapping,
+    config: Config,
+    drawn: Mapping[str, Drawn] = EMPTY,
 ) -> Report:
     """Return the report of one campaign.
 
@@ -60,6 +71,8 @@ def build_report(
         provenance.json.
     config : Config
         Names the conditions and gives every quantity its true unit.
+    drawn : mapping of str to Drawn, optional
+        Figures that were drawn before.
 
     Returns
     -------
@@ -70,8 +83,9 @@ def build_report(
     if closure is not None:
         closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
     plots = draw_all(tables, closure, config)
-    with timed("plots", rows=len(plots), of="plots"):
-        figures = draw_plots(plots)
+    left = {name: plot for name, plot in plots.items() if name not in drawn}
+    with timed("plots", rows=len(left), of="plots"):
+        figures = {**draw_plots(left), **drawn}
     images = {name: _images(plot, figures[name]) for name, plot in plots.items()}
     html = _environment().from_string(_text("template.html")).render(
         style=Markup(_text("style.css")), plots=images, **_content(tables, closure, provenance, config)
