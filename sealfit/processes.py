@@ -18,6 +18,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from sealfit.errors import SealfitError, WorkerError
+from sealfit.interrupts import undisturbed
 from sealfit.threads import one_thread
 
 Say = Callable[[str], None]
@@ -32,8 +33,9 @@ START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() 
 def prepare(*modules: str) -> None:
     """Begin to load `modules`, in the background, for processes that will be wanted soon."""
     if START == "forkserver":
-        from multiprocessing import forkserver
+        from multiprocessing import forkserver, resource_tracker
 
+        resource_tracker.ensure_running()  # it lets Ctrl-C through again when it starts
         multiprocessing.set_forkserver_preload(list(modules))
         with _no_interrupt_for_children():
             forkserver.ensure_running()
@@ -148,16 +150,18 @@ def _died() -> WorkerError:
 def _no_interrupt_for_children() -> Iterator[None]:
     """Start processes that do not see Ctrl-C: the parent stops them, so none prints a traceback of its own.
 
-    A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not lost.
+    A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not lost; nor
+    is the end that a process beside is told: what it is about to start would look for it in vain.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    with undisturbed(by=signal.SIGTERM):
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start_worker() -> None:

@@ -6,9 +6,7 @@ import contextlib
 import errno
 import os
 import shutil
-import signal
 import stat
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -118,19 +116,3 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-@contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """Let a Ctrl-C wait until the block has ended: moving files takes milliseconds, and half of it would be stale."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # Ctrl-C reaches the main thread only
-        return
-    waiting: list[object] = []
-    before = signal.signal(signal.SIGINT, lambda *caught: waiting.append(caught))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if waiting:
-            signal.raise_signal(signal.SIGINT)

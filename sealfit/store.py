@@ -16,9 +16,10 @@ from sealfit import __version__
 from sealfit.config import Config
 from sealfit.errors import ConfigError, OutError, StaleError
 from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, fingerprints, seen_config, step_keys
+from sealfit.interrupts import undisturbed
 from sealfit.lock import LOCK, only_writer
 from sealfit.provenance import provenance
-from sealfit.staging import PARQUET, STAGING, Staged, disk, file_size, sync, undisturbed
+from sealfit.staging import PARQUET, STAGING, Staged, disk, file_size, sync
 from sealfit.state import STATE, ConfigCopy, Done, State, to_json
 
 if TYPE_CHECKING:
@@ -262,7 +263,7 @@ class Store:
         staged.text("ended.json", to_json(ended.as_dict(), indent=None))
         staged.text(PROVENANCE, to_json(provenance(ended), indent=None))
         old = self.state.steps[name].files if name in self.state.steps else {}
-        with undisturbed(), disk(self.out):
+        with undisturbed(), disk(self.out):  # moving files takes milliseconds, and half of it would be stale
             staged.move("begun.json", STATE)
             sync(self.out)
             for file in files:

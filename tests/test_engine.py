@@ -13,6 +13,7 @@ import pytest
 
 from sealfit.engine import begin_beside, begin_map, cores, run_map, spare
 from sealfit.errors import CampaignError, Fault, RequestError, WorkerError
+from sealfit.processes import _no_interrupt_for_children
 
 HERE = Path(__file__).resolve().parent
 
@@ -132,7 +133,7 @@ PROGRAM = """
 import sys
 sys.path.insert(0, {tests!r})
 from contextlib import closing
-from sealfit.engine import begin_beside, run_map
+from sealfit.engine import begin_beside, prepare, run_map
 from test_engine import wait_beside, wait_long
 
 if __name__ == "__main__":
@@ -202,6 +203,49 @@ def test_no_worker_outlives_its_parent(tmp_path, how, work, processes):
     while any(map(alive, children)) and time.monotonic() < until:
         time.sleep(0.05)
     assert not any(map(alive, children))
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
+def test_a_server_that_is_still_loading_does_not_see_ctrl_c(tmp_path):
+    (tmp_path / "slow_to_load.py").write_text("import time\nopen('loading', 'w').close()\ntime.sleep(3)\n")
+    work = "prepare('slow_to_load', workers=2); wait_long(1)"
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM.format(tests=str(HERE), work=work))
+    with subprocess.Popen(
+        [sys.executable, program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    ) as run:
+        until = time.monotonic() + 20
+        while not (tmp_path / "loading").exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        assert (tmp_path / "loading").exists()
+        os.killpg(run.pid, signal.SIGINT)
+        _, stderr = run.communicate(timeout=20)
+    assert (run.returncode, stderr) == (130, "interrupted\n")
+
+
+def test_who_is_told_to_end_while_it_starts_others_ends_after():
+    def end(*_):
+        raise SystemExit(1)
+
+    before, begun = signal.signal(signal.SIGTERM, end), []
+
+    def start():
+        with _no_interrupt_for_children():
+            signal.raise_signal(signal.SIGTERM)
+            begun.append("others")
+
+    try:
+        with pytest.raises(SystemExit):
+            start()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert begun == ["others"]
 
 
 def test_begun_work_gives_the_same_and_can_be_given_up():
