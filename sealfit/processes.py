@@ -33,9 +33,8 @@ START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() 
 def prepare(*modules: str) -> None:
     """Begin to load `modules`, in the background, for processes that will be wanted soon."""
     if START == "forkserver":
-        from multiprocessing import forkserver, resource_tracker
+        from multiprocessing import forkserver
 
-        resource_tracker.ensure_running()  # it lets Ctrl-C through again when it starts
         multiprocessing.set_forkserver_preload(list(modules))
         with _no_interrupt_for_children():
             forkserver.ensure_running()
@@ -65,7 +64,7 @@ def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], worker
             send(1)
             yield made
         finished = True
-    except BrokenProcessPool as error:
+    except (BrokenProcessPool, EOFError) as error:  # the second where it was the server that starts them
         raise _died() from error
     finally:
         processes = list((executor._processes or {}).values())
@@ -92,8 +91,11 @@ class Beside:
         context = multiprocessing.get_context(START)
         self._told, tell = context.Pipe(duplex=False)
         self._process = context.Process(target=_telling, args=(work, asked, tell))
-        with _no_interrupt_for_children():
-            self._process.start()
+        try:
+            with _no_interrupt_for_children():
+                self._process.start()
+        except EOFError as error:
+            raise _died() from error
         tell.close()
         self._answered = False
 
@@ -133,6 +135,8 @@ def _telling(work: Callable[[bytes, Say], Any], asked: bytes, tell: Connection) 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends its own processes, and leaves nothing of theirs
     try:
         told = "made", work(asked, lambda text: tell.send(("said", text)))
+    except SystemExit:
+        return  # and lets go of what was begun, before anybody waits for it
     except Exception as error:
         if not isinstance(error, SealfitError):  # a bug: its traceback is here
             error.add_note(traceback.format_exc())
@@ -156,6 +160,9 @@ def _no_interrupt_for_children() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # here, as it lets Ctrl-C through again when it starts
     with undisturbed(by=signal.SIGTERM):
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:

@@ -13,7 +13,7 @@ import pytest
 
 from sealfit.engine import begin_beside, begin_map, cores, run_map, spare
 from sealfit.errors import CampaignError, Fault, RequestError, WorkerError
-from sealfit.processes import _no_interrupt_for_children
+from sealfit.processes import START, _no_interrupt_for_children
 
 HERE = Path(__file__).resolve().parent
 
@@ -315,6 +315,23 @@ def test_a_death_beside_is_a_clear_error():
         pytest.raises(WorkerError, match=r"worker process died.*--workers 1"),
     ):
         beside.result(lambda text: None)
+
+
+@pytest.mark.skipif(START != "forkserver", reason="no server starts processes here")
+def test_a_death_of_the_server_that_starts_workers_is_a_clear_error(tmp_path):
+    (tmp_path / "deadly_to_load.py").write_text("import os\nos._exit(1)\n")
+    for work in ("list(run_map(wait_long, range(4), workers=2))", "begin_beside(wait_beside, 4, workers=2)"):
+        (tmp_path / "program.py").write_text(
+            PROGRAM.format(tests=str(HERE), work=f"prepare('deadly_to_load', workers=2); {work}")
+        )
+        run = subprocess.run(
+            [sys.executable, tmp_path / "program.py"],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        )
+        assert "WorkerError: a worker process died before it had answered" in run.stderr
 
 
 def test_work_beside_that_is_given_up_ends():
