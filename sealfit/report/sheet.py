@@ -218,7 +218,7 @@ def _lines(places: np.ndarray, codes: np.ndarray) -> str:
     """Return straight lines by the steps from each vertex to the next: these are short."""
     begins = np.flatnonzero(codes == Path.MOVETO)
     pieces = []
-    for begin, end in zip(begins, [*begins[1:], len(codes)], strict=True):
+    for begin, end in zip(begins, np.append(begins, len(codes))[1:], strict=True):  # none of a path without places
         closed = bool(codes[end - 1] == Path.CLOSEPOLY)
         steps = np.diff(places[begin : end - closed], axis=0)
         steps = steps[steps.any(axis=1)]

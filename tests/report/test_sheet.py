@@ -122,3 +122,11 @@ def test_what_is_too_much_for_an_svg_is_in_it_as_pixels(sheet):
     assert (inside[..., 3] > 0).sum() == pytest.approx(
         (image(sheet.png())[y : y + height, x : x + width, 3] > 0).sum(), rel=0.05
     )
+
+
+def test_a_line_without_any_places_draws_nothing():
+    figure = Figure(figsize=(1, 1), dpi=100)
+    line = figure.add_artist(Line2D([0.2, 0.8], [np.nan, np.nan]))
+    sheet = Sheet(100, 100, 100)
+    with look():
+        assert sheet.part([line]).elements == []
