@@ -49,12 +49,12 @@ def _neighbours(value: np.ndarray) -> np.ndarray:
 
 
 def tops(power: np.ndarray) -> np.ndarray:
-    """Return where a spectrum is highest within a main lobe each side, its low end left out, shape (f,).
+    """Return where a spectrum is highest within a main lobe each side, both ends left out, shape (f,).
 
-    At the low end stand the smooth shapes of a stroke (warming, drift), which are no ripple.
+    At the low end stand the smooth shapes of a stroke (warming, drift), which are no ripple; at the high end only the
+    strokes that are sampled most finely are left, and their noise is not that of all.
     """
-    padded = np.pad(power, LOBE, constant_values=np.inf)[: power.size + LOBE]
-    padded = np.r_[padded, np.zeros(LOBE)]
+    padded = np.pad(power, LOBE, constant_values=np.inf)
     highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * LOBE + 1).max(axis=1)
     return power >= highest
 

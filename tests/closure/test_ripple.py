@@ -99,3 +99,15 @@ def test_a_slow_wave_in_time_is_not_taken_for_one_wavelength_at_the_slowest_spee
     assert peak.axis == "time_s"
     assert peak.wavelength == pytest.approx(1.7, rel=0.02)
     assert peak.p_value < 1e-3
+
+
+def test_noise_of_the_strokes_that_are_sampled_most_finely_is_no_ripple_where_only_they_reach():
+    rng = np.random.default_rng(0)
+    steps = (0.2638, 0.2641, 0.2647, 0.266, 0.268, 0.2725, 0.281, 0.292)  # each speed has its own
+    tables = []
+    for k in range(800):
+        x = rng.uniform(0.0, 4.0) + steps[k % 8] * np.arange(60) + rng.normal(0.0, 0.002, 60)
+        own = {"stroke_id": k, "unit": k, "direction": 1.0, "displacement_mm": x, "time_s": x / (1 + k % 8)}
+        tables.append(pd.DataFrame({**own, "residual_N": rng.normal(0.0, 0.1, 60)}))
+    peak = find_ripple(pd.concat(tables, ignore_index=True), common_phase=True)
+    assert peak.p_value > 0.05
