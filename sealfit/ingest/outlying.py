@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.special import stdtr
 
 from sealfit.ingest.scatter import Layout, ScatterFit, fit_scatter
 
@@ -68,7 +68,7 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
         taken, kept, apart = _take_out(layout, force, fit, kept, _furthest(layout, fit, kept, most))
         if apart.scatter.df < 3:
             break
-        for judged in _judge(fit, apart, taken, tests, tiny):
+        for judged in _judge(fit, apart, taken, tests, level, tiny):
             found.append(judged)
             over = judged.p >= level and abs(judged.t) < 3.0  # nothing further out remains
             if over:
@@ -124,7 +124,9 @@ def _less(kept: np.ndarray, taken: list[np.ndarray]) -> np.ndarray:
     return without
 
 
-def _judge(fit: ScatterFit, apart: ScatterFit, taken: list[np.ndarray], tests: int, tiny: float) -> list[_Judged]:
+def _judge(
+    fit: ScatterFit, apart: ScatterFit, taken: list[np.ndarray], tests: int, level: float, tiny: float
+) -> list[_Judged]:
     """Return t and p of each that was taken out, by the scatter without it and without those before it.
 
     Between the scatters with and without all of them, variances go by the share of the squares that is out, degrees of
@@ -138,7 +140,7 @@ def _judge(fit: ScatterFit, apart: ScatterFit, taken: list[np.ndarray], tests: i
     sd = np.sqrt((1.0 - gone) * fit.scatter.sd_N(force) ** 2 + gone * apart.scatter.sd_N(force) ** 2)
     t = fit.residual[worst] / (np.maximum(sd, tiny) * np.sqrt(fit.share[worst]))
     df = [(1.0 - n) * fit.df_at(f) + n * apart.df_at(f) for n, f in zip(number.tolist(), force.tolist(), strict=True)]
-    p_one = 2.0 * stdtr(df, -np.abs(t))
+    p_one = _two_sided_p(t, df, beyond_doubt=NEAR * level / tests)
     judged = []
     for k, rows in enumerate(taken):
         p = -np.expm1((tests - (len(rows) - 1)) * np.log1p(-min(p_one[k], 1.0 - 1e-16)))
@@ -148,6 +150,17 @@ def _judge(fit: ScatterFit, apart: ScatterFit, taken: list[np.ndarray], tests: i
     return judged
 
 
+def _two_sided_p(t: np.ndarray, df: list[float], *, beyond_doubt: float) -> np.ndarray:
+    """Return the chance of Student's t so far out; the normal distribution's, which is less, if all of those are larger
+    than what is beyond doubt: then nothing lies outside, and scipy, which takes long to load, is not wanted."""
+    least = np.array([math.erfc(size / math.sqrt(2.0)) for size in np.abs(t).tolist()])
+    if np.all(least > 2.0 * beyond_doubt):  # twice, as many tests together are a little less likely than their sum
+        return least
+    from scipy.special import stdtr
+
+    return 2.0 * stdtr(df, -np.abs(t))
+
+
 def _outliers(layout: Layout, force_N: np.ndarray, found: list[_Judged], level: float, tiny: float) -> list[_Judged]:
     """Return those up to the last one that exceeds its limit."""
     for last in range(len(found), 0, -1):
@@ -155,7 +168,7 @@ def _outliers(layout: Layout, force_N: np.ndarray, found: list[_Judged], level: 
         if level / NEAR < one.p < level * NEAR:
             kept = _less(np.ones(len(force_N), bool), [other.rows for other in found[: last - 1]])
             with_it, without = (fit_scatter(layout, force_N, rows) for rows in (kept, _less(kept, [one.rows])))
-            one = _judge(with_it, without, [one.rows], one.tests, tiny)[0]
+            one = _judge(with_it, without, [one.rows], one.tests, level, tiny)[0]
         if one.p < level:
             return [*found[: last - 1], one]
     return []
