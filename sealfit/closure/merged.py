@@ -12,7 +12,8 @@ from sealfit.fit.declared import declare
 from sealfit.fit.rows import POWER, Rows, make_rows, merge, thin
 
 STROKES = 4_000  # that are searched; of more, whole runs are dealt,
-LEAST_RUNS = 20  # at least so many for each number of the declared model,
+RUNS = 1_000  # at least so many, as they are the evidence of most channels,
+LEAST_RUNS = 20  # and at least so many for each number of the declared model,
 FURTHER = 4  # and so many times as many strokes where the campaign shows more than they do
 ROWS = 4_000  # that the search works on; more are merged along their strokes,
 PER_STROKE = 8  # to about so many of each stroke,
@@ -49,10 +50,10 @@ def searched(rows: Rows, seed: int) -> Iterator[Searched]:
     seed : int
         Of the deal.
     """
-    every, most, strokes = _merged(rows, rows, seed), STROKES, rows.groups.starts["stroke"].size
-    searched_before = 0
+    every, most, searched_before = _merged(rows, rows, seed), STROKES, 0
+    strokes, runs = (rows.groups.starts[level].size for level in ("stroke", "run"))
     while most < strokes:
-        drawn = _dealt(rows, most / strokes, seed)
+        drawn = _dealt(rows, min(max(most / strokes, RUNS / runs), 1.0), seed)
         if searched_before < np.count_nonzero(drawn) < drawn.size:
             part = rows.subset(drawn)
             yield Searched(part, _merged(part, rows, seed), every)

@@ -52,6 +52,7 @@ MANY_SPEEDS = (1.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 60.
 def few(monkeypatch):
     """A search that begins with 40 strokes, whatever the model."""
     monkeypatch.setattr("sealfit.closure.merged.STROKES", 40)
+    monkeypatch.setattr("sealfit.closure.merged.RUNS", 1)
     monkeypatch.setattr("sealfit.closure.merged.LEAST_RUNS", 1)
 
 
@@ -84,12 +85,20 @@ def test_a_part_has_the_campaigns_model_and_some_run_of_each_condition(few, monk
     npt.assert_allclose(evaluate(model, part.coarse, jacobian=False)[0], part.coarse.force, rtol=1e-4)
 
 
+def test_few_runs_of_very_many_strokes_are_all_searched(few, monkeypatch):
+    rows = make_rows(numbered(make_bins(1, bins=4)), has_aging=True)
+    monkeypatch.setattr("sealfit.closure.merged.RUNS", rows.groups.starts["run"].size)
+    (part,) = searched(rows, 1)
+    assert part.whole
+
+
 def warm(table, force):
     return force * (1 - 0.05 * (1 - np.exp(-table["time_s"].to_numpy() / 3)))
 
 
 def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(monkeypatch):
     bins = make_bins(3, effect=warm, setup=0.005, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4)
+    monkeypatch.setattr("sealfit.closure.merged.RUNS", 1)
     found, said = [], []
     for strokes in (60, 10_000):
         monkeypatch.setattr("sealfit.closure.merged.STROKES", strokes)
@@ -109,6 +118,7 @@ def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(monkeypatch
 
 def test_what_only_all_strokes_show_has_all_of_them_searched(monkeypatch):
     monkeypatch.setattr("sealfit.closure.merged.STROKES", 60)
+    monkeypatch.setattr("sealfit.closure.merged.RUNS", 1)
     rng = np.random.default_rng(5)
     bins = make_bins(3, setup=0.003, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, noise_N=0.1)
     humidity = bins["run_id"].map({run: rng.normal() for run in bins["run_id"].unique()})
