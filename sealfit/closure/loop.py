@@ -238,11 +238,13 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
         before, after = part.before, part.after
     else:
         before = after = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
-    forces = []
-    for fitted in (before, after)[: 1 if after is before else 2]:
+
+    def force(fitted: Fitted) -> np.ndarray:
         own = fitted if fold.every is None else fit(fitted.model, fold.every, fitted.scatter, turns=0)
-        forces.append(predict_rows(own, fold.test))
-    return forces[0], forces[-1]
+        return predict_rows(own, fold.test)
+
+    first = force(before)
+    return first, first if after is before else force(after)
 
 
 def _document(

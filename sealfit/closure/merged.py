@@ -68,7 +68,7 @@ def _merged(part: Rows, campaign: Rows, seed: int) -> Rows:
     if len(few) == part.force.size:
         return part
     made = make_rows(few, has_aging=campaign.has_aging, conditions=campaign.conditions)
-    made.cache["declared",] = declare(campaign)
+    declare(made, as_in=campaign)
     return made
 
 
