@@ -94,6 +94,11 @@ def make_bins(
     return pd.concat(tables, ignore_index=True)
 
 
+def warm(table: pd.DataFrame, force: np.ndarray) -> np.ndarray:
+    """Friction that falls by 5 % as it slides, with a time constant of 3 s: an `effect` of `make_bins`."""
+    return force * (1 - 0.05 * (1 - np.exp(-table["time_s"].to_numpy() / 3)))
+
+
 def make_traces(bins: pd.DataFrame) -> pd.DataFrame:
     """Return the bins themselves as steady samples: what the ripple search sees."""
     return bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(steady=True)

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import numpy.testing as npt
 import pytest
-from bins_helpers import make_bins, make_traces
+from bins_helpers import make_bins, make_traces, warm
 
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
@@ -13,10 +13,6 @@ from sealfit.tables import RESIDUALS_AFTER, SCHEMAS
 
 CHANNELS = {"lab_temperature_C": lambda rng: 22 + rng.normal(), "batch": lambda rng: str(rng.choice(list("ABC")))}
 SCATTER = {"setup": 0.005, "specimen": 0.01, "run_channels": CHANNELS}
-
-
-def warm(table, force):
-    return force * (1 - 0.05 * (1 - np.exp(-table["time_s"].to_numpy() / 3)))
 
 
 def close(bins):

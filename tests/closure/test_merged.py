@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import numpy.testing as npt
 import pytest
-from bins_helpers import make_bins, make_traces
+from bins_helpers import make_bins, make_traces, warm
 
 from sealfit.closure.grow import numbered
 from sealfit.closure.loop import close_loop
@@ -90,10 +90,6 @@ def test_few_runs_of_very_many_strokes_are_all_searched(few, monkeypatch):
     monkeypatch.setattr("sealfit.closure.merged.RUNS", rows.groups.starts["run"].size)
     (part,) = searched(rows, 1)
     assert part.whole
-
-
-def warm(table, force):
-    return force * (1 - 0.05 * (1 - np.exp(-table["time_s"].to_numpy() / 3)))
 
 
 def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(monkeypatch):
