@@ -11,6 +11,7 @@ from sealfit.effects import arrhenius_aging
 
 GAS_CONSTANT = arrhenius_aging.GAS_CONSTANT / 1000  # kJ/(mol K)
 TINY = 1e-300  # of a variance: values without any scatter
+ROUNDING = 1e-14  # of the largest variance: less is not known of a covariance
 
 
 def _inverse(celsius):
@@ -71,6 +72,11 @@ class Aged:
         own = (scatter * (self.value if about is None else about)) ** 2 + TINY
         return (np.diag(measured) if measured.ndim == 1 else measured) + np.diag(own)
 
+    @cached_property
+    def spread(self) -> Spread:
+        """The same for any scatter."""
+        return Spread(self.covariance(0.0), np.abs(self.value))
+
     def drivers(self) -> tuple[str, ...]:
         """Return the names of the coefficients in ln k of what was varied."""
         aged, found = self.days > 0, []
@@ -108,6 +114,39 @@ class Aged:
     def last_days(self) -> list[np.ndarray]:
         """Return the mask of each series' last day, shape (n,) each."""
         return [own & (self.days == self.days[own].max()) for own in self.whole_series()]
+
+
+class Spread:
+    """The covariance C(s) = M + s^2 diag(size)^2 of values for any scatter s, decomposed once.
+
+    Parameters
+    ----------
+    measured : ndarray, shape (n, n)
+        M.
+    size : ndarray, shape (n,)
+        What the scatter is relative to.
+
+    Notes
+    -----
+    Relative to the sizes C is M' + s^2, and the axes of M' are those of C for every s.
+    """
+
+    def __init__(self, measured: np.ndarray, size: np.ndarray) -> None:
+        self._size = np.maximum(size, ROUNDING * size.max())
+        variance, self._axes = np.linalg.eigh(measured / np.outer(self._size, self._size))
+        self._variance = np.maximum(variance, max(ROUNDING * variance[-1], TINY))
+
+    def whitening(self, scatter: float) -> np.ndarray:
+        """Return W with W C W' = 1, shape (n, n)."""
+        return self._axes.T / self._size / np.sqrt(self._variance + scatter**2)[:, None]
+
+    def chi2(self, residual: np.ndarray, scatter: float) -> float:
+        """Return r' C^-1 r of a residual, shape (n,)."""
+        return float(((residual / self._size) @ self._axes) ** 2 @ (1 / (self._variance + scatter**2)))
+
+    def log_determinant(self, scatter: float) -> float:
+        """Return ln det C."""
+        return float(np.log(self._variance + scatter**2).sum() + 2 * np.log(self._size).sum())
 
 
 def reference_of(tested: np.ndarray) -> float:

@@ -126,9 +126,9 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
     days = [np.unique(aged.days[own]).size for own in aged.whole_series()]
     if len(days) < 2 or min(days) < 3:
         return None
-    covariance = aged.covariance(law.scatter)
-    fitted = fit_law(Values(aged.days, aged.value, np.zeros(aged.value.size, int), series, covariance))
-    criterion = fitted.chi2 + float(np.linalg.slogdet(covariance)[1]) + fitted.x.size * np.log(aged.value.size)
+    origin = np.zeros(aged.value.size, int)
+    fitted = fit_law(Values(aged.days, aged.value, origin, series, aged.covariance(law.scatter)))
+    criterion = fitted.chi2 + aged.spread.log_determinant(law.scatter) + fitted.x.size * np.log(aged.value.size)
     squares = []
     for out in aged.last_days() if min(days) > 3 else []:
         part = fit_law(fitted.values.part(~out))

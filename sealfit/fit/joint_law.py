@@ -158,15 +158,14 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
     empty = JointLaw(aged, shape, way, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf)
     x, scatter, before = None, 0.05, np.inf
     for _ in range(TURNS):
-        x = solved(empty, aged.covariance(scatter), x)
+        x = solved(empty, aged.spread.whitening(scatter), x)
         before, scatter = scatter, _scatter(aged, aged.value - empty.at(aged, x), aged.value.size - len(names))
         if abs(scatter - before) <= SETTLED * before:
             break
-    root = np.linalg.cholesky(aged.covariance(scatter))
-    white = np.linalg.solve(root, np.column_stack([aged.value - empty.at(aged, x), empty.slope(aged, x).T]))
-    criterion = float(white[:, 0] @ white[:, 0] + 2 * np.log(np.diag(root)).sum())
-    criterion += len(names) * np.log(aged.value.size)
-    covariance = covariance_of(white[:, 1:].T @ white[:, 1:], np.zeros((len(names),) * 2))
+    criterion = aged.spread.chi2(aged.value - empty.at(aged, x), scatter) + aged.spread.log_determinant(scatter)
+    criterion += len(names) * float(np.log(aged.value.size))
+    white = aged.spread.whitening(scatter) @ empty.slope(aged, x).T
+    covariance = covariance_of(white.T @ white, np.zeros((len(names),) * 2))
     return replace(empty, x=x, covariance=covariance, scatter=scatter, criterion=criterion)
 
 
@@ -179,7 +178,7 @@ def _scatter(aged: Aged, residual: np.ndarray, df: int) -> float:
         return 0.0
 
     def excess(tau):
-        return float(residual @ np.linalg.solve(aged.covariance(tau), residual)) - df
+        return aged.spread.chi2(residual, tau) - df
 
     if excess(0.0) <= 0:
         return 0.0
@@ -217,14 +216,15 @@ def rivals_of(laws: Sequence[JointLaw]) -> list[JointLaw]:
 
 def left_out(law: JointLaw) -> dict[str, float]:
     """Return the RMS error of a law at whole series, and at last days, that it was not fitted to; NaN without any."""
-    aged, covariance = law.aged, law.aged.covariance(law.scatter)
+    aged, drivers = law.aged, law.aged.drivers()
     whole = aged.whole_series()
     held = {"series": whole if len(whole) > 2 else [], "last_day": aged.last_days()}
-    kept = {name: [out for out in masks if aged.part(~out).drivers() == aged.drivers()] for name, masks in held.items()}
+    plain = replace(aged, variance=None)  # a matrix that is not asked for here, and large
+    kept = {name: [out for out in masks if plain.part(~out).drivers() == drivers] for name, masks in held.items()}
     masks = np.array([out for own in kept.values() for out in own])
     if not len(masks):
         return dict.fromkeys(kept, np.nan)
-    errors = law.at(aged, solved_without(law, covariance, masks)) - aged.value
+    errors = law.at(aged, solved_without(law, aged.spread.whitening(law.scatter), masks)) - aged.value
     found, start = {}, 0
     for name, own in kept.items():
         squares = errors[start : start + len(own)][masks[start : start + len(own)]] ** 2

@@ -20,53 +20,53 @@ POLISHED = 4  # points of the grid
 DEPENDENT = 1e-20  # share of a loss beyond mu_0, squared, below which it is one with it
 
 
-def solved(law: JointLaw, covariance: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+def solved(law: JointLaw, white: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
     """Return the parameters of least squares, shape (p,): from a start, or from the best few of a grid.
 
     Parameters
     ----------
     law : JointLaw
         Gives shape, way, values and the references.
-    covariance : ndarray, shape (n, n)
-        Of the values.
+    white : ndarray, shape (n, n)
+        W with W C W' = 1 for the covariance C of the values.
     start : ndarray, shape (p,), optional
         Where to begin.
     """
-    problem = _Projected(law, covariance, law.aged.value[None])
+    problem = _Projected(law, white, law.aged.value[None])
     bent = problem.grid() if start is None else start[None, LINEAR:]
     x, rss = problem.polished(bent, np.zeros(len(bent), int))
     return x[np.argmin(rss)]
 
 
-def solved_many(law: JointLaw, covariance: np.ndarray, values: np.ndarray) -> np.ndarray:
+def solved_many(law: JointLaw, white: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the parameters for many draws of the values near the law's own, shape (draws, p), all draws at once.
 
     Parameters
     ----------
     law : JointLaw
         Where the search begins.
-    covariance : ndarray, shape (n, n)
-        Of the values of a draw.
+    white : ndarray, shape (n, n)
+        W with W C W' = 1 for the covariance C of the values of a draw.
     values : ndarray, shape (draws, n)
         The draws.
     """
-    return _Projected(law, covariance, values).polished(np.tile(law.x[LINEAR:], (len(values), 1)))[0]
+    return _Projected(law, white, values).polished(np.tile(law.x[LINEAR:], (len(values), 1)))[0]
 
 
-def solved_without(law: JointLaw, covariance: np.ndarray, masks: np.ndarray) -> np.ndarray:
+def solved_without(law: JointLaw, white: np.ndarray, masks: np.ndarray) -> np.ndarray:
     """Return the parameters without the values of each mask, shape (masks, p), all masks at once.
 
     Parameters
     ----------
     law : JointLaw
         Where the search begins.
-    covariance : ndarray, shape (n, n)
-        Of the values.
+    white : ndarray, shape (n, n)
+        W with W C W' = 1 for the covariance C of the values.
     masks : ndarray of bool, shape (masks, n)
         What is left out.
     """
     values = np.broadcast_to(law.aged.value, masks.shape)
-    return _Projected(law, covariance, values, masks).polished(np.tile(law.x[LINEAR:], (len(masks), 1)))[0]
+    return _Projected(law, white, values, masks).polished(np.tile(law.x[LINEAR:], (len(masks), 1)))[0]
 
 
 class _Projected:
@@ -75,8 +75,8 @@ class _Projected:
     Parameters
     ----------
     law : JointLaw
-    covariance : ndarray, shape (n, n)
-        Of the values of a set.
+    white : ndarray, shape (n, n)
+        W with W C W' = 1 for the covariance C of the values of a set.
     values : ndarray, shape (sets, n)
     masks : ndarray of bool, shape (sets, n), optional
         What is left out of each set.
@@ -87,9 +87,8 @@ class _Projected:
     BIT 15, 49-57, doi:10.1007/BF01932995.
     """
 
-    def __init__(self, law: JointLaw, covariance: np.ndarray, values: np.ndarray, masks: np.ndarray | None = None):
+    def __init__(self, law: JointLaw, white: np.ndarray, values: np.ndarray, masks: np.ndarray | None = None):
         self.law, self.values, self.aside = law, values, None
-        white = np.linalg.inv(np.linalg.cholesky(covariance))
         level = white.sum(axis=1)  # the column of mu_0
         if masks is None:
             self.level = (level @ white / (level @ level))[None]

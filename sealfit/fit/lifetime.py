@@ -214,9 +214,9 @@ def resampled(
     """
     rng, place = np.random.default_rng(seed), _place(law, temperature_C, compression_pct)
     mean = law.at(law.aged)
-    covariance = law.aged.covariance(law.scatter, mean)
-    drawn = mean + rng.standard_normal((draws, mean.size)) @ np.linalg.cholesky(covariance).T
-    found = [_days(law, x, goal, place) for x in solved_many(law, covariance, drawn)]
+    root = np.linalg.cholesky(law.aged.covariance(law.scatter, mean))
+    drawn = mean + rng.standard_normal((draws, mean.size)) @ root.T
+    found = [_days(law, x, goal, place) for x in solved_many(law, np.linalg.inv(root), drawn)]
     days, wider = _days(law, law.x, goal, place), law.t / ndtri(0.975)
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.log(np.quantile(found, [0.025, 0.975], method="inverted_cdf") / days)

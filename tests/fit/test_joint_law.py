@@ -142,9 +142,13 @@ def test_an_end_that_a_likely_law_leaves_open_stays_open():
     assert over_laws(laws, Goal(0.3), 60.0, 80.0)[1] == np.inf
 
 
+def whitened(covariance):
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
 def alone(law, covariance, values, keep=slice(None)):
     """The parameters by scipy, of some values by themselves."""
-    white = np.linalg.inv(np.linalg.cholesky(covariance[keep][:, keep]))
+    white = whitened(covariance[keep][:, keep])
     return least_squares(
         lambda x: white @ (law.at(law.aged, x) - values)[keep], law.x, x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15
     ).x
@@ -154,7 +158,7 @@ def test_many_draws_at_once_are_fitted_as_each_alone():
     law = fit_joint_law(campaign(scatter=0.01), "log", "rate")
     covariance = law.aged.covariance(law.scatter)
     drawn = np.random.default_rng(2).multivariate_normal(law.at(law.aged), covariance, 6)
-    for values, x in zip(drawn, solved_many(law, covariance, drawn), strict=True):
+    for values, x in zip(drawn, solved_many(law, whitened(covariance), drawn), strict=True):
         assert x == pytest.approx(alone(law, covariance, values), rel=1e-5, abs=1e-6)
 
 
@@ -165,8 +169,20 @@ def test_values_left_out_at_once_are_left_out_of_each_fit():
     law = fit_joint_law(replace(aged, variance=common), "log", "rate")
     covariance = law.aged.covariance(law.scatter)
     masks = np.array([*aged.whole_series(), *aged.last_days()])
-    for out, x in zip(masks, solved_without(law, covariance, masks), strict=True):
+    for out, x in zip(masks, solved_without(law, whitened(covariance), masks), strict=True):
         assert x == pytest.approx(alone(law, covariance, aged.value, ~out), rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.02])
+def test_a_decomposed_covariance_is_the_covariance(scatter):
+    aged = campaign(scatter=0.01)
+    common = 1e-5 * (aged.series()[:, None] == aged.series()) + np.diag(aged.variance)
+    aged = replace(aged, variance=common)
+    covariance, residual = aged.covariance(scatter), np.sin(np.arange(aged.value.size))
+    white = aged.spread.whitening(scatter)
+    assert white @ covariance @ white.T == pytest.approx(np.eye(aged.value.size), abs=1e-9)
+    assert aged.spread.chi2(residual, scatter) == pytest.approx(residual @ np.linalg.solve(covariance, residual))
+    assert aged.spread.log_determinant(scatter) == pytest.approx(np.linalg.slogdet(covariance)[1])
 
 
 @pytest.mark.parametrize("way", ["rate", "loss"])
