@@ -100,7 +100,7 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
         used["value"].to_numpy(float),
         np.array([fitted.index(name) for name in used["quantity"]], int),
         number,
-        steady_covariance(used, own),
+        steady_covariance(used, values_of(own, "covariance")),
     )
     return list(_rubber_rows(values, curves, fitted, used, own, unit, unaged))
 
@@ -131,18 +131,22 @@ def _curves(found: pd.DataFrame, series: list[str], quantities: list[str], unage
     return curves
 
 
-def steady_covariance(used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:
+def values_of(steady_fit: pd.DataFrame, quantity: str) -> dict[tuple[str, str], float]:
+    """Return what table `steady_fit` has under a `quantity`, by condition and parameter."""
+    rows = steady_fit[steady_fit["quantity"] == quantity]
+    return dict(zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"].tolist(), strict=True))
+
+
+def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -> np.ndarray:
     """Return the covariance of steady values, shape (n, n): full within a condition, none between conditions.
 
     Parameters
     ----------
     used : DataFrame
         The values: `condition`, `quantity` (mu_s, ...) and `value`.
-    own : DataFrame
-        Table `steady_fit`.
+    known : dict
+        The covariances: `values_of(steady_fit, "covariance")`.
     """
-    rows = own[own["quantity"] == "covariance"]
-    known = dict(zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"], strict=True))
     quantity = used["quantity"].to_numpy(object)
     covariance = np.diag((SMALLEST * used["value"].to_numpy(float)) ** 2 + 1e-300)
     for condition, places in used.groupby("condition", sort=False).indices.items():
@@ -197,8 +201,7 @@ def _rubber_rows(values, curves, fitted, used, own, unit, unaged) -> Iterator[di
 
 def _shift(joint: LawFit, used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:
     """Change of every parameter when the sensor reads one standard uncertainty too high in all conditions."""
-    rows = own[own["quantity"] == "sensor_shift"]
-    known = dict(zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"], strict=True))
+    known = values_of(own, "sensor_shift")
     moved = np.array([known.get(key, 0.0) for key in zip(used["condition"], used["quantity"], strict=True)], float)
     white = joint.values.whitening
     weighted = (white @ joint.jacobian).T @ (white @ np.nan_to_num(moved))

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.optimize import brentq
+from scipy.sparse import csr_array
 
 from sealfit.fit.batch import BatchFit, at_edge, check
 from sealfit.fit.law_search import search_law
@@ -167,13 +168,13 @@ def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
         Parameters of a fit to nearly the same values: polished only.
     """
     m, k = values.origins, values.curves
-    whiten = values.whitening
+    whiten = csr_array(values.whitening)  # of few entries
     limits = np.array([search_limits(values.days[values.curve == c]) for c in range(k)]).reshape(k, 2).T
     low, high = (np.concatenate([np.full(m + k, end), own]) for end, own in zip((-np.inf, np.inf), limits, strict=True))
 
     def evaluate(x, _rows):
         model, slope = law_model(values, x[0])
-        return ((model - values.value) @ whiten.T)[None], (slope.T @ whiten.T)[None]
+        return (whiten @ (model - values.value))[None], (whiten @ slope).T[None]
 
     def polished(x):
         found, rss = polish_many(evaluate, x[None], low, high)

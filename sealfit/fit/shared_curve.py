@@ -22,7 +22,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import minimize_scalar
 from scipy.special import fdtrc
 
-from sealfit.fit.aging import PAIRS, steady_covariance
+from sealfit.fit.aging import PAIRS, steady_covariance, values_of
 from sealfit.fit.condition import FULL, Condition, stacked
 from sealfit.fit.declared import series_of_curve
 from sealfit.fit.polish import covariance_of
@@ -77,6 +77,7 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
     conditions, _, variance = solve_conditions(steady)
     place = {c.name: k for k, c in enumerate(conditions)}
     series = series_of_curve(about.reset_index(drop=True), aging=True)
+    known_covariances = values_of(steady_fit, "covariance")
     tables, covariances = [], []
     for names in (about["condition"].to_numpy(object)[series == s] for s in dict.fromkeys(series)):
         places = [place[name] for name in names]
@@ -88,7 +89,7 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
             covered = found[2]
         own = free[free["condition"].isin(set(names) - covered)]
         tables.append(own)
-        covariances.append(steady_covariance(own, steady_fit))
+        covariances.append(steady_covariance(own, known_covariances))
     table = pd.concat(tables, ignore_index=True) if tables else free
     return Levels(table.merge(about, on="condition", how="left", validate="many_to_one"), block_diag(*covariances))
 
