@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import pandas as pd
 
 from sealfit.conditions import condition_columns
 from sealfit.config import Config
+from sealfit.engine import run_map
 from sealfit.fit.both_ways import both_ways_together
 from sealfit.fit.condition import FULL, Condition, bound, drop_flat_curve, judge, make_condition, solve
 from sealfit.fit.stribeck import NAMES, linearised
@@ -17,10 +19,11 @@ from sealfit.ingest.scatter import Scatter, repeat_scatter
 from sealfit.tables import STEADY_FIT, Units
 
 SIGNIFICANT = 0.05
+TOGETHER = 250  # conditions whose intervals one process finds at once
 FORCES = {"mu_s": "F_s", "mu_c": "F_c"}  # names without load
 
 
-def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
+def fit_conditions(steady: pd.DataFrame, config: Config, *, workers: int = 1) -> pd.DataFrame:
     r"""Fit Eq. 14 to every condition and say what its speeds determine.
 
     .. math:: F\,\mathrm{sgn}\,v = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}] + \sigma_2 |v|
@@ -34,6 +37,8 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
         Table `steady`; rows with `used` false are left out.
     config : Config
         Names the condition columns, the units and the sensor's accuracy.
+    workers : int
+        Processes for the intervals of many conditions.
 
     Returns
     -------
@@ -54,12 +59,11 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     sensor has opposite signs in the two directions and does at most the same; it is what the loop looks for.
     """
     conditions, scatter, variance = solve_conditions(steady)
-    bound(conditions, variance.rise())
     keys = condition_keys(steady, config)
-    rows = [
-        {"condition": c.name, **row} for k, c in enumerate(conditions) for row in _rows(c, k, variance, scatter, config)
-    ]
-    table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
+    blocks = [slice(start, start + TOGETHER) for start in range(0, len(conditions), TOGETHER)]
+    asked = [(conditions[block], variance.of(block)) for block in blocks]
+    found = run_map(partial(_told, scatter=scatter, config=config), asked, workers=workers, together=1)
+    table = pd.concat(found, ignore_index=True).merge(keys, on="condition", how="left", validate="many_to_one")
     fixed = STEADY_FIT.names()
     return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
 
@@ -111,6 +115,19 @@ def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
 
 # ---------------------------------------------------------------- what the table says
+def _told(given: tuple[list[Condition], UnitVariance], scatter: Scatter, config: Config) -> pd.DataFrame:
+    """Return the rows of some conditions, their intervals found."""
+    conditions, variance = given
+    bound(conditions, variance.rise())
+    return pd.DataFrame(
+        [
+            {"condition": c.name, **row}
+            for k, c in enumerate(conditions)
+            for row in _rows(c, k, variance, scatter, config)
+        ]
+    )
+
+
 def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter, config: Config) -> Iterator[dict]:
     unit_of = parameter_units(config.units, condition.has_load)
     _, _, force, weight = condition.arrays

@@ -9,7 +9,7 @@ by the Birge ratio, the root of the reduced chi-square.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -123,6 +123,11 @@ class UnitVariance:
     pooled: float  # reduced chi-square of all conditions together
     pooled_p: float
     own: np.ndarray  # (conditions,) bool: widened by its own ratio, being worse than the others
+
+    def of(self, some: slice) -> UnitVariance:
+        """Return what is said of some of the conditions."""
+        own = {name: getattr(self, name)[some] for name in ("value", "df", "f", "p", "own")}
+        return replace(self, **own)
 
     def rise(self) -> np.ndarray:
         """Return by how much chi-square may exceed its minimum inside a 95 % interval, shape (conditions,)."""

@@ -1,11 +1,13 @@
 """mu_s and mu_c from the forces with what the days of a series share: exact, surer, and free where days disagree."""
 
 import numpy as np
+import pandas.testing as pdt
 import pytest
 from scipy.optimize import least_squares
 from steady_tables import MU_C, MU_S
 
 from sealfit.config import Config, Quantity
+from sealfit.fit import all_series, steady
 from sealfit.fit.all_series import aged_values, joint_laws
 from sealfit.fit.joint_law import fit_joint_law
 from sealfit.fit.shared_curve import shared_levels
@@ -40,6 +42,16 @@ def run_table(table):
     """Run means with the condition's columns."""
     about = table[["condition", "temperature_C", "compression_ratio_pct", "aging_days"]].drop_duplicates()
     return run_means(table).merge(about, on="condition")
+
+
+def test_several_processes_give_the_same_tables(campaign, monkeypatch):
+    table, config = campaign(noise=0.01, series=SERIES, laws=arrhenius(), days=DAYS, ways=(1,)), Config()
+    one = fit_conditions(table, config)
+    monkeypatch.setattr(steady, "TOGETHER", 10)
+    monkeypatch.setattr(all_series, "MANY", 0)
+    pdt.assert_frame_equal(fit_conditions(table, config, workers=2), one)
+    for alone, shared in zip(joint_laws(table, one, config), joint_laws(table, one, config, workers=2), strict=True):
+        pdt.assert_frame_equal(shared, alone)
 
 
 def test_exact_forces_give_the_coefficients_back(campaign):
