@@ -137,10 +137,10 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Answer the force at new points."""
-    from sealfit import progress, requests, summary
+    from sealfit import progress, requests, summary_lines
 
     made = requests.predict(out, points, output, progress=progress.to_stderr())
-    end("predict", made, summary.predict_lines, as_json)
+    end("predict", made, summary_lines.predict_lines, as_json)
 
 
 @app.command()
@@ -169,9 +169,9 @@ def effects(
     as_json: Json = False,
 ) -> None:
     """List the catalogue of effects."""
-    from sealfit import requests, summary
+    from sealfit import requests, summary_lines
 
-    end("effects", requests.effects(out), summary.effects_lines, as_json)
+    end("effects", requests.effects(out), summary_lines.effects_lines, as_json)
 
 
 @app.command()
@@ -198,7 +198,7 @@ def check(
 ) -> None:
     """List every fault of a campaign, write nothing."""
     count = _workers(workers, scheduler)
-    from sealfit import progress, requests, summary
+    from sealfit import progress, requests, summary_lines
 
     found, faults = requests.check(campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr())
     if as_json:
@@ -206,7 +206,7 @@ def check(
     else:
         for fault in faults:
             typer.echo(f"{fault.severity}: {fault}")
-        for line in summary.ingest_lines(found) if found["files"] else ():
+        for line in summary_lines.ingest_lines(found) if found["files"] else ():
             typer.echo(line)
         typer.echo(
             f"{len(faults)} {'fault' if len(faults) == 1 else 'faults'} found." if faults else "No faults found."
@@ -255,13 +255,13 @@ def _single(
 
 def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
     """Do steps, with progress, and print what they came to."""
-    from sealfit import profiling, progress, steps, summary
+    from sealfit import profiling, progress, steps, summary_lines
 
     with profiling.profiled() as parts:
         made = work(steps, progress.to_stderr())
     if profile:
         made["profile"] = profiling.as_dicts(parts)
-    end(command, made, lambda made: summary.lines(made) + profiling.lines(made.get("profile", ())), as_json)
+    end(command, made, lambda made: summary_lines.lines(made) + profiling.lines(made.get("profile", ())), as_json)
 
 
 def _workers(workers: int | None, scheduler: str | None, *needed: str) -> int:

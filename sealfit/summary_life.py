@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from sealfit.summary import line
+from sealfit.summary_lines import line
 
 
 def lifetime_lines(part: Mapping) -> list[str]:

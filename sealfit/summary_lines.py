@@ -1,0 +1,152 @@
+"""What a command ends with, in a few lines: the figures of `summary` as people read them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+
+def lines(summary: Mapping) -> list[str]:
+    """Return the summary of one step or of all of them, a line for each thing worth knowing."""
+    writers = {
+        "ingest": ingest_lines,
+        "fit_steady": lambda part: _fit_lines("steady fit", part),
+        "fit_aging": lambda part: _fit_lines("aging", part),
+        "fit_dynamic": dynamic_lines,
+        "close_loop": closure_lines,
+        "report": lambda part: [line("report", part["file"])],
+    }
+    return [line for name, write in writers.items() if name in summary for line in write(summary[name])]
+
+
+def ingest_lines(part: Mapping) -> list[str]:
+    """Return the lines of an ingest."""
+    files, faults = part["files"], part["faults"]
+    text = f"{files['used']} used, {files['left_out']} left out"
+    if files["not_matched"]:
+        text += f", {files['not_matched']} not matched by the file-name pattern"
+    found = [line("files", text)]
+    left_out = [_count(part[f"{what}s_left_out"], what) for what in ("stroke", "row") if part[f"{what}s_left_out"]]
+    if sum(faults.values()):
+        text = f"{_count(faults['error'], 'error')}, {_count(faults['warning'], 'warning')}"
+        more = f"; left out: {', '.join(left_out)}" if left_out else ""
+        found.append(line("faults", f"{text}{more} (table quality)"))
+    found.append(line("conditions", f"{part['conditions']} in {_count(part['runs'], 'run')}"))
+    return found
+
+
+def _fit_lines(title: str, part: Mapping) -> list[str]:
+    ranges = part["parameters"]
+    if not ranges:
+        return [line(title, "nothing to fit")]
+    quantities = list(dict.fromkeys(entry["quantity"] for entry in ranges))
+    found = []
+    for quantity in quantities:
+        texts = [_range(entry) for entry in ranges if entry["quantity"] == quantity]
+        name = "" if len(quantities) == 1 else f"{quantity}: "
+        found.append(line(title if not found else "", name + ", ".join(texts)))
+    lacking = [entry for entry in ranges if entry["identified"] < entry["of"]]
+    if lacking:
+        names = [f"{e['quantity']} {e['parameter']}" if len(quantities) > 1 else e["parameter"] for e in lacking]
+        texts = [
+            f"{name} in {entry['of'] - entry['identified']} of {entry['of']}" if entry["of"] > 1 else name
+            for name, entry in zip(names, lacking, strict=True)
+        ]
+        reason = next((entry["reason"] for entry in lacking if entry["reason"]), "")
+        found.append(line("", f"not identified: {', '.join(texts)}. {reason}".rstrip()))
+    return found
+
+
+def dynamic_lines(part: Mapping) -> list[str]:
+    """Return the lines of the dynamic fit."""
+    found = _fit_lines("pre-sliding", part)
+    if part["above_sliding"]:
+        more = f"{part['largest_ratio'] - 1:.1%} at most, {part['largest_at']}"
+        text = f"above the sliding force in {part['above_sliding']} of {part['break_aways']} cases of condition, speed "
+        text += f"and direction ({more})"
+        found.append(line("break-away", text))
+    return found
+
+
+def _range(entry: Mapping) -> str:
+    unit = f" {entry['unit']}" if entry["unit"] else ""
+    if entry["min"] is None:
+        return f"{entry['parameter']} not identified"
+    if entry["min"] == entry["max"]:
+        return f"{entry['parameter']} {entry['min']:.4g}{unit}"
+    return f"{entry['parameter']} {entry['min']:.4g} to {entry['max']:.4g}{unit}"
+
+
+def closure_lines(part: Mapping) -> list[str]:
+    """Return the lines of a closed loop."""
+    unit, before, after = part["units"]["force_N"], part["before"], part["after"]
+    found = [line("verdict", f"{part['verdict']}: {part['sentence']}")]
+    for effect in part["effects"]:
+        status = "candidate, not applied: " if effect["candidate"] else "+ "
+        known = [p for p in effect["parameters"] if p["value"] is not None or p["name"] != "phi"]
+        values = ", ".join(_value(p) for p in known) if effect["named"] else "no form does as well"
+        found.append(line("", f"{status}{effect['label']}: {values}"))
+    rows = (("rmse", "rmse_N"), ("held out", "heldout_rmse_N"), ("run means", "rmse_runs_N"), ("largest", "max_abs_N"))
+    texts = [f"{name} {_number(before[key])} -> {_number(after[key])}" for name, key in rows]
+    found.append(line(f"error ({unit})", "; ".join(texts)))
+    if part["noise_floor_N"] is not None:
+        found.append(line("noise floor", f"{_number(part['noise_floor_N'])} {unit}"))
+    if part["left"]["channel"] is not None:
+        found.append(line("left", _left(part["left"], part["verdict"], unit)))
+    for run in part["next_runs"][:3]:
+        found.append(line("next runs", run["why"]))
+    return found
+
+
+def _left(left: Mapping, verdict: str, unit: str) -> str:
+    """Return what is left: how much above the floor, along which channels, and whether chance could have made it."""
+    above = f"rmse {_number(left['rmse_N'])} {unit} above the floor, " if left["rmse_N"] else ""
+    sure = "" if verdict == "unexplained" else ": no claim, a place to look"
+    return f"{above}along {left['channel']} (p {left['p_value']:.2g}){sure}"
+
+
+def _value(parameter: Mapping) -> str:
+    unit = f" {parameter['unit']}" if parameter["unit"] else ""
+    return f"{parameter['name']} {_number(parameter['value'])}{unit}"
+
+
+def _acts(effect: Mapping) -> str:
+    how = {"add": "added to", "multiply": "a factor on"}[effect["operation"]]
+    return f"{how} {'the force' if effect['acts_on'] == 'force' else effect['acts_on']}"
+
+
+def effects_lines(listed: Mapping) -> list[str]:
+    """Return the catalogue, an effect after the other."""
+    found = []
+    for effect in listed["effects"]:
+        mark = "  [in the model of this OUT]" if effect["id"] in (listed.get("added") or ()) else ""
+        found.append(f"{effect['id']}: {effect['label']}{mark}")
+        acts = ", ".join(_acts({**way, "acts_on": way["target"]}) for way in effect["acts_on"])
+        found.append(f"    {effect['form']}")
+        found.append(f"    {acts}")
+        for p in effect["parameters"]:
+            found.append(f"    {p['name']}{' [' + p['unit'] + ']' if p['unit'] else ''}: {p['meaning']}")
+    if listed.get("added", ()) is None:
+        found.append("The loop of this OUT is not closed, or stale: which effects it added is not known.")
+    return found
+
+
+def predict_lines(part: Mapping) -> list[str]:
+    """Return the lines of a prediction."""
+    text = f"{part['answered']} of {_count(part['rows'], 'row')} answered, {part['extrapolated']} extrapolated"
+    refused = part["rows"] - part["answered"]
+    if refused:
+        text += f"; {_count(refused, 'row')} could not be, and the column note says why"
+    return [line("points", text), line("answers", part["output"])]
+
+
+def line(title: str, text: str) -> str:
+    """Return a line of a summary under its title."""
+    return f"{title:<11} {text}"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3g}"
