@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from sealfit.errors import ConfigError
-from sealfit.tables import Units
+from sealfit.units import Units
 
 AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
 

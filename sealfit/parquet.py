@@ -14,7 +14,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from sealfit import __version__
-from sealfit.tables import TEXT, Column, Schema, Units
+from sealfit.tables import TEXT, Column, Schema
+from sealfit.units import Units
 
 CHANNEL = "channel of the campaign"
 Columns = Mapping[str, pd.Series | np.ndarray | pa.Array]  # of equal length, or a frame

@@ -11,7 +11,7 @@ from sealfit.progress import Silent
 from sealfit.state import ConfigCopy
 from sealfit.steps import FAULTY
 from sealfit.store import Store
-from sealfit.tables import Units
+from sealfit.units import Units
 
 
 def check(

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from sealfit.errors import OutError
 from sealfit.fingerprint import Fingerprint
 from sealfit.state import to_json
-from sealfit.tables import SCHEMAS, Units
+from sealfit.tables import SCHEMAS
+from sealfit.units import Units
 
 if TYPE_CHECKING:
     import pandas as pd

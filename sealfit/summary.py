@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from sealfit.tables import Units
+from sealfit.units import Units
 from sealfit.verdict import predicts_worse
 
 if TYPE_CHECKING:

@@ -25,7 +25,8 @@ from sealfit.fingerprint import STEPS, fingerprint, seen_config
 from sealfit.lock import LOCK
 from sealfit.state import ConfigCopy, State, to_json
 from sealfit.store import Store
-from sealfit.tables import BINS, INPUTS, QUALITY, RUNS, Units
+from sealfit.tables import BINS, INPUTS, QUALITY, RUNS
+from sealfit.units import Units
 
 HERE = Path(__file__).resolve().parent
 OUTPUTS = {  # table that stands for each step in these tests

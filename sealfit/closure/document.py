@@ -20,7 +20,7 @@ from sealfit.effects.contract import fill_unit
 from sealfit.fit.estimate import Fitted, fit, worth
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term
-from sealfit.tables import Units
+from sealfit.units import Units
 
 LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
 WORTH_A_LOOK = 0.05  # p-value of a channel by itself, not adjusted for the search

@@ -1,7 +1,8 @@
 """Physical effects, one file each, and the list of them.
 
 Mechanisms come first, then closed forms of any channel. Free shapes, whose size depends on the data, are built by
-`sealfit.effects.free`; the users' own effects are read by `sealfit.effects.user`. What a file holds is in `contract`.
+`sealfit.effects.free` and `categories`; the users' own effects are read by `sealfit.effects.user`. What a file holds
+is in `contract`.
 """
 
 from sealfit.effects.aging_floor import AGING_FLOOR

@@ -1,12 +1,12 @@
-r"""Free shapes, whose size the data decide: a smooth curve of a channel, or one level per category.
+r"""Free shapes, whose size the data decide: a smooth curve of a channel, a surface of two; others are in `categories`.
 
-They name no mechanism. Both are rebuilt from plain data by `free_effect`, so a model file holds them whole.
+They name no mechanism. All are rebuilt from plain data by `free_effect`, so a model file holds them whole.
 
-.. math:: h = \sum_j c_j B_j(x), \qquad h = \sum_k d_k [x = k]
+.. math:: h = \sum_j c_j B_j(x)
 
 B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the knot of reference has none. Beyond the
-outer knots a natural spline goes on as a straight line. Both are counted from their mean over the campaign where that
-is given: a constant that came in with them would stand for friction, and what scales friction would miss it.
+outer knots a natural spline goes on as a straight line. It is counted from its mean over the campaign where that is
+given: a constant that came in with it would stand for friction, and what scales friction would miss it.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, reference
+from sealfit.effects.categories import LESS_MEAN, LEVELS, SLOPES, levels_effect, listed, shares, slopes_effect
+from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter
 from sealfit.errors import ParameterError
 
-SMOOTH, LEVELS, SURFACE, SLOPES = "smooth", "levels", "surface", "slopes"
-LESS_MEAN = "; less its mean over the campaign"
+SMOOTH, SURFACE = "smooth", "surface"
 WIDE = 20.0  # a positive channel that spans this factor is looked at on a logarithmic scale
 BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))  # powers of the two scaled channels in a free surface
 
@@ -64,7 +64,7 @@ def smooth_effect(
         id=SMOOTH,
         label="smooth in {x}",
         equation=r"h = \sum_j c_j B_j(x)",
-        form=f"natural cubic spline through (x_j, c_j), knots {_listed(places)}, zero at {places[zero]:.6g}"
+        form=f"natural cubic spline through (x_j, c_j), knots {listed(places)}, zero at {places[zero]:.6g}"
         + LESS_MEAN * (means is not None),
         reads=(CHANNEL,),
         acts_on=ANYWHERE,
@@ -79,20 +79,16 @@ def smooth_effect(
             )
             for j in free
         ),
-        shape=partial(_spline, places, zero, _numbers(means, len(places))),
+        shape=partial(_spline, places, zero, shares(means, len(places))),
         source="Form: ours. de Boor 2001, A Practical Guide to Splines, Springer; natural end conditions.",
         # By hand: at a knot the spline is that knot's amplitude, whatever the others are.
         worked=(
             {CHANNEL: x},
             {f"c_{j + 1}": float(j + 1) for j in free},
-            float(free[-1] + 1) - sum((j + 1) * _numbers(means, len(places))[j] for j in free),
+            float(free[-1] + 1) - sum((j + 1) * shares(means, len(places))[j] for j in free),
         ),
         physical=False,
     )
-
-
-def _numbers(means: Sequence[float] | None, count: int) -> tuple[float, ...]:
-    return (0.0,) * count if means is None else tuple(float(m) for m in means)
 
 
 def _spline(places: tuple[float, ...], zero: int, means: tuple[float, ...], inputs: Mapping, **values) -> np.ndarray:
@@ -149,67 +145,6 @@ def _nearest(places: Sequence[float], reference: float | None) -> int:
     return 0 if reference is None else int(np.argmin(np.abs(np.array(places) - reference)))
 
 
-def levels_effect(categories: Sequence[str], means: Sequence[float] | None = None) -> Effect:
-    """Return one level per category of the channel, as differences from the first category.
-
-    Parameters
-    ----------
-    categories : sequence of str
-        At least two different categories.
-    means : sequence of float, optional
-        Share of each category in the campaign, for levels whose mean is zero; else the first category is zero.
-
-    Returns
-    -------
-    Effect
-        Amplitudes `d_1`, `d_2`, ... for the categories after the first. A category that is not listed gives NaN.
-
-    Raises
-    ------
-    ParameterError
-        If there are fewer than two categories, or one stands twice.
-    """
-    names = _different(LEVELS, categories)
-    return Effect(
-        id=LEVELS,
-        label="levels of {x}",
-        equation=r"h = \sum_k d_k [x = k]",
-        form=f"d_k for category k of {_listed(names)}; 0 for {names[0]}" + LESS_MEAN * (means is not None),
-        reads=(CHANNEL,),
-        acts_on=ANYWHERE,
-        parameters=tuple(
-            Parameter(f"d_{k}", "{y}", 0.0, AMPLITUDE, f"{name} less {names[0]}", linear=True)
-            for k, name in enumerate(names[1:], start=1)
-        ),
-        shape=partial(_levels, names, _numbers(means, len(names))),
-        source="Form: ours. One number per category, as in any analysis of variance.",
-        # By hand: the last category has its own difference.
-        worked=(
-            {CHANNEL: names[-1]},
-            {f"d_{k}": k / 10 for k in range(1, len(names))},
-            (len(names) - 1) / 10 - sum(k / 10 * m for k, m in enumerate(_numbers(means, len(names)))),
-        ),
-        physical=False,
-    )
-
-
-def _different(id: str, categories: Sequence[str]) -> tuple[str, ...]:
-    names = tuple(str(c) for c in categories)
-    if len(names) < 2 or len(set(names)) != len(names):
-        raise ParameterError(f"{id}: {list(names)} must be two or more different categories.", mend="List each once.")
-    return names
-
-
-def _levels(names: tuple[str, ...], means: tuple[float, ...], inputs: Mapping, **values) -> np.ndarray:
-    given = np.asarray(inputs[CHANNEL]).astype(str)
-    level = [0.0, *(values[f"d_{k}"] for k in range(1, len(names)))]
-    mean = sum(d * m for d, m in zip(level, means, strict=True))
-    result = np.full(given.shape, np.nan)
-    for name, d in zip(names, level, strict=True):
-        result[given == name] = d - mean
-    return result
-
-
 def surface_effect(x_knots: Sequence[float], z_knots: Sequence[float]) -> Effect:
     """Return a free surface of two channels: the mixed terms of a polynomial, zero where either is in its middle.
 
@@ -237,7 +172,7 @@ def surface_effect(x_knots: Sequence[float], z_knots: Sequence[float]) -> Effect
         label="smooth in {x} and {z}",
         equation=r"h = \sum_{jk} c_{jk} u^j w^k",
         form="c_jk u^j w^k summed over j, k = 1, 2; u, w = {x}, {z} mapped to -1..1 at "
-        + " and ".join(_listed(given) for given in knots),
+        + " and ".join(listed(given) for given in knots),
         reads=(CHANNEL, SECOND),
         acts_on=ANYWHERE,
         parameters=tuple(
@@ -269,57 +204,6 @@ def evenly(values, knots: Sequence[float]) -> np.ndarray:
     [-1.0, 0.0, 0.5, 1.0]
     """
     return np.interp(np.asarray(values, dtype=float), knots, np.linspace(-1, 1, len(knots)))
-
-
-def slopes_effect(categories: Sequence[str]) -> Effect:
-    """Return a straight line in a channel for each category of a second one, all zero at the reference.
-
-    Parameters
-    ----------
-    categories : sequence of str
-        At least two different categories.
-
-    Returns
-    -------
-    Effect
-        Amplitudes `e_1`, `e_2`, ..., the slope of each category. A category that is not listed gives NaN.
-
-    Raises
-    ------
-    ParameterError
-        If there are fewer than two categories, or one stands twice.
-    """
-    names = _different(SLOPES, categories)
-    return Effect(
-        id=SLOPES,
-        label="linear in {x}, by {z}",
-        equation=r"h = \sum_k e_k [z = k] (x - x_{ref})",
-        form=f"e_k (x - x_ref) for category k of {_listed(names)}",
-        reads=(CHANNEL, SECOND),
-        acts_on=ANYWHERE,
-        parameters=tuple(
-            Parameter(f"e_{k}", "{y}/{x}", 0.0, AMPLITUDE, f"slope for {name}", linear=True)
-            for k, name in enumerate(names, start=1)
-        ),
-        shape=partial(_slopes, names),
-        source="Form: ours. One slope per category, as in any analysis of covariance.",
-        # By hand: 3 above the reference, in the last category.
-        worked=(
-            {CHANNEL: 5.0, "x_ref": 2.0, SECOND: names[-1]},
-            {f"e_{k}": k / 10 for k in range(1, len(names) + 1)},
-            0.3 * len(names),
-        ),
-        physical=False,
-    )
-
-
-def _slopes(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
-    x = np.asarray(inputs[CHANNEL], dtype=float) - reference(inputs, CHANNEL, 0.0)
-    given = np.asarray(inputs[SECOND]).astype(str)
-    slope = np.full(given.shape, np.nan)
-    for k, name in enumerate(names, start=1):
-        slope[given == name] = values[f"e_{k}"]
-    return slope * x
 
 
 FREE: Mapping[str, tuple[Callable[..., Effect], tuple[str, ...]]] = {
@@ -359,7 +243,3 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
         if need not in fixed:
             raise ParameterError(f"{id}: '{need}' is missing.", mend=f"Give '{need}' in its fixed values.")
     return make(fixed)
-
-
-def _listed(values: Sequence[object]) -> str:
-    return ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in values)

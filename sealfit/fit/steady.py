@@ -16,7 +16,8 @@ from sealfit.fit.condition import FULL, Condition, bound, drop_flat_curve, judge
 from sealfit.fit.stribeck import NAMES, linearised
 from sealfit.fit.uncertainty import UnitVariance, likelier, run_means, run_weights, unit_variance
 from sealfit.ingest.scatter import Scatter, repeat_scatter
-from sealfit.tables import STEADY_FIT, Units
+from sealfit.tables import STEADY_FIT
+from sealfit.units import Units
 
 SIGNIFICANT = 0.05
 TOGETHER = 250  # conditions whose intervals one process finds at once

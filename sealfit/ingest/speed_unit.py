@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from sealfit.errors import ConfigError
-from sealfit.tables import Units
+from sealfit.units import Units
 
 LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "µm": 1e-6, "um": 1e-6, "μm": 1e-6, "in": 25.4e-3}
 ANGLE = {"turn": 2 * math.pi, "rev": 2 * math.pi, "rad": 1.0, "deg": math.pi / 180, "°": math.pi / 180}

@@ -15,7 +15,7 @@ from sealfit.report.numbers import count, given, number
 from sealfit.report.shown import MOST_PANELS, rms, telling
 from sealfit.report.style import AFTER, CYCLE, FLOOR, QUIET, SKY, Key, Panel, Plot
 from sealfit.report.symbols import ConditionNames, is_unaged, joined, plain, short, symbol_plain
-from sealfit.tables import Units
+from sealfit.units import Units
 
 TRACE_BUCKETS = 350  # of each, the lowest and the highest sample are drawn: what the eye can see of a trace
 MOST_TRACES = 6

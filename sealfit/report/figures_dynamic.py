@@ -14,7 +14,7 @@ from sealfit.report.marks import draw_band
 from sealfit.report.numbers import given, number
 from sealfit.report.style import BLACK, FLOOR, Key, Panel, Plot, shades
 from sealfit.report.symbols import ConditionNames, is_unaged, plain, short
-from sealfit.tables import Units
+from sealfit.units import Units
 
 MOST_PANELS = 6
 MOST_SPEEDS = 3

@@ -16,7 +16,7 @@ from sealfit.report.numbers import given, number
 from sealfit.report.shown import MOST_KEYS, MOST_PANELS, spread
 from sealfit.report.style import BLACK, FLOOR, Key, Panel, Plot, shades
 from sealfit.report.symbols import plain, symbol_math, symbol_plain
-from sealfit.tables import Units
+from sealfit.units import Units
 
 MARKERS = "os^Dv<>"
 SCALED = "scaled aging time"

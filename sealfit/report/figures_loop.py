@@ -12,7 +12,7 @@ from sealfit.config import Config
 from sealfit.report.numbers import known, number, together
 from sealfit.report.style import AFTER, BEFORE, FLOOR, QUIET, Key, Panel, Plot
 from sealfit.report.symbols import plain
-from sealfit.tables import Units
+from sealfit.units import Units
 
 LEVELS = ("specimen", "run", "file", "stroke", "sample")
 ERRORS = (("rmse_N", "all bins"), ("rmse_runs_N", "run means"), ("heldout_rmse_N", "held out"))

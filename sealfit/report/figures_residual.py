@@ -16,7 +16,7 @@ from sealfit.report.numbers import number, p_value
 from sealfit.report.shown import MOST_MARKS
 from sealfit.report.style import AFTER, BEFORE, FLOOR, QUIET, Key, Panel, Plot
 from sealfit.report.symbols import channel_label, channel_words, effect_label, plain, short, symbol_math, symbol_plain
-from sealfit.tables import Units
+from sealfit.units import Units
 
 MOST_CHANNELS = 18
 MANY_CATEGORIES = 24

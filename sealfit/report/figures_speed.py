@@ -16,7 +16,7 @@ from sealfit.report.numbers import count, number
 from sealfit.report.shown import MOST_KEYS, MOST_MARKS, MOST_PANELS, condition_misfits, rms, spread, telling
 from sealfit.report.style import BLACK, CYCLE, FLOOR, HEIGHT, Key, Panel, Plot, shades
 from sealfit.report.symbols import ConditionNames, channel_words, is_unaged, plain, short
-from sealfit.tables import Units
+from sealfit.units import Units
 
 MOST_CURVES = 24  # in one panel
 MOST_COLOURS = 10  # in one panel; with more, each condition has its own, or numbers are thinned

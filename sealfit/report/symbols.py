@@ -10,7 +10,7 @@ from markupsafe import Markup, escape
 
 from sealfit.conditions import UNAGED
 from sealfit.config import Config
-from sealfit.tables import Units
+from sealfit.units import Units
 
 GREEK = {
     "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "zeta": "ζ", "eta": "η", "theta": "θ",

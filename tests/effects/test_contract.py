@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealfit.effects import EFFECTS
+from sealfit.effects.categories import levels_effect
 from sealfit.effects.contract import CHANNEL, SECOND, Effect, Parameter, fill_unit
-from sealfit.effects.free import levels_effect, smooth_effect
+from sealfit.effects.free import smooth_effect
 from sealfit.errors import ParameterError
 
 FREE = {
@@ -189,7 +190,14 @@ def test_lives_in_a_file_of_its_own_name(effect):
 
 def test_every_effect_file_is_registered():
     folder = Path(sys.modules["sealfit.effects"].__file__).parent
-    files = {path.stem for path in folder.glob("*.py")} - {"__init__", "averaged", "contract", "free", "user"}
+    files = {path.stem for path in folder.glob("*.py")} - {
+        "__init__",
+        "averaged",
+        "categories",
+        "contract",
+        "free",
+        "user",
+    }
     assert files == set(EFFECTS)
 
 

@@ -2,7 +2,7 @@ import pytest
 
 from sealfit.errors import ConfigError
 from sealfit.ingest.speed_unit import speed_factor
-from sealfit.tables import Units
+from sealfit.units import Units
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from sealfit.report.figures_residual import channel_order, draw_channel, draw_sh
 from sealfit.report.figures_speed import curve_lines, force_speed, run_points
 from sealfit.report.frame import Ticks
 from sealfit.report.style import DPI, WIDTH, Key, Layout, Panel, Plot, compose
-from sealfit.tables import Units
+from sealfit.units import Units
 
 TORQUE = Units({"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")})
 

@@ -11,7 +11,7 @@ from sealfit.report.symbols import (
     symbol_plain,
     true_units,
 )
-from sealfit.tables import Units
+from sealfit.units import Units
 
 TORQUE = Units(
     {"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")},
