@@ -157,7 +157,9 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
     held += [p for p in equals if p.term.effect.physical and p not in held and p.size <= fewest]
     alike = [p for p in found if p.fitted.deviance - best.fitted.deviance < TIED]
     if not any(p.term.effect.id == LINEAR for p in alike):  # a straight line shows no mechanism
-        held += [p for p in alike if _own_mechanism(p) and p not in held]
+        own = [p for p in alike if _own_mechanism(p)]
+        least = min((p.fitted.deviance for p in own), default=0.0)
+        held += [p for p in own if p.fitted.deviance - least < 2 * TIED and p not in held]
     if held:
         first = min(held, key=lambda p: (_overturns(fitted, p), p.rank, p.criterion))
     else:
