@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from sealfit.closure.acting import acting_as_all_say
 from sealfit.closure.confirm import folds, heldout_level
 from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import effect_entries, effect_table, left_entry
@@ -94,11 +95,13 @@ def close_loop(
                     on_found=heldout.begin,
                     on_progress=say,
                 )
+            if not part.whole:
+                grown, on_all_strokes = acting_as_all_say(grown, part.every, heldout.samples, config, say)
             heldout.settle(grown)
             say("before and after on all rows")
             with timed("before and after", rows=rows.force.size, of="bins"):
                 before, after = _on_all(rows, grown)
-            if not part.whole and (more := overlooked(part.every, grown, after.scatter, config)):
+            if not part.whole and (more := overlooked(on_all_strokes, grown, config)):
                 say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
                 continue
             drawn = _drawn_tables(grown, before, after, config)

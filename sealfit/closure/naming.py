@@ -71,7 +71,7 @@ def propose(
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
     others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
     if not (calendar and others and max(p.chi2 for p in others) >= HALF * max(p.chi2 for p in calendar)):
-        return _ordered(fitted, _refitted(fitted, _spread(found)))
+        return named_among(fitted, _spread(found))
     # Conditions are tested one after the other and the calendar follows them: what was set or measured comes first.
     others, calendar = (_refitted(fitted, part) for part in (_spread(others), _spread(calendar)[:CALENDAR_RIVALS]))
     return _ordered(fitted, others) + sorted(calendar, key=lambda p: p.criterion)
@@ -93,7 +93,12 @@ def propose_ripples(fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: 
     """
     linearised = Linearised(fitted)
     found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(*form)]
-    return _ordered(fitted, _refitted(fitted, _spread(found)))
+    return named_among(fitted, _spread(found))
+
+
+def named_among(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
+    """Return proposals, which have values to start from, fitted jointly with the physics: first the one to report."""
+    return _ordered(fitted, _refitted(fitted, found))
 
 
 def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:

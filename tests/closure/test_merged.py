@@ -1,16 +1,19 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import numpy.testing as npt
 import pytest
-from bins_helpers import make_bins, make_traces, warm
+from bins_helpers import TRUE, make_bins, make_traces, warm
 
-from sealfit.closure.grow import numbered
+from sealfit.closure.acting import acting_as_all_say
+from sealfit.closure.grow import grow, numbered, steady_samples
 from sealfit.closure.loop import close_loop
 from sealfit.closure.merged import FURTHER, MOST_ROWS, PER_STROKE, ROWS, merged_bins, searched
 from sealfit.config import Config
+from sealfit.effects import EFFECTS
 from sealfit.fit.declared import declare
-from sealfit.fit.estimate import fit_declared
+from sealfit.fit.estimate import fit, fit_declared
 from sealfit.fit.joint import evaluate
 from sealfit.fit.rows import make_rows
 
@@ -110,6 +113,41 @@ def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(monkeypatch
         assert part[name]["rmse_N"] == pytest.approx(whole[name]["rmse_N"], rel=1e-4)
         assert part[name]["heldout_rmse_N"] == pytest.approx(whole[name]["heldout_rmse_N"], rel=5e-3)
     assert not found[0].tables["residuals_after"]["heldout_model_N"].isna().any()
+
+
+@pytest.mark.parametrize(("acts_on", "other", "seed"), [("mu", "force", 2), ("force", "mu", 6)])
+def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatch):
+    """Of the whole force sigma_2 |v| is a part, which a factor on mu leaves as it is."""
+    monkeypatch.setattr("sealfit.closure.merged.STROKES", 60)
+    monkeypatch.setattr("sealfit.closure.merged.RUNS", 1)
+
+    def stiffer(table, force):
+        viscous = TRUE["sigma_2"] * table["speed_mm_s"] if acts_on == "mu" else 0.0
+        return force + 0.1 * -np.expm1(-table["distance_mm"] / 10.0) * (force - viscous)
+
+    bins = numbered(make_bins(seed, effect=stiffer, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, noise_N=0.1))
+    part = next(searched(make_rows(bins, has_aging=True), 1))
+    samples = steady_samples(make_traces(bins), part.rows)
+    grown = grow(part.coarse, samples, Config(), EFFECTS)
+    (found,) = grown.added
+
+    def on(quantity):
+        term = replace(found.proposal.term, acts_on=quantity)
+        model = grown.before.model.with_term(term, found.proposal.fitted.model.values[-1])
+        return replace(found.proposal, term=term, fitted=fit(model, part.coarse, grown.after.scatter, turns=0))
+
+    for first, second in ((other, acts_on), (acts_on, other)):
+        chosen, rival = on(first), on(second)
+        item = replace(found, proposal=chosen, rivals=(rival,), rivals_rmse_N=(0.1,))
+        doubted = replace(grown, after=chosen.fitted, added=(item,))
+        told, whole = acting_as_all_say(doubted, part.every, samples, Config(), lambda text: None)
+        (effect,) = told.added
+        terms = (effect.proposal.term, *told.after.model.terms, *whole.model.terms)
+        assert [term.acts_on for term in terms] == [acts_on] * 3
+        assert told.after.rows is part.coarse
+        assert whole.rows is part.every
+        assert np.isfinite(effect.gain_N)
+        assert not effect.rivals
 
 
 def test_what_only_all_strokes_show_has_all_of_them_searched(monkeypatch):
