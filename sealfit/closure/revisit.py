@@ -50,6 +50,9 @@ class Revisit:
             without, proposals = self._anew(fitted, number, item)
             if not proposals or proposals[0].term.key() == item.proposal.term.key():
                 continue
+            # While it is missing, what stood for most of the residual may rank too low on a grid to be refitted.
+            if proposals[0].criterion > fitted.deviance + item.proposal.price + RIVAL:
+                continue
             better = self._confirmed(without, proposals, item.round)
             if better is not None and better.proposal.term.key() != item.proposal.term.key():
                 fitted = fit(better.proposal.fitted.model, fitted.rows, fitted.scatter, turns=2)

@@ -2,16 +2,19 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins, make_traces
 
+from sealfit.closure import revisit
 from sealfit.closure.channels import find_channels
+from sealfit.closure.confirm import Added
 from sealfit.closure.forms import terms_of
 from sealfit.closure.grow import grow, numbered, steady_samples
 from sealfit.closure.judge import Candidate, Judge, Judgement
-from sealfit.closure.linearised import PAIR, Linearised
+from sealfit.closure.linearised import PAIR, Linearised, Proposal
 from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.estimate import fit_declared
+from sealfit.fit.estimate import fit, fit_declared
 from sealfit.fit.rows import make_rows
+from sealfit.fit.terms import Term
 
 OIL = {"oil_ppm": lambda rng: rng.normal(50, 10)}
 
@@ -72,3 +75,37 @@ def test_two_channels_together_pay_for_being_one_of_many():
             for proposal in linearised(term, searched, candidate):
                 price[term.effect.id] = proposal.price
     assert price["product"] - price["linear"] == pytest.approx(PAIR)
+
+
+def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
+    def warming_and_oil(table, force):
+        warming = 0.1 * np.expm1(-table["distance_mm"].to_numpy() / 10)
+        return force * (1 + warming + 3e-4 * (table["oil_ppm"].to_numpy() - 50))
+
+    bins = make_bins(5, repeats=2, bins=12, noise_N=0.05, gain=5e-4, effect=warming_and_oil, run_channels=OIL)
+    rows = make_rows(bins, has_aging=True)
+    model = fit_declared(rows).model
+    warming = Term(EFFECTS["warming_distance"], ("distance_mm",), "force", "multiply")
+    oil = Term(EFFECTS["linear"], ("oil_ppm",), "force", "multiply", {"x_ref": 50.0})
+    model = model.with_term(warming, {"A": 0.1, "s_0": 10.0}).with_term(oil, {"A": 3e-4})
+    fitted = fit(model, rows, turns=2)
+    added = [
+        Added(Proposal(t, v, "run", 72, 1e3, 1e-3, np.empty(0), (t.channels, "force", "multiply")), 1.0, 1.0, (), (), 1)
+        for t, v in zip(fitted.model.terms, fitted.model.values, strict=True)
+    ]
+    refitted = []
+
+    def without_its_own_curve(*given):
+        refitted.extend(
+            p for p in propose(*given) if p.term.effect.id not in ("warming_distance", "exponential_approach")
+        )
+        return refitted
+
+    propose = revisit.propose
+    monkeypatch.setattr(revisit, "propose", without_its_own_curve)
+    channels = {c.name: c for c in find_channels(rows)}
+    again = revisit.Revisit(channels, EFFECTS, rows.table.head(0), Config(), lambda text: None, compare=False)
+    after, kept = again.all_but_last(fitted, added)
+    assert refitted
+    assert kept is added
+    assert after is fitted
