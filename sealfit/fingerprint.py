@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import NamedTuple
@@ -40,12 +41,73 @@ class Fingerprint(NamedTuple):
     sha256: str | None = None
 
 
-def fingerprint(path: Path | str, known: Fingerprint | None = None) -> Fingerprint:
-    """Return the fingerprint of `path`; the file is read only if its size or time differ from those `known`."""
+@dataclass(frozen=True)
+class Fingerprints(Mapping[str, Fingerprint]):
+    """Fingerprints of files by their names, column by column, as they are many.
+
+    `places` has the place of every file in the other columns, from 0, rising.
+    """
+
+    places: dict[str, int] = field(default_factory=dict)
+    size: list[int | None] = field(default_factory=list)
+    mtime_ns: list[int | None] = field(default_factory=list)
+    sha256: list[str | None] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, marks: Mapping[str, Fingerprint]) -> Fingerprints:
+        """Return these fingerprints as columns."""
+        return cls() | marks
+
+    @classmethod
+    def of_columns(cls, file: Sequence[str], **columns: list) -> Fingerprints:
+        """Return what `columns` told; ValueError if they differ in length."""
+        made = cls({name: i for i, name in enumerate(file)}, **columns)
+        if any(len(column) != len(made) for column in made.columns().values()):
+            raise ValueError("columns of different length")
+        return made
+
+    def columns(self) -> dict[str, list]:
+        """Return the columns by their names, `file` and those of a fingerprint."""
+        return {"file": list(self.places), "size": self.size, "mtime_ns": self.mtime_ns, "sha256": self.sha256}
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.places)
+
+    def __getitem__(self, file: str) -> Fingerprint:
+        i = self.places[file]
+        return Fingerprint(self.size[i], self.mtime_ns[i], self.sha256[i])
+
+    def __or__(self, other: Mapping[str, Fingerprint]) -> Fingerprints:
+        """Return these with those of `other`, which come in their places or after them."""
+        if not other:
+            return self
+        made = Fingerprints(dict(self.places), list(self.size), list(self.mtime_ns), list(self.sha256))
+        for file, mark in other.items():
+            i = made.places.setdefault(file, len(made.places))
+            for column, value in zip((made.size, made.mtime_ns, made.sha256), mark, strict=True):
+                column[i : i + 1] = [value]
+        return made
+
+    def take(self, files: Sequence[str]) -> Fingerprints:
+        """Return those of `files`, in this order; all None of a file that is not among these."""
+        at = [self.places.get(file, -1) for file in files]
+        told = {name: [*getattr(self, name), None] for name in Fingerprint._fields}
+        return Fingerprints.of_columns(files, **{name: [column[i] for i in at] for name, column in told.items()})
+
+    def readable(self) -> Fingerprints:
+        """Return those of the files that could be read."""
+        if None not in self.sha256:
+            return self
+        return Fingerprints.of({file: mark for file, mark in self.items() if mark.sha256 is not None})
+
+
+def fingerprint(path: Path | str) -> Fingerprint:
+    """Return the fingerprint of `path`, which is read."""
     try:
         stat = os.stat(path)
-        if known is not None and (stat.st_size, stat.st_mtime_ns) == (known.size, known.mtime_ns):
-            return known
         with open(path, "rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
@@ -58,11 +120,22 @@ def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
     return Fingerprint(status.st_size, status.st_mtime_ns, hashlib.sha256(raw).hexdigest())
 
 
-def fingerprints(folder: Path, known: Mapping[str, Fingerprint], config: Config) -> dict[str, Fingerprint]:
-    """Return the fingerprints, now, of every `known` file of the campaign `folder` and of every new trace file."""
-    place = os.path.join(folder, "")
-    now = {name: fingerprint(place + name, mark) for name, mark in known.items()}
-    return now | {name: fingerprint(place + name) for name in glob_names(folder, config.files) if name not in now}
+def changes(folder: Path, known: Fingerprints, config: Config) -> dict[str, Fingerprint]:
+    """Return the fingerprints, now, of what is new or not as it is `known` among the trace files of a campaign.
+
+    A file is read only if its size or time differ from those known.
+    """
+    place, changed = os.path.join(folder, ""), []
+    for file, size, mtime_ns in zip(known.places, known.size, known.mtime_ns, strict=True):
+        try:
+            status = os.stat(place + file)
+        except OSError:
+            changed.append(file)
+            continue
+        if status.st_mtime_ns != mtime_ns or status.st_size != size:
+            changed.append(file)
+    changed += [file for file in glob_names(folder, config.files) if file not in known.places]
+    return {file: fingerprint(place + file) for file in changed}
 
 
 def glob_names(folder: Path, files: Files) -> list[str]:
@@ -78,11 +151,12 @@ def seen_config(step: str, config: Config) -> Config:
     return config.model_copy(update=UNSEEN.get(step, {}))
 
 
-def step_keys(inputs: Mapping[str, Fingerprint], config: Config) -> dict[str, str]:
+def step_keys(inputs: Fingerprints, config: Config) -> dict[str, str]:
     """Return the key of every step, in order, for these inputs, this config and this version of the program."""
     keys: dict[str, str] = {}
-    names = sorted(inputs)
-    known = "\0".join([*names, *(inputs[name].sha256 or "" for name in names)])  # \0 stands in no path
+    names = sorted(inputs.places)
+    hashes = (inputs.sha256[inputs.places[name]] or "" for name in names)
+    known = "\0".join([*names, *hashes])  # \0 stands in no path
     before = hashlib.sha256(os.fsencode(known)).hexdigest()
     for step in STEPS:
         seen = [__version__, step, seen_config(step, config).model_dump(mode="json"), before]

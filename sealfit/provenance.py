@@ -13,6 +13,7 @@ PACKAGES = ("numpy", "pandas", "scipy", "pyarrow", "matplotlib", "pydantic", "ji
 
 def provenance(state: State) -> dict:
     """Return versions, campaign, config, every input with its hash, and when each step was done."""
+    known = state.inputs
     return {
         "program": "sealfit",
         "version": __version__,
@@ -26,9 +27,9 @@ def provenance(state: State) -> dict:
             "text": state.config.text,
         },
         "inputs": [
-            {"file": name, "size": mark.size, "sha256": mark.sha256}
-            for name, mark in state.inputs.items()
-            if mark.sha256 is not None
+            {"file": name, "size": size, "sha256": sha256}
+            for name, size, sha256 in zip(known.places, known.size, known.sha256, strict=True)
+            if sha256 is not None
         ],
         "steps": [
             {"step": name, "version": done.version, "finished_at": done.finished_at, "seconds": done.seconds}

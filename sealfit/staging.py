@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sealfit.errors import OutError
-from sealfit.fingerprint import Fingerprint
+from sealfit.fingerprint import Fingerprints
 from sealfit.state import to_json
 from sealfit.tables import SCHEMAS
 from sealfit.units import Units
@@ -34,7 +34,7 @@ class Staged:
         self._folder = out / f"{STAGING}{os.getpid()}-{step}"
         self.seconds: float | None = None  # of its work, where that began before the step's turn
         self.files: dict[str, int] = {}
-        self.inputs: dict[str, Fingerprint] | None = None  # set by ingest: what it read
+        self.inputs: Fingerprints | None = None  # set by ingest: what it read
 
     def table(self, name: str, frame: pd.DataFrame) -> None:
         """Write table `name` of `tables.SCHEMAS`; ValueError if the frame does not have its columns and types."""

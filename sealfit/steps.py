@@ -161,11 +161,11 @@ def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
         for name, table in ingested.tables.items():
             staged.table(name, table)
     staged.adopt(ingested.stored)
-    marks = dict(ingested.marks)
+    marks = ingested.marks
     named = {fault.file for fault in ingested.faults if fault.file} | set(glob_names(campaign, config.files))
-    for name in sorted(named - marks.keys()):  # missing or unreadable: if that changes, the campaign has changed
-        marks[name] = fingerprint(campaign / name)
-    staged.inputs = {**marks, RUNS: runs_before}
+    # Missing or unreadable: if that changes, the campaign has changed.
+    marks |= {name: fingerprint(campaign / name) for name in sorted(named - marks.keys())}
+    staged.inputs = marks | {RUNS: runs_before}
     return int(ingested.tables["inputs"]["rows"].sum()), "samples"
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from sealfit import __version__
 from sealfit.config import Config
 from sealfit.errors import ConfigError, OutError, StaleError
-from sealfit.fingerprint import STEPS, Fingerprint, fingerprint, fingerprints, seen_config, step_keys
+from sealfit.fingerprint import STEPS, Fingerprint, Fingerprints, changes, fingerprint, seen_config, step_keys
 from sealfit.interrupts import undisturbed
 from sealfit.lock import LOCK, only_writer
 from sealfit.provenance import provenance
@@ -40,14 +40,14 @@ class Store:
         self.warnings: list[str] = []
         self._keys: dict[str, str] | None = None  # of every step for the campaign as it is now
         self.anew = False  # whether what is stored already is to be made again
+        self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new, or not as the state has them
         if state.campaign.is_dir():
-            self._now = fingerprints(state.campaign, state.inputs, self.config)
-        else:
-            self._now = dict(state.inputs)
-            if known:
-                self.warnings.append(
-                    f"the campaign folder {state.campaign} is not there: whether it has changed cannot be told."
-                )
+            self._changed = changes(state.campaign, state.inputs, self.config)
+        elif known:
+            self.warnings.append(
+                f"the campaign folder {state.campaign} is not there: whether it has changed cannot be told."
+            )
+        self.marks = state.inputs | self._changed  # the campaign's files as they are now
 
     # ------------------------------------------------------------ opening
     @classmethod
@@ -101,8 +101,8 @@ class Store:
             return cls(out, State(campaign, source), known=False, kept=kept)
         store_inputs, moved = kept.inputs, kept.campaign != campaign
         if moved:
-            store_inputs = {name: fingerprint(campaign / name) for name in kept.inputs}
-            if any(mark.sha256 != kept.inputs[name].sha256 for name, mark in store_inputs.items()):
+            store_inputs = Fingerprints.of({name: fingerprint(campaign / name) for name in kept.inputs})
+            if store_inputs.sha256 != kept.inputs.sha256:
                 raise OutError(
                     f"belongs to the campaign {kept.campaign}, and {campaign} holds other data.",
                     file=out,
@@ -121,10 +121,10 @@ class Store:
         kept = self._kept
         if kept is None:
             return
-        if self._now != self.state.inputs:
-            now = ((name, self._now.get(name, mark), mark) for name, mark in self.state.inputs.items())
-            same = {name: new if new.sha256 == mark.sha256 else mark for name, new, mark in now}
-            self.state = replace(self.state, inputs=same)
+        known = self.state.inputs
+        same = {n: mark for n, mark in self._changed.items() if n in known and mark.sha256 == known[n].sha256}
+        if same:
+            self.state = replace(self.state, inputs=known | same)
         source = self.state.config if _same_config(kept.config, self.config) else kept.config
         tidy = replace(self.state, config=source)
         if tidy != kept:
@@ -140,7 +140,7 @@ class Store:
     def why_stale(self, step: str) -> str:
         """Return in words why `step` has to be done, or "" if it is current."""
         if self._keys is None:
-            self._keys = step_keys(self._now, self.config)
+            self._keys = step_keys(self.marks, self.config)
         keys = self._keys
         for name in STEPS[: STEPS.index(step) + 1]:
             done = self.state.steps.get(name)
@@ -157,7 +157,7 @@ class Store:
         if done.version != __version__:
             return f"it was made by sealfit {done.version}, this is {__version__}"
         known = self.state.inputs
-        changed = sorted(n for n, mark in self._now.items() if n not in known or mark.sha256 != known[n].sha256)
+        changed = sorted(n for n, mark in self._changed.items() if n not in known or mark.sha256 != known[n].sha256)
         if changed:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             return f"inputs changed ({', '.join(changed[:3])}{more})"
@@ -257,7 +257,8 @@ class Store:
         # Until every file is in its place the step counts as not done: a kill in between cannot pass a mixture of old
         # and new tables as current. All is on the disk before the first move, so a full disk changes nothing in OUT.
         earlier = {step: self.state.steps[step] for step in STEPS[: STEPS.index(name)] if step in self.state.steps}
-        begun = replace(self.state, inputs=inputs if earlier else {}, steps=earlier)  # none are known of steps not done
+        known = inputs if earlier else Fingerprints()  # none are known of steps not done
+        begun = replace(self.state, inputs=known, steps=earlier)
         ended = replace(begun, inputs=inputs, steps={**earlier, name: done})
         staged.text("begun.json", to_json(begun.as_dict(), indent=None))
         staged.text("ended.json", to_json(ended.as_dict(), indent=None))
@@ -276,7 +277,7 @@ class Store:
             sync(self.out)
             self.state = ended
         if staged.inputs is not None:
-            self._now, self._keys = dict(inputs), None
+            self.marks, self._changed, self._keys = inputs, {}, None
 
     def _left_over(self, old: Mapping[str, int], files: Mapping[str, int]) -> set[str]:
         """Return the files of an earlier time of the step that are not its any more.
@@ -294,11 +295,6 @@ class Store:
 
         done = self.state.steps.get("ingest")
         return known_parts(self.out, done.files) if done and not self.anew else {}
-
-    @property
-    def marks(self) -> Mapping[str, Fingerprint]:
-        """The campaign's files as they are now."""
-        return self._now
 
 
 def _make_folder(out: Path) -> bool:

@@ -7,7 +7,7 @@ import pandas as pd
 from small_tables import small
 
 from sealfit.errors import Fault
-from sealfit.fingerprint import fingerprint
+from sealfit.fingerprint import Fingerprints, fingerprint
 
 FAULT = Fault(
     "not_a_number", "is not a number.", "a.csv", None, 3, "force_N", "x", "warning", "row left out", "Mend the cell."
@@ -79,7 +79,7 @@ class Parts:
         good = Fault("read", "was read.", "a.csv", severity="info", action="kept")
         quality = pd.DataFrame([fault.as_dict() for fault in (good, *self.faults)])
         tables |= {"inputs": inputs, "quality": quality}
-        return SimpleNamespace(tables=tables, faults=[good, *self.faults], marks=marks, stored={})
+        return SimpleNamespace(tables=tables, faults=[good, *self.faults], marks=Fingerprints.of(marks), stored={})
 
     def fit_conditions(self, steady, config, *, workers):
         self._called("fit-steady", config)

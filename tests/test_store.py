@@ -21,7 +21,7 @@ from small_tables import small
 from sealfit import parquet, staging
 from sealfit.config import parse_config
 from sealfit.errors import ConfigError, OutError, StaleError
-from sealfit.fingerprint import STEPS, fingerprint, seen_config
+from sealfit.fingerprint import STEPS, Fingerprints, fingerprint, seen_config
 from sealfit.lock import LOCK
 from sealfit.state import ConfigCopy, State, to_json
 from sealfit.store import Store
@@ -57,7 +57,7 @@ def do(store, step, rows=2):
     with store.step(step) as staged:
         if step == "ingest":
             campaign = store.state.campaign
-            staged.inputs = {p.name: fingerprint(p) for p in sorted(campaign.iterdir())}
+            staged.inputs = Fingerprints.of({p.name: fingerprint(p) for p in sorted(campaign.iterdir())})
         staged.table(OUTPUTS[step], small(OUTPUTS[step], rows))
 
 
@@ -397,11 +397,11 @@ def test_a_folder_that_was_made_for_nothing_goes_again(out, campaign):
 def test_what_a_step_no_longer_writes_is_removed(out, campaign):
     with Store.writing(out, campaign, ConfigCopy.at(None)) as store:
         with store.step("ingest") as staged:
-            staged.inputs = {}
+            staged.inputs = Fingerprints()
             staged.text("plots/old.svg", "old")
             staged.text("plots/both.svg", "one")
         with store.step("ingest") as staged:
-            staged.inputs = {}
+            staged.inputs = Fingerprints()
             staged.text("plots/both.svg", "two")
     assert sorted(p.name for p in (out / "plots").iterdir()) == ["both.svg"]
     assert (out / "plots/both.svg").read_text() == "two"

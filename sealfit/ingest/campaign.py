@@ -16,7 +16,7 @@ import pyarrow as pa
 from sealfit.config import Config
 from sealfit.engine import run_map
 from sealfit.errors import CampaignError, Fault
-from sealfit.fingerprint import Fingerprint
+from sealfit.fingerprint import Fingerprints
 from sealfit.ingest.inputs import inputs_table
 from sealfit.ingest.part import SAMPLED, Asked
 from sealfit.ingest.parts import plan_parts
@@ -41,7 +41,7 @@ class Place:
 
     folder: Path
     known: Mapping[str, Path] = field(default_factory=dict)
-    marks: Mapping[str, Fingerprint] = field(default_factory=dict)
+    marks: Fingerprints = field(default_factory=Fingerprints)
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Ingested:
 
     tables: dict[str, pd.DataFrame]
     faults: list[Fault]
-    marks: dict[str, Fingerprint]
+    marks: Fingerprints
     stored: dict[str, int]
 
 
@@ -88,12 +88,12 @@ def ingest_campaign(
         For faults that concern the whole campaign, or where not one stroke can be used.
     """
     campaign = Path(campaign)
-    marks = place.marks if place else {}
     with timed("listing trace files") as part:
         listing, faults = list_traces(campaign, config)
+        marks = (place.marks if place else Fingerprints()).take(listing.files)
         plan = _plan(campaign, listing, marks)
         part.rows, part.of = len(listing), "files"
-    make = _Maker(campaign, config, listing, plan, workers=workers, on_file=on_file, place=place)
+    make = _Maker(campaign, config, listing, plan, marks, workers=workers, on_file=on_file, place=place)
     with timed("reading trace files") as part:
         parts = make.parts()
         part.rows, part.of = make.reread, "files"
@@ -112,7 +112,7 @@ def ingest_campaign(
     parts = make.settled(parts, _ruled_out(plan, strokes, files))
     used = np.zeros(len(listing), bool)
     used[files[strokes["used"].to_numpy(bool)]] = True
-    inputs, marks = inputs_table(campaign, listing, plan, parts, used, faults)
+    inputs, marks = inputs_table(campaign, make.marks, plan, parts, used, faults)
     tables = {
         "inputs": inputs,
         "runs": shaped(strokes, RUNS, drop=(*STEADY_ONLY, *OF_SAMPLES)),
@@ -125,12 +125,11 @@ def ingest_campaign(
     return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY], marks, stored)
 
 
-def _plan(campaign: Path, listing: Listing, marks: Mapping[str, Fingerprint]) -> list[np.ndarray]:
+def _plan(campaign: Path, listing: Listing, marks: Fingerprints) -> list[np.ndarray]:
     """Return the files of each part, by their numbers in the listing."""
-    known = (marks[file].size if file in marks else None for file in listing.files)
     sizes = [
         _size(os.path.join(campaign, file)) if size is None else size
-        for file, size in zip(listing.files, known, strict=True)
+        for file, size in zip(listing.files, marks.size, strict=True)
     ]
     plan = plan_parts(listing.conditions.cells(), listing.columns["run_id"].cells(), sizes)
     return [np.array(files) for files in plan]
@@ -144,7 +143,10 @@ def _size(path: str) -> int:
 
 
 class _Maker:
-    """Makes the parts of a plan: takes those that are stored, reads the others."""
+    """Makes the parts of a plan: takes those that are stored, reads the others.
+
+    `marks` are the files of the listing as they were read, or as they were known where they need not be read.
+    """
 
     def __init__(
         self,
@@ -152,6 +154,7 @@ class _Maker:
         config: Config,
         listing: Listing,
         plan: Sequence[np.ndarray],
+        marks: Fingerprints,
         *,
         workers: int,
         on_file: Callable[[int, int], None] | None,
@@ -160,7 +163,7 @@ class _Maker:
         self._make = partial(make_part, campaign=campaign, config=config, folder=place.folder if place else None)
         self._config, self._workers, self._on_file = config, workers, on_file or (lambda done, total: None)
         self._listing, self._plan, self._place = listing, plan, place
-        self.reread = 0
+        self.marks, self.reread = marks, 0
 
     def parts(self) -> list[Made]:
         """Return every part, by what its own files say."""
@@ -189,11 +192,11 @@ class _Maker:
         known = {name: column.known for name, column in self._listing.columns.items()}
         for i, rows in enumerate(self._plan):
             files = [self._listing.files[row] for row in rows.tolist()]
-            marks = [self._place.marks.get(file) for file in files]
+            hashes = [self.marks.sha256[row] for row in rows.tolist()]
             cells = {name: column[rows] for name, column in words.items() if known[name][rows].any()}
-            path = self._place.known.get(part_key(files, cells, marks, seen) or "")
+            path = self._place.known.get(part_key(files, cells, hashes, seen) or "")
             if path is not None:
-                made[i] = load_part(path, marks)
+                made[i] = load_part(path)
         return made
 
     def _read(self, asked: Mapping[int, Asked]) -> dict[int, Made]:
@@ -205,6 +208,7 @@ class _Maker:
             made[i] = part
             done += len(part.rows)
             self._on_file(done, total)
+        self.marks |= {file: mark for part in made.values() for file, mark in part.marks.items()}
         self.reread += total
         return made
 

@@ -2,35 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from itertools import chain
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from sealfit.errors import Fault
-from sealfit.fingerprint import Fingerprint, fingerprint
-from sealfit.ingest.refs import Listing
+from sealfit.fingerprint import Fingerprints, fingerprint
 from sealfit.ingest.stored import Made
 
 
 def inputs_table(
     campaign: Path,
-    listing: Listing,
+    marks: Fingerprints,
     plan: Sequence[np.ndarray],
     parts: Sequence[Made],
     used: np.ndarray,
     faults: Sequence[Fault],
-) -> tuple[pd.DataFrame, dict[str, Fingerprint]]:
+) -> tuple[pd.DataFrame, Fingerprints]:
     """Return table `inputs`, every trace file of the campaign and those that are not used, and their fingerprints.
 
     Parameters
     ----------
     campaign : Path
         Campaign folder.
-    listing : Listing
-        The files that are listed.
+    marks : Fingerprints
+        The files of the listing, as they were read.
     plan : sequence of ndarray
         The files of each part, by their numbers in the listing.
     parts : sequence of Made
@@ -40,33 +38,22 @@ def inputs_table(
     faults : sequence of Fault
         All findings; those that leave out files which are not in the listing name them.
     """
-    order = np.argsort(np.concatenate(plan)).tolist()
-
-    def in_order(of_parts: Iterable[Sequence]) -> list:
-        values = list(chain.from_iterable(of_parts))
-        return [values[i] for i in order]
-
-    files, marks = list(listing.files), in_order(part.marks for part in parts)
-    rows, found = in_order(part.rows for part in parts), in_order(part.found for part in parts)
-    status = np.where(used, "used", "left out").tolist()
-    known = set(files)
+    others: dict[str, str] = {}  # files that are not in the listing, and their status
     for fault in faults:
-        if fault.file is not None and fault.file not in known and fault.action == "file left out":
-            known.add(fault.file)
-            files.append(fault.file)
-            marks.append(fingerprint(campaign / fault.file))
-            rows.append(0)
-            found.append(0)
-            status.append("left out" if fault.severity == "error" else "not matched")
+        if fault.file is not None and fault.file not in marks.places and fault.action == "file left out":
+            others.setdefault(fault.file, "left out" if fault.severity == "error" else "not matched")
+    marks |= {file: fingerprint(campaign / file) for file in others}
+    counts = np.zeros((2, len(marks)), np.int64)
+    counts[:, np.concatenate(plan)] = np.concatenate([[part.rows, part.found] for part in parts], axis=1)
     table = pd.DataFrame(
         {
-            "file": pd.array(files, "str"),
-            "size": pd.array([mark.size for mark in marks], "Int64"),
-            "mtime_ns": pd.array([mark.mtime_ns for mark in marks], "Int64"),
-            "sha256": pd.array([mark.sha256 for mark in marks], "str"),
-            "rows": rows,
-            "strokes": found,
-            "status": pd.array(status, "str"),
+            "file": pd.array(list(marks), "str"),
+            "size": pd.array(marks.size, "Int64"),
+            "mtime_ns": pd.array(marks.mtime_ns, "Int64"),
+            "sha256": pd.array(marks.sha256, "str"),
+            "rows": counts[0],
+            "strokes": counts[1],
+            "status": pd.array([*np.where(used, "used", "left out").tolist(), *others.values()], "str"),
         }
     )
-    return table, {file: mark for file, mark in zip(files, marks, strict=True) if mark.sha256 is not None}
+    return table, marks.readable()

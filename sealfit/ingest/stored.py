@@ -40,13 +40,13 @@ Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each col
 class Made:
     """One part as the campaign needs it.
 
-    Of its files, in the order in which they were asked for, `marks` are the fingerprints, `rows` the rows that were
-    read, and `found` the strokes. `unused` and `wanted` are what was asked for (`part.Asked`); `columns` are those of
-    its tables; the tables themselves are in `tables`, or on the disk in `stored`: files by their names below OUT, with
-    their sizes in bytes.
+    Of its files, in the order in which they were asked for, `rows` are the rows that were read, and `found` the
+    strokes; `marks` are the fingerprints of those that were read now. `unused` and `wanted` are what was asked for
+    (`part.Asked`); `columns` are those of its tables; the tables themselves are in `tables`, or on the disk in
+    `stored`: files by their names below OUT, with their sizes in bytes.
     """
 
-    marks: Sequence[Fingerprint]
+    marks: Mapping[str, Fingerprint]
     rows: Sequence[int]
     found: Sequence[int]
     faults: tuple[Fault, ...]
@@ -68,7 +68,7 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     """
     keep_freed_memory()
     part = read_part(asked, campaign, config)
-    marks = [found.mark for found in part.files]
+    marks = {found.file: found.mark for found in part.files}
     rows, count = [found.rows for found in part.files], [found.strokes for found in part.files]
     given = (marks, rows, count, part.faults, part.strokes, asked.unused, asked.columns)
     tables = part.tables
@@ -79,7 +79,8 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         tables = {
             name: parquet.with_columns(table, asked.columns[name], config.units) for name, table in tables.items()
         }
-    name = _file_name(part_key(asked.refs.files, asked.refs.words(), marks, seen_by_parts(config)), asked)
+    hashes = [found.mark.sha256 for found in part.files]
+    name = _file_name(part_key(asked.refs.files, asked.refs.words(), hashes, seen_by_parts(config)), asked)
     with disk(folder.parent), _whole_files(folder) as write:
         stored = {
             (file := f"{of}{PARQUET}/{name}"): write(file, table, parquet.write_arrow) for of, table in tables.items()
@@ -105,7 +106,7 @@ def seen_by_parts(config: Config) -> str:
 
 
 def part_key(
-    files: Sequence[str], known: Mapping[str, np.ndarray], marks: Sequence[Fingerprint | None], seen: str
+    files: Sequence[str], known: Mapping[str, np.ndarray], hashes: Sequence[str | None], seen: str
 ) -> str | None:
     """Return a hash of what a part is made from, or None where a file's content is not known.
 
@@ -115,12 +116,11 @@ def part_key(
         Its files.
     known : dict of str to ndarray, each of shape (n,)
         What is known of them, in words: the columns in which any of them has a value.
-    marks : sequence of Fingerprint or None, length n
-        Their fingerprints.
+    hashes : sequence of str or None, length n
+        Of their content.
     seen : str
         What `seen_by_parts` says.
     """
-    hashes = [None if mark is None else mark.sha256 for mark in marks]
     if None in hashes:
         return None
     cells = [word for words in known.values() for word in words.tolist()]
@@ -152,14 +152,14 @@ def known_parts(out: Path, files: Mapping[str, int]) -> dict[str, Path]:
     return {name.split("-", 1)[0]: path for name, path in whole.items()}
 
 
-def load_part(path: Path, marks: Sequence[Fingerprint]) -> Made:
-    """Return a part of these files that was stored before, without its tables."""
+def load_part(path: Path) -> Made:
+    """Return a part that was stored before, without its tables."""
     strokes = parquet.read_ipc(path)
     about = json.loads(strokes.schema.metadata[_ABOUT])
     unused = frozenset((file, stroke) for file, stroke in about["unused"])
     stored = {**about["stored"], f"{PARTS}/{path.name}": path.stat().st_size}
     faults = tuple(Fault(**fault) for fault in about["faults"])
-    given = (marks, about["rows"], about["found"], faults, strokes, unused, about["wanted"])
+    given = ({}, about["rows"], about["found"], faults, strokes, unused, about["wanted"])
     return Made(*given, about["columns"], {}, stored)
 
 
