@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from sealfit.conditions import add_keys, condition_columns
 from sealfit.config import Config
@@ -71,7 +72,7 @@ def add_order(entries: Entries, columns: Columns) -> tuple[Columns, list[Fault]]
     if any(time.tzinfo for time in times if time is not None):
         zoned = [time if time is None or time.tzinfo else time.replace(tzinfo=UTC) for time in times]
         times = [None if time is None else time.astimezone(UTC).replace(tzinfo=None) for time in zoned]
-    moment = np.array([*times, None], "datetime64[us]")[started.codes]
+    moment = pa.array([*times, None], pa.timestamp("us")).to_numpy(zero_copy_only=False)[started.codes]
     known = ~np.isnat(moment)
     if not known.any():
         return columns, faults
