@@ -87,7 +87,7 @@ def _furthest(layout: Layout, fit: ScatterFit, kept: np.ndarray, most: int) -> l
     """Return the rows to take out next, the most extreme first, one of a run: alone, or with the only other repeat."""
     size = np.where(kept & (fit.share > ALONE), np.abs(fit.t), -1.0)
     order = np.argsort(-size, kind="stable")[: int((size >= 0.0).sum())]
-    first = np.sort(np.unique(layout.run[order], return_index=True)[1])
+    first = np.flatnonzero(~pd.Index(layout.run[order]).duplicated())
     few = int(np.searchsorted(np.cumsum(size[order[first]] ** 2), SQUARES * fit.scatter.df))
     first = first[: max(1, min(most, few))]
     count = np.bincount(layout.run[kept], minlength=layout.runs)

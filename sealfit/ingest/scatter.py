@@ -155,8 +155,8 @@ def _pattern(
     if not per_number.any():
         return change
     # Normal equations of the numbers after the runs are eliminated: small, as many as there are repeats.
-    cross = np.zeros((layout.runs, len(present)))
-    np.add.at(cross, (layout.run, layout.repeat), weight)
+    cell = layout.run * len(present) + layout.repeat
+    cross = np.bincount(cell, weight, minlength=layout.runs * len(present)).reshape(layout.runs, len(present))
     scaled = np.divide(cross, per_run[:, None], out=np.zeros_like(cross), where=per_run[:, None] > 0)
     sums = np.bincount(layout.run, weight * log_force, minlength=layout.runs)
     run_mean = np.divide(sums, per_run, out=np.zeros(layout.runs), where=per_run > 0)
