@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 
 from sealfit.config import Config, Quality
 from sealfit.errors import Fault
@@ -247,19 +246,18 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
     place = {file: i for i, file in enumerate(files)}
     ordered = sorted(faults, key=lambda fault: (place.get(fault.file or "", -1), fault.stroke or 0, fault.line or 0))
     told = np.array([place.get(fault.file or "", -1) for fault in ordered], int)
-    silent = np.setdiff1d(np.arange(len(files)), told)
+    silent = np.flatnonzero(~np.isin(np.arange(len(files)), told))
     order = np.argsort(np.concatenate([told, silent]), kind="stable")
+    finding = np.minimum(order, len(ordered))  # that of a file without any stands after all others
     found = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in ordered]
     columns = {}
     for name in QUALITY.names():
-        whole = name in ("stroke", "line")
-        kind = pa.int64() if whole else pa.large_string()
         if name == "file":
-            fine = pa.array([files[i] for i in silent.tolist()], kind)
+            names = [*(row["file"] for row in found), *(files[i] for i in silent.tolist())]
+            columns[name] = pd.array([names[i] for i in order.tolist()], "str")
         else:
-            fine = pa.repeat(pa.scalar(FINE_FILE.get(name), kind), len(silent))
-        column = pa.concat_arrays([pa.array([row[name] for row in found], kind), fine]).take(pa.array(order))
-        columns[name] = pd.array(column.tolist() if whole else column, dtype="Int64" if whole else "str")
+            kind = "Int64" if name in ("stroke", "line") else "str"
+            columns[name] = pd.array([*(row[name] for row in found), FINE_FILE.get(name)], kind).take(finding)
     return pd.DataFrame(columns)
 
 
