@@ -101,7 +101,7 @@ def ingest_campaign(
     files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
     order = np.argsort(files, kind="stable")
     strokes, files = strokes_of([part.strokes for part in parts]).take(order).reset_index(drop=True), files[order]
-    parts = [replace(part, strokes=part.strokes.schema.empty_table()) for part in parts]  # they are in one table now
+    parts = [replace(part, strokes=None) for part in parts]  # they are in one table now
     strokes, found = judged(strokes)
     faults += found
     if not strokes["used"].any():
@@ -251,7 +251,7 @@ def _is_text(dtype: pa.DataType) -> bool:
 
 def _worded(part: pa.Table, words: set[str]) -> pa.Table:
     for i, column in enumerate(part.schema):
-        if column.name in words:
+        if column.name in words and column.type != pa.string():
             values = part.column(i)
             if not _is_text(column.type):
                 texts = values.to_pandas().map(str, na_action="ignore").astype(object)

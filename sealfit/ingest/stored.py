@@ -15,6 +15,7 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -41,16 +42,16 @@ class Made:
     """One part as the campaign needs it.
 
     Of its files, in the order in which they were asked for, `rows` are the rows that were read, and `found` the
-    strokes; `marks` are the fingerprints of those that were read now. `unused` and `wanted` are what was asked for
-    (`part.Asked`); `columns` are those of its tables; the tables themselves are in `tables`, or on the disk in
-    `stored`: files by their names below OUT, with their sizes in bytes.
+    strokes; `marks` are the fingerprints of those that were read now. `strokes` is None once they are let go. `unused`
+    and `wanted` are what was asked for (`part.Asked`); `columns` are those of its tables; the tables themselves are in
+    `tables`, or on the disk in `stored`: files by their names below OUT, with their sizes in bytes.
     """
 
     marks: Mapping[str, Fingerprint]
     rows: Sequence[int]
     found: Sequence[int]
     faults: tuple[Fault, ...]
-    strokes: pa.Table
+    strokes: pa.Table | None
     unused: frozenset
     wanted: Columns | None
     columns: Columns
@@ -123,7 +124,7 @@ def part_key(
     """
     if None in hashes:
         return None
-    cells = [word for words in known.values() for word in words.tolist()]
+    cells = chain.from_iterable(words.tolist() for words in known.values())
     told = [seen, json.dumps(list(known)), *files, *hashes, *cells]
     # Words may hold any mark, so that their lengths are told too.
     lengths = np.fromiter(map(len, told), np.int64, len(told))
