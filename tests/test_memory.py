@@ -1,8 +1,11 @@
 import ctypes
+import os
 import subprocess
 import sys
 
 import pytest
+
+from sealfit.ending import exit_code
 
 FAULTS = """
 import resource, sys
@@ -32,3 +35,13 @@ def test_arrays_made_again_and_again_take_the_pages_of_those_before():
     ]
     columns = 10 * 4 * 1_500_000 * 8 // 4096  # pages of all columns made
     assert made[0] < 0.1 * columns < made[1]
+
+
+@pytest.mark.parametrize(("said", "used"), [(None, "system"), ("default", "default")])
+def test_arrow_asks_the_system_for_memory_unless_the_user_says_otherwise(said, used, monkeypatch):
+    name = "ARROW_DEFAULT_MEMORY_POOL"
+    monkeypatch.setenv(name, said or "")
+    if said is None:
+        monkeypatch.delenv(name)
+    assert exit_code(lambda **given: 0) == 0
+    assert os.environ[name] == used
