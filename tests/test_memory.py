@@ -45,3 +45,11 @@ def test_arrow_asks_the_system_for_memory_unless_the_user_says_otherwise(said, u
         monkeypatch.delenv(name)
     assert exit_code(lambda **given: 0) == 0
     assert os.environ[name] == used
+
+
+def test_a_command_that_ends_looks_for_no_garbage():
+    told = "import atexit, gc; atexit.register(lambda: print(gc.get_freeze_count()))"
+    ended = "from sealfit.ending import exit_code; exit_code(lambda **given: 0)"
+    for code, some in ((told, False), (f"{told}; {ended}", True)):
+        ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+        assert (int(ran.stdout) > 0) == some
