@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -17,9 +16,9 @@ from sealfit.config import Config
 from sealfit.errors import ConfigError, OutError, StaleError
 from sealfit.fingerprint import STEPS, Fingerprint, Fingerprints, changes, fingerprint, seen_config, step_keys
 from sealfit.interrupts import undisturbed
-from sealfit.lock import LOCK, only_writer
+from sealfit.own_folder import held
 from sealfit.provenance import provenance
-from sealfit.staging import PARQUET, STAGING, Staged, disk, file_size, sync
+from sealfit.staging import PARQUET, Staged, disk, file_size, sync
 from sealfit.state import STATE, ConfigCopy, Done, State, to_json
 
 if TYPE_CHECKING:
@@ -78,21 +77,13 @@ class Store:
         """
         if campaign is None or source is None:
             cls.open(out)  # raises if there is nothing to go on from
-        made = _make_folder(out)
-        try:
-            with only_writer(out):
-                for left in out.glob(f"{STAGING}*"):  # of a run that was killed
-                    shutil.rmtree(left, ignore_errors=True)
-                if campaign is None or source is None:
-                    store = cls.open(out)
-                else:
-                    store = cls._of_campaign(out, campaign.resolve(), source)
-                store._keep_what_moved()
-                yield store
-        finally:
-            if made:
-                with contextlib.suppress(OSError):  # stays if it holds anything
-                    out.rmdir()
+        with held(out):
+            if campaign is None or source is None:
+                store = cls.open(out)
+            else:
+                store = cls._of_campaign(out, campaign.resolve(), source)
+            store._keep_what_moved()
+            yield store
 
     @classmethod
     def _of_campaign(cls, out: Path, campaign: Path, source: ConfigCopy) -> Store:
@@ -295,24 +286,6 @@ class Store:
 
         done = self.state.steps.get("ingest")
         return known_parts(self.out, done.files) if done and not self.anew else {}
-
-
-def _make_folder(out: Path) -> bool:
-    """Make `out` if it is not there, and return whether it was made; refuse a folder that sealfit did not make."""
-    if out.exists() and not out.is_dir():
-        raise OutError("is a file.", file=out, mend="Give --out a folder.")
-    if out.is_dir():
-        strangers = [p.name for p in out.iterdir() if p.name != LOCK and not p.name.startswith(STAGING)]
-        if strangers and STATE not in strangers:
-            raise OutError(
-                f"is not empty (it holds {sorted(strangers)[0]}) and was not made by sealfit.",
-                file=out,
-                mend="Choose another --out.",
-            )
-        return False
-    with disk(out):
-        out.mkdir(parents=True)
-    return True
 
 
 def _same_config(kept: ConfigCopy, config: Config) -> bool:
