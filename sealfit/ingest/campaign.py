@@ -97,7 +97,7 @@ def ingest_campaign(
     with timed("reading trace files") as part:
         parts = make.parts()
         part.rows, part.of = make.reread, "files"
-    faults += _by_file([fault for part in parts for fault in part.faults], listing)
+    faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: marks.places[fault.file])
     files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
     order = np.argsort(files, kind="stable")
     strokes, files = strokes_of([part.strokes for part in parts]).take(order).reset_index(drop=True), files[order]
@@ -211,11 +211,6 @@ class _Maker:
         self.marks |= {file: mark for part in made.values() for file, mark in part.marks.items()}
         self.reread += total
         return made
-
-
-def _by_file(faults: Sequence[Fault], listing: Listing) -> list[Fault]:
-    place = {file: i for i, file in enumerate(listing.files)} if faults else {}
-    return sorted(faults, key=lambda fault: place[fault.file])
 
 
 def _ruled_out(plan: Sequence[np.ndarray], strokes: pd.DataFrame, files: np.ndarray) -> list[frozenset]:
