@@ -13,7 +13,7 @@ from sealfit.errors import ConfigError, OutError
 from sealfit.fingerprint import Fingerprints
 
 STATE = "state.json"
-FORMAT = 3
+FORMAT = 4
 DEFAULT = "default"
 
 

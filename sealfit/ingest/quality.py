@@ -15,6 +15,7 @@ import pandas as pd
 from sealfit.config import Config, Quality
 from sealfit.errors import Fault
 from sealfit.ingest.pieces import Pieces
+from sealfit.ingest.spikes import resolution
 from sealfit.ingest.strokes import Stroke
 from sealfit.tables import QUALITY
 
@@ -24,6 +25,8 @@ FINE = 0.3  # share of equal neighbours below which noise is plainly larger than
 # cannot be told from a stuck one.
 COARSE = 0.6
 FEW_LEVELS = 5
+NEXT_LEVELS = 30
+BY_CHANCE = 1e-4  # that so many samples lie at the extreme; few strokes come so far that it is asked
 FINE_FILE = {"check": "ok", "severity": "info", "action": "kept", "reason": "nothing found.", "mend": ""}
 
 
@@ -139,9 +142,25 @@ def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list
     at_next_level = np.count_nonzero(np.abs(others) == np.abs(others).max())
     if not _shows_noise(force_N, ~top, FINE) or top.sum() <= 2 * at_next_level:
         return []  # few levels altogether: the sensor is coarse, not at its end
+    if not _piled_up(size):
+        return []
     value = float(force_N[np.argmax(size)])
     reason = f"{share:.0%} of the steady samples lie exactly at the extreme {value:g}: the end of the sensor's range."
     return [_broken("saturated", reason, line[np.argmax(top)], value, "Use a larger range and measure again.")]
+
+
+def _piled_up(size_N: np.ndarray) -> bool:
+    """Return whether more samples lie at the very extreme than chance puts there.
+
+    Samples thin out towards their extreme. So of those at the extreme and at the k levels next to it no more than a
+    share of 1 / (k + 1) is expected at the extreme; a binomial tail says how many more chance may make it.
+    """
+    from scipy.special import bdtrc  # here, as scipy takes its time to load and few strokes come so far
+
+    away = np.rint((size_N.max() - size_N) / resolution(size_N))  # levels below the extreme
+    levels = np.arange(NEXT_LEVELS + 1)
+    near = np.searchsorted(np.sort(away), levels, side="right")  # samples at the extreme and the k levels next to it
+    return bool(bdtrc(near[0] - 1, near[1:], 1 / (levels[1:] + 1)).min() < BY_CHANCE)
 
 
 def _shows_noise(force_N: np.ndarray, rows: np.ndarray, most_equal: float) -> bool:
