@@ -55,7 +55,10 @@ def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
     axis : str
         Column along which the wave runs.
     """
-    strokes = Strokes.of(samples, axis)
+    return _waves(Strokes.of(samples, axis), lengths)
+
+
+def _waves(strokes: Strokes, lengths: np.ndarray) -> Waves:
     square, product = np.zeros((strokes.size.size, lengths.size, 2, 2)), np.zeros((strokes.size.size, lengths.size, 2))
     total, middle = np.zeros((2, strokes.size.size))
     for size in np.unique(strokes.size).tolist():  # those of one size at once, as far as they fit into the cache
@@ -96,8 +99,9 @@ def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tu
 
     The error is a jackknife over files.
     """
-    lengths = 1 / (1 / wavelength + AROUND / np.median(Strokes.of(samples, axis).span))
-    waves = waves_of(samples, lengths, axis)
+    strokes = Strokes.of(samples, axis)
+    lengths = 1 / (1 / wavelength + AROUND / np.median(strokes.span))
+    waves = _waves(strokes, lengths)
     files, file = np.unique(waves.unit, return_inverse=True)
     share = np.zeros((len(files), lengths.size))
     np.add.at(share, file, waves.share)
