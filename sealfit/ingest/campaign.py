@@ -25,7 +25,16 @@ from sealfit.ingest.quality import quality_table
 from sealfit.ingest.refs import Listing
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.shaped import STEADY_ONLY, shaped
-from sealfit.ingest.stored import Made, agrees, common_columns, load_part, make_part, part_key, seen_by_parts
+from sealfit.ingest.stored import (
+    Made,
+    agrees,
+    common_columns,
+    load_part,
+    make_part,
+    part_key,
+    seen_by_parts,
+    stored_strokes,
+)
 from sealfit.parquet import spelled_out
 from sealfit.profiling import timed
 from sealfit.tables import RUNS, STEADY
@@ -100,7 +109,7 @@ def ingest_campaign(
     faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: marks.places[fault.file])
     files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
     order = np.argsort(files, kind="stable")
-    strokes, files = strokes_of([part.strokes for part in parts]).take(order).reset_index(drop=True), files[order]
+    strokes, files = strokes_of([make.strokes(part) for part in parts]).take(order).reset_index(drop=True), files[order]
     parts = [replace(part, strokes=None) for part in parts]  # they are in one table now
     strokes, found = judged(strokes)
     faults += found
@@ -172,6 +181,10 @@ class _Maker:
             {i: Asked(self._listing.take(self._plan[i])) for i in range(len(self._plan)) if i not in made}
         )
         return [made[i] for i in range(len(self._plan))]
+
+    def strokes(self, part: Made) -> pa.Table:
+        """Return the strokes of a part, from the disk if they lie there."""
+        return stored_strokes(part, self._place.folder) if part.strokes is None else part.strokes
 
     def settled(self, parts: Sequence[Made], unused: Sequence[frozenset]) -> list[Made]:
         """Return the parts, made again where the whole campaign leaves out other strokes or has other columns."""

@@ -42,9 +42,10 @@ class Made:
     """One part as the campaign needs it.
 
     Of its files, in the order in which they were asked for, `rows` are the rows that were read, and `found` the
-    strokes; `marks` are the fingerprints of those that were read now. `strokes` is None once they are let go. `unused`
-    and `wanted` are what was asked for (`part.Asked`); `columns` are those of its tables; the tables themselves are in
-    `tables`, or on the disk in `stored`: files by their names below OUT, with their sizes in bytes.
+    strokes; `marks` are the fingerprints of those that were read now. `strokes` is None where they are left on the disk
+    (`stored_strokes`), and once they are let go. `unused` and `wanted` are what was asked for (`part.Asked`); `columns`
+    are those of its tables; the tables themselves are in `tables`, or on the disk in `stored`: files by their names
+    below OUT, with their sizes in bytes.
     """
 
     marks: Mapping[str, Fingerprint]
@@ -71,10 +72,9 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     part = read_part(asked, campaign, config)
     marks = {found.file: found.mark for found in part.files}
     rows, count = [found.rows for found in part.files], [found.strokes for found in part.files]
-    given = (marks, rows, count, part.faults, part.strokes, asked.unused, asked.columns)
     tables = part.tables
     if folder is None:
-        return Made(*given, {}, tables, {})
+        return Made(marks, rows, count, part.faults, part.strokes, asked.unused, asked.columns, {}, tables, {})
     columns = {name: {f.name: str(f.type) for f in parquet.spelled_out(table.schema)} for name, table in tables.items()}
     if asked.columns is not None:
         tables = {
@@ -98,7 +98,13 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         metadata = {**(part.strokes.schema.metadata or {}), _ABOUT: json.dumps(about)}
         file = f"{PARTS}/{Path(name).with_suffix(ARROW)}"
         stored[file] = write(file, part.strokes.replace_schema_metadata(metadata), parquet.write_ipc)
-    return Made(*given, columns, {}, stored)
+    # Its strokes are not sent: whoever asked finds them on the disk, and need not hold them while other parts are read.
+    return Made(marks, rows, count, part.faults, None, asked.unused, asked.columns, columns, {}, stored)
+
+
+def stored_strokes(part: Made, folder: Path) -> pa.Table:
+    """Return the strokes of a part that was made in `folder`."""
+    return parquet.read_ipc(folder / next(name for name in part.stored if name.startswith(f"{PARTS}/")))
 
 
 def seen_by_parts(config: Config) -> str:
