@@ -20,7 +20,7 @@ from sealfit.tables import AGING_LAWS, MASTER_CURVE
 
 TEMPERATURE, COMPRESSION = "temperature_C", "compression_ratio_pct"
 SEPARATE = "separate"  # Eq. 15 with a and b of its own for every series
-MANY = 250  # values of a quantity from which a process of its own is worth its start
+MANY = 600  # values of a quantity from which a process of its own is worth its start
 LIKELY = 3  # laws held against data they were not fitted to
 CURVE_POINTS = 61
 START_POINTS = 20  # more, between day 0 and a third of the first day

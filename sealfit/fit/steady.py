@@ -20,7 +20,8 @@ from sealfit.tables import STEADY_FIT
 from sealfit.units import Units
 
 SIGNIFICANT = 0.05
-TOGETHER = 250  # conditions whose intervals one process finds at once
+TOGETHER = 250  # conditions whose intervals one process finds at once,
+MANY = 3000  # where there are so many: fewer are done before a process has started
 FORCES = {"mu_s": "F_s", "mu_c": "F_c"}  # names without load
 
 
@@ -63,6 +64,7 @@ def fit_conditions(steady: pd.DataFrame, config: Config, *, workers: int = 1) ->
     keys = condition_keys(steady, config)
     blocks = [slice(start, start + TOGETHER) for start in range(0, len(conditions), TOGETHER)]
     asked = [(conditions[block], variance.of(block)) for block in blocks]
+    workers = workers if len(conditions) >= MANY else 1
     found = run_map(partial(_told, scatter=scatter, config=config), asked, workers=workers, together=1)
     table = pd.concat(found, ignore_index=True).merge(keys, on="condition", how="left", validate="many_to_one")
     fixed = STEADY_FIT.names()

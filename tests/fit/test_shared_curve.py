@@ -48,6 +48,7 @@ def test_several_processes_give_the_same_tables(campaign, monkeypatch):
     table, config = campaign(noise=0.01, series=SERIES, laws=arrhenius(), days=DAYS, ways=(1,)), Config()
     one = fit_conditions(table, config)
     monkeypatch.setattr(steady, "TOGETHER", 10)
+    monkeypatch.setattr(steady, "MANY", 0)
     monkeypatch.setattr(all_series, "MANY", 0)
     pdt.assert_frame_equal(fit_conditions(table, config, workers=2), one)
     for alone, shared in zip(joint_laws(table, one, config), joint_laws(table, one, config, workers=2), strict=True):
