@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.acting import acting_as_all_say
 from sealfit.closure.confirm import folds, heldout_level
 from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import effect_entries, effect_table, left_entry
@@ -20,6 +19,7 @@ from sealfit.closure.merged import Searched, searched
 from sealfit.closure.next_runs import next_runs
 from sealfit.closure.overlooked import overlooked
 from sealfit.closure.record import to_record
+from sealfit.closure.told_by_all import told_by_all
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
@@ -96,7 +96,7 @@ def close_loop(
                     on_progress=say,
                 )
             if not part.whole:
-                grown, on_all_strokes = acting_as_all_say(grown, part.every, heldout.samples, config, say)
+                grown, on_all_strokes = told_by_all(grown, part.every, heldout.samples, config, say)
             heldout.settle(grown)
             say("before and after on all rows")
             with timed("before and after", rows=rows.force.size, of="bins"):

@@ -6,10 +6,10 @@ import numpy.testing as npt
 import pytest
 from bins_helpers import TRUE, make_bins, make_traces, warm
 
-from sealfit.closure.acting import acting_as_all_say
 from sealfit.closure.grow import grow, numbered, steady_samples
 from sealfit.closure.loop import close_loop
 from sealfit.closure.merged import FURTHER, MOST_ROWS, PER_STROKE, ROWS, merged_bins, searched
+from sealfit.closure.told_by_all import told_by_all
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.declared import declare
@@ -140,7 +140,7 @@ def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatc
         chosen, rival = on(first), on(second)
         item = replace(found, proposal=chosen, rivals=(rival,), rivals_rmse_N=(0.1,))
         doubted = replace(grown, after=chosen.fitted, added=(item,))
-        told, whole = acting_as_all_say(doubted, part.every, samples, Config(), lambda text: None)
+        told, whole = told_by_all(doubted, part.every, samples, Config(), lambda text: None)
         (effect,) = told.added
         terms = (effect.proposal.term, *told.after.model.terms, *whole.model.terms)
         assert [term.acts_on for term in terms] == [acts_on] * 3
