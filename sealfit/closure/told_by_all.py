@@ -44,7 +44,7 @@ def told_by_all(
     """
     added, after = list(grown.added), grown.after
     whole = fit(after.model, every, after.scatter, turns=1)
-    for first in grown.added:
+    for first in (a for a in grown.added if not _periodic(a.proposal)):
         item = first
         for others_of in (_first_rivals, _on_other_quantities):
             number = next(k for k, a in enumerate(added) if a is item)
@@ -70,14 +70,14 @@ def told_by_all(
 
 def _first_rivals(item: Added, without: Fitted) -> list[Proposal]:
     """Return the first rivals of an effect as they were fitted to the part, joined with all else."""
-    return [] if _periodic(item) else [_joined(rival, rival.term, without) for rival in item.rivals[:COMPARED]]
+    return [_joined(rival, rival.term, without) for rival in item.rivals[:COMPARED] if not _periodic(rival)]
 
 
 def _on_other_quantities(item: Added, without: Fitted) -> list[Proposal]:
     """Return an effect on the quantities that its rivals act on, each fitted to the part."""
     term, found = item.proposal.term, []
     for way in dict.fromkeys(map(_way, item.rivals)):
-        if way != _way(item.proposal) and way in term.effect.acts_on and not _periodic(item):
+        if way != _way(item.proposal) and way in term.effect.acts_on:
             found.append(_joined(item.proposal, replace(term, acts_on=way[0], operation=way[1]), without))
     return found
 
@@ -89,8 +89,8 @@ def _joined(proposal: Proposal, term: Term, without: Fitted) -> Proposal:
     return replace(proposal, term=term, fitted=fitted)
 
 
-def _periodic(item: Added) -> bool:
-    return item.proposal.term.effect.id in PERIODIC
+def _periodic(proposal: Proposal) -> bool:
+    return proposal.term.effect.id in PERIODIC
 
 
 def _instead(item: Added, chosen: Proposal, gain: Gain) -> Added:
