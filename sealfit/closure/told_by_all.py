@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pandas as pd
 
-from sealfit.closure.confirm import COMPARED, Added, Gain, heldout_gain
+from sealfit.closure.confirm import COMPARED, Added, heldout_gain
 from sealfit.closure.forms import PERIODIC, describe
 from sealfit.closure.grow import Grown
 from sealfit.closure.linearised import Proposal
@@ -15,7 +15,6 @@ from sealfit.closure.naming import RIVAL, named_among
 from sealfit.config import Config
 from sealfit.fit.estimate import Fitted, fit, fitted_at
 from sealfit.fit.rows import Rows
-from sealfit.fit.terms import Term
 
 Way = tuple[str, str]  # what an effect acts on, and how
 
@@ -44,12 +43,11 @@ def told_by_all(
     """
     added, after = list(grown.added), grown.after
     whole = fit(after.model, every, after.scatter, turns=1)
-    for first in (a for a in grown.added if not _periodic(a.proposal)):
+    for first in (a for a in grown.added if a.rivals and not _periodic(a.proposal)):
         item = first
         for others_of in (_first_rivals, _on_other_quantities):
             number = next(k for k, a in enumerate(added) if a is item)
-            without = fit(after.model.without_term(number), after.rows, after.scatter, turns=0, friction=after.friction)
-            asked = [item.proposal, *others_of(item, without)]
+            asked = [item.proposal, *others_of(item)]
             if len(asked) == 1:
                 continue
             base = fitted_at(whole.model.without_term(number), every, whole.scatter, whole.friction)
@@ -57,10 +55,8 @@ def told_by_all(
             chosen = next(p for p in asked if p.term is found[0].term)
             if chosen is not item.proposal:
                 say(f"all strokes say {describe(chosen.term)} rather than {describe(item.proposal.term)}")
-                gain = heldout_gain(without, chosen, config.loop.folds, config.loop.seed, samples, {})
-                item = _instead(item, chosen, gain)
-                added = [*added[:number], *added[number + 1 :], item]
-                after, whole = fit(chosen.fitted.model, after.rows, after.scatter, turns=2), found[0].fitted
+                item, after = _instead(item, chosen, after, number, samples, config)
+                added, whole = [*added[:number], *added[number + 1 :], item], found[0].fitted
             if others_of is _on_other_quantities:
                 left = [_way(p) for p in found if p.criterion - found[0].criterion < RIVAL]
                 number = next(k for k, a in enumerate(added) if a is item)
@@ -68,36 +64,39 @@ def told_by_all(
     return replace(grown, added=tuple(added), after=after), whole
 
 
-def _first_rivals(item: Added, without: Fitted) -> list[Proposal]:
-    """Return the first rivals of an effect as they were fitted to the part, joined with all else."""
-    return [_joined(rival, rival.term, without) for rival in item.rivals[:COMPARED] if not _periodic(rival)]
+def _first_rivals(item: Added) -> list[Proposal]:
+    """Return the first rivals of an effect."""
+    return [rival for rival in item.rivals[:COMPARED] if not _periodic(rival)]
 
 
-def _on_other_quantities(item: Added, without: Fitted) -> list[Proposal]:
-    """Return an effect on the quantities that its rivals act on, each fitted to the part."""
-    term, found = item.proposal.term, []
-    for way in dict.fromkeys(map(_way, item.rivals)):
-        if way != _way(item.proposal) and way in term.effect.acts_on:
-            found.append(_joined(item.proposal, replace(term, acts_on=way[0], operation=way[1]), without))
-    return found
+def _on_other_quantities(item: Added) -> list[Proposal]:
+    """Return an effect on the quantities that its rivals act on, to begin where it stands."""
+    term = item.proposal.term
+    ways = (way for way in dict.fromkeys(map(_way, item.rivals)) if way != _way(item.proposal))
+    return [
+        replace(item.proposal, term=replace(term, acts_on=way[0], operation=way[1]))
+        for way in ways
+        if way in term.effect.acts_on
+    ]
 
 
-def _joined(proposal: Proposal, term: Term, without: Fitted) -> Proposal:
-    """Return a proposal with another term, or its own, fitted to the part with all else that is in the model."""
-    model = without.model.with_term(term, _values(proposal))
-    fitted = fit(model, without.rows, without.scatter, turns=0, friction=without.friction)
-    return replace(proposal, term=term, fitted=fitted)
+def _instead(
+    item: Added, chosen: Proposal, after: Fitted, number: int, samples: pd.DataFrame, config: Config
+) -> tuple[Added, Fitted]:
+    """Return an effect with another proposal in its place and its own among the rivals, and the part's fit with it."""
+    rows, scatter, friction = after.rows, after.scatter, after.friction
+    without = fit(after.model.without_term(number), rows, scatter, turns=0, friction=friction)
+    model = without.model.with_term(chosen.term, _values(chosen))
+    chosen = replace(chosen, fitted=fit(model, rows, scatter, turns=0, friction=friction))
+    gain = heldout_gain(without, chosen, config.loop.folds, config.loop.seed, samples, {})
+    rest = [r for r in _rivals(item) if r[0].term is not chosen.term]
+    item = _with_rivals(item, [(item.proposal, item.left_N), *rest])
+    after = fit(chosen.fitted.model, rows, scatter, turns=2)
+    return replace(item, proposal=chosen, gain_N=gain.rmse_N, left_N=gain.left_N), after
 
 
 def _periodic(proposal: Proposal) -> bool:
     return proposal.term.effect.id in PERIODIC
-
-
-def _instead(item: Added, chosen: Proposal, gain: Gain) -> Added:
-    """Return an effect with another proposal in its place, and its own among the rivals."""
-    rest = [r for r in _rivals(item) if r[0].term is not chosen.term]
-    item = _with_rivals(item, [(item.proposal, item.left_N), *rest])
-    return replace(item, proposal=chosen, gain_N=gain.rmse_N, left_N=gain.left_N)
 
 
 def _rivals(item: Added) -> list[tuple[Proposal, float]]:
