@@ -3,7 +3,8 @@ r"""P-values adjusted for the whole search: for every channel, quantity and widt
 Flipping the signs of whole units at random many times costs one matrix product a candidate, and the largest
 standardised T over all candidates gives the p-value adjusted for the search (Westfall & Young 1993; sign flips of score
 contributions: Hemerik, Goeman & Finos 2020, doi:10.1111/rssb.12369). P-values by the jackknife are adjusted by the
-number of candidates (Bonferroni); each way has half of the error. Tests on few specimens are adjusted by draws (`few`).
+number of candidates (Bonferroni); each way has half of the error. Tests on few specimens are adjusted by draws (`few`),
+contrasts in few units by their number (`slopes`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from sealfit.closure import few
 from sealfit.closure.few import FewUnits
 from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge, Judgement, log_p_of, wald
+from sealfit.closure.slopes import slope_log_p
 
 FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
 MOST_SIGNS = 1 << 22  # drawn at once: 34 MB
@@ -26,29 +28,30 @@ SEARCHES = 2  # single channels and pairs of them: each search has half of the e
 def judged(judge: Judge, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
     """Return candidates with p-values adjusted over all of them, strongest evidence first."""
     judgements = [c.judgement for c in candidates]
-    p_values = adjust(judgements, [c.unit for c in candidates], rng)
-    by_specimen = adjust_few(judge.few, judgements, rng)
-    for k, judgement in enumerate(judgements):
-        if judgement.units >= JACKKNIFE_UNITS:  # of two ways, each has half of the error
-            p_values[k] = 2 * min(p_values[k], len(candidates) * np.exp(judgement.log_p_jackknife))
-        elif judgement.few is not None:
-            p_values[k] = by_specimen[k]
+    p_values = np.ones(len(candidates))
+    many = [k for k, j in enumerate(judgements) if j.few is None and not j.slopes]
+    if many:
+        p_values[many] = adjust([judgements[k] for k in many], rng)
+    for k in many:
+        if judgements[k].scores.shape[0] >= JACKKNIFE_UNITS:  # of two ways, each has half of the error
+            p_values[k] = 2 * min(p_values[k], len(many) * np.exp(judgements[k].log_p_jackknife))
+    p_values = np.minimum(p_values, adjust_few(judge.few, judgements, rng))
+    p_values = np.minimum(p_values, adjust_slopes(judgements))
     found = [replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)]
     return sorted(found, key=lambda c: -c.evidence)
 
 
-def adjust(
-    judgements: Sequence[Judgement], levels: Sequence[str], rng: np.random.Generator, flips: int = FLIPS
-) -> np.ndarray:
+def adjust(judgements: Sequence[Judgement], rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:
     """Return each p-value adjusted over all judgements, by the maximum over sign flips, shape (m,).
 
-    Those of one level are flipped with the same signs, so that what they share counts once.
+    Those of as many units are flipped with the same signs, so that what they share counts once.
     """
     alike = defaultdict(lambda: defaultdict(list))
-    for judgement, level in zip(judgements, levels, strict=True):
-        alike[level, judgement.units][judgement.scores.shape[1]].append(judgement.scores)
+    for judgement in judgements:
+        units, df = judgement.scores.shape
+        alike[units][df].append(judgement.scores)
     least = np.zeros(flips)
-    for (_, units), by_df in alike.items():
+    for units, by_df in alike.items():
         scores = np.column_stack([own for scores in by_df.values() for own in scores])
         totals = _flipped(scores, flips, rng)
         first = 0
@@ -85,6 +88,21 @@ def adjust_few(
             test = judgements[k].few
             least = np.minimum(least, few.log_p_of(drawn[test.target], test.basis, test.known))
         p_values[tried] = _adjusted([judgements[k].few.log_p for k in tried], least)
+    return p_values
+
+
+def adjust_slopes(judgements: Sequence[Judgement]) -> np.ndarray:
+    """Return the p-values of the contrasts in few units, times the number of all contrasts, shape (m,); 1 for none.
+
+    A candidate has that of its strongest contrast, by the variant of it that says least.
+    """
+    p_values = np.ones(len(judgements))
+    tried = [k for k, j in enumerate(judgements) if j.slopes]
+    if tried:
+        logs = iter(slope_log_p([test for k in tried for test in judgements[k].slopes]))
+        least = [max(float(next(logs).min()) for _ in judgements[k].slopes) for k in tried]
+        count = sum(judgements[k].slopes[0].slope.size for k in tried)
+        p_values[tried] = np.minimum(count * np.exp(least), 1.0)
     return p_values
 
 

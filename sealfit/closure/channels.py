@@ -1,7 +1,8 @@
-"""Channels: what may order a residual, and the unit of evidence of each.
+"""Channels: what may order a residual, and the level at which each varies.
 
-The unit of evidence is the coarsest nesting level within each of whose groups the channel is constant. A category with
-each of its levels in one group only (a serial number) is a grouping, never an effect.
+A channel varies at the coarsest nesting level within whose groups nearly none of its variance lies. Measured numbers
+jitter, so no level rests on exact equality. A category with each of its levels in one group only (a serial number) is a
+grouping, never an effect.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import BSpline
 
+from sealfit.closure.slopes import LEAST_UNITS as LEAST_SLOPES
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.declared import SAME_SPEED
@@ -29,6 +31,18 @@ FREE_DF = 4  # columns of a free shape: enough for a peak, an approach or a step
 FINE_DF = 9  # of a second, finer shape, for two humps or a narrow one
 FINE_UNITS = 50  # units from which it is tried
 
+WITHIN = 1e-4
+"""Share of a channel's variance within groups, below which it counts as constant there: 1 % of its standard deviation.
+
+Measured speeds of one setting differ by 1e-5 to 1e-3 of themselves, settings by 10 % and more.
+"""
+
+SAME_VALUE = 1e-3
+"""Of a channel's range on the scale it is looked at: values nearer to each other are one setting measured twice."""
+
+MOST_SETTINGS = 50
+"""Of a channel that was set: one with more groups of values is taken as it was measured."""
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -43,6 +57,11 @@ class Channel:
     def numeric(self) -> bool:
         """Whether the channel holds numbers."""
         return self.values.dtype.kind == "f"
+
+    @property
+    def scatters(self) -> bool:
+        """Whether specimens differ in their slope along the channel without any effect."""
+        return self.unit == "sample" or self.name in ("speed_mm_s", "direction")
 
 
 def channels_of(rows: Rows, config: Config) -> list[Channel]:
@@ -82,6 +101,7 @@ def find_channels(
                 continue
             if name == "speed_mm_s" and values.max() <= SAME_SPEED * values.min():
                 continue  # one setting: what is left of the speed tells directions apart, or strokes
+            values = settings(level_values(values, rows))
         elif not 2 <= np.unique(values).size <= MOST_LEVELS:
             continue
         unit = unit_of(values, rows)
@@ -95,21 +115,60 @@ def find_channels(
 
 
 def unit_of(values: np.ndarray, rows: Rows) -> str:
-    """Return the coarsest level within each of whose groups `values` are constant; "sample" if within none."""
+    """Return the coarsest level within whose groups `values` vary by next to nothing; "sample" if there is none."""
+    numeric = values.dtype.kind == "f"
+    least = WITHIN * float(np.var(values)) if numeric else 0.0
     for level in reversed(LEVELS):
         start, code = rows.groups.starts[level], rows.codes(level)
-        first = values[start][code]
-        if values.dtype.kind == "f":
-            close = np.abs(values - first) <= 1e-9 * max(float(np.abs(values).max()), 1e-300)
+        if not numeric:
+            constant = (values == values[start][code]).all()
         else:
-            close = values == first
-        if close.all():
+            # Rounding leaves 1e-9 of the largest value between the mean of equal numbers and these themselves.
+            rounding = 1e-9 * float(np.abs(values).max())
+            constant = np.mean((values - rows.groups.means(values, level)[code]) ** 2) <= max(least, rounding**2)
+        if constant:
             return level
     return "sample"
 
 
+def level_values(values: np.ndarray, rows: Rows) -> np.ndarray:
+    """Return numbers as their means in the groups of the level at which they vary: jitter within groups is left out."""
+    level = unit_of(values, rows)
+    return values if level == "sample" else rows.groups.means(values, level)[rows.codes(level)]
+
+
+def settings(values: np.ndarray) -> np.ndarray:
+    """Return numbers with the mean of each setting in place of its measured values; as they are where nothing was set.
+
+    Settings are groups of values with a gap on either side; a channel that goes on without gaps has none.
+    """
+    distinct, place = np.unique(values, return_inverse=True)
+    at = scaled(distinct)
+    first = np.flatnonzero(np.r_[True, np.diff(at) > SAME_VALUE])
+    widest = float((at[np.r_[first[1:] - 1, at.size - 1]] - at[first]).max())
+    if first.size > MOST_SETTINGS or not 0 < widest <= 10 * SAME_VALUE:
+        return values
+    group = (np.searchsorted(first, np.arange(at.size), side="right") - 1)[place]
+    return (np.bincount(group, values) / np.bincount(group))[group]
+
+
+def scatter_level(channels: Iterable[Channel], rows: Rows) -> str:
+    """Return the level of the units that a contrast of some channels is judged between.
+
+    It is the coarsest level at which the slope along the channels may scatter without any effect. Specimens differ in
+    how their friction depends on the place in a stroke, on speed and on direction, so these are judged between
+    specimens; what else varies from run to run is judged between runs. A product has the units of its coarser channel,
+    as each of them may have a slope of its own along the finer one. With few units the next finer level has to do.
+    """
+    channels = list(channels)
+    unit = max((c.unit for c in channels), key=FINER.get)
+    coarsest = "specimen" if unit == "specimen" or any(c.scatters for c in channels) else "run"
+    levels = LEVELS[max(FINER[unit], 1) - 1 : FINER[coarsest]]
+    return next((level for level in reversed(levels) if rows.groups.starts[level].size >= LEAST_SLOPES), levels[0])
+
+
 def flip_level(unit: str, rows: Rows) -> str:
-    """Return the level whose whole groups are moved by sign flips, folds and bootstraps.
+    """Return the level whose whole groups are held out, and counted as evidence by Schwarz's criterion.
 
     Of a few files, or one, the strokes speak, and of these files alone.
     """

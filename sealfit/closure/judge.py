@@ -14,7 +14,8 @@ units over the kurtosis of c, and a few runs in extreme places hide what all oth
 estimate is also held against its jackknife over whole units (CV3; MacKinnon, Nielsen & Webb 2023,
 doi:10.1016/j.jeconom.2022.04.001). A few runs may hold nearly all that columns say and agree by chance, so what the
 columns explain must count as well: by chi-squared, or by F against the runs' own scatter where they are one number a
-run. With fewer specimens than thirty, what is constant in them is held against their own scatter (`few`).
+run. With fewer specimens than thirty, what is constant in them is held against their own scatter (`few`), and what
+varies within them against the scatter of their slopes (`slopes`).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from scipy.special import betainc, chdtrc, fdtrc
 
 from sealfit.closure.channels import FINER
 from sealfit.closure.few import LEAST_ERROR, FewTest, FewUnits
+from sealfit.closure.slopes import SlopeTest, slope_test
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.tangent import OwnColumns, Tangent
 
@@ -51,6 +53,7 @@ class Judgement(NamedTuple):
     log_p_jackknife: float = 0.0  # of the estimate against its jackknife over units; 0 where that was not tried
     scores: np.ndarray | None = None  # (units, k)
     few: FewTest | None = None  # against the scatter of few specimens; None where that was not tried
+    slopes: tuple[SlopeTest, ...] = ()  # against the slopes of few units, in every variant; empty where not tried
 
 
 @dataclass(frozen=True)
@@ -73,8 +76,9 @@ class Candidate:
 
     @property
     def sure(self) -> bool:
-        """Whether it may be claimed: too few specimens do not show their own scatter."""
-        return self.judgement.few is None or self.judgement.few.error_df >= LEAST_ERROR
+        """Whether it may be claimed: too few specimens do not show their own scatter, or show that they differ."""
+        agree = all(test.agree[np.argmax(np.abs(test.slope))] for test in self.judgement.slopes)
+        return agree and (self.judgement.few is None or self.judgement.few.error_df >= LEAST_ERROR)
 
     @property
     def chi2(self) -> float:
@@ -147,30 +151,39 @@ class Judge:
         own = OwnColumns(rows.codes("specimen"), white * told[rows.codes("specimen")])
         return own, basis.orthonormal(RANK, freed=own.freed)
 
-    def __call__(self, variants: Sequence[np.ndarray], level: str, target: tuple[str, str]) -> Judgement | None:
+    def __call__(
+        self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]
+    ) -> Judgement | None:
         """Return the judgement that says least of all variants of some columns; None where one cannot be judged.
 
         Parameters
         ----------
         variants : sequence of ndarray, shape (n, k)
             Columns as `variants` gives them.
+        between : str
+            Level of the units whose slopes along the columns may scatter.
         level : str
-            Level whose whole groups are the evidence.
+            Level whose whole groups are held out.
         target : tuple of str
             (acts_on, operation) of the columns.
         """
+        starts = self.fitted.rows.groups.starts
+        few = starts[between].size < JACKKNIFE_UNITS
         found = []
         for left in variants:
-            judgement = self._judge(left, level, target)
+            judgement = self._judge(left, level if few else between, target)
             if judgement is None:
                 return None
             found.append(judgement)
         weakest = max(found, key=lambda j: max(j.log_p, j.log_p_jackknife))
-        if level == "specimen" and weakest.units < JACKKNIFE_UNITS:
+        weakest = weakest._replace(units=starts[level].size)
+        if not few:
+            return weakest
+        if level == "specimen":
             test = self.few.test(variants[0], target)
-            if test is not None:
-                return weakest._replace(chi2=test.chi2, df=test.basis.shape[1], few=test)
-        return weakest
+            return weakest if test is None else weakest._replace(chi2=test.chi2, df=test.basis.shape[1], few=test)
+        tests = tuple(slope_test(self.fitted, left, between) for left in variants)
+        return None if any(test is None for test in tests) else weakest._replace(slopes=tests)
 
     def _judge(self, left: np.ndarray, level: str, target: tuple[str, str]) -> Judgement | None:
         fitted = self.fitted

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from sealfit.closure.adjusted import judged
-from sealfit.closure.channels import FINER, Channel, even_knots, flip_level, off_zero
+from sealfit.closure.channels import FINER, Channel, even_knots, flip_level, off_zero, scatter_level
 from sealfit.closure.judge import Candidate, Judge
 from sealfit.closure.search import MAIN_TARGETS
 from sealfit.effects.free import BENDS, evenly
@@ -92,6 +92,7 @@ def _of_pair(judge: Judge, one: Channel, other: Channel) -> list[Candidate]:
     if not blocks:
         return []
     fitted, finer = judge.fitted, min(one.unit, other.unit, key=FINER.get)
+    between = scatter_level((one, other), fitted.rows)
     level = flip_level(finer, fitted.rows)
     shapes = np.column_stack(blocks)
     ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
@@ -101,7 +102,7 @@ def _of_pair(judge: Judge, one: Channel, other: Channel) -> list[Candidate]:
             continue
         variants = judge.variants(shapes * fitted.slope(*target)[:, None], finer)
         for block, first, last in zip(blocks, ends[:-1], ends[1:], strict=True):
-            judgement = judge([v[:, first:last] for v in variants], level, target)
+            judgement = judge([v[:, first:last] for v in variants], between, level, target)
             if judgement is not None:
                 names = (one.name, other.name)
                 found.append(Candidate(names, *target, level, block, judgement, pair=True))

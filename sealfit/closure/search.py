@@ -18,6 +18,7 @@ from sealfit.closure.channels import (
     flip_level,
     free_columns,
     kinks,
+    scatter_level,
     unit_of,
 )
 from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge
@@ -107,8 +108,9 @@ def _of_shapes(
             names = ("direction", channel.name)
             unit = min(unit, _direction_unit(rows), key=FINER.get)
         level = flip_level(unit, rows)
+        between = level if channel.grouping else scatter_level([channel], rows)
         for width in dict.fromkeys(widths or (own.shape[1],)):
-            judgement = judge([v[:, first : first + width] for v in variants], level, (acts_on, operation))
+            judgement = judge([v[:, first : first + width] for v in variants], between, level, (acts_on, operation))
             if judgement is not None:
                 yield Candidate(names, acts_on, operation, level, own[:, :width], judgement)
 

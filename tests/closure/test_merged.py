@@ -99,7 +99,7 @@ def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(monkeypatch
     bins = make_bins(3, effect=warm, setup=0.005, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4)
     monkeypatch.setattr("sealfit.closure.merged.RUNS", 1)
     found, said = [], []
-    for strokes in (60, 10_000):
+    for strokes in (120, 10_000):
         monkeypatch.setattr("sealfit.closure.merged.STROKES", strokes)
         found.append(close_loop(bins, make_traces(bins), Config(), on_progress=said.append))
     assert not any("show more" in text for text in said)

@@ -1,0 +1,135 @@
+from dataclasses import replace
+
+import numpy as np
+import numpy.testing as npt
+import pytest
+from bins_helpers import make_bins
+from scipy import stats
+
+from sealfit.closure.channels import find_channels, level_values, scatter_level, settings, unit_of
+from sealfit.closure.judge import Judge
+from sealfit.closure.pairs import search_pairs
+from sealfit.closure.search import search
+from sealfit.closure.slopes import SlopeTest, log_p_of_t, slope_log_p, slope_test
+from sealfit.fit.estimate import fit_declared
+from sealfit.fit.rows import make_rows
+
+FEW_SPEEDS = (1.0, 4.0, 16.0, 64.0)
+
+
+def strongest(bins):
+    """The smallest p-value of a claim in one search of single channels and pairs."""
+    rows = make_rows(bins, has_aging=True)
+    judge, channels, rng = Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
+    singles = search(judge, channels, rng)
+    return min((c.p_value for c in (*singles, *search_pairs(judge, channels, singles, rng)) if c.sure), default=1.0)
+
+
+def tilted(level, size_N, seed):
+    """An effect that is none: every group of a level has a slope of its own along the stroke."""
+
+    def shape(table, force):
+        group = "".join(str(table[name].iloc[0]) for name in level)
+        rng = np.random.default_rng([seed, *group.encode()])
+        return force + rng.normal(0, size_N) * (table["displacement_mm"].to_numpy() - 20) / 40
+
+    return shape
+
+
+@pytest.mark.parametrize(
+    ("days", "level"),
+    [((1.0, 4.0, 16.0), ["condition"]), ((4.0,), ["condition"]), ((1.0, 4.0), ["run_id"])],
+    ids=["seven specimens", "three specimens", "runs"],
+)
+def test_slopes_that_specimens_or_runs_have_at_random_are_no_effect(days, level):
+    smallest = [
+        strongest(make_bins(seed, days=days, speeds=FEW_SPEEDS, repeats=2, bins=8, effect=tilted(level, 0.5, seed)))
+        for seed in range(12)
+    ]
+    assert min(smallest) > 0.0005  # the least of 12 uniform numbers is smaller in 6 of 1,000
+    assert sum(p < 0.05 for p in smallest) <= 3  # more in 2 of 1,000
+
+
+def test_the_same_slope_in_a_few_specimens_is_an_effect():
+    def warmer(table, force):
+        return force * (1 - 0.03 * (1 - np.exp(-table["distance_mm"].to_numpy() / 10)))
+
+    bins = make_bins(3, days=(1.0, 4.0), temperatures=(60.0,), speeds=FEW_SPEEDS, repeats=2, bins=8, effect=warmer)
+    assert strongest(bins) < 1e-4
+
+
+def test_an_offset_that_stands_in_the_scatter_of_eight_runs_is_found():
+    bins = make_bins(
+        1, days=(4.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, directions=(1, -1), repeats=1, bins=8,
+        effect=lambda table, force: force + 1.5,
+    )  # fmt: skip
+    assert strongest(bins) < 1e-3
+
+
+def test_one_contrast_of_equal_units_is_students_t():
+    rng = np.random.default_rng(0)
+    rows = make_rows(make_bins(0, days=(1.0, 4.0), speeds=FEW_SPEEDS, bins=8), has_aging=True)
+    fitted = fit_declared(rows)
+    units = rows.groups.starts["run"].size
+    left = np.tile(np.linspace(-1, 1, 8), rows.force.size // 8)[:, None]
+    noise = rng.normal(size=rows.force.size)
+    bare = replace(fitted, white_residual=noise)
+    bare.__dict__["_widened"] = {"run": noise}  # nothing was taken out of the units
+    test = slope_test(bare, left, "run")
+    scores = rows.groups.sums(left[:, 0] * noise, "run") / np.sqrt((left**2).sum())
+    wanted = stats.ttest_1samp(scores, 0.0)
+    npt.assert_allclose(test.slope / np.sqrt(test.variance), wanted.statistic, rtol=1e-9)
+    npt.assert_allclose(test.df, units - 1, rtol=1e-9)
+
+
+def test_moderated_p_values_are_uniform_where_every_unit_has_its_own_slope():
+    rng = np.random.default_rng(5)
+    units, contrasts, found = 8, 40, []
+    for _ in range(400):
+        own = rng.normal(size=(units, 1)) * rng.uniform(0, 3) * rng.choice([-1, 1], contrasts)  # shared by all
+        scores = (own + rng.normal(size=(units, contrasts))) / np.sqrt(units)
+        slope = scores.sum(axis=0)
+        deviations = (scores - slope / units) / np.sqrt(1 - 1 / units)
+        test = SlopeTest(
+            "run", slope, (deviations**2).sum(axis=0), np.full(contrasts, units - 1.0), np.ones(contrasts, bool),
+            deviations, np.ones(contrasts, bool),
+        )  # fmt: skip
+        found.append(slope_log_p([test])[0][0])
+    assert np.mean(np.array(found) < np.log(0.01)) < 0.025
+
+
+def test_log_p_of_students_t_far_out():
+    npt.assert_allclose(log_p_of_t(np.array([12.0]), np.array([9.0])), np.log(2 * stats.t.sf(12.0, 9.0)), rtol=1e-9)
+
+
+def test_jitter_moves_no_channel_to_another_level():
+    bins = make_bins(repeats=3, bins=8)
+    clean = {c.name: (c.unit, np.unique(c.values).size) for c in find_channels(make_rows(bins, has_aging=True))}
+    rng = np.random.default_rng(2)
+    for size in (1e-6, 1e-4, 1e-3):
+        noisy = bins.assign(speed_mm_s=bins["speed_mm_s"] * (1 + size * rng.normal(size=len(bins))))
+        found = {c.name: (c.unit, np.unique(c.values).size) for c in find_channels(make_rows(noisy, has_aging=True))}
+        assert found["speed_mm_s"] == clean["speed_mm_s"] == ("run", 8)
+
+
+def test_settings_are_groups_of_values_with_gaps_between_them():
+    rng = np.random.default_rng(0)
+    measured = np.repeat([1.0, 2.0, 50.0], 20) * (1 + 1e-4 * rng.normal(size=60))
+    assert np.unique(settings(measured)).size == 3
+    goes_on = rng.uniform(1, 2, 300)
+    assert settings(goes_on) is goes_on
+
+
+def test_what_specimens_differ_in_is_judged_between_specimens():
+    bins = make_bins(repeats=2, bins=4, run_channels={"oil_ppm": lambda rng: rng.normal()})
+    rows = make_rows(bins, has_aging=True)
+    channels = {c.name: c for c in find_channels(rows)}
+    assert {name: scatter_level([channels[name]], rows) for name in ("displacement_mm", "speed_mm_s", "oil_ppm")} == {
+        "displacement_mm": "specimen", "speed_mm_s": "specimen", "oil_ppm": "run",
+    }  # fmt: skip
+    assert scatter_level([channels["oil_ppm"], channels["temperature_C"]], rows) == "specimen"
+    few = rows.subset(rows.codes("specimen") < 2)
+    assert scatter_level([channels["displacement_mm"]], few) == "run"
+    jittered = channels["oil_ppm"].values * (1 + 1e-5 * np.random.default_rng(0).normal(size=rows.force.size))
+    assert unit_of(jittered, rows) == "run"
+    assert np.unique(level_values(jittered, rows)).size == rows.groups.starts["run"].size
