@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sealfit.units import Units
-from sealfit.verdict import predicts_worse
+from sealfit.verdict import power_clause, quality_clause, untold_clause
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -95,7 +95,10 @@ def of_dynamic(fit: pd.DataFrame) -> dict:
 
 def of_closure(closure: Mapping, units: Units) -> dict:
     """Return the verdict, the errors before and after, the effects and what is left."""
-    kept = ("verdict", "units", "noise_floor_N", "before", "after", "heldout_unit", "left", "next_runs")
+    kept = (
+        "verdict", "fit_quality", "sensitivity", "refused", "units", "noise_floor_N", "before", "after",
+        "heldout_unit", "left", "next_runs",
+    )  # fmt: skip
     effects = [{key: effect[key] for key in EFFECT_KEYS} for effect in closure["effects"]]
     return {**{key: closure[key] for key in kept}, "sentence": verdict_sentence(closure, units), "effects": effects}
 
@@ -106,15 +109,15 @@ def verdict_sentence(closure: Mapping, units: Units) -> str:
     added = {0: "no effect was added", 1: "one effect was missing and is added"}.get(
         count, f"{count} effects were missing and are added"
     )
+    quality = quality_clause(closure)
     if closure["verdict"] == "nothing_missing":
-        return "the declared model explains these measurements down to their own scatter"
+        power = power_clause(closure, units)
+        return "; ".join(filter(None, ["nothing was found that the declared model misses", quality, power]))
+    if closure["verdict"] == "cannot_tell":
+        return f"{quality}, and these files cannot tell why: {untold_clause(closure, units)}"
     if closure["verdict"] == "closed":
-        return f"{added}; no significant structure is left"
-    if predicts_worse(closure) and not closure["left"]["channel"]:
-        after, before = (closure[name]["heldout_rmse_N"] for name in ("after", "before"))
-        them, change = "it" if count == 1 else "them", f"{before:.3g} -> {after:.3g} {units.unit('force')}"
-        return f"{added}, but what is held out is predicted worse with {them} ({change}): do not predict with {them}"
-    return f"{added}, and something is left that could not be named{_where(closure['left'], units)}"
+        return f"{added}; no significant structure is left; {quality}"
+    return f"{added}, and something is left that no model holds{_where(closure['left'], units)}; {quality}"
 
 
 def _where(left: Mapping, units: Units) -> str:

@@ -1,18 +1,43 @@
-"""What closure.json says beyond its verdict."""
+"""Clauses that the summary and the report share: fit quality beside the verdict, and what could have been seen."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-WORSE = 1.01  # times the error before: less is no difference
+from sealfit.units import Units
+
+NAMED = 3
+"""Variables whose smallest effect a sentence gives."""
 
 
-def predicts_worse(closure: Mapping) -> bool:
-    """Return whether effects were added and what was held out is predicted worse with them than without.
+def quality_clause(closure: Mapping) -> str:
+    """Return how the error compares with the scatter of repeats, in a clause."""
+    quality = closure.get("fit_quality") or {"state": "unknown"}
+    if quality["state"] == "unknown":
+        return "whether the error is only scatter is not known without repeats"
+    if quality["state"] == "within_scatter":
+        return "the error is within the scatter of repeats"
+    times, p_value = quality["ratio"], quality["p_value"]
+    return f"the error is {times:.2g} times the scatter of repeats (lack of fit p = {p_value:.1g})"
 
-    Then the loop has not closed, however little structure is left: somewhere an effect says anything, as a free shape
-    does where one stroke alone goes.
-    """
-    before, after = (closure[name].get("heldout_rmse_N") for name in ("before", "after"))
-    added = any(not effect["candidate"] for effect in closure["effects"])
-    return bool(added and before is not None and after is not None and after > WORSE * before)
+
+def power_clause(closure: Mapping, units: Units) -> str:
+    """Return the smallest effects that the campaign would have found, in a clause; empty where nothing is known."""
+    known = [s for s in closure.get("sensitivity") or () if s["smallest_N"] is not None]
+    if not known:
+        return ""
+    largest = sorted(known, key=lambda s: -s["smallest_N"])[:NAMED]
+    texts = [f"{units.label(s['variable'])} {s['smallest_pct']:.2g} %" for s in largest]
+    return f"the least sensitive variables would have shown an effect of {', '.join(texts)} of the force"
+
+
+def untold_clause(closure: Mapping, units: Units) -> str:
+    """Return which variables the campaign could not tell of, and what would do, in a clause."""
+    texts = []
+    for entry in [s for s in closure["sensitivity"] if s["cannot_tell"]][:NAMED]:
+        name, smallest, files = entry["variable"], entry["smallest_pct"], entry["files_needed"]
+        size = "no effect" if smallest is None else f"no effect below {smallest:.2g} % of the force"
+        more = f"; about {files} files like these would show one of 1 %" if files and smallest is not None else ""
+        more = f"; at least {files} files are needed" if files and smallest is None else more
+        texts.append(f"{units.label(name)} ({size} could be seen{more})")
+    return ", ".join(texts)

@@ -167,7 +167,8 @@ def test_run_does_every_step_and_says_so_in_a_few_lines(sealfit, parts, campaign
     assert "files       1 used, 0 left out" in lines
     assert "steady fit  mu_s 0.7 to 0.8" in lines
     assert "            not identified: mu_s in 1 of 3. Too few speeds." in lines
-    assert "verdict     closed: one effect was missing and is added; no significant structure is left" in lines
+    sentence = "one effect was missing and is added; no significant structure is left; the error is within the scatter"
+    assert f"verdict     closed: {sentence} of repeats" in lines
     assert "            + lead-screw ripple: A 0.25 N, n unknown" in lines
     assert "error (N)   rmse 0.4 -> 0.2; held out 0.5 -> unknown; run means 0.3 -> 0.3; largest 1.5 -> 1.5" in lines
     assert f"report      {out / 'report.html'}" in lines
@@ -279,12 +280,12 @@ def test_an_effect_that_is_not_named_or_not_applied_is_said_so(sealfit, parts, c
 @pytest.mark.parametrize(
     ("verdict", "effects", "left", "expected"),
     [
-        ("nothing_missing", [], [None, None, None], "the declared model explains"),
+        ("nothing_missing", [], [None, None, None], "nothing was found that the declared model misses"),
         (
             "unexplained",
             [],
             ["run", "elapsed_h", 0.00123],
-            "no effect was added, and something is left that could not be named, at the level of the run,"
+            "no effect was added, and something is left that no model holds, at the level of the run,"
             " along time since first run (h) (p = 0.0012)",
         ),
         ("closed", [fake_parts.EFFECT] * 2, [None, None, None], "2 effects were missing and are added; no significant"),

@@ -34,10 +34,13 @@ sd_N = 0.2
 kind = "repeat_gain"
 sd_rel = 0.01
 """
-ERROR_KEYS = {"rmse_N", "rmse_runs_N", "heldout_rmse_N", "max_abs_N", "mean_abs_pct", "lack_of_fit_p"}
+ERROR_KEYS = {
+    "rmse_N", "rmse_runs_N", "heldout_rmse_N", "heldout_extrapolated_rmse_N", "max_abs_N", "mean_abs_pct",
+    "lack_of_fit_p",
+}  # fmt: skip
 KEYS = {
     "schema", "verdict", "units", "noise_floor_N", "before", "after", "heldout_unit", "effects", "scatter", "left",
-    "next_runs",
+    "next_runs", "fit_quality", "sensitivity", "refused",
 }  # fmt: skip
 TIMES = ("provenance.json", "state.json", "report.html")  # hold times of day
 
@@ -121,7 +124,7 @@ def test_a_run_ends_with_a_short_summary(first):
     lines = run.stdout.splitlines()
     assert 7 <= len(lines) <= 14
     assert lines[0] == "files       80 used, 0 left out"
-    assert "verdict     nothing_missing: the declared model explains" in run.stdout
+    assert "verdict     nothing_missing: nothing was found that the declared model misses" in run.stdout
     assert lines[-1] == f"report      {out / 'report.html'}"
     assert "reading trace files: 80 of 80" in run.stderr
 

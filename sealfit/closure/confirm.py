@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, FINER, LEAST_UNITS, unit_of
+from sealfit.closure.channels import CALENDAR, LEAST_UNITS, level_values, settings
 from sealfit.closure.forms import describe
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
@@ -16,12 +16,28 @@ from sealfit.closure.waves import agreement, pass_shifts
 from sealfit.config import Config
 from sealfit.fit.estimate import Fitted, as_smooth_as_wanted, fit
 from sealfit.fit.joint import Model, evaluate
-from sealfit.fit.rows import Rows
+from sealfit.fit.rows import LEVELS, Rows
+from sealfit.fit.terms import Term
 from sealfit.fit.whitening import Whitening
 
 SURE = 0.005  # p-value, over files (Wilcoxon), at which a ripple of free phase helps the half it was not fitted to
 COMPARED = 4  # rivals, best first, that are put to held-out data too
 TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
+
+MOSTLY = 0.5
+"""Share of an effect's variance that must lie within groups for its gain to be taken about their means."""
+
+BEYOND = 0.02
+"""Of the range of what the fit saw, by which a held-out row may lie outside before it counts as extrapolated."""
+
+SAME = 0.01
+"""Of a value, by which measured numbers of one setting may differ."""
+
+REPEATED = 10.0
+"""Samples for each value of the force from which its steps are those of the recorder, not of chance."""
+
+LEAST_SETTINGS, MOST_SETTINGS = 4, 15
+"""Settings of a channel between which a shape interpolates: with fewer none is inside, with more they lie densely."""
 
 
 def heldout_level(rows: Rows) -> str:
@@ -83,6 +99,64 @@ def _edge(rows: Rows, condition: int) -> bool:
     return bool(days.iloc[condition] in (0.0, own.max()))
 
 
+def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.ndarray:
+    """Return which of the rows held out lie inside what the other rows cover, shape (n,): the rest are extrapolated.
+
+    Parameters
+    ----------
+    rows : Rows
+        All rows.
+    out : ndarray of bool, shape (n,)
+        Which are held out.
+    channels : iterable of str
+        What the effects of the model read.
+    """
+    inside = out.copy()
+    series = rows.conditions["series"].to_numpy()[rows.condition]
+    speed = np.abs(rows.speed)
+    for own in np.unique(series[out]):
+        here = series == own
+        seen = here & ~out
+        tested = np.unique(rows.condition[seen])
+        lawful = rows.has_aging and tested.size > 1
+        days = rows.days[seen | (~out & (rows.days == 0))]  # unaged rubber starts every series
+        new = here & out & ~np.isin(rows.condition, tested)
+        if not lawful:
+            inside &= ~new
+        else:
+            inside &= ~(new & ((rows.days < days.min()) | (rows.days > days.max())))
+        if seen.any():
+            inside &= ~(here & out & _outside(speed, speed[seen]))
+    for name in channels:
+        values = rows.values(name)
+        if values.dtype.kind == "f":
+            inside &= ~_outside(values, values[~out])
+        else:
+            inside &= np.isin(values, np.unique(values[~out]))
+    return inside
+
+
+def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return which values lie beyond those seen, by more than measured numbers of one setting differ."""
+    low, high = float(seen.min()), float(seen.max())
+    slack = BEYOND * (high - low) + SAME * max(abs(low), abs(high))
+    return (values < low - slack) | (values > high + slack)
+
+
+def whole_settings(rows: Rows, values: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield masks of the rows held out, shape (n,): everything at one inner setting of a channel, one after the other.
+
+    A free shape through every setting fits those it was given, and says nothing of what lies between them.
+    """
+    for setting in np.unique(values)[1:-1]:
+        out = values == setting
+        for c in np.unique(rows.condition[out]):
+            if not (~out & (rows.condition == c)).any() and _edge(rows, c):
+                out = out & (rows.condition != c)
+        if out.any():
+            yield out
+
+
 @dataclass(frozen=True)
 class Gain:
     """What a proposal gains on held-out groups: in RMSE, and in the sum of squares with scatter accounted for."""
@@ -90,11 +164,12 @@ class Gain:
     rmse_N: float  # fall of the RMSE
     left_N: float  # RMSE with it
     deviance: float  # fall of the whitened sum of squares: what a piece of scatter moves as a whole counts once
+    error: float = 0.0  # standard error of that fall, from the groups held out
 
     @property
     def real(self) -> bool:
-        """Whether the held-out data speak for the proposal, in either way."""
-        return self.deviance > 0 and self.rmse_N > 0
+        """Whether the held-out data speak for the proposal, in either way, by more than their own scatter."""
+        return self.deviance > self.error and self.rmse_N > 0
 
 
 def heldout_gain(
@@ -104,28 +179,61 @@ def heldout_gain(
 
     The RMSE of a rig whose files scatter by newtons does not see a ripple of a tenth; the whitened sum of squares of
     the held-out groups does, as the offset and gain of a whole file or run cost it little. For the same reason the
-    RMSE is taken about the means of the groups inside which the effect's channels vary. `known` keeps what the model
-    without it leaves in each fold, for the next proposal.
+    RMSE is taken about the means of the groups inside which the effect varies. `known` keeps what the model without it
+    leaves in each fold, for the next proposal.
     """
     if "shift" in proposal.term.fixed:
         return _gain_within_files(before, proposal, samples)
-    rows, after, scatter = before.rows, proposal.fitted, before.scatter
-    squares, white, total = np.zeros(2), np.zeros(2), 0.0
+    rows = before.rows
     calendar = [name for name in proposal.term.channels if name in CALENDAR]
     masks = blocks(rows, proposal.unit, count, calendar[0]) if calendar else folds(rows, proposal.unit, count, seed)
+    around = None if calendar else _around(proposal)  # a block of time is asked for whole
+    return _gain(before, proposal, masks, around, (proposal.unit, *calendar[:1]), known)
+
+
+def gain_between_settings(before: Fitted, proposal: Proposal, known: dict[tuple, np.ndarray]) -> Iterator[Gain]:
+    """Yield what a proposal gains where all files at an inner setting of one of its channels are held out."""
+    rows = before.rows
+    for name in proposal.term.channels:
+        values = rows.values(name)
+        if name in CALENDAR or values.dtype.kind != "f":
+            continue
+        values = settings(level_values(np.abs(values) if name == "speed_mm_s" else values, rows))
+        if LEAST_SETTINGS <= np.unique(values).size <= MOST_SETTINGS:
+            yield _gain(before, proposal, whole_settings(rows, values), None, ("setting", name), known)
+
+
+def _gain(
+    before: Fitted,
+    proposal: Proposal,
+    masks: Iterable[np.ndarray],
+    around: str | None,
+    key: tuple,
+    known: dict[tuple, np.ndarray],
+) -> Gain:
+    """Return the gain on rows held out by `masks`; the RMSE is about the means of groups where a level is named."""
+    rows, after, scatter = before.rows, proposal.fitted, before.scatter
+    squares, total, falls = np.zeros(2), 0.0, []
     for number, out in enumerate(masks):
-        test = rows.subset(out)
-        weight, whitening = rows.weight[out], Whitening(scatter, before.friction[out], test.groups)
+        inside = covered(rows, out, proposal.term.channels)[out]
+        if not inside.any():
+            continue
+        held = rows.subset(out)
+        test = held.subset(inside)
+        weight, whitening = rows.weight[out][inside], Whitening(scatter, before.friction[out][inside], test.groups)
         total += float(weight.sum())
-        fold = (proposal.unit, *calendar[:1], number)
-        if fold not in known:
-            known[fold] = _left_in(before, before.model, out, test)
-        for k, residual in enumerate((known[fold], _left_in(before, after.model, out, test))):
-            inside = residual if calendar else _about(residual, test, proposal)  # a block of time is asked for whole
-            squares[k] += float(weight @ inside**2)
-            white[k] += float((whitening(residual[:, None]) ** 2).sum())
+        if (*key, number) not in known:
+            known[*key, number] = _left_in(before, before.model, out, held)
+        white = []
+        for k, left in enumerate((known[*key, number], _left_in(before, after.model, out, held))):
+            residual = left[inside]
+            squares[k] += float(weight @ _about(residual, test, around) ** 2)
+            white.append(test.groups.sums(whitening(residual[:, None])[:, 0] ** 2, proposal.unit))
+        falls.append(white[0] - white[1])
+    fall = np.concatenate(falls) if falls else np.zeros(1)
     rmse = np.sqrt(squares / max(total, 1e-300))
-    return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(white[0] - white[1]))
+    error = float(np.std(fall) * np.sqrt(fall.size))
+    return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(fall.sum()), error)
 
 
 def _left_in(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.ndarray:
@@ -136,15 +244,24 @@ def _left_in(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.nd
     return test.force - evaluate(kept.model, test, jacobian=False)[0]
 
 
-def _about(residual: np.ndarray, rows: Rows, proposal: Proposal) -> np.ndarray:
-    """Return a residual about the mean of its file, run or specimen: the finest whose groups the effect varies in."""
-    units = [unit_of(rows.values(name), rows) for name in proposal.term.channels]
-    finest = min(units, key=FINER.get)
-    around = {"sample": "stroke", "stroke": "file", "file": "run", "run": "specimen"}.get(finest)
-    if around is None or proposal.term.channels == ("direction",):
-        return residual
-    code = rows.codes(around) * 2 + (rows.speed > 0)  # in each direction apart: an offset between them is no shape
-    return residual - (np.bincount(code, residual) / np.maximum(np.bincount(code), 1))[code]
+def _around(proposal: Proposal) -> str | None:
+    """Return the finest level within whose groups most of what the effect adds to the force varies; None for none."""
+    fitted = proposal.fitted
+    rows = fitted.rows
+    if proposal.term.channels == ("direction",):
+        return None
+    without = fitted.model.without_term(len(fitted.model.terms) - 1)
+    added = fitted.force - evaluate(without, rows, jacobian=False)[0]
+    least = MOSTLY * float(np.var(added))
+    return next((level for level in LEVELS if np.mean(_about(added, rows, level) ** 2) >= least), None)
+
+
+def _about(values: np.ndarray, rows: Rows, level: str | None) -> np.ndarray:
+    """Return values less their mean in each group of a level and direction: an offset between these is no shape."""
+    if level is None:
+        return values
+    code = rows.codes(level) * 2 + (rows.speed > 0)
+    return values - (np.bincount(code, values) / np.maximum(np.bincount(code), 1))[code]
 
 
 def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame) -> Gain:
@@ -206,6 +323,15 @@ class Added:
     round: int
 
 
+@dataclass(frozen=True)
+class Refused:
+    """What the search found significant and no model holds, with the reason."""
+
+    term: Term
+    p_value: float
+    reason: str
+
+
 def confirmed(
     fitted: Fitted,
     proposals: Sequence[Proposal],
@@ -215,8 +341,11 @@ def confirmed(
     say: Callable[[str], None],
     *,
     compare: bool,
+    refused: list[Refused],
 ) -> Added | None:
     """Return the first of a round's best proposals that gains on held-out data; None where none does.
+
+    What is refused is added to `refused`, with the reason.
 
     Parameters
     ----------
@@ -234,15 +363,57 @@ def confirmed(
         Told in words what is being done.
     compare : bool
         Whether its rivals are asked for the held-out data too.
+    refused : list of Refused
+        Grows by the best proposal where none is confirmed.
     """
+    reasons = []
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
+    least = unseen_N(samples)
     for proposal in proposals[:TRIES]:
         gain = heldout_gain(fitted, proposal, *folds_of)
+        reason = _why_not(fitted, proposal, gain, least, folds_of[-1])
+        reasons.append(reason)
         unit = config.units.unit("force")
         say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
-        if gain.real:
+        if reason is None:
             others = rivals(proposal, proposals)
             rmse = [heldout_gain(fitted, o, *folds_of).left_N for o in others[:COMPARED]] if compare else []
             rmse += [np.nan] * (len(others) - len(rmse))
             return Added(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
+    if proposals:
+        refused.append(Refused(proposals[0].term, proposals[0].p_value, reasons[0]))
     return None
+
+
+def _why_not(fitted: Fitted, proposal: Proposal, gain: Gain, least: float, known: dict) -> str | None:
+    """Return why a proposal is not confirmed; None where it is."""
+    if not gain.real:
+        return "it does not predict the data that were held out better than the model without it"
+    if _size(proposal) <= least:
+        return "it is smaller than the rounding error of the recorded force"
+    if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
+        return "it does not predict whole settings that were held out, between those it was fitted to"
+    return None
+
+
+def _size(proposal: Proposal) -> float:
+    """Return the RMS of what a proposal adds to the force."""
+    fitted = proposal.fitted
+    without = fitted.model.without_term(len(fitted.model.terms) - 1)
+    return float(np.std(fitted.force - evaluate(without, fitted.rows, jacobian=False)[0]))
+
+
+def unseen_N(samples: pd.DataFrame) -> float:
+    r"""Return the RMS of a rounding error that noise does not average out: what an effect must exceed; else 0.
+
+    A force in steps of q has a rounding error of :math:`q / \sqrt{12}`. Noise of half a step or more spreads it, and
+    means of many samples resolve less than a step. Below that, rounding errors repeat from file to file.
+    """
+    force = samples["force_N"].to_numpy(dtype=float)
+    steps = np.diff(np.unique(force))
+    if steps.size == 0 or steps.size > force.size / REPEATED:
+        return 0.0
+    step = float(np.median(steps))
+    same = np.diff(samples["stroke_id"].to_numpy()) == 0
+    noise = float(np.std(np.diff(force)[same]) / np.sqrt(2)) if same.any() else 0.0
+    return step / np.sqrt(12) if noise < step / 2 else 0.0

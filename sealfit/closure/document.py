@@ -1,32 +1,130 @@
-"""closure.json's entries: effects with intervals, and what is left."""
+"""closure.json: the verdict, errors, effects with intervals, what could have been seen, and what is left."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import FINER, Channel, unit_of
-from sealfit.closure.confirm import Added
+from sealfit.closure.confirm import Added, Refused
 from sealfit.closure.forms import describe, free_term
 from sealfit.closure.grow import Grown
 from sealfit.closure.intervals import effect_intervals
 from sealfit.closure.judge import Candidate, Judge
+from sealfit.closure.levels import errors, lack_of_fit, noise_floor, scatter_list
+from sealfit.closure.next_runs import next_runs
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import search
+from sealfit.closure.sensitivity import LEVEL_NAMES, cannot_tell, sensitivity
 from sealfit.config import Config
-from sealfit.effects.contract import fill_unit
+from sealfit.effects.contract import Effect, fill_unit
 from sealfit.fit.estimate import Fitted, fit, worth
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term
 from sealfit.units import Units
 
-LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
 WORTH_A_LOOK = 0.05  # p-value of a channel by itself, not adjusted for the search
 EVEN = 0.5  # adjusted p-value from which chance is the likelier explanation
 OFFSET = "zero_offset"
+SAME_ERROR = 1.001
+"""Ratio of errors in sample up to which they are equal: effects are fitted by whitened, not by plain, squares."""
+
+SLOTS = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
 UNSTEADY = 0.2  # share of an offset by which it may differ from run to run and still be one offset
+
+
+@dataclass(frozen=True)
+class Ends:
+    """The model before and after on all rows, and the forces by fits that did not see a row's unit."""
+
+    before: Fitted
+    after: Fitted
+    held_before: np.ndarray  # (n,) NaN where never held out
+    held_after: np.ndarray
+    covered: np.ndarray  # (n,) whether the rest of the campaign covers the row: what it does not is extrapolated
+
+    def heldout_rmse_N(self, held: np.ndarray, *, extrapolated: bool = False) -> float | None:
+        """Return the error of forces held out, on rows that the rest of the campaign covers or on the others."""
+        rows = self.before.rows
+        chosen = np.isfinite(held) & (self.covered != extrapolated)
+        weight = rows.weight[chosen]
+        if not chosen.any():
+            return None
+        return float(np.sqrt(weight @ (rows.force - held)[chosen] ** 2 / weight.sum()))
+
+    @property
+    def gains(self) -> bool:
+        """Whether after has lower errors than before, held out, and no higher ones in sample."""
+        weight = self.before.rows.weight
+        inside = [float(np.sqrt(weight @ f.residual**2)) for f in (self.before, self.after)]
+        held = [self.heldout_rmse_N(h) for h in (self.held_before, self.held_after)]
+        return inside[1] <= SAME_ERROR * inside[0] and (held[0] is None or held[1] < held[0])
+
+
+def closure_document(
+    grown: Grown, ends: Ends, heldout_unit: str, config: Config, effects: Mapping[str, Effect]
+) -> dict:
+    """Return closure.json."""
+    after, units = ends.after, config.units
+    numbers = {}
+    for name, fitted, held in (("before", ends.before, ends.held_before), ("after", after, ends.held_after)):
+        found = errors(fitted.rows, fitted.residual)
+        numbers[name] = {
+            "rmse_N": found["rmse_N"],
+            "rmse_runs_N": found["rmse_runs_N"],
+            "heldout_rmse_N": ends.heldout_rmse_N(held),
+            "heldout_extrapolated_rmse_N": ends.heldout_rmse_N(held, extrapolated=True),
+            "max_abs_N": found["max_abs_N"],
+            "mean_abs_pct": found["mean_abs_pct"],
+            "lack_of_fit_p": lack_of_fit(fitted),
+        }
+    floor, scatter = noise_floor(after), scatter_list(after)
+    quality = fit_quality(numbers["after"], floor, config.loop.family_error)
+    seen = sensitivity(grown, config.loop.family_error)
+    untold = set(cannot_tell(grown, seen, scatter))
+    if grown.left is not None or grown.worse:
+        verdict = "unexplained"
+    elif grown.added:
+        verdict = "closed"
+    else:
+        verdict = "cannot_tell" if untold and quality["state"] != "within_scatter" else "nothing_missing"
+    return {
+        "schema": 1,
+        "verdict": verdict,
+        "fit_quality": quality,
+        "sensitivity": [{**entry, "cannot_tell": entry["variable"] in untold} for entry in seen],
+        "refused": [_refused(item, after.rows) for item in grown.refused],
+        "units": {slot: units.of(slot) for slot in SLOTS},
+        "noise_floor_N": floor,
+        **numbers,
+        "heldout_unit": heldout_unit,
+        "effects": effect_entries(after, grown, config),
+        "scatter": scatter,
+        "left": left_entry(grown, numbers["after"]["rmse_N"], floor),
+        "next_runs": next_runs(grown, config, effects),
+    }
+
+
+def fit_quality(errors_after: Mapping, floor_N: float | None, alpha: float) -> dict:
+    """Return closure.json's `fit_quality`: whether the error is what repeats scatter by, or how many times that."""
+    p_value = errors_after["lack_of_fit_p"]
+    if floor_N is None or p_value is None:
+        return {"state": "unknown", "ratio": None, "p_value": None}
+    state = "above_scatter" if p_value < alpha else "within_scatter"
+    return {"state": state, "ratio": errors_after["rmse_N"] / max(floor_N, 1e-300), "p_value": p_value}
+
+
+def _refused(item: Refused, rows: Rows) -> dict:
+    return {
+        "id": item.term.effect.id,
+        "channels": channels_of(item.term, rows),
+        "acts_on": item.term.acts_on,
+        "p_value": item.p_value,
+        "reason": item.reason,
+    }
 
 
 def effect_entries(after: Fitted, grown: Grown, config: Config) -> list[dict]:
@@ -147,15 +245,19 @@ def effect_table(entries: Sequence[dict], added: Sequence[Added]) -> pd.DataFram
     return pd.DataFrame(records, columns=names)
 
 
-def left_entry(grown: Grown, rmse_N: float, floor_N: float | None, *, look: bool = True) -> dict:
+def left_entry(grown: Grown, rmse_N: float, floor_N: float | None) -> dict:
     """Return closure.json's `left`: the error above the floor, and the strongest structure that is still there.
 
     Where nothing is significant any more but effects were added, the channel that orders most of what is left is named
-    with its p-value, as a place to look: it is no claim. Without `look` it is not: what is named is then significant.
+    with its p-value: it is not significant. An effect that lowered no error is left, too.
     """
     above = float(np.sqrt(max(rmse_N**2 - floor_N**2, 0.0))) if floor_N is not None else None
     left = grown.left
-    if left is None and grown.added and look:
+    if left is None and grown.worse:
+        item, rows = grown.worse[-1], grown.after.rows
+        names = " ".join(channels_of(item.term, rows))
+        return {"rmse_N": above, "level": effect_level(item.term, rows), "channel": names, "p_value": item.p_value}
+    if left is None and grown.added:
         left = _unsteady_offset(grown) or _largest(
             grown.after, [c for c in grown.last if c.judgement.log_p <= np.log(WORTH_A_LOOK) and c.p_value < EVEN]
         )

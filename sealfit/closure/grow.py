@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel, channels_of
-from sealfit.closure.confirm import TRIES, Added, confirmed
+from sealfit.closure.confirm import TRIES, Added, Refused, confirmed
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.judge import Candidate, Judge
 from sealfit.closure.laws import AGING, richer_laws
@@ -51,6 +51,8 @@ class Grown:
     left: Candidate | Peak | None  # what is still significant
     unsure: Added | None  # the best form of what too few specimens show; not in any model
     channels: Mapping[str, Channel] = field(default_factory=dict)
+    refused: tuple[Refused, ...] = ()  # significant, and in no model
+    worse: tuple[Refused, ...] = ()  # of these, what was in the model and lowered no error
 
 
 def grow(
@@ -105,6 +107,7 @@ def grow(
     added = list(ripples.added)
     revisit = Revisit(channels, effects, ripples.samples, config, say, compare=compare)
     refused: set[tuple] = set()
+    not_confirmed = ripples.refused
     left: Candidate | Peak | None = None
     again = False  # whether earlier effects have been asked again
     for number in range(len(added) + 1, config.loop.max_rounds + 3):
@@ -134,7 +137,9 @@ def grow(
             continue
         open_ += [c for c in _standing_for(open_, last) if c.key not in refused]
         proposals = propose(fitted, open_, channels, effects, [p for _, p in laws])
-        accepted = confirmed(fitted, proposals, ripples.samples, config, number, say, compare=compare)
+        accepted = confirmed(
+            fitted, proposals, ripples.samples, config, number, say, compare=compare, refused=not_confirmed
+        )
         if accepted is None:
             refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
             continue
@@ -152,7 +157,9 @@ def grow(
         others = tuple(rivals(proposals[0], proposals))
         left = doubtful[0]
         unsure = Added(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
-    return Grown(before, fitted if added else before, tuple(added), first, last, left, unsure, channels)
+    return Grown(
+        before, fitted if added else before, tuple(added), first, last, left, unsure, channels, tuple(not_confirmed)
+    )
 
 
 def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:

@@ -62,12 +62,12 @@ def pure_error(rows: Rows, residual: np.ndarray) -> tuple[float, float] | None:
 
 
 def noise_floor(fitted: Fitted) -> float | None:
-    """Return the RMSE that the true mean would have on these bins: bin, file and run scatter; None without repeats."""
+    """Return the RMSE that the true mean would have on these bins, from repeats of a run alone; None without repeats.
+
+    What set-ups of runs differ by is not in it: without runs made twice it cannot be told from a lack of fit.
+    """
     pure = pure_error(fitted.rows, fitted.residual)
-    if pure is None:
-        return None
-    run = fitted.rows.weight @ fitted.scatter.level_variance("run", fitted.force)
-    return float(np.sqrt(pure[0] + run))
+    return None if pure is None else float(np.sqrt(pure[0]))
 
 
 def lack_of_fit(fitted: Fitted) -> float | None:

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import folds, heldout_level
+from sealfit.closure.confirm import Refused, covered, folds, heldout_level
 from sealfit.closure.curves import channel_table, curve_table, shape_table
-from sealfit.closure.document import effect_entries, effect_table, left_entry
+from sealfit.closure.document import Ends, closure_document, effect_table
+from sealfit.closure.forms import describe
 from sealfit.closure.grow import Grown, Start, grow, numbered, predict_rows, steady_samples
-from sealfit.closure.levels import errors, lack_of_fit, level_table, noise_floor, scatter_list
+from sealfit.closure.judge import JACKKNIFE_UNITS
+from sealfit.closure.levels import level_table
 from sealfit.closure.merged import Searched, searched
-from sealfit.closure.next_runs import next_runs
 from sealfit.closure.overlooked import overlooked
 from sealfit.closure.record import to_record
 from sealfit.closure.told_by_all import told_by_all
@@ -25,10 +26,10 @@ from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
 from sealfit.engine import begin_map, many_workers
 from sealfit.fit.estimate import Fitted, fit, fit_declared
+from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows, make_rows
 from sealfit.profiling import timed
 from sealfit.samples import StoredTraces
-from sealfit.verdict import predicts_worse
 
 
 @dataclass(frozen=True)
@@ -104,12 +105,15 @@ def close_loop(
             if not part.whole and (more := overlooked(on_all_strokes, grown, config)):
                 say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
                 continue
-            drawn = _drawn_tables(grown, before, after, config)
-            say(f"held out by {heldout.level}: the search repeated without each fold")
+            say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
             with timed("held out", rows=len(heldout.masks), of="folds"):
-                held_before, held_after = heldout.forces(say)
+                held_before, held_after = heldout.forces(grown, say)
+                ends = Ends(before, after, held_before, held_after, heldout.covered(after.model))
+                grown, ends = _no_worse(grown, ends, heldout, say)
             break
-    document = _document(config, effects, grown, before, after, held_before, held_after, heldout.level)
+    before, after, held_before, held_after = ends.before, ends.after, ends.held_before, ends.held_after
+    drawn = _drawn_tables(grown, before, after, config)
+    document = closure_document(grown, ends, heldout.level, config, effects)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their order again
     tables = {
         "effects": effect_table([e for e in document["effects"] if not e["candidate"]], grown.added),
@@ -163,33 +167,59 @@ class _HeldOut:
         self.masks = list(folds(rows, self.level, config.loop.folds, config.loop.seed))
         self._begun: Generator | None = None
 
+    @property
+    def repeats(self) -> bool:
+        """Whether the search is repeated in each fold: without a fifth of few runs it has not the power to find much.
+
+        Then what the whole campaign shows is refitted without each fold.
+        """
+        return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
+
     def begin(self, before: Fitted) -> None:
         """Set processes to work, on the assumption that something will be added."""
-        if many_workers(self.workers):
+        if self.repeats and many_workers(self.workers):
             self._begun = begin_map(_held_out, _Folds(self, before, search=True), workers=self.workers)
 
     def close(self) -> None:
         """End what is still being computed."""
         if self._begun is not None:
             self._begun.close()
+            self._begun = None
 
     def settle(self, grown: Grown) -> None:
-        """Set processes to work on what is known to be wanted: without a search, unless something was added."""
-        if self._begun is None or not grown.added:
+        """Set processes to work on the folds, or end what they do where nothing needs a search."""
+        if not (grown.added and self.repeats):
             self.close()
-            if not grown.added:
-                self.samples = self.samples.iloc[[]]  # much of the memory, and nothing is searched again
-            folds = _Folds(self, grown.before, search=bool(grown.added))
-            # One refit of merged bins takes less than the start of a process and the way of its rows there.
-            self._begun = begin_map(_held_out, folds, workers=self.workers if folds.search else 1)
+            self.samples = self.samples.iloc[[]]  # much of the memory, and nothing is searched again
+        elif self._begun is None:
+            self._begun = begin_map(_held_out, _Folds(self, grown.before, search=True), workers=self.workers)
 
-    def forces(self, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
+    def forces(self, grown: Grown, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
         """Return each row's force, before and after, by fits that did not see its group; NaN if never held out."""
+        if self._begun is None:
+            before = self.refitted(grown.before)
+            return before, self.refitted(grown.after) if grown.added else before
         before, after = np.full(self.rows.force.size, np.nan), np.full(self.rows.force.size, np.nan)
         for k, (out, parts) in enumerate(zip(self.masks, self._begun, strict=True)):
             say(f"  fold {k + 1} of {len(self.masks)}")
             before[out], after[out] = parts
         return before, after
+
+    def refitted(self, fitted: Fitted) -> np.ndarray:
+        """Return each row's force by a model's fits to the other folds, shape (n,); NaN if never held out."""
+        force = np.full(self.rows.force.size, np.nan)
+        folds = _Folds(self, fitted, search=False)
+        for out, (own, _) in zip(self.masks, map(_held_out, folds), strict=True):
+            force[out] = own
+        return force
+
+    def covered(self, model: Model) -> np.ndarray:
+        """Return which rows were held out and lie inside what the others cover, shape (n,)."""
+        channels = [name for term in model.terms for name in term.channels]
+        found = np.zeros(self.rows.force.size, dtype=bool)
+        for out in self.masks:
+            found |= covered(self.rows, out, channels)
+        return found
 
 
 @dataclass(frozen=True)
@@ -250,41 +280,25 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
     return first, first if after is before else force(after)
 
 
-def _document(
-    config, effects, grown: Grown, before: Fitted, after: Fitted, held_before, held_after, level: str
-) -> dict:
-    floor = noise_floor(after)
-    entries = effect_entries(after, grown, config)
-    numbers = {}
-    for name, fitted, held in (("before", before, held_before), ("after", after, held_after)):
-        found = errors(fitted.rows, fitted.residual)
-        known = np.isfinite(held)
-        weight = fitted.rows.weight[known]
-        out = float(np.sqrt(weight @ (fitted.rows.force - held)[known] ** 2 / weight.sum())) if known.any() else None
-        numbers[name] = {
-            "rmse_N": found["rmse_N"],
-            "rmse_runs_N": found["rmse_runs_N"],
-            "heldout_rmse_N": out,
-            "max_abs_N": found["max_abs_N"],
-            "mean_abs_pct": found["mean_abs_pct"],
-            "lack_of_fit_p": lack_of_fit(fitted),
-        }
-    worse = predicts_worse({**numbers, "effects": entries})
-    verdict = "unexplained" if grown.left is not None or worse else "closed" if grown.added else "nothing_missing"
-    units = config.units
-    slots = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
-    return {
-        "schema": 1,
-        "verdict": verdict,
-        "units": {slot: units.of(slot) for slot in slots},
-        "noise_floor_N": floor,
-        **numbers,
-        "heldout_unit": level,
-        "effects": entries,
-        "scatter": scatter_list(after),
-        "left": left_entry(grown, numbers["after"]["rmse_N"], floor, look=not worse),
-        "next_runs": next_runs(grown, config, effects),
-    }
+def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], None]) -> tuple[Grown, Ends]:
+    """Return the end of the loop with the first effects alone, as many as lower the error in sample and held out.
+
+    What is left out was significant: it is put on record as refused, and the verdict says that something is left.
+    """
+    refused = []
+    while grown.added and not ends.gains:
+        last = grown.added[-1].proposal
+        say(f"left out, as the error is no lower with it: {describe(last.term)}")
+        refused.append(Refused(last.term, last.p_value, "with it the error is no lower, in sample or held out"))
+        model = grown.after.model.without_term(len(grown.added) - 1)
+        own = fit(model, grown.after.rows, grown.after.scatter, turns=2) if model.terms else grown.before
+        grown = replace(grown, after=own, added=grown.added[:-1])
+        _, after = _on_all(ends.before.rows, grown)
+        if not grown.added:
+            ends = replace(ends, after=ends.before, held_after=ends.held_before)
+        else:
+            ends = replace(ends, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model))
+    return replace(grown, refused=(*grown.refused, *refused), worse=tuple(refused)), ends
 
 
 def _residual_table(bins: pd.DataFrame, fitted: Fitted, held: np.ndarray) -> pd.DataFrame:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import Added, confirmed
+from sealfit.closure.confirm import Added, Refused, confirmed
 from sealfit.closure.naming import propose_ripples
 from sealfit.closure.ripple import AXES, Peak, strongest
 from sealfit.closure.spectrum import Spectrum, begin_spectra
@@ -44,6 +44,8 @@ class Ripples:
         The samples with `residual_N`: the force less the ripples added so far.
     added : list of Added
         Those confirmed.
+    refused : list of Refused
+        Those significant but not confirmed.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class Ripples:
     ) -> None:
         self.config, self.effects, self.say, self.compare, self.workers = config, effects, say, compare, workers
         self.added: list[Added] = []
+        self.refused: list[Refused] = []
         self.samples = samples.assign(residual_N=samples["force_N"])
         self._found: Peak | None = None
         self._begun: Iterator[Spectrum] | None = self._begin()
@@ -87,7 +90,9 @@ class Ripples:
         while self.found is not None and len(self.added) < self.config.loop.max_rounds:
             proposals = propose_ripples(own, self.found, self.samples, self.effects)
             number = len(self.added) + 1
-            accepted = confirmed(own, proposals, self.samples, self.config, number, self.say, compare=self.compare)
+            accepted = confirmed(
+                own, proposals, self.samples, self.config, number, self.say, compare=self.compare, refused=self.refused
+            )
             if accepted is None:
                 self._found = None
                 break

@@ -99,7 +99,9 @@ class Revisit:
 
     def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> Added | None:
         self.say(f"  round {number} again:")
-        return confirmed(without, proposals, self.samples, self.config, number, self.say, compare=self.compare)
+        return confirmed(
+            without, proposals, self.samples, self.config, number, self.say, compare=self.compare, refused=[]
+        )
 
     def _channel(self, item: Added) -> str | None:
         """Return the channel along which an effect was found; None for a pair and for a ripple."""

@@ -34,6 +34,9 @@ LEAST_DF = 1.5
 MOST_DF = 1e4
 """Degrees of freedom of a prior that the contrasts' variances do not contradict: as good as known."""
 
+WAYS = 2
+"""Variances that a contrast is held against: moderated, and its own. Each has half of the error."""
+
 LARGEST_LEVERAGE = 0.98
 """Of a unit in a contrast; one with more owns it, and nothing else says how it scatters."""
 
@@ -115,15 +118,22 @@ def _agree(leverage: np.ndarray, scores: np.ndarray) -> np.ndarray:
 
 def slope_log_p(tests: Sequence[SlopeTest]) -> list[np.ndarray]:
     """Return the log p-values of the contrasts of several candidates, two-sided, not adjusted for their number."""
+    found = []
+    for test, (variance, df) in zip(tests, moderated(tests), strict=True):
+        logs = [log_p_of_t(test.slope / np.sqrt(v), d) for v, d in ((variance, df), (test.variance, test.df))]
+        found.append(np.minimum(np.log(WAYS) + np.minimum(*logs), 0.0))
+    return found
+
+
+def moderated(tests: Sequence[SlopeTest]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return for each test the variances of its contrasts, moderated by all of a kind, and their degrees of freedom."""
     priors = {kind: _prior(tests, *kind) for kind in {(t.level, bool(a)) for t in tests for a in t.along}}
     found = []
     for test in tests:
         own = [priors[test.level, bool(a)] for a in test.along]
         known, variance = (np.array(part) for part in zip(*[(p.df, p.variance) for p in own], strict=True))
         df = test.df + known
-        moderated = (known * variance + test.df * test.variance) / df
-        logs = [log_p_of_t(test.slope / np.sqrt(v), d) for v, d in ((moderated, df), (test.variance, test.df))]
-        found.append(np.minimum(np.log(2) + np.minimum(*logs), 0.0))
+        found.append(((known * variance + test.df * test.variance) / df, df))
     return found
 
 

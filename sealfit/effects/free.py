@@ -5,8 +5,8 @@ They name no mechanism. All are rebuilt from plain data by `free_effect`, so a m
 .. math:: h = \sum_j c_j B_j(x)
 
 B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the knot of reference has none. Beyond the
-outer knots a natural spline goes on as a straight line. It is counted from its mean over the campaign where that is
-given: a constant that came in with it would stand for friction, and what scales friction would miss it.
+outer knots the shape keeps its last value: nothing was measured there. It is counted from its mean over the campaign
+where that is given: a constant that came in with it would stand for friction, and what scales friction would miss it.
 """
 
 from __future__ import annotations
@@ -99,19 +99,15 @@ def _spline(places: tuple[float, ...], zero: int, means: tuple[float, ...], inpu
 
 @lru_cache(maxsize=64)
 def _cardinal(places: tuple[float, ...]):
-    """Return the cardinal splines of these knots and their slopes at both ends."""
+    """Return the cardinal splines of these knots."""
     from scipy.interpolate import CubicSpline  # here, so that the catalogue can be listed without scipy
 
-    spline = CubicSpline(places, np.eye(len(places)), bc_type="natural")
-    return spline, spline(places[0], 1), spline(places[-1], 1)
+    return CubicSpline(places, np.eye(len(places)), bc_type="natural")
 
 
 def natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
-    """Return every cardinal spline B_j at x, shape (..., knots): straight beyond the outer knots."""
-    spline, first, last = _cardinal(places)
-    inside = np.clip(x, places[0], places[-1])
-    below, above = np.minimum(x - places[0], 0.0), np.maximum(x - places[-1], 0.0)
-    return spline(inside) + below[..., None] * first + above[..., None] * last
+    """Return every cardinal spline B_j at x, shape (..., knots): constant beyond the outer knots."""
+    return _cardinal(places)(np.clip(x, places[0], places[-1]))
 
 
 @lru_cache(maxsize=64)
@@ -131,7 +127,7 @@ def roughness(places: tuple[float, ...], reference: float | None = None) -> np.n
         Its null space is the straight line. A straight line in the logarithm, where that is meant.
     """
     x = np.log(places) if places[0] > 0 and places[-1] / places[0] >= WIDE else np.array(places)
-    bend = _cardinal(tuple(((x - x[0]) / (x[-1] - x[0])).tolist()))[0].derivative(2)
+    bend = _cardinal(tuple(((x - x[0]) / (x[-1] - x[0])).tolist())).derivative(2)
     at, width = bend(bend.x), np.diff(bend.x)[:, None]  # h'' of each cardinal spline is straight between knots
     left, right = at[:-1], at[1:]
     across = left.T @ (width / 6 * right)

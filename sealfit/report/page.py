@@ -35,6 +35,7 @@ VERDICTS = {
     "closed": "Closed",
     "nothing_missing": "Nothing missing",
     "unexplained": "Unexplained",
+    "cannot_tell": "Cannot tell",
     None: "Not closed yet",
 }
 

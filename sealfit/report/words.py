@@ -11,7 +11,7 @@ from markupsafe import Markup
 from sealfit.config import Config
 from sealfit.report.numbers import NOTHING, known, measured, number, of_unit, p_value, together
 from sealfit.report.symbols import channel_label, channel_words, effect_label, joined, split_channels, symbol_html
-from sealfit.verdict import predicts_worse
+from sealfit.verdict import power_clause, quality_clause, untold_clause
 
 FLAT = 0.02  # of its span: a shape that crosses zero by less is of one sign
 STARTS = (
@@ -39,11 +39,19 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
     if closure is None:
         return Markup("The loop has not been closed on these data, so nothing is said yet about what the model misses.")
     errors = error_clause(closure, config)
+    if known(closure["noise_floor_N"]):
+        errors = Markup("{}; {}").format(errors, quality_clause(closure))
     if closure["verdict"] == "nothing_missing":
         text = Markup(
             "The declared model misses nothing that these data can show: no channel orders what it leaves over."
         )
-        return text + Markup(" {}").format(_sentence(errors))
+        power = power_clause(closure, config.units)
+        clauses = [errors, *([power] if power else [])]
+        return Markup(" ").join([text, *(_sentence(clause) for clause in clauses)])
+    if closure["verdict"] == "cannot_tell":
+        return Markup("These files cannot tell what the declared model misses: {}. {}").format(
+            untold_clause(closure, config.units), _sentence(errors)
+        )
     added = [(k, e) for k, e in enumerate(closure["effects"]) if not e["candidate"]]
     missed = _missed_effects(added, shapes, config)
     many = COUNTED.get(len(added), str(len(added)))
@@ -53,11 +61,6 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
             return _sentence(errors)
         them = "them" if len(added) > 1 else "it"
         return Markup("The declared model missed {}; with {} {}.").format(lead, them, errors)
-    if predicts_worse(closure) and not closure["left"].get("channels"):
-        them = "them" if len(added) > 1 else "it"
-        return Markup("{} would explain what the declared model leaves over, but {}: do not predict with {}.").format(
-            lead[:1].upper() + lead[1:], errors, them
-        )
     where = _where(closure["left"], config)
     if missed:
         return Markup(
@@ -192,7 +195,7 @@ def left_over(closure: Mapping, config: Config) -> Markup:
                 f"; {of_unit(number(left['rmse_N'], 2), unit)} of it lies above the floor (roots of sums of squares)"
             )
         said[0] += "."
-    if closure["verdict"] == "unexplained" and (left.get("channels") or not predicts_worse(closure)):
+    if closure["verdict"] == "unexplained":
         said.append(f"It is not only noise: {_where(left, config)}.")
     elif left.get("channels"):
         said.append(f"No channel orders it more surely than chance would; where to look first: {_where(left, config)}.")

@@ -5,7 +5,6 @@ from report.made_tables import empty, shapes
 
 from sealfit.config import Config
 from sealfit.report.words import acts, does, left_over, verdict, with_left_channels
-from sealfit.verdict import predicts_worse
 
 NUMBERS = {
     "rmse_N": 1.3,
@@ -48,6 +47,7 @@ def document(kind="closed", effects=(WARMING,), floor=0.2899, **left):
     after = {**NUMBERS, "heldout_rmse_N": 0.3121, "rmse_N": 0.31} if effects else NUMBERS
     left = {"rmse_N": 0.31, "level": None, "channel": None, "p_value": None, **left}
     found = {"verdict": kind, "before": NUMBERS, "after": after, "noise_floor_N": floor, "heldout_unit": "run"}
+    found["fit_quality"] = {"state": "above_scatter", "ratio": 1.07, "p_value": 0.0002}
     return with_left_channels({**found, "effects": list(effects), "left": left}, {"displacement_mm", "oil temp"})
 
 
@@ -59,21 +59,9 @@ def said(closure, table=None, config=None):
 def test_closed_says_what_was_missed_and_what_it_brings():
     assert said(document()) == (
         "The declared model missed warming by sliding (μ falls by 6.1 % [5.5, 6.7], time constant of warming τ = 4.0 s "
-        "[3.6, 4.5]); with it the error on runs the fit did not see falls from 1.42 N to 0.31 N; noise floor 0.29 N."
+        "[3.6, 4.5]); with it the error on runs the fit did not see falls from 1.42 N to 0.31 N; noise floor 0.29 N; "
+        "the error is 1.1 times the scatter of repeats (lack of fit p = 0.0002)."
     )
-
-
-def test_effects_that_predict_worse_are_not_called_a_closed_loop():
-    closure = document("unexplained")
-    closure["after"] = {**closure["after"], "heldout_rmse_N": 7.4}
-    assert predicts_worse(closure)
-    text = said(closure)
-    assert text.startswith("Warming by sliding (")
-    assert "rises from 1.42 N to 7.4" in text
-    assert "do not predict with it" in text
-    assert "It is not only noise" not in left_over(closure, Config())
-    assert not predicts_worse(document())
-    assert not predicts_worse({**closure, "effects": []})
 
 
 def test_several_effects_are_counted_and_candidates_are_not():
@@ -118,7 +106,28 @@ def test_nothing_missing_gives_one_error():
     text = said(document("nothing_missing", effects=()), empty("shapes"))
     assert text == (
         "The declared model misses nothing that these data can show: no channel orders what it leaves over. "
-        "The error on runs the fit did not see is 1.42 N; noise floor 0.29 N."
+        "The error on runs the fit did not see is 1.42 N; noise floor 0.29 N; "
+        "the error is 1.1 times the scatter of repeats (lack of fit p = 0.0002)."
+    )
+
+
+SEEN = {"variable": "displacement_mm", "level": "trace", "smallest_N": 0.5, "smallest_pct": 1.25, "files_needed": 40}
+SEEN["cannot_tell"] = True
+
+
+def test_nothing_missing_says_what_would_have_been_seen():
+    text = said({**document("nothing_missing", effects=()), "sensitivity": [SEEN]}, empty("shapes"))
+    assert text.endswith("would have shown an effect of displacement (mm) 1.2 % of the force.")
+
+
+def test_cannot_tell_says_of_what_and_what_would_do():
+    unseen = {**SEEN, "variable": "oil temp", "smallest_N": None, "smallest_pct": None, "files_needed": 12}
+    closure = {**document("cannot_tell", effects=()), "sensitivity": [SEEN, unseen]}
+    text = said(closure, empty("shapes"))
+    assert text.startswith(
+        "These files cannot tell what the declared model misses: displacement (mm) (no effect below 1.2 % of the force "
+        "could be seen; about 40 files like these would show one of 1 %), oil temp (no effect could be seen; "
+        "at least 12 files are needed). The error on runs"
     )
 
 
@@ -141,7 +150,9 @@ def test_an_error_that_grows_is_not_called_falling():
 
 
 def test_without_repeats_the_floor_is_unknown():
-    assert said(document(floor=None)).endswith("the noise floor is not known without repeats.")
+    unknown = {"state": "unknown", "ratio": None, "p_value": None}
+    text = said({**document(floor=None), "fit_quality": unknown})
+    assert text.endswith("the noise floor is not known without repeats.")
 
 
 def test_without_held_out_errors_the_fitted_ones_are_named_so():
