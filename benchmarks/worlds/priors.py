@@ -39,7 +39,7 @@ PRIORS: dict[str, Prior] = {
     "ramp_share": Prior("log", (0.002, 0.1), "share of the stroke on which the fastest test accelerates"),
     "dwell_share": Prior("uniform", (0.0, 0.05), "recording starts a little before the motion"),
     "start": Prior("choice", ("rest", "reversed"), "a piece is put on anew, or was just moved back"),
-    "start_scatter": Prior("log", (1e-4, 0.2), "of the start position, share of the stroke: parts position from distance"),
+    "start_scatter": Prior("log", (1e-4, 0.2), "of the start position, share of the stroke: position is not distance"),
     "position_noise": Prior("log", (1e-6, 2e-3), "encoder or potentiometer, share of the stroke"),
     "position_step": Prior("log", (1e-6, 1e-3), "resolution of the position, share of the stroke"),
     "speed_error": Prior("log", (1e-5, 5e-3), "relative difference of a file's true speed from the set one"),
