@@ -17,11 +17,13 @@ from process_tree import memory, tree
 
 from worlds.campaign import draw_points, points_csv, truth_record, write_campaign
 from worlds.motion import force_at
+from worlds.parameters import laws_inside, lifetime_answer, lifetime_question
 from worlds.score import Target, explained_by, on_variables, scored
 from worlds.true_form import CLAIM_LEVEL, CLEAR, Rows, codes, error_at, make_rows, unit_of, z_values
 from worlds.world import World, draw_world
 
 LOOK_EVERY_S = 0.2
+LEAST_SHARE = 0.01  # of an effect beside the declared quantities: of less, nothing can be said to be the same
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 POWER = "power"  # sealfit's derived channel: load times speed
 
@@ -108,7 +110,21 @@ def run_world(task: Task) -> dict:
         closure = json.loads((home / "out" / "closure.json").read_text("utf-8"))
         record |= read_closure(world, rows, closure, record["effects"])
         record |= predicted(task, world, rows, home)
+        if not world.effects and world.days.size:
+            record |= {"laws": laws_inside(world, home / "out"), "lifetime": lifetime(task, world, home)}
     return json.loads(json.dumps(record, default=float))
+
+
+def lifetime(task: Task, world: World, home: Path) -> dict | None:
+    """Return what `lifetime` says of the first aged series, or None where it cannot be asked."""
+    question = lifetime_question(world)
+    if question is None:
+        return None
+    words, true = question
+    ended = command([task.python, "-m", "sealfit", "lifetime", str(home / "out"), *words], task.limit_s)
+    if ended.code != 0:
+        return {"exit": ended.code, "traceback": ended.traceback, "said": ended.output[-500:]}
+    return {"exit": 0, **lifetime_answer(ended.output[ended.output.index("{") :], true)}
 
 
 def true_effects(world: World, rows: Rows) -> list[dict]:
@@ -157,6 +173,8 @@ def read_closure(world: World, rows: Rows, closure: dict, effects: list[dict]) -
     table = rows.table.assign(**{POWER: rows.table.get("load_N", 1.0) * rows.table["speed_mm_s"]})
     root = 1 / np.sqrt(rows.variance + 1e-4 * rows.table["mean"].to_numpy() ** 2)
     for j, place in enumerate(rows.effects):
+        if effects[j]["share"] < LEAST_SHARE:
+            continue
         others = np.delete(rows.columns, place, axis=1) * root[:, None]
         for k, claim in enumerate(claims):
             names = claim["channels"]

@@ -23,6 +23,8 @@ def failed(record: dict) -> str | None:
     if record.get("predict_exit", 0) != 0:
         said = record.get("predict_said", "").strip().splitlines() or [""]
         return f"predict exit {record['predict_exit']}: {said[-1][:160]}"
+    if (record.get("lifetime") or {}).get("traceback"):
+        return f"lifetime traceback: {record['lifetime']['traceback']}"
     return None
 
 
@@ -113,6 +115,8 @@ def figures(records: list[dict], fine: list[dict]) -> str:
         ("predict: error after above before by more than 5 %", share(int((before > WORSE).sum()), before.size)),
         ("predict: after over the true form, median, 95th percentile", _quantiles(true_form)),
         ("points inside the 95 % interval of the mean", share(*pooled)),
+        *((f"intervals of {name} of Eq. 15, nothing hidden", share(*_laws(fine, name))) for name in ("mu_0", "a", "b")),
+        ("intervals of lifetimes, nothing hidden", share(*_lifetimes(fine))),
         ("effects of about the size that `sensitivity` states: found", share(sum(near), len(near))),
         ("seconds of `run`: median, 95th percentile, most", _quantiles(seconds, last=True)),
         ("peak resident MB: median, 95th percentile, most", _quantiles(memory, last=True)),
@@ -121,6 +125,16 @@ def figures(records: list[dict], fine: list[dict]) -> str:
         ("worlds with refused effects", str(sum(bool(r["refused"]) for r in fine))),
     ]
     return _table(("figure", "value"), rows)
+
+
+def _laws(fine: list[dict], name: str) -> tuple[int, int]:
+    counts = [r["laws"][name] for r in fine if r.get("laws")]
+    return sum(c[0] for c in counts), sum(c[1] for c in counts)
+
+
+def _lifetimes(fine: list[dict]) -> tuple[int, int]:
+    told = [r["lifetime"]["inside"] for r in fine if r.get("lifetime") and r["lifetime"].get("inside") is not None]
+    return sum(told), len(told)
 
 
 def _states(fine: list[dict]) -> Counter:

@@ -12,8 +12,7 @@ effect inside files runs where there are twelve, else files. The t value has as 
 beyond the rank of their means, and is given as the normal z of the same p, at the true amplitude and at the measured
 one; the smaller counts. So z is conservative: what demeaning takes away is not used.
 
-The true form's error at new points: y on X by generalised least squares with the drawn variances of every kind of
-scatter (known exactly here), and the derivatives at the points.
+The true form's error at new points: d of the same generalised least squares, and the derivatives at the points.
 """
 
 from __future__ import annotations
@@ -166,6 +165,9 @@ def z_values(rows: Rows, world: World) -> list[dict]:
     """Return for each effect its unit, z at the true amplitude and as measured, and how much of it is its own."""
     units = codes(rows)
     found = []
+    if not rows.effects:
+        return found
+    d, covariance = fitted(world, rows)
     for place in rows.effects:
         number = rows.names[place][1]
         effect = world.effects[number]
@@ -173,7 +175,11 @@ def z_values(rows: Rows, world: World) -> list[dict]:
         each = [unit_of(_setting(rows, n), units) for n in names]
         order = ("sample", *LEVELS)
         unit = min(each, key=order.index) if each else "specimen_id"
-        found.append({"unit": unit, "level": CLAIM_LEVEL[unit], **_z(rows, units, unit, place, world)})
+        own = _z(rows, units, unit, place, world)
+        se = float(np.sqrt(covariance[place, place]))
+        whole = {"z": (1 + float(d[place])) / se, "z_expected": 1 / se}
+        both = {name: min(own[name], value, key=abs) for name, value in whole.items()}
+        found.append({"unit": unit, "level": CLAIM_LEVEL[unit], **own, **both})
     return found
 
 
@@ -260,11 +266,11 @@ def error_at(world: World, rows: Rows, points: pd.DataFrame) -> np.ndarray:
         moved[f"_f{k + 2}"] = force_at(world, points, **more)
     table = points[["series"]].assign(**moved)
     at = _columns(world, table, [f"_f{k + 2}" for k in range(len(order))], "_f1", rows.names)
-    return at @ fitted(world, rows)
+    return at @ fitted(world, rows)[0]
 
 
-def fitted(world: World, rows: Rows) -> np.ndarray:
-    """Return d of the true form, by generalised least squares: scatter correlates the rows of a unit."""
+def fitted(world: World, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Return d of the true form and its covariance, by generalised least squares: scatter correlates a unit's rows."""
     table, units, mean = rows.table, codes(rows), friction_N(rows, world)
     along = (table["distance_mm"] / world.rig["stroke_mm"] - 0.5).to_numpy()
     moved = {q: sum(rows.columns[:, k] for k, n in enumerate(rows.names) if n[0] == q) for q in ("v_s", "sigma_2")}
@@ -272,7 +278,7 @@ def fitted(world: World, rows: Rows) -> np.ndarray:
     terms = [(s["sd"] ** 2, bases[s["kind"]], units[UNIT[s["level"]]]) for s in world.scatter]
     wrong = world.files["_wrong"].to_numpy()[world.files["file"].searchsorted(table["file"])]
     terms.append((WRONG_GAIN**2, np.where(wrong, mean, 0.0), units["file"]))
-    inner = np.diag(np.full(rows.columns.shape[1], VAGUE**-2))
+    inner = np.diag([1e-6 if name[0] == "effect" else VAGUE**-2 for name in rows.names])
     right = np.zeros(rows.columns.shape[1])
     for block in blocks(units["specimen_id"], units["file"]):
         x, y = rows.columns[block], table["y"].to_numpy()[block]
@@ -282,7 +288,8 @@ def fitted(world: World, rows: Rows) -> np.ndarray:
         solved = cho_solve(cho_factor(v), np.column_stack([x, y]))
         inner += x.T @ solved[:, :-1]
         right += x.T @ solved[:, -1]
-    return np.linalg.lstsq(inner, right, rcond=1e-14)[0]
+    covariance = np.linalg.pinv(inner, rcond=1e-14, hermitian=True)
+    return covariance @ right, covariance
 
 
 def blocks(specimen: np.ndarray, file: np.ndarray) -> list[np.ndarray]:

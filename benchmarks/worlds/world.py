@@ -14,6 +14,7 @@ from worlds.priors import draw
 
 LEAST_SAMPLES = 60  # of the fastest stroke: nobody logs a test with fewer
 MOST_TOTAL = {"small": 250_000, "any": 4_000_000}  # samples of a world, so that it is quick
+FASTEST = 500.0  # mm/s: no rig for seals slides faster
 PLACES = 12  # along a stroke, where effects are scaled
 TEMPERATURES = (23.0, 40.0, 60.0, 70.0, 80.0, 100.0)
 COMPRESSIONS = (100.0, 90.0, 80.0, 70.0)
@@ -91,8 +92,8 @@ def _design(rng, size: str) -> dict:
     while files() < 8:
         count["repeats" if rng.random() < 0.5 else "speeds"] += 1
     stroke = draw("stroke_mm", rng)
-    v_s, decades = draw("v_s_mm_s", rng), draw("decades", rng)
-    slowest = v_s * 10 ** (-decades * draw("speed_place", rng))
+    v_s, decades, place = draw("v_s_mm_s", rng), draw("decades", rng), draw("speed_place", rng)
+    slowest = min(v_s * 10 ** (-decades * place), FASTEST / 10**decades)
     speeds = _sharp(np.geomspace(slowest, slowest * 10**decades, count["speeds"]), 3)
     days = np.sort(rng.choice(DAYS, count["days"], replace=False)) if count["days"] else np.empty(0)
     aged = days
@@ -106,6 +107,7 @@ def _design(rng, size: str) -> dict:
     one = -1 if rng.random() < 0.2 else 1
     rig = {
         "stroke_mm": stroke,
+        "v_s_mm_s": v_s,
         "stroke_bristles": draw("stroke_bristles", rng),
         "start_mm": float(rng.uniform(-20, 20)),
         "start_scatter_mm": stroke * draw("start_scatter", rng),
@@ -164,7 +166,7 @@ def _friction(world: World, rng) -> None:
     aging = world.days.size > 0
     speeds = world.speeds_mm_s
     mu_c, over = draw("mu_c", rng), draw("mu_s_over_mu_c", rng)
-    v_s = float(np.exp(rng.uniform(*np.log(speeds[[0, -1]]) * 0.6 + 0.4 * np.log(speeds).mean())))
+    v_s = world.rig["v_s_mm_s"]
     load = float(world.loads_N.mean())
     sigma_2 = draw("viscous_share", rng) * mu_c * load / speeds[-1]
     spread = draw("series_spread", rng)
