@@ -6,7 +6,7 @@ NO_NETWORK = echo "make: the packages that sealfit needs could not be installed;
 CODE := $(wildcard sealfit tests benchmarks)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-solver bench-start bench-speed paper clean
+.PHONY: help demo test lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-solver bench-start bench-speed bench-worlds paper clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -37,6 +37,10 @@ bench-coverage: .venv/.installed-test
 # In an environment of its own, as pygam holds scipy back. What is in out/loop.jsonl already is not run again.
 bench-loop: .venv/.installed-bench ## close the loop on some 700 campaigns beside what people would use instead (90 minutes)
 	.venv/bench/bin/python benchmarks/loop.py --out out/loop.jsonl
+
+# Seeded by the newest commit. What out/worlds.jsonl holds is not run again; pass more with WORLDS="--size any --jobs 2".
+bench-worlds: .venv/.installed-test ## sealfit on 600 campaigns drawn at random by another simulator (two hours and more)
+	$(BIN)/python benchmarks/worlds.py --out out/worlds.jsonl --count 600 $(WORLDS)
 
 # Side by side with a bare loop of pyarrow and with typer alone, so on a quiet machine.
 bench-start: .venv/.installed-test
