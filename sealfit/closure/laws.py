@@ -29,7 +29,7 @@ from sealfit.fit.terms import Term, mean_derivatives, shape_of
 
 AGING = "aging_days"
 TARGET = ("mu", "multiply")
-Q = 2  # numbers more than the declared law: an amplitude and a day
+FEWEST = 2  # numbers more than the declared law that a richer one has: an amplitude and a day
 ROWS = 2  # of each stroke: aging moves strokes as a whole
 STARTS = 4  # days from which a law's own number is sought
 
@@ -54,8 +54,8 @@ def richer_laws(
         return []
     known = {t.effect.id for t in fitted.model.terms}
     laws = [e for e in effects.values() if e.physical and e.reads == (AGING,) and TARGET in e.acts_on]
-    laws = [e for e in laws if e.id not in known and len(e.linear) == len(e.nonlinear) == 1]
-    if specimens - fitted.model.declared.numbers_of_mu <= Q:
+    laws = [e for e in laws if e.id not in known and len(e.linear) == 1 and e.nonlinear]
+    if specimens - fitted.model.declared.numbers_of_mu <= FEWEST:
         return []
     rows = fitted.rows.sparse(ROWS)
     before = settled(fit(fitted.model, rows, fitted.scatter, turns=1))
@@ -75,8 +75,10 @@ def _judged(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[
     )
     gain = min(before.deviance, without.deviance) - after.deviance
     units = fitted.rows.groups.starts["specimen"].size
-    q, left = Q, units - fitted.model.declared.numbers_of_mu
+    q, left = len(effect.parameters), units - fitted.model.declared.numbers_of_mu
     error = left - q
+    if error < 1:
+        return None
     amplitude = effect.linear[0]
     at = after.model.place(place).start + [p.name for p in effect.parameters].index(amplitude)
     ratio = np.exp((gain + units * np.log(left / error) - q) / units)
@@ -103,7 +105,11 @@ def _best(before: Fitted, term: Term) -> Fitted | None:
         (shape,) = mean_derivatives(term, {**effect.start(), number: day}, rows, only_linear=True)
         left = project(before, (before.slope(*TARGET) * shape)[:, None])[:, 0]
         size = float(left @ left)
-        start = {amplitude: float(left @ before.white_residual) / size if size > 0 else 0.0, number: day}
+        start = {
+            **effect.start(),
+            amplitude: float(left @ before.white_residual) / size if size > 0 else 0.0,
+            number: day,
+        }
         model = before.model.with_term(term, {p.name: start[p.name] for p in effect.parameters})
         found.append(settled(fit(model, rows, before.scatter, turns=0, friction=before.friction)))
     return min(found, key=lambda f: f.deviance, default=None)

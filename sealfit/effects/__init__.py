@@ -5,6 +5,7 @@ Mechanisms come first, then closed forms of any channel. Free shapes, whose size
 is in `contract`.
 """
 
+from sealfit.effects.aging_delay import AGING_DELAY
 from sealfit.effects.aging_floor import AGING_FLOOR
 from sealfit.effects.aging_induction import AGING_INDUCTION
 from sealfit.effects.arrhenius_aging import ARRHENIUS_AGING
@@ -75,6 +76,7 @@ EFFECTS = {
         COMPRESSION_FACTOR,
         AGING_FLOOR,
         AGING_INDUCTION,
+        AGING_DELAY,
         STRIBECK_SPEED_AGING,
         VISCOSITY_AGING,
         LAB_TEMPERATURE,
