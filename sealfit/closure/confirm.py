@@ -178,8 +178,8 @@ def heldout_gain(
     """Return what a proposal gains on held-out groups of its own unit.
 
     The RMSE of a rig whose files scatter by newtons does not see a ripple of a tenth; the whitened sum of squares of
-    the held-out groups does, as the offset and gain of a whole file or run cost it little. For the same reason the
-    RMSE is taken about the means of the groups inside which the effect varies. `known` keeps what the model without it
+    the held-out groups does, as the offset and gain of a whole file or run cost it little. For the same reason both
+    are taken about the means of the groups inside which the effect varies. `known` keeps what the model without it
     leaves in each fold, for the next proposal.
     """
     if "shift" in proposal.term.fixed:
@@ -211,7 +211,7 @@ def _gain(
     key: tuple,
     known: dict[tuple, np.ndarray],
 ) -> Gain:
-    """Return the gain on rows held out by `masks`; the RMSE is about the means of groups where a level is named."""
+    """Return the gain on rows held out by `masks`; about the means of groups where a level is named."""
     rows, after, scatter = before.rows, proposal.fitted, before.scatter
     squares, total, falls = np.zeros(2), 0.0, []
     for number, out in enumerate(masks):
@@ -226,8 +226,8 @@ def _gain(
             known[*key, number] = _left_in(before, before.model, out, held)
         white = []
         for k, left in enumerate((known[*key, number], _left_in(before, after.model, out, held))):
-            residual = left[inside]
-            squares[k] += float(weight @ _about(residual, test, around) ** 2)
+            residual = _about(left[inside], test, around)
+            squares[k] += float(weight @ residual**2)
             white.append(test.groups.sums(whitening(residual[:, None])[:, 0] ** 2, proposal.unit))
         falls.append(white[0] - white[1])
     fall = np.concatenate(falls) if falls else np.zeros(1)
