@@ -127,6 +127,8 @@ def effects_lines(listed: Mapping) -> list[str]:
             found.append(f"    {p['name']}{' [' + p['unit'] + ']' if p['unit'] else ''}: {p['meaning']}")
     if listed.get("added", ()) is None:
         found.append("The loop of this OUT is not closed, or stale: which effects it added is not known.")
+    if listed.get("note"):
+        found.append(f"note: {listed['note']}")
     return found
 
 

@@ -350,10 +350,10 @@ def test_wrong_places_come_with_the_likeliest_right_one(sealfit, parts, campaign
 
 def test_effects_are_never_read_from_a_campaign(sealfit, parts, campaign, out):
     (campaign / "mine").mkdir()
-    (campaign / "rig.toml").write_text("[loop]\neffects_folder = 'mine'")
-    ended = sealfit("run", campaign, "--out", out, "--config", campaign / "rig.toml")
+    (campaign.parent / "rig.toml").write_text("[loop]\neffects_folder = 'campaign/mine'")
+    ended = sealfit("run", campaign, "--out", out, "--config", campaign.parent / "rig.toml")
     assert ended.code == 1
-    assert "lies in the campaign, and Python is never run from there. Move it" in ended.stderr
+    assert "lies in the campaign, and Python is never run from there. Read the files" in ended.stderr
 
 
 # ---------------------------------------------------------------- predict
