@@ -353,7 +353,7 @@ def test_effects_are_never_read_from_a_campaign(sealfit, parts, campaign, out):
     (campaign.parent / "rig.toml").write_text("[loop]\neffects_folder = 'campaign/mine'")
     ended = sealfit("run", campaign, "--out", out, "--config", campaign.parent / "rig.toml")
     assert ended.code == 1
-    assert "lies in the campaign, and Python is never run from there. Read the files" in ended.stderr
+    assert f"mine lies in {campaign}, and Python is never run from there. Read the files" in ended.stderr
 
 
 # ---------------------------------------------------------------- predict
