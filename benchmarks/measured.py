@@ -40,7 +40,7 @@ def kidney(source: Path, folder: Path) -> Path:
 
 
 def emps_plateaus(source: Path, folder: Path, most: int = 16) -> Path:
-    """Write the first `most` plateaus of EMPS to the campaign `folder`, a file each, and return its config beside it."""
+    """Write the first `most` plateaus of EMPS to the campaign `folder`, a file each; return its config, beside it."""
     table = pd.read_csv(source / "emps" / "csv" / "DATA_EMPS.csv")
     time, place = table["time_s"].to_numpy(), 1e3 * table["position_m"].to_numpy()
     speed = _smooth(np.gradient(place, time), 51)
@@ -49,7 +49,7 @@ def emps_plateaus(source: Path, folder: Path, most: int = 16) -> Path:
     folder.mkdir(parents=True)
     rows = []
     long = ends[np.diff(ends, axis=1)[:, 0] >= SHORTEST]
-    for first, end in long[:most] + (MARGIN, -MARGIN):
+    for first, end in long[:most] + np.array([MARGIN, -MARGIN]):
         own = slice(first, end)
         trace = pd.DataFrame(
             {
