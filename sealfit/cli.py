@@ -296,7 +296,7 @@ def _workers(workers: int | None, scheduler: str | None, *needed: str) -> int:
 
 
 def main() -> None:
-    """Run the command line; the exit code is 0, 1 (input or request), 2 (usage) or 130 (Ctrl-C)."""
+    """Run the command line; the exit code is 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
     sys.exit(exit_code(app))
 
 
