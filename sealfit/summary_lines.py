@@ -30,6 +30,7 @@ def ingest_lines(part: Mapping) -> list[str]:
         text = f"{_count(faults['error'], 'error')}, {_count(faults['warning'], 'warning')}"
         more = f"; left out: {', '.join(left_out)}" if left_out else ""
         found.append(line("faults", f"{text}{more} (table quality)"))
+    found += [line("column", f"{one['column']}: {one['reason']}") for one in part["incomplete_columns"]]
     found.append(line("conditions", f"{part['conditions']} in {_count(part['runs'], 'run')}"))
     return found
 

@@ -37,7 +37,7 @@ sd_rel = 0.01
 ERROR_KEYS = {"rmse_N", "rmse_runs_N", "heldout_rmse_N", "max_abs_N", "mean_abs_pct", "lack_of_fit_p"}
 KEYS = {
     "schema", "verdict", "units", "noise_floor_N", "before", "after", "heldout_unit", "effects", "scatter", "left",
-    "next_runs",
+    "next_runs", "incomplete_channels",
 }  # fmt: skip
 TIMES = ("provenance.json", "state.json", "report.html")  # hold times of day
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from sealfit.closure.channels import incomplete_channels
 from sealfit.closure.confirm import folds, heldout_level
 from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import effect_entries, effect_table, left_entry
@@ -110,6 +111,7 @@ def close_loop(
                 held_before, held_after = heldout.forces(say)
             break
     document = _document(config, effects, grown, before, after, held_before, held_after, heldout.level)
+    document["incomplete_channels"] = incomplete_channels(rows)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their order again
     tables = {
         "effects": effect_table([e for e in document["effects"] if not e["candidate"]], grown.added),

@@ -23,6 +23,7 @@ from sealfit.fit.declared import Declared
 from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.whitening import Component, Scatter
+from sealfit.ingest.incomplete import NO_VALUE
 
 BEYOND = 1e-6  # relative slack before a value counts as outside the tested range
 ANSWERS = (
@@ -188,7 +189,7 @@ def _check_values(table: pd.DataFrame, after: Model, model: dict, notes: list) -
             for k in np.flatnonzero(~np.isfinite(table[name].to_numpy())):
                 notes[k].append(f"{name} must be a number")
         elif isinstance(tested, list):
-            table[name] = table[name].astype(str)
+            table[name] = table[name].astype(object).where(table[name].notna(), NO_VALUE).astype(str)
             for k in np.flatnonzero(~table[name].isin(tested).to_numpy()):
                 notes[k].append(f"{name} must be one of {', '.join(tested)}")
 
