@@ -25,6 +25,14 @@ position_origin = "rig"
 [strokes]
 whole_file = true
 """
+KIDNEY_CONFIG = """
+name = "kidney"
+condition = ["set_pressure_bar"]
+position_origin = "rig"
+[bins]
+per_stroke = 100
+min_samples = 2
+"""
 
 
 def measured() -> Path | None:
@@ -37,6 +45,25 @@ def kidney(source: Path, folder: Path) -> Path:
     """Copy the traces of pneuseal-kidney to the campaign `folder` and return its config."""
     shutil.copytree(source / "pneuseal-kidney" / "raw", folder / "raw")
     return ROOT / "configs" / "kidney.toml"
+
+
+def kidney_plain(source: Path, folder: Path) -> Path:
+    """Write pneuseal-kidney as a campaign with the default columns, force on the piston less the pressure's part.
+
+    The author's piston area, and without the first 15 rows of each file, as `configs/kidney.toml` has it.
+    """
+    folder.mkdir(parents=True)
+    rows = []
+    for path in sorted((source / "pneuseal-kidney" / "raw").glob("*.csv")):
+        raw = np.loadtxt(path)[15:]
+        force = raw[:, 6] - raw[:, 5] * 1e5 * np.pi * (0.0257 / 2) ** 2
+        trace = {"time_s": raw[:, 0] / 1000, "displacement_mm": raw[:, 4], "force_N": force, "pressure_bar": raw[:, 5]}
+        pd.DataFrame(trace).to_csv(folder / path.name, index=False)
+        rows.append({"file": path.name, "set_pressure_bar": int(path.stem[-4])})
+    pd.DataFrame(rows).to_csv(folder / "runs.csv", index=False)
+    config = folder.with_suffix(".toml")
+    config.write_text(KIDNEY_CONFIG)
+    return config
 
 
 def emps_plateaus(source: Path, folder: Path, most: int = 16) -> Path:
