@@ -21,7 +21,7 @@ from paper_numbers import PUBLISHED_LAWS, Line, agreement, compared, printed_err
 
 from sealfit.engine import cores
 from sealfit.progress import to_stderr
-from sealfit.report.style import compose
+from sealfit.report.style import compose, look
 from sealfit.simulate import simulate
 from sealfit.simulation.physics import Growth, Physics
 from sealfit.steps import STEPS, run
@@ -98,7 +98,8 @@ def main() -> None:
     shown = []
     for plot in figures(found):
         figure = compose(replace(plot, title=plot.title.split(":")[0]))
-        figure.savefig(given.docs / f"{plot.name}.png", dpi=110, metadata={"Software": None})
+        with look():
+            figure.savefig(given.docs / f"{plot.name}.png", dpi=110, metadata={"Software": None})
         alt = " ".join(panel.alt for panel in plot.panels)
         shown.append(f"### {plot.title}\n\n![{alt}]({plot.name}.png)\n")
     page = TEXT.format(

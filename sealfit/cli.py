@@ -11,7 +11,19 @@ import typer
 
 from sealfit import __version__
 from sealfit.ending import end, exit_code, print_json
-from sealfit.options import Campaign, ConfigFile, Force, Json, Out, Profile, Results, Scheduler, Strict, Workers
+from sealfit.options import (
+    Campaign,
+    ConfigFile,
+    EffectsFolder,
+    Force,
+    Json,
+    Out,
+    Profile,
+    Results,
+    Scheduler,
+    Strict,
+    Workers,
+)
 
 app = typer.Typer(
     help="From a friction rig's CSV files to the LuGre model of an aging rubber seal, and to what that model lacks.",
@@ -95,6 +107,7 @@ def fit_dynamic(
 @app.command("close-loop")
 def close_loop(
     out: Results,
+    effects_folder: EffectsFolder = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     force: Force = False,
@@ -102,7 +115,7 @@ def close_loop(
     as_json: Json = False,
 ) -> None:
     """Find, name and add what the model lacks."""
-    _single("close-loop", out, force, profile, as_json, workers, scheduler)
+    _single("close-loop", out, force, profile, as_json, workers, scheduler, effects_folder=effects_folder)
 
 
 @app.command()
@@ -116,6 +129,7 @@ def run(
     campaign: Campaign,
     out: Out,
     config: ConfigFile = None,
+    effects_folder: EffectsFolder = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     force: Force = False,
@@ -126,7 +140,8 @@ def run(
     """Do every step that is not current, in order."""
     from sealfit.fingerprint import STEPS
 
-    _run(STEPS, campaign, out, config, workers, scheduler, force, strict, profile, as_json)
+    own = {"effects_folder": effects_folder}
+    _run(STEPS, campaign, out, config, workers, scheduler, force, strict, profile, as_json, **own)
 
 
 @app.command()
@@ -134,12 +149,13 @@ def predict(
     out: Results,
     points: Annotated[Path, typer.Option("--points", help="CSV of points: condition columns, speed, channels.")],
     output: Annotated[Path, typer.Option("--output", help="CSV to write: the points and their answers.")],
+    effects_folder: EffectsFolder = None,
     as_json: Json = False,
 ) -> None:
     """Answer the force at new points."""
     from sealfit import progress, requests, summary_lines
 
-    made = requests.predict(out, points, output, progress=progress.to_stderr())
+    made = requests.predict(out, points, output, effects_folder=effects_folder, progress=progress.to_stderr())
     end("predict", made, summary_lines.predict_lines, as_json)
 
 
@@ -166,12 +182,13 @@ def lifetime(
 @app.command()
 def effects(
     out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="Results, for their units and effects.")] = None,
+    effects_folder: EffectsFolder = None,
     as_json: Json = False,
 ) -> None:
     """List the catalogue of effects."""
     from sealfit import requests, summary_lines
 
-    end("effects", requests.effects(out), summary_lines.effects_lines, as_json)
+    end("effects", requests.effects(out, effects_folder), summary_lines.effects_lines, as_json)
 
 
 @app.command()
@@ -227,9 +244,10 @@ def _run(
     strict: bool,
     profile: bool,
     as_json: bool,
+    **options: Path | None,
 ) -> None:
     count = _workers(workers, scheduler, "sealfit.ingest.stored")
-    options = {"workers": count, "scheduler": scheduler, "force": force, "strict": strict}
+    options |= {"workers": count, "scheduler": scheduler, "force": force, "strict": strict}
     command = "ingest" if len(names) == 1 else "run"
     _do(
         command,
@@ -247,9 +265,10 @@ def _single(
     as_json: bool,
     workers: int | None = None,
     scheduler: str | None = None,
+    **options: Path | None,
 ) -> None:
     needed = {"fit-dynamic": ("sealfit.fit.dynamic",), "close-loop": ("sealfit.closure.loop",)}.get(step, ())
-    options = {"workers": _workers(workers, scheduler, *needed), "scheduler": scheduler, "force": force}
+    options |= {"workers": _workers(workers, scheduler, *needed), "scheduler": scheduler, "force": force}
     _do(step, profile, as_json, lambda steps, progress: steps.single(step, out, progress=progress, **options))
 
 
@@ -277,7 +296,7 @@ def _workers(workers: int | None, scheduler: str | None, *needed: str) -> int:
 
 
 def main() -> None:
-    """Run the command line; the exit code is 0, 1 (input or request), 2 (usage) or 130 (Ctrl-C)."""
+    """Run the command line; the exit code is 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
     sys.exit(exit_code(app))
 
 

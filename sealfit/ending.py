@@ -7,6 +7,7 @@ import gc
 import json
 import os
 import sys
+import traceback
 from collections.abc import Callable
 
 import typer
@@ -14,6 +15,7 @@ import typer
 from sealfit.errors import SealfitError
 from sealfit.threads import one_thread
 
+BUG = 70  # EX_SOFTWARE of sysexits.h
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
 
@@ -33,7 +35,7 @@ def print_json(document: dict) -> None:
 
 
 def exit_code(app: typer.Typer) -> int:
-    """Run the command line and say how it ended: 0, 1 (input or request), 2 (usage) or 130 (Ctrl-C)."""
+    """Run the command line and say how it ended: 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
     one_thread()
     gc.set_threshold(100_000, 20, 20)  # a campaign is many objects and no cycles: looking for them takes a fifth
     atexit.register(gc.freeze)  # nor when the process ends, where that takes a tenth of a second
@@ -52,7 +54,7 @@ def exit_code(app: typer.Typer) -> int:
     except Exception as error:
         # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they can do.
         if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):
-            raise
+            return _bug(error)
         text = error.format_message()
         if "NoArgs" in type(error).__name__:  # `sealfit` alone: its message is the help
             return _fail(text, [_error("no command was given.")], error.exit_code)
@@ -67,6 +69,14 @@ def _fail(message: str, errors: list[dict], code: int) -> int:
         print(json.dumps({"ok": False, "errors": errors}, indent=1, ensure_ascii=False, allow_nan=False))
     print(message, file=sys.stderr)
     return code
+
+
+def _bug(error: Exception) -> int:
+    """Say that the program, not its input, is at fault: the traceback on stderr, one line of it under --json."""
+    traceback.print_exception(error)
+    told = " ".join("".join(traceback.format_exception_only(error)).split())
+    mend = "Please report it, with the traceback on stderr."
+    return _fail(f"sealfit: this is a bug. {mend}", [{**_error(told), "kind": "bug", "mend": mend}], BUG)
 
 
 def _interrupted() -> int:

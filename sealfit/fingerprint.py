@@ -151,8 +151,12 @@ def seen_config(step: str, config: Config) -> Config:
     return config.model_copy(update=UNSEEN.get(step, {}))
 
 
-def step_keys(inputs: Fingerprints, config: Config) -> dict[str, str]:
-    """Return the key of every step, in order, for these inputs, this config and this version of the program."""
+def step_keys(inputs: Fingerprints, config: Config, effects: Mapping[str, str | None] | None = None) -> dict[str, str]:
+    """Return the key of every step, in order, for these inputs, this config and this version of the program.
+
+    `effects` are the hashes of the user's own effects; where their folder lies does not matter.
+    """
+    config = config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
     keys: dict[str, str] = {}
     names = sorted(inputs.places)
     hashes = (inputs.sha256[inputs.places[name]] or "" for name in names)
@@ -160,12 +164,7 @@ def step_keys(inputs: Fingerprints, config: Config) -> dict[str, str]:
     before = hashlib.sha256(os.fsencode(known)).hexdigest()
     for step in STEPS:
         seen = [__version__, step, seen_config(step, config).model_dump(mode="json"), before]
-        if step == "close-loop" and config.loop.effects_folder is not None:
-            seen.append(folder_hashes(Path(config.loop.effects_folder)))
+        if step == "close-loop" and effects:
+            seen.append(dict(effects))
         keys[step] = before = hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()
     return keys
-
-
-def folder_hashes(folder: Path) -> dict[str, str | None]:
-    """Return the hash of every Python file below the users' folder of effects."""
-    return {path.relative_to(folder).as_posix(): fingerprint(path).sha256 for path in sorted(folder.rglob("*.py"))}

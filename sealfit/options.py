@@ -17,4 +17,8 @@ Scheduler = Annotated[
 Force = Annotated[bool, typer.Option("--force", help="Do it again even if it is current.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
 Profile = Annotated[bool, typer.Option("--profile", help="Print seconds and rows per step.")]
+EffectsFolder = Annotated[
+    Path | None,
+    typer.Option("--effects-folder", metavar="FOLDER", help="Folder of your own effects. Python is run from it."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]

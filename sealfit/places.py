@@ -7,7 +7,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from sealfit.config import Config
-from sealfit.errors import CampaignError, ConfigError, Fault, RequestError
+from sealfit.errors import CampaignError, Fault, RequestError
 from sealfit.state import STATE
 
 RUNS = "runs.csv"
@@ -35,16 +35,6 @@ def campaign_folder(path: Path, config: Config) -> Path:
             mend = "Did you mean " + " or ".join(_quoted(folder) for folder in below[:3]) + "?"
         raise CampaignError([Fault("runs_csv", f"{path} has no {RUNS}.", file=RUNS, mend=mend)])
     return path
-
-
-def refuse_effects_in(campaign: Path, config: Config) -> None:
-    """Raise ConfigError if the folder of users' effects lies in the campaign: Python is never run from data."""
-    folder = config.loop.effects_folder
-    if folder is not None and Path(folder).resolve().is_relative_to(campaign.resolve()):
-        raise ConfigError(
-            f"key 'loop.effects_folder': {folder} lies in the campaign, and Python is never run from there.",
-            mend="Move it beside the config.",
-        )
 
 
 def existing_out(out: Path) -> Path:

@@ -31,6 +31,7 @@ def provenance(state: State) -> dict:
             for name, size, sha256 in zip(known.places, known.size, known.sha256, strict=True)
             if sha256 is not None
         ],
+        "own_effects": [{"file": name, "sha256": sha256} for name, sha256 in state.effects.items()],
         "steps": [
             {"step": name, "version": done.version, "finished_at": done.finished_at, "seconds": done.seconds}
             for name, done in state.steps.items()

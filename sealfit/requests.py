@@ -6,7 +6,8 @@ from pathlib import Path
 
 from sealfit.engine import on_cluster
 from sealfit.errors import CampaignError, Fault, OutError
-from sealfit.places import RUNS, campaign_folder, existing_file, existing_out, refuse_effects_in
+from sealfit.own_effects import OPTION, own_effects_folder, what_differs
+from sealfit.places import RUNS, campaign_folder, existing_file, existing_out
 from sealfit.progress import Silent
 from sealfit.state import ConfigCopy
 from sealfit.steps import FAULTY
@@ -32,8 +33,9 @@ def check(
     from sealfit import summary
     from sealfit.ingest.campaign import ingest_campaign
 
-    checked = ConfigCopy.at(config).parse()
-    refuse_effects_in(campaign, checked)
+    source = ConfigCopy.at(config)
+    checked = source.parse()
+    own_effects_folder(None, source, campaign)
     try:
         folder = campaign_folder(campaign, checked)
         with on_cluster(scheduler, folder), (progress or Silent()).counting("reading trace files") as on_file:
@@ -44,25 +46,35 @@ def check(
     return summary.of_ingest(ingested.tables), faults
 
 
-def predict(out: Path, points: Path, output: Path, *, progress: Silent | None = None) -> dict:
+def predict(
+    out: Path,
+    points: Path,
+    output: Path,
+    *,
+    effects_folder: Path | None = None,
+    progress: Silent | None = None,
+) -> dict:
     """Write the answers to `points` (CSV) to `output` (CSV) and return how many rows were answered.
+
+    `effects_folder` is run: it holds the user's own effects, which the model may need.
 
     Raises
     ------
     StaleError
-        If the loop has not been closed on the campaign as it stands.
+        If the loop has not been closed on the campaign as it stands, or with other effects of the user's own.
     RequestError
-        If the points cannot be read, lack a column that the model needs, or the answers cannot be written.
+        If the points cannot be read, lack a column that the model needs, the answers cannot be written, or the model
+        needs the user's own effects and no folder of them is given.
     """
     from sealfit.closure.predict import predict as answer
     from sealfit.points import read_points, write_answers
 
-    store = Store.open(existing_out(out))
+    store = Store.open(existing_out(out), effects_folder)
     for warning in store.warnings:
         (progress or Silent()).warn(warning)
     store.require("close-loop")
     asked = read_points(points)
-    answers = answer(store.read_json("model"), asked.values)
+    answers = answer(store.read_json("model"), asked.values, _own_effects(store.effects))
     return {"out": str(store.out), "output": str(output), **write_answers(asked, answers, output)}
 
 
@@ -103,22 +115,40 @@ def lifetime(
     return {"out": str(store.out), "quantity": quantity, **chosen, "rivals": rivals}
 
 
-def effects(out: Path | None = None) -> dict:
-    """Return the catalogue; with OUT, in its units, with the users' own effects and those that its loop added."""
+def _own_effects(folder: Path | None) -> dict:
+    """Return the user's own effects, whose files are run, by id; none without a folder."""
+    if folder is None:
+        return {}
+    from sealfit.effects.user import load_user_effects
+
+    return load_user_effects(folder)
+
+
+def effects(out: Path | None = None, effects_folder: Path | None = None) -> dict:
+    """Return the catalogue; with OUT, in its units and with those that its loop added.
+
+    With `effects_folder`, whose files are run, the user's own effects too. `note` says if OUT has others, or some and
+    none are given.
+    """
     from sealfit import summary
     from sealfit.effects import EFFECTS
 
     if out is None:
-        return {"effects": summary.of_effects(EFFECTS.values(), Units())}
-    store = Store.open(existing_out(out))
-    known = dict(EFFECTS)
-    if store.config.loop.effects_folder is not None:
-        from sealfit.effects.user import load_user_effects
-
-        known |= load_user_effects(Path(store.config.loop.effects_folder))
+        known = EFFECTS | _own_effects(own_effects_folder(effects_folder, None))
+        return {"effects": summary.of_effects(known.values(), Units())}
+    store = Store.open(existing_out(out), effects_folder)
+    known = EFFECTS | _own_effects(store.effects)
     closed = not store.why_stale("close-loop")
     added = [effect["id"] for effect in store.read_json("closure")["effects"]] if closed else None
-    return {"effects": summary.of_effects(known.values(), store.config.units), "added": added}
+    listed = {"effects": summary.of_effects(known.values(), store.config.units), "added": added}
+    return {**listed, "note": _note_on_own(store)}
+
+
+def _note_on_own(store: Store) -> str | None:
+    if store.effects is None and store.state.effects:
+        files = ", ".join(store.state.effects)
+        return f"your own effects ({files}) are listed only from a folder that you name: add {OPTION} FOLDER."
+    return what_differs(store.kept_effects, store.state.effects) or None
 
 
 def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:

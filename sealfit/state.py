@@ -6,10 +6,10 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from sealfit.config import Config, parse_config, read_config
-from sealfit.errors import ConfigError, OutError
+from sealfit.errors import OutError
 from sealfit.fingerprint import Fingerprints
 
 STATE = "state.json"
@@ -47,22 +47,22 @@ class ConfigCopy:
         return self
 
     def parse(self) -> Config:
-        """Return the checked config; a folder of the users' effects is taken relative to the config's own folder.
+        """Return the checked config.
 
         Raises
         ------
         ConfigError
-            If the text is not a config, or the folder of effects does not exist.
+            If the text is not a config.
         """
-        config = parse_config(self.text, str(self.path or DEFAULT))
-        if config.loop.effects_folder is None:
-            return config
-        folder = ((self.path.parent if self.path else Path()) / config.loop.effects_folder).resolve()
-        if not folder.is_dir():
-            raise ConfigError(
-                f"key 'loop.effects_folder': there is no folder {folder}.", file=self.path, mend="Mend the path."
-            )
-        return config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": str(folder)})})
+        return parse_config(self.text, str(self.path or DEFAULT))
+
+    def effects_folder(self) -> Path | None:
+        """Return the folder that `loop.effects_folder` names, relative to the config's own folder; None without it.
+
+        Only a config that the command line names may lead to its being run: see `own_effects`.
+        """
+        named = self.parse().loop.effects_folder
+        return None if named is None else (self.path.parent if self.path else Path()) / named
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +83,7 @@ class State:
     campaign: Path
     config: ConfigCopy
     inputs: Fingerprints = field(default_factory=Fingerprints)
+    effects: dict[str, str | None] = field(default_factory=dict)  # SHA-256 of the user's own effects, by file name
     steps: dict[str, Done] = field(default_factory=dict)
 
     def as_dict(self) -> dict:
@@ -93,6 +94,7 @@ class State:
             "campaign": str(self.campaign),
             "config": {"path": str(self.config.path) if self.config.path else None, "text": self.config.text},
             "inputs": self.inputs.columns(),
+            "own_effects": self.effects,
             "steps": {name: asdict(done) for name, done in self.steps.items()},
         }
 
@@ -117,7 +119,8 @@ class State:
             return cls(
                 *belongs,
                 Fingerprints.of_columns(**kept["inputs"]),
-                {name: Done(**done) for name, done in kept["steps"].items()},
+                dict(kept.get("own_effects", {})),
+                {name: _inside(Done(**done)) for name, done in kept["steps"].items()},
             )
         except (FileNotFoundError, NotADirectoryError):
             return None
@@ -127,6 +130,14 @@ class State:
             raise OutError(
                 "is not a state that this version of sealfit can read.", file=path, mend="Choose another --out."
             ) from error
+
+
+def _inside(done: Done) -> Done:
+    """Return `done`; ValueError if a file of it lies outside OUT: what a step wrote is read, and removed, again."""
+    for file in done.files:
+        if PurePath(file).is_absolute() or ".." in PurePath(file).parts:
+            raise ValueError(f"{file} lies outside")
+    return done
 
 
 def to_json(document: object, *, indent: int | None = 1) -> str:

@@ -13,7 +13,8 @@ from sealfit.engine import on_cluster
 from sealfit.errors import CampaignError, Fault
 from sealfit.fingerprint import STEPS, fingerprint, glob_names
 from sealfit.order import Counted, Order, Work
-from sealfit.places import RUNS, campaign_folder, existing_out, refuse_effects_in
+from sealfit.own_effects import own_effects_folder
+from sealfit.places import RUNS, campaign_folder, existing_out
 from sealfit.profiling import timed
 from sealfit.progress import Silent
 from sealfit.staging import Staged
@@ -47,6 +48,7 @@ def run(
     scheduler: str | None = None,
     force: bool = False,
     strict: bool = False,
+    effects_folder: Path | None = None,
     progress: Silent | None = None,
 ) -> dict:
     """Do every step of `steps` that is not current, in order, and return the summary of all of them.
@@ -65,6 +67,8 @@ def run(
         Do current steps too.
     strict : bool
         Stop at any fault of the campaign, after the first step.
+    effects_folder : Path or None
+        Folder of the user's own effects, which is run; it comes before the one that the config names.
 
     Raises
     ------
@@ -74,9 +78,9 @@ def run(
     progress = progress or Silent()
     source = ConfigCopy.at(config)
     checked = source.parse()
-    refuse_effects_in(campaign, checked)
+    own = own_effects_folder(effects_folder, source, out, campaign)  # before OUT is made
     folder = campaign_folder(campaign, checked)
-    with Store.writing(out, folder, source) as store, on_cluster(scheduler, folder, out):
+    with Store.writing(out, folder, source, own) as store, on_cluster(scheduler, folder, out):
         return _do_steps(store, steps, workers=workers, force=force, strict=strict, progress=progress)
 
 
@@ -92,6 +96,7 @@ def single(
     workers: int = 1,
     scheduler: str | None = None,
     force: bool = False,
+    effects_folder: Path | None = None,
     progress: Silent | None = None,
 ) -> dict:
     """Do one step after the first in an OUT whose earlier steps are current, and return its summary.
@@ -100,8 +105,10 @@ def single(
     ------
     StaleError
         If a step before it is missing or stale; it names the command to run.
+    RequestError
+        If close-loop needs the user's own effects and no `effects_folder` is given.
     """
-    with Store.writing(existing_out(out)) as store, on_cluster(scheduler, out):
+    with Store.writing(existing_out(out), effects=effects_folder) as store, on_cluster(scheduler, out):
         store.require(STEPS[STEPS.index(step) - 1])
         return _do_steps(store, (step,), workers=workers, force=force, strict=False, progress=progress or Silent())
 
@@ -211,6 +218,7 @@ def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -
 def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     from sealfit.closure.loop import close_loop
 
+    store.require_effects()
     config = store.seen_config("close-loop")
     closure = close_loop(store.read("bins"), store.traces(), config, workers=workers, on_progress=progress.say)
     with timed("writing tables"):

@@ -16,6 +16,7 @@ from sealfit.config import Config
 from sealfit.errors import ConfigError, OutError, StaleError
 from sealfit.fingerprint import STEPS, Fingerprint, Fingerprints, changes, fingerprint, seen_config, step_keys
 from sealfit.interrupts import undisturbed
+from sealfit.own_effects import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
 from sealfit.own_folder import held
 from sealfit.provenance import provenance
 from sealfit.staging import PARQUET, Staged, disk, file_size, sync
@@ -30,12 +31,19 @@ PROVENANCE = "provenance.json"
 
 
 class Store:
-    """One OUT folder with the campaign and the config it belongs to; `known` if it holds results already."""
+    """One OUT folder with the campaign and the config it belongs to; `known` if it holds results already.
 
-    def __init__(self, out: Path, state: State, *, known: bool, kept: State | None = None):
+    `effects` is the folder of the user's own effects that the command line names; the config has it, and no other.
+    """
+
+    def __init__(self, out: Path, state: State, *, known: bool, kept: State | None = None, effects: Path | None = None):
         self.out, self.state = out, state
         self._kept = kept  # the state as it stands in `out`
-        self.config: Config = state.config.parse()
+        self.effects = effects
+        config = state.config.parse()
+        self._names_effects = config.loop.effects_folder is not None
+        own = {"effects_folder": None if effects is None else str(effects)}
+        self.config: Config = config.model_copy(update={"loop": config.loop.model_copy(update=own)})
         self.warnings: list[str] = []
         self._keys: dict[str, str] | None = None  # of every step for the campaign as it is now
         self.anew = False  # whether what is stored already is to be made again
@@ -50,24 +58,37 @@ class Store:
 
     # ------------------------------------------------------------ opening
     @classmethod
-    def open(cls, out: Path) -> Store:
-        """Return the results in `out`, for reading.
+    def open(cls, out: Path, effects: Path | None = None) -> Store:
+        """Return the results in `out`, for reading; `effects` is the folder that --effects-folder names.
 
         Raises
         ------
         OutError
             If `out` holds no results of sealfit.
+        ConfigError
+            If `effects` may not be run, as `own_effects_folder`.
         """
         state = State.read(out)
         if state is None:
             what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
             raise OutError(what, file=out, mend=f"Make them with: sealfit run CAMPAIGN --out {shlex.quote(str(out))}")
-        return cls(out, replace(state, config=state.config.now()), known=True, kept=state)
+        effects = own_effects_folder(effects, None, out, state.campaign)
+        config = state.config.now()
+        hashes = effects_seen(effects, state.effects, state.config, config)
+        return cls(out, replace(state, config=config, effects=hashes), known=True, kept=state, effects=effects)
 
     @classmethod
     @contextlib.contextmanager
-    def writing(cls, out: Path, campaign: Path | None = None, source: ConfigCopy | None = None) -> Iterator[Store]:
+    def writing(
+        cls,
+        out: Path,
+        campaign: Path | None = None,
+        source: ConfigCopy | None = None,
+        effects: Path | None = None,
+    ) -> Iterator[Store]:
         """Hold `out` as its only writer and give the store; without `campaign`, one that holds results already.
+
+        `source` is the config that the command line names, `effects` the folder that --effects-folder names.
 
         Raises
         ------
@@ -76,20 +97,22 @@ class Store:
             process, or cannot be written.
         """
         if campaign is None or source is None:
-            cls.open(out)  # raises if there is nothing to go on from
+            cls.open(out, effects)  # raises if there is nothing to go on from
         with held(out):
             if campaign is None or source is None:
-                store = cls.open(out)
+                store = cls.open(out, effects)
             else:
-                store = cls._of_campaign(out, campaign.resolve(), source)
+                folder = own_effects_folder(effects, source, out, campaign)
+                store = cls._of_campaign(out, campaign.resolve(), source, folder)
             store._keep_what_moved()
             yield store
 
     @classmethod
-    def _of_campaign(cls, out: Path, campaign: Path, source: ConfigCopy) -> Store:
+    def _of_campaign(cls, out: Path, campaign: Path, source: ConfigCopy, effects: Path | None) -> Store:
         kept = State.read(out)
+        hashes = {} if effects is None else effect_hashes(effects)
         if kept is None or (kept.campaign != campaign and not kept.steps):
-            return cls(out, State(campaign, source), known=False, kept=kept)
+            return cls(out, State(campaign, source, effects=hashes), known=False, kept=kept, effects=effects)
         store_inputs, moved = kept.inputs, kept.campaign != campaign
         if moved:
             store_inputs = Fingerprints.of({name: fingerprint(campaign / name) for name in kept.inputs})
@@ -99,8 +122,8 @@ class Store:
                     file=out,
                     mend="Choose another --out.",
                 )
-        state = replace(kept, campaign=campaign, config=source, inputs=store_inputs)
-        store = cls(out, state, known=True, kept=kept)
+        state = replace(kept, campaign=campaign, config=source, inputs=store_inputs, effects=hashes)
+        store = cls(out, state, known=True, kept=kept, effects=effects)
         if moved:
             store.warnings.append(
                 f"{out} was made from {kept.campaign}; {campaign} holds the same data and takes over."
@@ -116,8 +139,8 @@ class Store:
         same = {n: mark for n, mark in self._changed.items() if n in known and mark.sha256 == known[n].sha256}
         if same:
             self.state = replace(self.state, inputs=known | same)
-        source = self.state.config if _same_config(kept.config, self.config) else kept.config
-        tidy = replace(self.state, config=source)
+        source = self.state.config if _same_config(kept.config, self.state.config) else kept.config
+        tidy = replace(self.state, config=source, effects=kept.effects)
         if tidy != kept:
             staged = Staged(self.out, self.config.units, "state")
             try:
@@ -127,24 +150,29 @@ class Store:
             finally:
                 staged.clear()
 
+    @property
+    def kept_effects(self) -> dict[str, str | None]:
+        """Hashes of the user's own effects with which the results were made, by file name."""
+        return self._kept.effects if self._kept is not None else {}
+
     # ------------------------------------------------------------ current or stale
     def why_stale(self, step: str) -> str:
         """Return in words why `step` has to be done, or "" if it is current."""
         if self._keys is None:
-            self._keys = step_keys(self.marks, self.config)
+            self._keys = step_keys(self.marks, self.config, self.state.effects)
         keys = self._keys
         for name in STEPS[: STEPS.index(step) + 1]:
             done = self.state.steps.get(name)
             if done is None:
                 return f"{name} has not been done"
             if done.key != keys[name]:
-                return f"{name} is stale: {self._what_changed(done)}"
+                return f"{name} is stale: {self._what_changed(name, done)}"
             for file, size in done.files.items():
                 if file_size(f"{self.out}/{file}") != size:
                     return f"{name} is stale: its {file} is missing or was changed"
         return ""
 
-    def _what_changed(self, done: Done) -> str:
+    def _what_changed(self, step: str, done: Done) -> str:
         if done.version != __version__:
             return f"it was made by sealfit {done.version}, this is {__version__}"
         known = self.state.inputs
@@ -152,6 +180,9 @@ class Store:
         if changed:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             return f"inputs changed ({', '.join(changed[:3])}{more})"
+        own = what_differs(self.kept_effects, self.state.effects)
+        if own and step == "close-loop":
+            return own
         return f"the config ({self.state.config.name}) changed"
 
     def require(self, step: str) -> None:
@@ -161,11 +192,18 @@ class Store:
             if why:
                 raise StaleError(f"{why}.", file=self.out, mend=f"Run: {self.command(name)}")
 
+    def require_effects(self) -> None:
+        """Raise RequestError if the loop is to be closed with the user's own effects and no folder of them is given."""
+        if self.effects is None and (self._names_effects or self.state.effects):
+            raise needed("the loop is closed with", self.state.effects)
+
     def command(self, step: str) -> str:
         """Return the command line that does `step`."""
         out = shlex.quote(str(self.out))
         if step != "ingest":
-            return f"sealfit {step} {out}"
+            own = self.effects or ("FOLDER" if self._names_effects or self.state.effects else None)
+            option = f" {OPTION} {shlex.quote(str(own))}" if own and step == "close-loop" else ""
+            return f"sealfit {step} {out}{option}"
         config = f" --config {shlex.quote(str(self.state.config.path))}" if self.state.config.path else ""
         return f"sealfit ingest {shlex.quote(str(self.state.campaign))} --out {out}{config}"
 
@@ -239,7 +277,7 @@ class Store:
         inputs = self.state.inputs if staged.inputs is None else staged.inputs
         files = dict(staged.files)
         done = Done(
-            step_keys(inputs, self.config)[name],
+            step_keys(inputs, self.config, self.state.effects)[name],
             __version__,
             datetime.now(UTC).isoformat(timespec="seconds"),
             round(seconds, 3),
@@ -288,8 +326,8 @@ class Store:
         return known_parts(self.out, done.files) if done and not self.anew else {}
 
 
-def _same_config(kept: ConfigCopy, config: Config) -> bool:
+def _same_config(kept: ConfigCopy, config: ConfigCopy) -> bool:
     try:
-        return kept.parse() == config
+        return kept.parse() == config.parse()
     except ConfigError:
         return False

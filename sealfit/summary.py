@@ -20,7 +20,7 @@ NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift")  # `quantity` of r
 OF_INGEST = {  # columns that its summary counts
     "inputs": ["status"],
     "runs": ["used", "run_id"],
-    "quality": ["action", "severity"],
+    "quality": ["action", "severity", "check", "column", "value", "reason"],
     "steady": ["condition"],
 }
 EFFECT_KEYS = ("id", "label", "form", "acts_on", "operation", "channels", "named", "candidate", "parameters")
@@ -52,9 +52,19 @@ def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
         "rows_left_out": int((quality["action"] == "row left out").sum()),
         "strokes_left_out": int((quality["action"] == "stroke left out").sum()),
         "faults": {severity: int((quality["severity"] == severity).sum()) for severity in ("error", "warning")},
+        "incomplete_columns": _incomplete(quality),
         "runs": int(runs["run_id"].nunique()),
         "conditions": int(steady["condition"].nunique()),
     }
+
+
+def _incomplete(quality: pd.DataFrame) -> list[dict]:
+    """Return the columns that some files have no value of, and what that does."""
+    rows = quality[quality["check"] == "incomplete_column"]
+    return [
+        {"column": column, "files_without": int(float(value)), "reason": reason}
+        for column, value, reason in zip(rows["column"], rows["value"], rows["reason"], strict=True)
+    ]
 
 
 def of_fit(fit: pd.DataFrame, of: str) -> dict:

@@ -30,6 +30,7 @@ def ingest_lines(part: Mapping) -> list[str]:
         text = f"{_count(faults['error'], 'error')}, {_count(faults['warning'], 'warning')}"
         more = f"; left out: {', '.join(left_out)}" if left_out else ""
         found.append(line("faults", f"{text}{more} (table quality)"))
+    found += [line("column", f"{one['column']}: {one['reason']}") for one in part["incomplete_columns"]]
     found.append(line("conditions", f"{part['conditions']} in {_count(part['runs'], 'run')}"))
     return found
 
@@ -127,6 +128,8 @@ def effects_lines(listed: Mapping) -> list[str]:
             found.append(f"    {p['name']}{' [' + p['unit'] + ']' if p['unit'] else ''}: {p['meaning']}")
     if listed.get("added", ()) is None:
         found.append("The loop of this OUT is not closed, or stale: which effects it added is not known.")
+    if listed.get("note"):
+        found.append(f"note: {listed['note']}")
     return found
 
 

@@ -122,8 +122,8 @@ class Parts:
             html=f"<p>{closure['verdict']}</p>", figures={"one": SimpleNamespace(svg="<svg/>", png=b"PNG")}
         )
 
-    def predict(self, model, points):
-        self._called("predict")
+    def predict(self, model, points, own):
+        self._called("predict", own)
         assert model["ready"]
         answers = {name: 1.0 for name in ("force_before_N", "force_after_N", "force_after_lo95_N")}
         answers |= {name: 2.0 for name in ("force_after_hi95_N", "meas_lo95_N", "meas_hi95_N")}

@@ -144,11 +144,43 @@ def test_ctrl_c_is_130_one_line_and_out_is_intact(sealfit, parts, campaign, out)
     assert sealfit("run", campaign, "--out", out, "--json").json["ok"] is False
 
 
-def test_a_bug_keeps_its_traceback(monkeypatch, parts, campaign, out):
-    parts.raises["fit-steady"] = ZeroDivisionError("a bug")
-    monkeypatch.setattr(sys, "argv", ["sealfit", "run", str(campaign), "--out", str(out)])
-    with pytest.raises(ZeroDivisionError, match="a bug"):
-        cli.main()
+def test_a_bug_is_70_and_keeps_its_traceback(sealfit, parts, campaign, out):
+    parts.raises["fit-steady"] = ZeroDivisionError("a\nbug")
+    ended = sealfit("run", campaign, "--out", out)
+    assert (ended.code, ended.stdout) == (70, "")
+    assert "Traceback (most recent call last):" in ended.stderr
+    assert "fake_parts.py" in ended.stderr
+    assert "ZeroDivisionError: a\nbug" in ended.stderr
+    assert ended.stderr.splitlines()[-1].startswith("sealfit: this is a bug. Please report it")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "at"),
+    [
+        (["run", "c", "--out", "o"], "sealfit.steps.run"),
+        (["ingest", "c", "--out", "o"], "sealfit.steps.run"),
+        (["close-loop", "o"], "sealfit.steps.single"),
+        (["predict", "o", "--points", "p.csv", "--output", "q.csv"], "sealfit.requests.predict"),
+        (["lifetime", "o"], "sealfit.requests.lifetime"),
+        (["effects"], "sealfit.requests.effects"),
+        (["simulate", "s.toml", "--out", "c"], "sealfit.requests.simulate"),
+        (["check", "c"], "sealfit.requests.check"),
+        (["effects"], "sealfit.state.to_json"),
+    ],
+)
+def test_a_bug_under_json_leaves_one_object(sealfit, monkeypatch, arguments, at):
+    def broken(*given, **named):
+        raise ZeroDivisionError("a\nbug")
+
+    monkeypatch.setattr(at, broken)
+    ended = sealfit(*arguments, "--json")
+    assert ended.code == 70
+    assert ended.json["ok"] is False
+    (error,) = ended.json["errors"]
+    assert error["kind"] == "bug"
+    assert error["reason"] == "ZeroDivisionError: a bug"
+    assert {"file", "line", "column", "value", "mend", "reason"} <= set(error)
+    assert "Traceback (most recent call last):" in ended.stderr
 
 
 def test_a_reader_that_leaves_early_is_no_fault():
@@ -351,10 +383,10 @@ def test_wrong_places_come_with_the_likeliest_right_one(sealfit, parts, campaign
 
 def test_effects_are_never_read_from_a_campaign(sealfit, parts, campaign, out):
     (campaign / "mine").mkdir()
-    (campaign / "rig.toml").write_text("[loop]\neffects_folder = 'mine'")
-    ended = sealfit("run", campaign, "--out", out, "--config", campaign / "rig.toml")
+    (campaign.parent / "rig.toml").write_text("[loop]\neffects_folder = 'campaign/mine'")
+    ended = sealfit("run", campaign, "--out", out, "--config", campaign.parent / "rig.toml")
     assert ended.code == 1
-    assert "lies in the campaign, and Python is never run from there. Move it" in ended.stderr
+    assert f"mine lies in {campaign}, and Python is never run from there. Read the files" in ended.stderr
 
 
 # ---------------------------------------------------------------- predict

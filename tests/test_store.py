@@ -20,7 +20,7 @@ from small_tables import small
 
 from sealfit import parquet, staging
 from sealfit.config import parse_config
-from sealfit.errors import ConfigError, OutError, StaleError
+from sealfit.errors import OutError, StaleError
 from sealfit.fingerprint import STEPS, Fingerprints, fingerprint, seen_config
 from sealfit.lock import LOCK
 from sealfit.state import ConfigCopy, State, to_json
@@ -273,9 +273,15 @@ def test_a_user_s_effect_that_changed_makes_the_loop_stale(out, campaign):
     assert stale(out) == ["close-loop", "report"]
 
 
-def test_a_missing_folder_of_effects_is_a_fault_of_the_config(campaign):
-    with pytest.raises(ConfigError, match=r"rig.toml: key 'loop.effects_folder': there is no folder"):
-        rig(campaign.parent, "[loop]\neffects_folder = 'mine'").parse()
+def test_a_file_outside_out_that_the_state_names_is_never_touched(out, campaign):
+    do_all(out, campaign)
+    state = json.loads((out / "state.json").read_text())
+    for file in ("../rig.toml", str(out.parent / "rig.toml")):
+        state["steps"]["report"]["files"][file] = 1
+        (out / "state.json").write_text(json.dumps(state))
+        with pytest.raises(OutError, match="is not a state that this version"):
+            Store.open(out)
+        del state["steps"]["report"]["files"][file]
 
 
 def test_a_redone_step_makes_those_after_it_stale(out, campaign):

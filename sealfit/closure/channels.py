@@ -17,7 +17,7 @@ from sealfit.closure.slopes import LEAST_UNITS as LEAST_SLOPES
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.declared import SAME_SPEED
-from sealfit.fit.rows import LEVELS, Rows
+from sealfit.fit.rows import LEVELS, Rows, open_columns
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 MANY_UNITS = 20  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up
@@ -111,6 +111,18 @@ def find_channels(
                 continue
             channel = replace(channel, grouping=True)
         found.append(channel)
+    return found
+
+
+def incomplete_channels(rows: Rows) -> list[dict]:
+    """Return the campaign's own channels that some files lack, how many of how many, and whether it is searched."""
+    found = []
+    for name in open_columns(rows.table):
+        known = rows.table[name].notna().groupby(rows.codes("file")).any()
+        if not known.all() and known.any():
+            whole = rows.values(name).dtype.kind != "f" or bool(np.isfinite(rows.values(name)).all())
+            counts = {"files_without": int((~known).sum()), "files": len(known)}
+            found.append({"channel": name, **counts, "searched": whole})
     return found
 
 

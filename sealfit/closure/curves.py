@@ -14,7 +14,7 @@ from sealfit.config import Config
 from sealfit.effects.contract import SECOND
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.joint import evaluate
-from sealfit.fit.rows import point_rows
+from sealfit.fit.rows import open_columns, point_rows
 from sealfit.fit.tangent import Tangent
 from sealfit.fit.terms import Term, term_derivatives
 from sealfit.tables import CHANNELS, CURVES, SHAPES
@@ -141,7 +141,8 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     moving = np.flatnonzero(way != 0)
     order = moving[np.lexsort((-way[moving], rows.condition[moving]))]  # of a condition, what moves forwards first
     cuts = np.flatnonzero(np.diff(rows.condition[order]) | (np.diff(way[order]) != 0)) + 1
-    columns = {name: _averaged(rows.table[name], np.split(order, cuts)) for name in read}
+    own = {name: pd.Series(rows.values(name), name=name) for name in open_columns(rows.table)}
+    columns = {name: _averaged(own.get(name, rows.table[name]), np.split(order, cuts)) for name in read}
     speeds = [np.abs(rows.speed[chosen]) for chosen in np.split(order, cuts)]
     counts = [POINTS if own.max() > 1.02 * own.min() else 1 for own in speeds]
     first = order[np.r_[0, cuts]]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import FINER, Channel, unit_of
+from sealfit.closure.channels import FINER, Channel, incomplete_channels, unit_of
 from sealfit.closure.confirm import Added, Refused
 from sealfit.closure.forms import describe, free_term
 from sealfit.closure.grow import Grown
@@ -105,6 +105,7 @@ def closure_document(
         "scatter": scatter,
         "left": left_entry(grown, numbers["after"]["rmse_N"], floor),
         "next_runs": next_runs(grown, config, effects),
+        "incomplete_channels": incomplete_channels(after.rows),
     }
 
 

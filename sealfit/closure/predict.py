@@ -7,6 +7,7 @@ measurement adds one draw of each level and the noise of a bin. The sensor's acc
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -16,11 +17,13 @@ from sealfit.closure.intervals import mean_se, t_quantile
 from sealfit.closure.record import from_record
 from sealfit.conditions import add_keys
 from sealfit.config import Config
+from sealfit.effects.contract import Effect
 from sealfit.errors import RequestError
 from sealfit.fit.declared import Declared
 from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.whitening import Component, Scatter
+from sealfit.ingest.incomplete import NO_VALUE
 
 BEYOND = 1e-6  # relative slack before a value counts as outside the tested range
 ANSWERS = (
@@ -28,7 +31,7 @@ ANSWERS = (
 )  # fmt: skip
 
 
-def predict(model: dict, points: pd.DataFrame) -> pd.DataFrame:
+def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None = None) -> pd.DataFrame:
     """Return `points` with the forces before and after, their intervals, `extrapolated` and `note`.
 
     Parameters
@@ -38,13 +41,16 @@ def predict(model: dict, points: pd.DataFrame) -> pd.DataFrame:
     points : DataFrame
         Condition columns, signed `speed_mm_s`, and every channel that the after-model reads; grouping columns such as
         `specimen_id` are ignored.
+    own : mapping of str to Effect, optional
+        The user's own effects, by id.
 
     Raises
     ------
     RequestError
-        If a condition column, the speed or a channel of the after-model is missing altogether.
+        If a condition column, the speed or a channel of the after-model is missing altogether, or the model holds an
+        effect of the user's own that is not in `own`.
     """
-    before, after, conditions = from_record(model)
+    before, after, conditions = from_record(model, own)
     config = Config.model_validate(model["config"])
     table = _complete(points.reset_index(drop=True), model, after, config)
     notes = [[] for _ in range(len(table))]
@@ -183,7 +189,7 @@ def _check_values(table: pd.DataFrame, after: Model, model: dict, notes: list) -
             for k in np.flatnonzero(~np.isfinite(table[name].to_numpy())):
                 notes[k].append(f"{name} must be a number")
         elif isinstance(tested, list):
-            table[name] = table[name].astype(str)
+            table[name] = table[name].astype(object).where(table[name].notna(), NO_VALUE).astype(str)
             for k in np.flatnonzero(~table[name].isin(tested).to_numpy()):
                 notes[k].append(f"{name} must be one of {', '.join(tested)}")
 

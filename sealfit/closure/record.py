@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pandas as pd
 
 from sealfit.closure.intervals import degrees_of_freedom
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
+from sealfit.effects.contract import Effect
 from sealfit.effects.free import FREE, free_effect
 from sealfit.fit.declared import QUANTITIES, Declared, JointParameter
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term
+from sealfit.own_effects import needed
 
 
 def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
@@ -21,7 +25,7 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
     rows = after.rows
     return {
         "schema": 1,
-        "config": config.model_dump(mode="json"),
+        "config": _without_effects(config).model_dump(mode="json"),
         "conditions": rows.conditions.to_dict(orient="list"),
         "has_load": rows.has_load,
         "has_aging": rows.has_aging,
@@ -46,6 +50,11 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
         },
         "ranges": _ranges(rows),
     }
+
+
+def _without_effects(config: Config) -> Config:
+    """Return the config without the folder of the user's own effects: whoever predicts names theirs."""
+    return config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
 
 
 def _model(model: Model) -> dict:
@@ -84,8 +93,21 @@ def _ranges(rows: Rows) -> dict:
     return ranges
 
 
-def from_record(record: dict) -> tuple[Model, Model, pd.DataFrame]:
-    """Return the models before and after and the table of conditions from a record."""
+def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[Model, Model, pd.DataFrame]:
+    """Return the models before and after and the table of conditions from a record.
+
+    Parameters
+    ----------
+    record : dict
+        As `to_record` returned it; nothing in it is run.
+    own : mapping of str to Effect, optional
+        The user's own effects, by id.
+
+    Raises
+    ------
+    RequestError
+        If the model has an effect that is neither in the catalogue nor in `own`.
+    """
     raw = record["declared"]
     declared = Declared(
         tuple(JointParameter(*p) for p in raw["parameters"]),
@@ -95,14 +117,10 @@ def from_record(record: dict) -> tuple[Model, Model, pd.DataFrame]:
         raw["stribeck"],
         raw["law"],
     )
-    effects = dict(EFFECTS)
-    folder = record["config"]["loop"]["effects_folder"]
-    if folder is not None:
-        from pathlib import Path
-
-        from sealfit.effects.user import load_user_effects
-
-        effects |= load_user_effects(Path(folder))
+    effects = {**EFFECTS, **(own or {})}
+    ids = {term["id"] for stage in ("before", "after") for term in record[stage]["terms"]}
+    if unknown := sorted(ids - effects.keys() - FREE.keys()):
+        raise needed("the model holds", unknown)
     models = []
     for stage in ("before", "after"):
         model = Model(declared, np.array(record[stage]["theta"], dtype=float))

@@ -66,7 +66,7 @@ def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
     table = {
         FORCE: np.where(peak > 0.0, peak, np.nan),
         RATIO: np.divide(peak, line, out=np.full(len(of), np.nan), where=(peak > 0.0) & (line > 0.0)),
-        SLIDING: lines.force,
+        SLIDING: np.where(lines.force > 0.0, lines.force, np.nan),
         TOP: mean[each, whole] - sliding[each, whole],
         NOISE: np.hypot(error, 1 / np.sqrt(np.maximum(hits[each, whole] * per_cell, 1.0))),
         PLACES: np.maximum(count / (2 * half + 1), 1.0)[of],

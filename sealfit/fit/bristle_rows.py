@@ -12,6 +12,7 @@ from sealfit.fit.steady import parameter_units, table_row
 from sealfit.fit.stiffness import Stiffness
 
 NO_START = "no stroke begins at rest or at a reversal within its rows: the rise of the force is not in these traces"
+ALONG = "the sliding force of some strokes lies along the motion: check the offset between the directions, and the sign"
 TOO_FAST = "the force comes up within a few samples: sample faster, or start more slowly"
 MISSED = "the force does not come up as the model's does: {share:.0%} of the sliding force is left"
 NO_CURVE = "the Stribeck curve is not known: what it does along the ramp looks like damping"
@@ -19,7 +20,7 @@ ONE_START = "one start alone: no scatter is known; measure repeats"
 WIDE = "the starts disagree: only that it lies between {low:.3g} and {high:.3g} {unit} is known"
 
 
-def bristle_rows(found: Stiffness | None, curve: Curve, config: Config) -> Iterator[dict]:
+def bristle_rows(found: Stiffness | None, curve: Curve, config: Config, *, braked: bool = True) -> Iterator[dict]:
     """Yield rows of table `dynamic_fit` for one condition: sigma_0, sigma_1 and what the fit rests on.
 
     Parameters
@@ -30,10 +31,12 @@ def bristle_rows(found: Stiffness | None, curve: Curve, config: Config) -> Itera
         That the strokes were fitted with.
     config : Config
         Gives the units and the sensor's accuracy.
+    braked : bool
+        Whether the sliding force of every stroke opposes the motion.
     """
     units = dynamic_units(config)
     if found is None or not found.seen:
-        reason = NO_START if found is None else TOO_FAST
+        reason = TOO_FAST if found is not None else NO_START if braked else ALONG
         for name in ("sigma_0", "sigma_1"):
             yield table_row(quantity="dynamic", parameter=name, unit=units[name], identified=False, reason=reason)
         return

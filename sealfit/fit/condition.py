@@ -196,6 +196,9 @@ def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
         verdict = {n: (ok, why or "no repeats and no spare run: no interval.") for n, (ok, why) in verdict.items()}
     if "sigma_2" in condition.names and condition.values[condition.names.index("sigma_2")] == 0.0:
         verdict["sigma_2"] = (verdict["sigma_2"][0], "at its physical limit 0: friction does not rise with speed here.")
+    for name in ("mu_s", "mu_c"):
+        if name in condition.names and condition.values[condition.names.index(name)] == 0.0:
+            verdict[name] = (False, "at its physical limit 0: these runs show no friction that it could be.")
     against = int((condition.runs["force"] < 0).sum())
     if against:
         told = f"{against} runs have a force along the motion: check the sign of force or displacement."

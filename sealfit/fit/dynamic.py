@@ -161,9 +161,10 @@ def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
         rows = rows[np.argsort(strokes.group[rows], kind="stable")]
         own, whole = ([parts[row] for row in rows.tolist() if row in parts] for parts in (starts, wholes))
         curve = _curve(fitted.get(name, {}), strokes, rows)
-        found = fit_stiffness(_evidence(own, strokes, run, curve), curve)
+        braked = _against_motion(own, strokes)
+        found = fit_stiffness(_evidence(own, strokes, run, curve), curve) if braked else None
         models = found.forces_N if found is not None and found.seen else None
-        fit = [{"condition": name, **row} for row in bristle_rows(found, curve, config)]
+        fit = [{"condition": name, **row} for row in bristle_rows(found, curve, config, braked=braked)]
         begun = _Grouped(own, strokes) if own else None
         made.append(
             _Found(
@@ -210,6 +211,14 @@ def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
     table = table.reindex(columns=["chi2", "df"]).dropna()
     df = float(table["df"].sum())
     return (float(table["chi2"].sum()) / df, df) if df > 0 else (1.0, 1.0)
+
+
+def _against_motion(starts: Sequence[Start], strokes: _Strokes) -> bool:
+    """Whether the sliding force of every start opposes the motion, as a bristle's does.
+
+    An offset between the directions, or a wrong sign, can turn it round; bristles then have no force to come up to.
+    """
+    return all(strokes.size_N[start.row] > 0 for start in starts)
 
 
 def _evidence(starts: Sequence[Start], strokes: _Strokes, run: np.ndarray, curve: Curve) -> list[Stroke]:

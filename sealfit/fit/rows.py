@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.fit.groups import Groups
+from sealfit.ingest.incomplete import LEAST_KNOWN, NO_VALUE
 from sealfit.tables import BINS
 
 LEVELS = ("stroke", "file", "run", "specimen")
@@ -55,6 +56,7 @@ class Rows:
     has_load: bool
     has_aging: bool
     weight: np.ndarray  # (n,) sums to 1; each file weighs the same
+    filled: dict[str, np.ndarray] = field(default_factory=dict)  # channels that some files lack: `fill_missing`
     cache: dict = field(default_factory=dict, compare=False, repr=False)  # arrays derived from the table, once
 
     @property
@@ -63,13 +65,15 @@ class Rows:
         return [name for name in self.table.columns if name not in NOT_CHANNELS]
 
     def values(self, channel: str) -> np.ndarray:
-        """Return one channel as floats, or as strings if it is a category."""
+        """Return one channel as floats, or as strings if it is a category; with what stands for missing values."""
+        if channel in self.filled:
+            return self.filled[channel]
         if channel not in self.cache:
             column = self.table[channel]
             if pd.api.types.is_numeric_dtype(column):
                 self.cache[channel] = column.to_numpy(dtype=float, na_value=np.nan)
             else:
-                self.cache[channel] = column.astype(str).to_numpy(dtype=str)
+                self.cache[channel] = column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
         return self.cache[channel]
 
     def bin_width(self, channel: str) -> np.ndarray:
@@ -123,6 +127,7 @@ class Rows:
             days=self.days[mask],
             condition=self.condition[mask],
             weight=weight / weight.sum(),
+            filled={name: values[mask] for name, values in self.filled.items()},
             cache={
                 name: values[mask] for name, values in self.cache.items() if isinstance(name, str) or name[0] == "width"
             },
@@ -189,7 +194,39 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
         has_load=has_load,
         has_aging=has_aging,
         weight=1.0 / per_file / (files.max() + 1),
+        filled=fill_missing(table, groups),
     )
+
+
+def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
+    """Return the campaign's own numeric channels that a few files lack, each with its missing values filled in.
+
+    A missing value is that of its stroke, file, run or specimen, the first of them that has any (the mean, where they
+    differ), else the mean of all files. So a channel stays constant wherever it was, and files without a value say
+    next to nothing of a slope along it. Channels that too many files lack are not in it.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Rows of `bins`, sorted.
+    groups : Groups
+        Of these rows.
+    """
+    found, files = {}, groups.starts["file"].size
+    for name in open_columns(table):
+        if not pd.api.types.is_numeric_dtype(table[name]):
+            continue
+        column = pd.Series(table[name].to_numpy(dtype=float, na_value=np.nan))
+        per_file = column.groupby(groups.codes["file"]).mean()
+        if not column.isna().any() or per_file.notna().sum() < LEAST_KNOWN * files:
+            continue
+        values = column
+        for level in LEVELS:
+            known = column.groupby(groups.codes[level])
+            low, high = known.transform("min"), known.transform("max")
+            values = values.fillna(low.where(low == high, known.transform("mean")))
+        found[name] = values.fillna(per_file.mean()).to_numpy()
+    return found
 
 
 def sliding_power(load: np.ndarray | pd.Series, speed: np.ndarray | pd.Series) -> np.ndarray | pd.Series:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import nnls
 
 from sealfit.fit.declared import declare
 from sealfit.fit.reml import reml
 from sealfit.fit.rows import LEVELS, Rows
 from sealfit.fit.tangent import Tangent
 from sealfit.fit.whitening import Component, Scatter
+from sealfit.ingest.scatter import two_nonnegative
 
 LEAST_NOISE = 1e-6  # of the force: below what any sensor resolves; keeps noise-free data from weights without end
 LEAST_FILES = 6  # from which files can be compared in shape
@@ -129,16 +129,12 @@ def row_noise(rows: Rows, residual: np.ndarray, force: np.ndarray) -> tuple[floa
         return max(float(np.std(residual)), 1e-9), 0.0, 1.0
     variance = np.add.reduceat(inside**2, start)[long] / (count[long] - 1)
     floor = (LEAST_NOISE * float(np.sqrt(np.mean(force**2)))) ** 2 + 1e-300
-    columns = np.column_stack([np.ones(long.sum()), size[long] ** 2])
-    weight = np.sqrt(count[long])
+    square = size[long] ** 2
     guess = np.full(long.sum(), float(np.mean(variance)) + floor)
     for _ in range(4):
-        scaled = columns / guess[:, None] * weight[:, None]
-        norm = np.linalg.norm(scaled, axis=0) + 1e-300
-        answer, _ = nnls(scaled / norm, (variance + floor) / guess * weight)
-        answer = answer / norm
-        guess = np.maximum(columns @ answer, floor)
-    return float(np.sqrt(max(answer[0], floor))), float(np.sqrt(answer[1])), _inflation(inside, code, start, count)
+        a, b = two_nonnegative(square, variance + floor, count[long] / guess**2)
+        guess = np.maximum(a + b * square, floor)
+    return float(np.sqrt(max(a, floor))), float(np.sqrt(b)), _inflation(inside, code, start, count)
 
 
 def _inflation(inside: np.ndarray, code: np.ndarray, start: np.ndarray, count: np.ndarray) -> float:

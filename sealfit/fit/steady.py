@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,7 +15,14 @@ from sealfit.engine import run_map
 from sealfit.fit.both_ways import both_ways_together
 from sealfit.fit.condition import FULL, Condition, bound, drop_flat_curve, judge, make_condition, solve
 from sealfit.fit.stribeck import NAMES, linearised
-from sealfit.fit.uncertainty import UnitVariance, likelier, run_means, run_weights, unit_variance
+from sealfit.fit.uncertainty import (
+    UnitVariance,
+    likelier,
+    proportional_weights,
+    run_means,
+    run_weights,
+    unit_variance,
+)
 from sealfit.ingest.scatter import Scatter, repeat_scatter
 from sealfit.tables import STEADY_FIT
 from sealfit.units import Units
@@ -88,10 +96,9 @@ def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, Un
     """
     runs = run_means(steady)
     scatter = repeat_scatter(both_ways_together(steady[steady["used"].to_numpy(bool)]))
-    choices = run_weights(runs, scatter)
-    solved = [_solved(runs.assign(weight=weight)) for weight in choices]
-    chi2 = [sum(c.chi2 for c in conditions) for conditions in solved]
-    conditions = solved[likelier(chi2, choices, sum(c.df for c in solved[0])) if len(solved) > 1 else 0]
+    conditions = _solved(runs.assign(weight=run_weights(runs, scatter)))
+    if not scatter.df > 0:
+        conditions = _likelier_weighted(conditions)
     first = _unit_variance(conditions, scatter)
     for condition, value, df in zip(conditions, first.value, first.df, strict=True):
         if condition.model == FULL:
@@ -103,6 +110,20 @@ def _solved(runs: pd.DataFrame) -> list[Condition]:
     conditions = [make_condition(name, rows) for name, rows in runs.groupby("condition", sort=True)]
     solve(conditions)
     return conditions
+
+
+def _likelier_weighted(even: list[Condition]) -> list[Condition]:
+    """Return the conditions with even weights or with those of a scatter in proportion to friction, the likelier.
+
+    Without repeats only the shape of the scatter can be guessed, and the residuals say which they bear out.
+    """
+    sizes = np.cumsum([len(c.runs) for c in even])[:-1]
+    weight = proportional_weights(np.concatenate([c.model_force() for c in even]))
+    other = [replace(c, runs=c.runs.assign(weight=w)) for c, w in zip(even, np.split(weight, sizes), strict=True)]
+    solve(other)
+    chi2 = [sum(c.chi2 for c in conditions) for conditions in (even, other)]
+    chosen = likelier(chi2, [np.ones(weight.size), weight], sum(c.df for c in even))
+    return (even, other)[chosen]
 
 
 def _unit_variance(conditions: list[Condition], scatter: Scatter) -> UnitVariance:
@@ -147,7 +168,9 @@ def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter
             j = condition.names.index(name)
             low, high = (None, None) if condition.low is None else (condition.low[j], condition.high[j])
             open_below = name == "v_s" and low == 0.0
-            row |= {"value": condition.values[j], "se": _finite(np.sqrt(covariance[j, j])), "u_sys": abs(shift[j])}
+            stuck = name in ("mu_s", "mu_c") and condition.values[j] == 0.0  # at its limit: not known with error zero
+            se = None if stuck else _finite(np.sqrt(covariance[j, j]))
+            row |= {"value": condition.values[j], "se": se, "u_sys": abs(shift[j])}
             row |= {"lo95": None if open_below else _finite(low), "hi95": _finite(high)}
         yield table_row(**row)
     residual = force - condition.model_force()

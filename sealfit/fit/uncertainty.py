@@ -81,17 +81,26 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     return runs
 
 
-def run_weights(runs: pd.DataFrame, scatter: Scatter) -> list[np.ndarray]:
-    """Return 1/variance of each run mean, shape (n,): one choice with repeats, two without.
-
-    With repeats it follows from their pooled scatter. Without, only its shape can be guessed, the same everywhere or in
-    proportion to the force squared, and `likelier` says which the residuals bear out.
-    """
-    force = runs["force"].abs().to_numpy(float)
+def run_weights(runs: pd.DataFrame, scatter: Scatter) -> np.ndarray:
+    """Return 1/variance of each run mean, shape (n,), from the pooled scatter of repeats; without repeats 1."""
     if not scatter.df > 0:
-        return [np.ones(len(runs)), 1.0 / np.maximum(force, SMALLEST_SHARE * force.max() or 1.0) ** 2]
+        return np.ones(len(runs))
+    force = runs["force"].abs().to_numpy(float)
     floor = SMALLEST_SD * float(force.max()) or 1.0
-    return [runs["files"].to_numpy(float) / np.maximum(scatter.sd_N(force), floor) ** 2]
+    return runs["files"].to_numpy(float) / np.maximum(scatter.sd_N(force), floor) ** 2
+
+
+def proportional_weights(fitted_N: np.ndarray) -> np.ndarray:
+    """Return 1/variance of run means whose scatter is in proportion to the friction, shape (n,), up to a factor.
+
+    Parameters
+    ----------
+    fitted_N : ndarray, shape (n,)
+        Friction of every run by a fit with even weights. A run's own force will not do: its error would
+        set its weight, and where an offset leaves the force of one direction near zero, that run would decide alone.
+    """
+    size = np.abs(fitted_N)
+    return 1.0 / np.maximum(size, SMALLEST_SHARE * size.max(initial=0.0) or 1.0) ** 2
 
 
 def likelier(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float) -> int:

@@ -17,6 +17,7 @@ from sealfit.config import Config
 from sealfit.engine import run_map
 from sealfit.errors import CampaignError, Fault
 from sealfit.fingerprint import Fingerprints
+from sealfit.ingest.incomplete import incomplete_columns
 from sealfit.ingest.inputs import inputs_table
 from sealfit.ingest.part import SAMPLED, Asked
 from sealfit.ingest.parts import plan_parts
@@ -117,6 +118,7 @@ def ingest_campaign(
         raise CampaignError(_nothing_left(faults, len(listing)))
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
+    faults += incomplete_columns(steady)
     strokes = strokes.assign(used=_still_used(strokes, steady))
     parts = make.settled(parts, _ruled_out(plan, strokes, files))
     used = np.zeros(len(listing), bool)

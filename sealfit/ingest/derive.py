@@ -20,6 +20,7 @@ from sealfit.errors import Fault
 from sealfit.ingest.coded import Coded, Columns, nothing
 from sealfit.ingest.runs_csv import Entries, Entry
 
+SETTING = 0.005  # commanded speeds and loads closer than this share are one setting; a plate or a step is more
 SAME_SPEED = 0.05  # measured speeds closer than this share are one commanded speed; rigs repeat within a few percent
 
 
@@ -50,6 +51,33 @@ def condition_keys(columns: Columns, files: int, config: Config) -> Coded:
 
 def _text(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:g}"
+
+
+def as_set(columns: Columns) -> Columns:
+    """Return the columns with commanded speeds and loads that differ by rounding only taken as one setting.
+
+    Values within `SETTING` of the smallest of them become the one that most files have. A controller's readback, or a
+    change of units, leaves such differences, and runs must not fall apart over them.
+    """
+    return columns | {name: _one_setting(columns[name]) for name in ("speed_mm_s", "load_N") if name in columns}
+
+
+def _one_setting(column: Coded) -> Coded:
+    values = column.values
+    count = np.bincount(column.codes[column.known], minlength=len(values))
+    order = sorted(
+        (k for k in range(len(values)) if math.isfinite(values[k])), key=lambda k: (abs(values[k]), values[k])
+    )
+    groups: list[list[int]] = []
+    for sign in (1.0, -1.0):
+        start = None
+        for k in (k for k in order if math.copysign(1.0, values[k]) == sign):
+            if start is None or abs(values[k]) > abs(values[start]) * (1 + SETTING):
+                start = k
+                groups.append([])
+            groups[-1].append(k)
+    usual = {values[k]: values[max(group, key=lambda k: count[k])] for group in groups for k in group}
+    return column.map(lambda value: usual.get(value, value))
 
 
 def add_order(entries: Entries, columns: Columns) -> tuple[Columns, list[Fault]]:

@@ -24,6 +24,7 @@ from sealfit.ingest.derive import (
     add_repeats,
     add_runs,
     add_specimens,
+    as_set,
     condition_keys,
     disagreements,
 )
@@ -78,6 +79,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     columns, found = add_order(entries, columns)
     faults += found
     _stop_at_errors(faults)
+    columns = as_set(columns)
     conditions = condition_keys(columns, len(entries), config)
     columns, found = add_runs(columns, conditions, measured, config.units.unit("speed"))
     faults += found

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+ALIKE = 1e-12  # (spread of x)^2 over (its size)^2 below which a constant and x cannot be told apart
 PATTERN_RUNS = 3  # fewer runs cannot tell a common pattern of their repeats from the scatter itself
 
 
@@ -191,7 +192,7 @@ def _variance(
     a = b = 0.0
     for _ in range(50):
         before = expected
-        a, b = _two_nonnegative(force2, variance, df / expected**2)
+        a, b = two_nonnegative(force2, variance, df / expected**2)
         # A run whose own variance is near zero must not take all the weight.
         expected = np.maximum(a + b * force2, 0.01 * pooled)
         if np.abs(expected - before).max() < 1e-6 * pooled:
@@ -201,14 +202,21 @@ def _variance(
     return float(a), float(b), np.linalg.inv(design.T @ (design * weight[:, None]))
 
 
-def _two_nonnegative(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """Return a, b >= 0 of the weighted least squares y = a + b x."""
+def two_nonnegative(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    """Return a, b >= 0 of the weighted least squares y = a + b x, exactly; b = 0 where x does not vary.
+
+    Parameters
+    ----------
+    x, y, weight : ndarray, shape (n,)
+        x >= 0, the values, and 1/variance up to a factor.
+    """
     w, wx, wy, wxx, wxy = weight.sum(), weight @ x, weight @ y, weight @ (x * x), weight @ (x * y)
     determinant = w * wxx - wx * wx
-    if determinant > 0.0:
-        a, b = (wxx * wy - wx * wxy) / determinant, (w * wxy - wx * wy) / determinant
-        if a >= 0.0 and b >= 0.0:
-            return a, b
+    if determinant <= ALIKE * w * wxx:
+        return wy / w, 0.0
+    a, b = (wxx * wy - wx * wxy) / determinant, (w * wxy - wx * wy) / determinant
+    if a >= 0.0 and b >= 0.0:
+        return a, b
     only_a, only_b = wy / w, wxy / wxx
     loss = [((y - only_a) ** 2 * weight).sum(), ((y - only_b * x) ** 2 * weight).sum()]
     return (only_a, 0.0) if loss[0] <= loss[1] else (0.0, only_b)

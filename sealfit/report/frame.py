@@ -94,10 +94,11 @@ class Words:
     """Writes in the size and colour that the current look has for labels of "xtick" or "axes"."""
 
     def __init__(self, of: str, renderer: RendererBase):
-        self.points = float(mpl.rcParams[f"{of}.labelsize"])
-        self._font = FontProperties(size=self.points)
+        self._font = FontProperties(size=mpl.rcParams[f"{of}.labelsize"])
+        self.points = self._font.get_size_in_points()  # the setting may be a word, as "medium"
         self._renderer, self._gc = renderer, renderer.new_gc()
-        self._gc.set_foreground(mpl.rcParams[f"{of}.labelcolor"])
+        colour = mpl.rcParams[f"{of}.labelcolor"]
+        self._gc.set_foreground(mpl.rcParams[f"{of}.color"] if colour == "inherit" else colour)
 
     def width(self, text: str) -> float:
         """Return the width of a text in pixels."""

@@ -105,8 +105,10 @@ class Plot:
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Draw in the report's look; the caller's settings are as before afterwards."""
-    with mpl.rc_context(RC):
+    """Draw in the report's look, whatever a matplotlibrc says; the caller's settings are as before afterwards."""
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(RC)
         yield
 
 

@@ -160,6 +160,17 @@ def test_traces_that_begin_in_steady_sliding_say_so(tmp_path):
     assert found.curves.empty
 
 
+def test_a_sliding_force_along_the_motion_is_said(tmp_path):
+    design = {"directions": (1, -1), "strokes_per_file": 4, "max_rows": 2000, "speeds_mm_s": (5.0,), "repeats": 2}
+    tables, _ = made(tmp_path, **design)
+    shifted = {name: tables[name].assign(force_N=tables[name]["force_N"] + 60.0) for name in ("traces", "steady")}
+    config = load_config()
+    fit = fit_dynamic(shifted["traces"], shifted["steady"], fit_conditions(shifted["steady"], config), config).fit
+    found = dynamic(fit)
+    assert not found["identified"].any()
+    assert found["reason"].str.contains("lies along the motion: check the offset between the directions").all()
+
+
 def test_a_ramp_of_another_shape_is_followed_by_its_own_speed(tmp_path):
     tables, _ = made(tmp_path)
     traces = tables["traces"]

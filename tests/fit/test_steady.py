@@ -268,6 +268,41 @@ def test_without_repeats_the_residuals_say_how_scatter_goes_with_force(campaign,
     npt.assert_allclose(np.sqrt(np.mean(np.square(stated))) / np.std(errors), 1.0, atol=0.34)
 
 
+def one_file_each_way(forces):
+    """Table `steady` of one file a condition, a slow way out and a fast way back, without repeats or loads."""
+    rows = [
+        {
+            "condition": f"c{k}", "series": "", "rubber": "", "run_id": f"c{k}{way:+}", "repeat": 1,
+            "file": f"c{k}.csv", "direction": way, "speed_mm_s": way * speed, "load_N": np.nan, "force_N": way * force,
+            "used": True,
+        }
+        for k, pair in enumerate(forces)
+        for way, speed, force in zip((1, -1), (7.0, 14.0), pair, strict=True)
+    ]  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+@pytest.mark.parametrize("offset", [0.0, 8.0, 11.0, 40.0])
+def test_without_repeats_an_offset_lets_no_direction_decide_alone(offset):
+    table = one_file_each_way([(10 + 0.5 * k + offset, 10 + 0.5 * k - offset) for k in range(7)])
+    fits = fit_conditions(table, Config(condition=["c"]))
+    for k in range(7):
+        row = steady(fits, "F_c", f"c{k}")
+        npt.assert_allclose(row.value, 10 + 0.5 * k)  # half the difference of the two ways
+        assert row.se >= 0.9 * offset / np.sqrt(2)
+        assert row.identified
+
+
+def test_a_coefficient_at_its_limit_is_not_identified_and_has_no_error_of_zero():
+    fits = fit_conditions(one_file_each_way([(-10.0, -9.0), (-11.0, -9.5)]), Config(condition=["c"]))
+    row = steady(fits, "F_c", "c0")
+    assert row.value == 0.0
+    assert np.isnan(row.se)
+    assert not row.identified
+    assert "at its physical limit 0" in row.reason
+    assert "check the sign of force or displacement" in row.reason
+
+
 def test_four_single_runs_are_fitted_exactly_and_trusted_with_nothing(campaign):
     fits = fit_conditions(campaign(repeats=1, speeds=(1, 4, 10, 40), ways=(1,), **UNAGED), Config())
     row = steady(fits, "mu_s")

@@ -98,6 +98,26 @@ def test_named_specimens_and_opposite_speeds_are_runs_of_their_own(tmp_path):
     assert found["c.csv"]["speed_set_mm_s"] == 5.0
 
 
+def test_settings_that_differ_by_rounding_are_one(tmp_path):
+    table = FULL.replace("4,49.03,5,2024-03-01T10", "4,49.030001,5.0000004,2024-03-01T10").replace(
+        "8,49.03,5,", "8,49.05,-5.001,"
+    )
+    refs, found = list_traces(campaign(tmp_path, table), config())
+    assert found == []
+    assert [ref.channels["load_N"] for ref in refs] == [49.03] * 3
+    assert [ref.channels["speed_set_mm_s"] for ref in refs][:2] == [5.0, 5.0]
+    refs, _ = list_traces(campaign(tmp_path, FULL.replace("8,49.03,5,", "8,49.5,5.05,")), config())
+    assert refs[2].channels["load_N"] == 49.5
+    assert refs[2].channels["speed_set_mm_s"] == 5.05
+
+
+def test_without_run_id_settings_that_differ_by_rounding_are_one_run(tmp_path):
+    table = "file,temperature_C,compression_ratio_pct,aging_days,speed_mm_s\na.csv,60,80,4,5\nb.csv,60,80,4,5.00001\n"
+    refs, _ = list_traces(campaign(tmp_path, table), config())
+    assert len({ref.channels["run_id"] for ref in refs}) == 1
+    assert sorted(ref.channels["repeat"] for ref in refs) == [1, 2]
+
+
 def test_repeats_follow_the_clock_and_fill_gaps(tmp_path):
     head = "file,run_id,aging_days,started_at,repeat\n"
     clock = head + "a.csv,r,4,2024-03-01 12:00,\nb.csv,r,4,2024-03-01T11:00Z,\nc.csv,r,4,2024-03-01T10:00,"

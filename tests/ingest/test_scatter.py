@@ -2,9 +2,10 @@ import numpy as np
 import numpy.testing as npt
 import pandas as pd
 import pytest
+from scipy.optimize import nnls
 
 from sealfit.ingest.outlying import outlying_repeats
-from sealfit.ingest.scatter import repeat_means, repeat_scatter
+from sealfit.ingest.scatter import repeat_means, repeat_scatter, two_nonnegative
 
 S0, G = 0.1, 0.01
 
@@ -108,6 +109,24 @@ def test_of_two_repeats_that_disagree_neither_is_singled_out():
     found = outlying_repeats(means, 0.001)
     assert found["file"].tolist() == ["0/0", "0/1"]
     assert found["alone"].all()
+
+
+@pytest.mark.parametrize("spread", [0.0, 1e-15, 1e-12, 1e-9, 1e-3, 0.5])
+def test_two_coefficients_that_are_not_negative(spread):
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        size = 40.0 * (1 + spread * rng.standard_normal(9))
+        y, weight = rng.chisquare(10, 9), rng.uniform(0.5, 2.0, 9)
+        a, b = two_nonnegative(size**2, y, weight)
+        assert a >= 0
+        assert b >= 0
+        rss = float(weight @ (y - a - b * size**2) ** 2)
+        # No worse than a constant, nor than what a general solver finds, which refuses columns that are alike.
+        assert rss <= float(weight @ (y - weight @ y / weight.sum()) ** 2) * (1 + 1e-9)
+        if spread >= 1e-3:
+            root = np.sqrt(weight)
+            columns = np.column_stack([np.ones(9), size**2 / 1600]) * root[:, None]
+            assert rss == pytest.approx(nnls(columns, y * root)[1] ** 2, rel=1e-6)
 
 
 def test_repeats_equal_to_the_last_digit_are_answered():

@@ -1,0 +1,466 @@
+"""Whether claims hang on what does not matter: campaigns changed in ways that change nothing, and analysed again.
+
+    python benchmarks/invariances.py --list
+    python benchmarks/invariances.py --out out/invariances.jsonl [--campaigns ripple drift] [--changes jitter_time_1e-6]
+
+A campaign is changed (measured numbers jittered by 1e-6 to 1e-3 of themselves, files renamed and shuffled, other units
+and signs through the config, idle columns, another seed, ...) and analysed again. Verdict and effects (id, channels,
+acts_on, operation) must stay, and numbers move by at most a tenth of a standard error, after conversion of units. The
+table says, per campaign and change, what moved. Pairs that are in the file already are not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from campaigns import RIG
+from effect_kinds import COLUMN, EFFECT_CAMPAIGNS
+from measured import emps_plateaus, kidney_plain, measured
+
+from sealfit.closure.loop import close_loop
+from sealfit.config import parse_config
+from sealfit.ingest.campaign import ingest_campaign
+from sealfit.simulate import Spec, simulate
+
+OF_SE = 0.1  # of a standard error, by which a number may move
+STATISTICAL = 0.5  # where the data are not the same: a file, half of a file's rows, or the bins are others
+ROUNDING = 1e-5  # of a number that has no interval
+PREFIXES = {"N": 1.0, "mN": 1e-3, "mm": 1e-3, "m": 1.0, "s": 1.0, "ms": 1e-3}
+
+# ---------------------------------------------------------------- campaigns
+SPEEDS = (0.5, 2.0, 5.0, 15.0, 50.0)
+ONE_WAY = {"temperatures_C": (60.0,), "days": (2.0, 16.0), "speeds_mm_s": SPEEDS, "start_scatter_mm": 4.0}
+BOTH_WAYS = {**ONE_WAY, "days": (4.0,), "directions": (1, -1)}
+AGED = {**ONE_WAY, "days": (1.0, 2.0, 4.0, 8.0, 16.0, 32.0), "temperatures_C": (60.0, 80.0), "repeats": 2}
+ROWS = 120
+NULLS = {
+    "null_white": ({"kind": "white", "sd_N": 0.2},),
+    "null_rig": RIG,
+    "null_setup": ({"kind": "run_setup", "sd_rel": 0.01, "sd_N": 0.1}, {"kind": "white", "sd_N": 0.05}),
+}
+MANY_RUNS = {**ONE_WAY, "days": (4.0,), "speeds_mm_s": tuple(np.geomspace(0.5, 50.0, 16).round(2)), "repeats": 2}
+SHORT = {**ONE_WAY, "days": (), "repeats": 2}  # ten files
+DESIGNS = {
+    "column": MANY_RUNS,
+    "batch": MANY_RUNS,
+    "stribeck_exponent": MANY_RUNS,
+    "zero_offset": BOTH_WAYS,
+    "short": SHORT,
+    "aging_induction": {**AGED, "speeds_mm_s": (0.5, 5.0, 50.0)},
+}
+STRENGTH = 10.0  # strong, as campaigns.py has it
+KINDS = {
+    "ripple": "ripple",
+    "warming": "warming_distance",
+    "zero_offset": "zero_offset",
+    "short": "ripple",
+    "drift": "drift",
+    "conditioning": "conditioning",
+    "column": "column_linear_mu",
+    "batch": "column_category_mu",
+    "aging_induction": "aging_induction",
+}
+EXPONENT = {
+    "id": "stribeck_exponent",
+    "parameters": {"A": 0.3, "v_s": 5.0, "n": 0.8},
+    "acts_on": "mu",
+    "operation": "add",
+}
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign in memory: runs.csv and its traces by file name, and the config as TOML."""
+
+    runs: pd.DataFrame
+    traces: dict[str, pd.DataFrame]
+    config: str
+
+    @classmethod
+    def read(cls, folder: Path, config: str) -> Campaign:
+        """Return the campaign in `folder`."""
+        runs = pd.read_csv(folder / "runs.csv")
+        return cls(runs, {file: pd.read_csv(folder / file) for file in runs["file"]}, config)
+
+    def write(self, folder: Path) -> None:
+        """Write the campaign to `folder`."""
+        for file, trace in self.traces.items():
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            trace.to_csv(folder / file, index=False)
+        self.runs.to_csv(folder / "runs.csv", index=False)
+
+    def each(self, change: Callable[[pd.DataFrame], pd.DataFrame]) -> Campaign:
+        """Return the campaign with every trace changed."""
+        return replace(self, traces={file: change(trace) for file, trace in self.traces.items()})
+
+    def told(self, **sections: Mapping[str, object]) -> Campaign:
+        """Return the campaign with keys of the config set, section by section; "" is the top."""
+        table = tomllib.loads(self.config)
+        for section, keys in sections.items():
+            table[section] = {**table.get(section, {}), **keys}
+        return replace(self, config=toml(table))
+
+
+def names() -> list[str]:
+    """Names of all campaigns; the measured ones where SEALFIT_MEASURED names their folder."""
+    return [*NULLS, *KINDS, "stribeck_exponent", *(("kidney", "emps") if measured() else ())]
+
+
+def campaign(name: str) -> Campaign:
+    """Return a campaign as it is."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "c"
+        if name in ("kidney", "emps"):
+            config = (kidney_plain if name == "kidney" else emps_plateaus)(measured(), made)
+            return Campaign.read(made, config.read_text())
+        simulate(spec(name), made)
+        return Campaign.read(made, "")
+
+
+def spec(name: str) -> Spec:
+    """Return the SPEC of a simulated campaign."""
+    effects, channels, noise = (), (COLUMN,), RIG
+    if name in NULLS:
+        noise = NULLS[name]
+    elif name == "stribeck_exponent":
+        effects = (EXPONENT,)
+    else:
+        effects, own = EFFECT_CAMPAIGNS[KINDS[name]](STRENGTH)
+        channels = own or channels
+    design = {"max_rows": ROWS, **DESIGNS.get(name, ONE_WAY)}
+    return Spec(
+        name=name, seed=7, physics={"growth": {}}, design=design, effects=effects, channels=channels, noise=noise
+    )
+
+
+# ---------------------------------------------------------------- changes that change nothing
+@dataclass(frozen=True)
+class Change:
+    """What is done to a campaign, and how its numbers may be compared with those before."""
+
+    make: Callable[[Campaign, np.random.Generator], Campaign]
+    tolerance: float = OF_SE
+    shift_mm: float = 0.0  # of every position
+    mirrored: bool = False  # directions change places: signs of odd amplitudes, places and phases turn round
+    aliases: Mapping[str, str] = field(default_factory=dict)  # a copy's name -> the column's
+
+
+def jitter(column: str, size: float, *, samples: bool = False) -> Change:
+    """Multiply a measured column by 1 + size z: one z a file (its clock, its scale), or one a sample."""
+
+    def make(given: Campaign, rng: np.random.Generator) -> Campaign:
+        return given.each(
+            lambda trace: trace.assign(
+                **{column: trace[column] * (1 + size * rng.standard_normal(len(trace) if samples else 1))}
+            )
+        )
+
+    return Change(make)
+
+
+def jitter_commanded(size: float) -> Change:
+    """Jitter the commanded speeds, as where they are read from a controller."""
+
+    def make(given: Campaign, rng: np.random.Generator) -> Campaign:
+        if "speed_mm_s" not in given.runs:
+            return given
+        factor = 1 + size * rng.standard_normal(len(given.runs))
+        return replace(given, runs=given.runs.assign(speed_mm_s=given.runs["speed_mm_s"] * factor))
+
+    return Change(make)
+
+
+def renamed(given: Campaign, rng: np.random.Generator) -> Campaign:
+    """Give files names without meaning, in another order."""
+    number = rng.permutation(len(given.runs))
+    new = {file: f"trace_{k:04d}.csv" for file, k in zip(given.runs["file"], number, strict=True)}
+    runs = given.runs.assign(file=given.runs["file"].map(new))
+    return replace(given, runs=runs, traces={new[file]: trace for file, trace in given.traces.items()})
+
+
+def shuffled(given: Campaign, rng: np.random.Generator) -> Campaign:
+    """Shuffle the rows of runs.csv; repeats that are numbered by their place keep their numbers."""
+    return replace(given, runs=given.runs.iloc[rng.permutation(len(given.runs))].reset_index(drop=True))
+
+
+def units(force: float = 1.0, length: float = 1.0, clock: float = 1.0) -> Change:
+    """Write the files in mN, m or ms and say so in the config; its own numbers in these units follow."""
+    names = {
+        "force": "mN" if force != 1 else "N",
+        "length": "m" if length != 1 else "mm",
+        "time": "ms" if clock != 1 else "s",
+    }
+    slots = {
+        "force": {"quantity": "friction force", "unit": names["force"]},
+        "load": {"quantity": "normal load", "unit": names["force"]},
+        "displacement": {"quantity": "displacement", "unit": names["length"]},
+        "speed": {"quantity": "speed", "unit": f"{names['length']}/{names['time']}"},
+        "time": {"quantity": "time", "unit": names["time"]},
+    }
+    factors = {"force_N": force, "displacement_mm": length, "time_s": clock, "load_N": force}
+    factors["speed_mm_s"] = length / clock
+
+    def scaled(table: pd.DataFrame) -> pd.DataFrame:
+        return table.assign(**{name: table[name] * by for name, by in factors.items() if name in table})
+
+    def make(given: Campaign, rng: np.random.Generator) -> Campaign:
+        made = replace(given.each(scaled), runs=scaled(given.runs))
+        return made.told(quantities=slots, sensor={"accuracy": 0.2 * force})
+
+    return Change(make)
+
+
+def turned(column: str) -> Change:
+    """Write a column with the other sign, which the config turns round again."""
+
+    def make(given: Campaign, rng: np.random.Generator) -> Campaign:
+        slots = [name for name in ("time_s", "displacement_mm", "force_N") if name != column]
+        trace = {
+            "columns": {**{name: name for name in slots}, "raw": "raw"},
+            "compute": {column: "-raw"},
+            "drop_columns": ["raw"],
+        }
+        return given.each(lambda t: t.rename(columns={column: "raw"}).assign(raw=-t[column])).told(trace=trace)
+
+    return Change(make)
+
+
+def mirrored(given: Campaign, rng: np.random.Generator) -> Campaign:
+    """Turn the rig round: what was forward is backward, force and displacement with the other sign."""
+    return given.each(lambda t: t.assign(force_N=-t["force_N"], displacement_mm=-t["displacement_mm"]))
+
+
+def moved(shift_mm: float) -> Change:
+    """Move the zero of the position."""
+
+    def make(given: Campaign, rng: np.random.Generator) -> Campaign:
+        return given.each(lambda t: t.assign(displacement_mm=t["displacement_mm"] + shift_mm))
+
+    return Change(make, shift_mm=shift_mm)
+
+
+def column(values: Callable[[pd.DataFrame, np.random.Generator], object], **aliases: str) -> Change:
+    """Add a column `extra` to runs.csv."""
+    return Change(lambda given, rng: replace(given, runs=given.runs.assign(extra=values(given.runs, rng))), **aliases)
+
+
+def copied(given: Campaign, rng: np.random.Generator) -> Campaign:
+    """Add a copy of the campaign's own column, or of the load."""
+    own = next((name for name in ("oil_ppm", "cleaner", "set_pressure_bar", "load_N") if name in given.runs), None)
+    return given if own is None else replace(given, runs=given.runs.assign(**{f"{own}_again": given.runs[own]}))
+
+
+def halved(given: Campaign, rng: np.random.Generator) -> Campaign:
+    """Keep every second row of one file."""
+    file = given.runs["file"][len(given.runs) // 3]
+    return replace(given, traces={**given.traces, file: given.traces[file].iloc[::2]})
+
+
+def one_left_out(given: Campaign, rng: np.random.Generator) -> Campaign:
+    """Leave one file out."""
+    gone = len(given.runs) // 2
+    traces = {file: trace for file, trace in given.traces.items() if file != given.runs["file"][gone]}
+    return replace(given, runs=given.runs.drop(index=gone).reset_index(drop=True), traces=traces)
+
+
+CHANGES: dict[str, Change] = {
+    **{f"jitter_{what}_{size:.0e}".replace("e-0", "e-"): jitter(name, size)
+       for what, name in (("time", "time_s"), ("position", "displacement_mm")) for size in (1e-6, 1e-4, 1e-3)},
+    "jitter_samples_1e-6": jitter("displacement_mm", 1e-6, samples=True),
+    "jitter_force_1e-6": jitter("force_N", 1e-6, samples=True),
+    "jitter_commanded_1e-6": jitter_commanded(1e-6),
+    "jitter_commanded_1e-3": jitter_commanded(1e-3),
+    "renamed": Change(renamed),
+    "shuffled": Change(shuffled),
+    "mN": units(force=1e3),
+    "metre": units(length=1e-3),
+    "ms": units(clock=1e3),
+    "force_turned": turned("force_N"),
+    "position_turned": turned("displacement_mm"),
+    "mirrored": Change(mirrored, mirrored=True),
+    "moved": moved(137.3),
+    "constant_column": column(lambda runs, rng: 4.0),
+    "idle_column": column(lambda runs, rng: rng.standard_normal(len(runs)).round(4)),
+    "serial_number": column(lambda runs, rng: [f"N{k}" for k in range(len(runs))]),
+    "copied_column": Change(
+        copied, aliases={f"{own}_again": own for own in ("oil_ppm", "cleaner", "set_pressure_bar", "load_N")}
+    ),
+    "half_rate": Change(halved, STATISTICAL),
+    "one_left_out": Change(one_left_out, STATISTICAL),
+    "seed": Change(lambda given, rng: given.told(loop={"seed": 11})),
+    "bins_20": Change(lambda given, rng: given.told(bins={"per_stroke": 20}), STATISTICAL),
+    "bins_80": Change(lambda given, rng: given.told(bins={"per_stroke": 80}), STATISTICAL),
+}  # fmt: skip
+
+
+# ---------------------------------------------------------------- what moved
+def closed(given: Campaign) -> dict:
+    """Return closure.json of a campaign."""
+    config = parse_config(given.config, "invariances")
+    with tempfile.TemporaryDirectory() as folder:
+        given.write(Path(folder))
+        tables = ingest_campaign(Path(folder), config, workers=1).tables
+    return json.loads(json.dumps(close_loop(tables["bins"], tables["traces"], config).document, default=float))
+
+
+def toml(table: Mapping) -> str:
+    """Return a config of plain values as TOML: keys of the top first, tables inline."""
+    return "\n".join(f"{key} = {_inline(value)}" for key, value in table.items()) + "\n"
+
+
+def _inline(value: object) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{json.dumps(k)} = {_inline(v)}" for k, v in value.items()) + "}"
+    return json.dumps(value)
+
+
+def moves(before: dict, after: dict, change: Change) -> list[str]:
+    """Return what differs between two closures beyond what the change allows, in words; none if nothing does."""
+    found = []
+    if before["verdict"] != after["verdict"]:
+        found.append(f"verdict {before['verdict']} -> {after['verdict']}")
+    old, new = ({_key(e, change.aliases): e for e in closure["effects"]} for closure in (before, after))
+    found += [f"lost {_words(key)}" for key in old if key not in new]
+    found += [f"new {_words(key)}" for key in new if key not in old]
+    for key in old.keys() & new.keys():
+        found += _numbers(old[key], new[key], change)
+    return found
+
+
+def _key(effect: dict, aliases: Mapping[str, str]) -> tuple:
+    channels = tuple(sorted(aliases.get(name, name) for name in effect["channels"]))
+    return effect["id"], channels, effect["acts_on"], effect["operation"], effect["candidate"]
+
+
+def _words(key: tuple) -> str:
+    id, channels, acts_on, operation, candidate = key
+    return f"{id}({', '.join(channels)}) {operation} {acts_on}{' candidate' if candidate else ''}"
+
+
+def _numbers(old: dict, new: dict, change: Change) -> list[str]:
+    if not old["named"] or not new["named"]:
+        return [] if old["named"] == new["named"] else [f"{old['id']} named {old['named']} -> {new['named']}"]
+    found = []
+    values = {p["name"]: p for p in old["parameters"]}
+    if values.keys() != {p["name"] for p in new["parameters"]}:
+        return [f"{old['id']}: other parameters"]
+    for p in new["parameters"]:
+        was = values[p["name"]]
+        if None in (p["value"], was["value"], was["ci95"][0], was["ci95"][1]):
+            continue
+        unit, own = factor(was["unit"]), factor(p["unit"])
+        a, b, se = was["value"] * unit, p["value"] * own, (was["ci95"][1] - was["ci95"][0]) / 3.92 * unit
+        apart = _apart(p["name"], a, b, old, change, values)
+        if apart > change.tolerance * se + ROUNDING * abs(a):
+            found.append(f"{old['id']} {p['name']} by {apart / max(se, 1e-300):.2g} se")
+    return found
+
+
+def _apart(name: str, a: float, b: float, effect: dict, change: Change, values: dict) -> float:
+    """Return how far two values of a parameter are apart, in base units, after what the change does to it."""
+    on_position = "displacement_mm" in effect["channels"]
+    if name == "phi":
+        expected = a
+        if on_position and change.shift_mm:
+            expected = a - 2 * np.pi * change.shift_mm / values["lambda"]["value"]
+        return 0.0 if change.mirrored else abs((b - expected + np.pi) % (2 * np.pi) - np.pi)
+    if on_position and name.startswith("x_"):
+        return 0.0 if change.mirrored else abs(b - a - change.shift_mm * 1e-3)
+    return abs(abs(b) - abs(a)) if change.mirrored else abs(b - a)
+
+
+def factor(unit: str) -> float:
+    """Return how many of the base units (N, m, s) a unit is; what is none of these counts as 1."""
+    text = re.sub(r"[A-Za-z%]+", lambda word: repr(PREFIXES.get(word[0], 1.0)), unit.replace("^", "**"))
+    text = re.sub(r"[^0-9.e+\-*/() ]", "", text).strip()
+    text = re.sub(r"(?<=[0-9.)])\s+(?=[0-9(])", "*", text)
+    return float(eval(text, {"__builtins__": {}})) if text else 1.0  # digits and operators only
+
+
+# ---------------------------------------------------------------- the table
+def main(arguments: list[str] | None = None) -> int:
+    """Run what is asked for, print the table, and return 1 if anything moved."""
+    parser = argparse.ArgumentParser(description="Close the loop again on campaigns changed in what does not matter.")
+    parser.add_argument("--list", action="store_true", help="print campaigns and changes")
+    parser.add_argument("--campaigns", nargs="+", choices=names(), default=names(), metavar="NAME")
+    parser.add_argument("--changes", nargs="+", choices=list(CHANGES), default=list(CHANGES), metavar="NAME")
+    parser.add_argument("--out", type=Path, default=Path("out/invariances.jsonl"), metavar="JSONL")
+    given = parser.parse_args(arguments)
+    if given.list:
+        print("campaigns:", *names(), "\nchanges:", *CHANGES)
+        return 0
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    done = _read(given.out)
+    with given.out.open("a") as file:
+        for name in given.campaigns:
+            wanted = [change for change in ("as it is", *given.changes) if (name, change) not in done]
+            made = campaign(name) if wanted else None
+            for number, change in enumerate(wanted):
+                row = _run(name, change, made, done)
+                done[name, change] = row
+                print(json.dumps(row), file=file, flush=True)
+                said = f"{name}: {number + 1} of {len(wanted)}, {change}: {row.get('error') or 'done'}"
+                print(f"{said} ({row['seconds']} s)", file=sys.stderr)
+    moved = table(done, given.campaigns, given.changes)
+    print("\n".join(moved.lines))
+    return int(moved.count > 0)
+
+
+def _read(path: Path) -> dict[tuple[str, str], dict]:
+    lines = path.read_text().splitlines() if path.is_file() else []
+    return {(row["campaign"], row["change"]): row for row in map(json.loads, lines)}
+
+
+def _run(name: str, change: str, made: Campaign, done: Mapping) -> dict:
+    began = time.monotonic()
+    row = {"campaign": name, "change": change}
+    try:
+        rng = np.random.default_rng(5)
+        closure = closed(made if change == "as it is" else CHANGES[change].make(made, rng))
+        row["closure"] = {key: closure[key] for key in ("verdict", "effects", "before", "after")}
+    except Exception as error:  # a campaign that cannot be analysed once changed is a finding
+        row["error"] = f"{type(error).__name__}: {str(error)[:200]}"
+    return {**row, "seconds": round(time.monotonic() - began, 1)}
+
+
+@dataclass(frozen=True)
+class Moved:
+    """The table as lines, and how many pairs moved."""
+
+    lines: list[str]
+    count: int
+
+
+def table(done: Mapping, campaigns: list[str], changes: list[str]) -> Moved:
+    """Return what moved, a line for each pair of campaign and change where anything did."""
+    lines, count, pairs = ["| campaign | change | what moved |", "|---|---|---|"], 0, 0
+    for name in campaigns:
+        base = done.get((name, "as it is"), {})
+        verdict = base.get("closure", {}).get("verdict", base.get("error", "not run"))
+        effects = [_words(_key(e, {})) for e in base.get("closure", {}).get("effects", ())]
+        lines.append(f"| {name} | as it is | {verdict}: {'; '.join(effects) or 'no effect'} |")
+        for change in changes:
+            row = done.get((name, change))
+            if row is None or "closure" not in base:
+                continue
+            pairs += 1
+            found = [row["error"]] if "error" in row else moves(base["closure"], row["closure"], CHANGES[change])
+            if found:
+                count += 1
+                lines.append(f"| {name} | {change} | {'; '.join(found)} |")
+    return Moved([*lines, "", f"{count} of {pairs} pairs moved."], count)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

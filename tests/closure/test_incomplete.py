@@ -1,0 +1,120 @@
+"""A column that a few files have no value of: searched, and said so."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from campaigns import RIG, SPEEDS
+from effect_kinds import COLUMN, GRADES
+
+from sealfit.fit.rows import make_rows
+from sealfit.ingest.incomplete import NO_VALUE, incomplete_columns
+from sealfit.simulate import Spec, simulate
+from sealfit.steps import STEPS, run
+from sealfit.store import Store
+from sealfit.summary_lines import lines
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """120 files of an oil content that moves mu by some 10 %, and of an idle category."""
+    folder = tmp_path_factory.mktemp("incomplete") / "c"
+    oil = {"id": "linear", "channels": ("oil_ppm",), "parameters": {"A": 0.005}, "acts_on": "mu"}
+    oil |= {"operation": "multiply", "reference": {"x_ref": 50.0}}
+    design = {
+        "temperatures_C": (60.0,),
+        "days": (1.0, 4.0, 8.0, 16.0),
+        "max_rows": 100,
+        "speeds_mm_s": SPEEDS,
+    }
+    simulate(
+        Spec(seed=4, physics={"growth": {}}, design=design, effects=(oil,), channels=(COLUMN, GRADES), noise=RIG),
+        folder,
+    )
+    return folder
+
+
+def ingested(campaign, tmp_path, blank):
+    """Ingest the campaign with some cells of runs.csv empty; `blank` tells which files, by column."""
+    made = Path(shutil.copytree(campaign, tmp_path / "c"))
+    runs = pd.read_csv(made / "runs.csv", dtype=str)
+    for name, rows in blank.items():
+        runs.loc[rows(runs), name] = ""
+    runs.to_csv(made / "runs.csv", index=False)
+    return made
+
+
+def closed(campaign, out):
+    made = run(campaign, out, steps=STEPS[:-1])
+    return made, json.loads((out / "closure.json").read_text())
+
+
+def test_a_column_that_a_few_files_lack_is_searched_and_said(campaign, tmp_path):
+    def few(runs):  # one whole run and one file of another
+        return (runs["run_id"] == runs["run_id"][0]) | (runs.index == 40)
+
+    made, closure = closed(ingested(campaign, tmp_path, {"oil_ppm": few}), tmp_path / "out")
+    assert [effect["channels"] for effect in closure["effects"]] == [["oil_ppm"]]
+    slope = next(p for p in closure["effects"][0]["parameters"] if p["name"] == "A")
+    assert slope["ci95"][0] < 0.005 < slope["ci95"][1]
+    files = Store.open(tmp_path / "out").read("inputs")["file"].size
+    assert closure["incomplete_channels"] == [
+        {"channel": "oil_ppm", "files_without": 4, "files": files, "searched": True}
+    ]
+    said = f"4 of {files} files have no value: the search for effects takes them at the mean of their run"
+    quality = Store.open(tmp_path / "out").read("quality")
+    assert quality.loc[quality["check"] == "incomplete_column", "reason"].str.startswith(said).tolist() == [True]
+    assert any(line.startswith(f"column      oil_ppm: {said}") for line in lines(made))
+
+
+def test_a_column_that_many_files_lack_is_left_out_and_said(campaign, tmp_path):
+    def half(runs):
+        return runs.index % 2 == 0
+
+    made, closure = closed(ingested(campaign, tmp_path, {"oil_ppm": half}), tmp_path / "out")
+    (told,) = closure["incomplete_channels"]
+    assert (told["channel"], told["searched"]) == ("oil_ppm", False)
+    assert not any("oil_ppm" in effect["channels"] for effect in closure["effects"])
+    assert any("the search for effects leaves the column out" in line for line in lines(made))
+
+
+# ---------------------------------------------------------------- what stands for a missing value
+def bins(**columns):
+    file = np.repeat([f"f{k}" for k in range(6)], 2)
+    table = {
+        "file": file, "run_id": np.repeat(["a", "b", "c"], 4), "stroke": 1, "specimen_id": "s", "condition": "c",
+        "series": "", "rubber": "", "force_N": 1.0, "speed_mm_s": 1.0, "load_N": 2.0, "n": 9, "displacement_mm": 1.0,
+    }  # fmt: skip
+    return pd.DataFrame({**table, **{name: np.repeat(values, 2) for name, values in columns.items()}})
+
+
+def test_a_missing_value_is_that_of_its_run_else_the_mean():
+    nan = np.nan
+    rows = make_rows(bins(oil=[0.1, nan, 7.0, 7.0, 7.0, 7.0]), has_aging=False)
+    assert rows.values("oil")[2] == 0.1  # to the last digit: it is constant in its run
+    assert rows.subset(np.arange(12) > 1).values("oil")[0] == 0.1
+    rows = make_rows(bins(oil=[1.0, 3.0, 5.0, nan, 7.0, 7.0]), has_aging=False)
+    assert rows.values("oil")[6] == 5.0
+    rows = make_rows(bins(oil=[1.0, nan, nan, 5.0, 7.0, 7.0]), has_aging=False)
+    assert np.isnan(rows.values("oil")).sum() == 4  # four of six files have a value: too few
+
+
+def test_a_missing_category_is_a_level_of_its_own():
+    rows = make_rows(bins(grade=["K", None, "L", "L", "K", "K"]), has_aging=False)
+    assert sorted(set(rows.values("grade"))) == [NO_VALUE, "K", "L"]
+
+
+def test_each_column_that_some_files_lack_is_said_once():
+    steady = bins(oil=[1.0, np.nan, 7.0, 7.0, 7.0, 7.0], grade=["K", None, None, "L", "K", "K"], idle=[1.0] * 6)
+    steady = steady.assign(
+        used=True, load_N=np.where(steady["file"] == "f3", np.nan, 2.0), run_order=[np.nan] + [1.0] * 11
+    )
+    told = {fault.column: fault.reason for fault in incomplete_columns(steady)}
+    assert set(told) == {"oil", "grade", "load_N", "run_order"}
+    assert told["oil"].startswith("1 of 6 files have no value: the search for effects takes them at the mean")
+    assert told["grade"] == f"2 of 6 files have no value: they are a level of their own, {NO_VALUE}."
+    assert told["load_N"].endswith("the loop fits forces in place of coefficients.")
+    assert told["run_order"].endswith("the search for effects leaves the column out.")

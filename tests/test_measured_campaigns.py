@@ -1,0 +1,48 @@
+"""Measured campaigns by others, from files to report; SEALFIT_MEASURED names the folder of measured data."""
+
+import numpy as np
+import pytest
+from measured import emps_plateaus, kidney, measured
+
+from sealfit.steps import run
+from sealfit.store import Store
+
+pytestmark = pytest.mark.skipif(measured() is None, reason="SEALFIT_MEASURED names no folder of measured data")
+PRESSURE = '- pressure_bar * 1e5 * pi * (bore_m / 2) ** 2"'
+
+
+def sliding(out):
+    fits = Store.open(out).read("steady_fit")
+    rows = fits[(fits["quantity"] == "steady") & (fits["parameter"] == "F_c")]
+    return rows.sort_values("condition")
+
+
+@pytest.mark.parametrize(
+    "part", [PRESSURE, '"', '- pressure_bar * 55.6"'], ids=["author's area", "no area", "7 % more"]
+)
+def test_kidney_friction_does_not_hang_on_the_piston_area(tmp_path, part):
+    config = kidney(measured(), tmp_path / "campaign")
+    text = config.read_text()
+    assert text.count(PRESSURE) == 1
+    (tmp_path / "rig.toml").write_text(text.replace(PRESSURE, part))
+    run(tmp_path / "campaign", tmp_path / "out", tmp_path / "rig.toml")
+    found = sliding(tmp_path / "out")
+    # By hand: half the difference of the directions is 9 to 12 N at 4 to 7 bar, and not zero anywhere.
+    assert ((found["value"] > 6.5) & (found["value"] < 16)).all()
+    assert ((found["value"].iloc[3:] > 8.5) & (found["value"].iloc[3:] < 15.5)).all()
+    assert (found["se"] > 0).all()
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_emps_plateaus_go_through(tmp_path):
+    config = emps_plateaus(measured(), tmp_path / "campaign")
+    run(tmp_path / "campaign", tmp_path / "out", config)
+    steady = Store.open(tmp_path / "out").read("steady")
+    at = steady["speed_set_mm_s"] == 125
+    # By hand: forward about 41 N, backward about 51 N at the same speed, repeating within some 0.2 N.
+    for way, force in ((1, 40.7), (-1, -50.5)):
+        own = steady.loc[at & (steady["direction"] == way), "force_N"]
+        assert own.mean() == pytest.approx(force, abs=0.5)
+        assert own.std() < 0.4
+    assert sliding(tmp_path / "out")["value"].item() == pytest.approx(21.8, abs=1.5)
+    assert np.isfinite(sliding(tmp_path / "out")["se"].item())
