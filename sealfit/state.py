@@ -13,7 +13,7 @@ from sealfit.errors import OutError
 from sealfit.fingerprint import Fingerprints
 
 STATE = "state.json"
-FORMAT = 4
+FORMAT = 5
 DEFAULT = "default"
 
 

@@ -49,6 +49,7 @@ SPEED = Column("speed_mm_s", "mm/s", FLOAT, "measured sliding speed, signed")
 SPEED_SET = Column("speed_set_mm_s", "mm/s", FLOAT, "commanded speed, magnitude; null if not given")
 LOAD = Column("load_N", "N", FLOAT, "normal load; null if not given")
 FORCE = Column("force_N", "N", FLOAT, "friction force, with the sign of the motion where it opposes it")
+PRESLIDING = Column("presliding_N", "N", FLOAT, "what is left of the pre-sliding rise, taken out of force_N")
 DISPLACEMENT = Column("displacement_mm", "mm", FLOAT, "displacement in the rig's own coordinate")
 DISTANCE = Column("distance_mm", "mm", FLOAT, "distance slid since the stroke's start")
 TIME = Column("time_s", "s", FLOAT, "time in the file; from the stroke's first row in a file of several strokes")
@@ -108,6 +109,7 @@ TRACES = Schema(
         TIME,
         DISPLACEMENT,
         FORCE,
+        Column("presliding_N", "N", FLOAT, "in the steady window, what is left in force_N of the pre-sliding rise"),
         Column("steady", "", BOOL, "true inside the steady window"),
     ),
     open_=True,  # channels measured along the trace
@@ -132,7 +134,8 @@ STEADY = Schema(
         SPEED,
         SPEED_SET,
         LOAD,
-        Column("force_N", "N", FLOAT, "mean force over the steady window"),
+        Column("force_N", "N", FLOAT, "friction force: mean over the steady window, without presliding_N"),
+        PRESLIDING,
         Column("force_sd_N", "N", FLOAT, "standard deviation of the samples in the window"),
         Column("force_se_N", "N", FLOAT, "standard error of the mean, autocorrelation counted in"),
         Column("n", "", INT, "samples in the window"),
@@ -156,7 +159,8 @@ BINS = Schema(
         SPEED,
         SPEED_SET,
         LOAD,
-        FORCE,
+        Column("force_N", "N", FLOAT, "friction force: mean in the bin, without presliding_N"),
+        PRESLIDING,
         Column("force_sd_N", "N", FLOAT, "standard deviation of the samples in the bin"),
         Column("n", "", INT, "samples in the bin"),
         DISPLACEMENT,

@@ -101,4 +101,4 @@ def warm(table: pd.DataFrame, force: np.ndarray) -> np.ndarray:
 
 def make_traces(bins: pd.DataFrame) -> pd.DataFrame:
     """Return the bins themselves as steady samples: what the ripple search sees."""
-    return bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(steady=True)
+    return bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(presliding_N=0.0, steady=True)

@@ -240,8 +240,9 @@ def steady_samples(traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows) ->
     about = {name: strokes[name].to_numpy() for name in ("stroke_id", "stroke", "direction")}
     about["unit"] = rows.codes("file")[first]
     parts = []
-    for part in a_part_at_a_time(traces, ["file", "stroke", "steady", *SAMPLED]):
+    for part in a_part_at_a_time(traces, ["file", "stroke", "steady", "presliding_N", *SAMPLED]):
         steady = part[part["steady"].to_numpy(dtype=bool)]
+        steady = steady.assign(force_N=steady["force_N"] - steady["presliding_N"])
         edges, own = strokes_of(steady, index)
         place = np.repeat(own, np.diff(edges))
         known = place >= 0

@@ -28,6 +28,7 @@ NOT_CHANNELS = {
     "n",
     "force_N",
     "force_sd_N",
+    "presliding_N",
     "specimen_id",
     "condition",
     "series",

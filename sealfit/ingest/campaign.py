@@ -40,7 +40,15 @@ from sealfit.parquet import spelled_out
 from sealfit.profiling import timed
 from sealfit.tables import RUNS, STEADY
 
-OF_SAMPLES = ("time_s", "displacement_mm", "distance_mm", "force_N", "force_sd_N", "n")  # their means are in `steady`
+OF_SAMPLES = (
+    "time_s",
+    "displacement_mm",
+    "distance_mm",
+    "force_N",
+    "presliding_N",
+    "force_sd_N",
+    "n",
+)  # their means are in `steady`
 FAULTY = ("warning", "error")
 SHOWN = 20  # faults that a campaign without a single usable stroke lists
 

@@ -177,6 +177,7 @@ def _bins(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config
     """Return table `bins`: means of what was measured along the trace, and what is known of the whole stroke."""
     rows = np.flatnonzero(samples["steady"])
     measured = {name: values[rows] for name, values in samples.items() if name not in ("stroke", "steady", "sliding")}
+    measured["force_N"] = measured["force_N"] - measured["presliding_N"]
     made = bin_table(measured, strokes, config.bins)
     binned, place = np.unique(made.pop("row"), return_inverse=True)
     known = {name: [values[i] for i in binned.tolist()] for name, values in strokes.items()}

@@ -21,6 +21,14 @@ LONG = 0.1  # rise to 63 % over more than this share of the stroke: a stroke har
 LENGTHS = np.geomspace(0.3, 3.0, 25)  # rise lengths that are tried, as multiples of the distance to 63 %
 GRID_ROWS = 8192  # rows of starts fitted at once: bounds the memory, times the lengths that are tried
 MARGIN = 1.05  # the first arrival in the later band is early by a part of the last bend
+STEP = 1.06  # from one rise length to the next that is tried on the plateau of the speed; a parabola lies between
+REFINED = STEP ** np.arange(-16, 17)  # those lengths, as multiples of the first ones
+REACH = 16.0  # rise lengths over which that fit reaches: nothing is left of the rise, a slow change is still straight
+SLOPED = 8.0  # rise lengths from which a slope beside the rise can be told from the rise itself
+POWERS = (1, 2)  # of the rivals (1 - x / k)^p: a straight rise (elasticity of the rig, fretting), and a rounded one
+ENDS = np.geomspace(0.8, 8.0, 14)  # k that are tried, as multiples of the rise length
+UNLIKELY = 10.0  # twice the log likelihood by which a rival must be better: no bristle then, and nothing is taken out
+FAR = 500.0  # rise lengths beyond which an exponential overflows
 
 
 class Start(NamedTuple):
@@ -31,9 +39,30 @@ class Start(NamedTuple):
     force_N: np.ndarray
     ramp_end: int
 
+    @property
+    def plateau_mm(self) -> float:
+        """Distance at which the speed has reached its plateau."""
+        return float(self.distance_mm[min(self.ramp_end, len(self.distance_mm) - 1)])
+
+
+class Rise(NamedTuple):
+    """Where the rise of one start is over, and what is left of it: `left_N * exp(-distance / length_mm)`.
+
+    `left_N` is the force at distance 0 less that of steady sliding, negative where the force comes up; 0 where there
+    is no rise, or none that follows the bristles' law.
+    """
+
+    end_mm: float
+    left_N: float = 0.0
+    length_mm: float = 1.0
+
+    def at(self, distance_mm: np.ndarray) -> np.ndarray:
+        """Return what is left of the rise, in N, shape (n,)."""
+        return self.left_N * np.exp(-distance_mm / self.length_mm)
+
 
 def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> float:
-    """Return the distance from which the force of one start is past its pre-sliding rise: see `rise_ends_mm`.
+    """Return the distance from which the force of one start is past its pre-sliding rise: see `rises`.
 
     Examples
     --------
@@ -42,19 +71,20 @@ def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> 
     >>> 5.1 < end < 5.8
     True
     """
-    return rise_ends_mm([Start(distance_mm, force_N, ramp_end)])[0]
+    return rises([Start(distance_mm, force_N, ramp_end)])[0].end_mm
 
 
-def rise_ends_mm(starts: Sequence[Start]) -> list[float]:
-    """Return, for every start, the distance in mm from which the force is past its pre-sliding rise; 0 without one.
+def rises(starts: Sequence[Start]) -> list[Rise]:
+    """Return, for every start, where its pre-sliding rise is over (0 mm without one), and what is left of it there.
 
     A bristle at constant speed follows dz/dx = 1 - z / z_ss (LuGre, Eq. 2 divided by v), so the force comes up as
     F(x) = A + B x - C exp(-x / x_0); A + B x stands for whatever changes slowly beside it. For every x_0 on a grid
     the rest is linear least squares; the x_0 with the smallest sum of squares is taken, and the rise ends where
     1/50000 of it is left. A rig that comes up along a straight line (its own elasticity) is over well before.
 
-    Where the rise takes more than a tenth of the stroke (a fretting stroke), no such law is asked: it ends where the
-    force first arrives in the band of the late plateau.
+    Where that would take more than a third of the stroke, the rise ends earlier; where it takes more than a tenth of
+    the stroke to come up by 63 %, it ends where the force first arrives in the band of the late plateau. What is left
+    of it then is known from the same law, fitted once more to the rows of constant speed.
 
     Only a force that begins below everything the plateau later shows is a rise: the trough of a ripple, or a force
     that warming lets fall, is not.
@@ -65,15 +95,84 @@ def rise_ends_mm(starts: Sequence[Start]) -> list[float]:
     """
     levels = [_level_N(start) for start in starts]
     scales = [_scale_mm(start, level) for start, level in zip(starts, levels, strict=True)]
-    fast = [i for i, scale in enumerate(scales) if scale > 0.0 and not _slow(starts[i], levels[i], scale)]
-    fitted = dict(zip(fast, _rise_lengths_mm([starts[i] for i in fast], [scales[i] for i in fast]), strict=True))
-    ends = []
-    for i, (start, level, scale) in enumerate(zip(starts, levels, scales, strict=True)):
-        if i in fitted:
-            ends.append(_settled_mm(start, level, fitted[i]))
-        else:
-            ends.append(MARGIN * _arrival_mm(*start[:2]) if scale > 0.0 else 0.0)
-    return ends
+    rising = [i for i, scale in enumerate(scales) if scale > 0.0]
+    own, scales = [starts[i] for i in rising], [scales[i] for i in rising]
+    slow = [_slow(starts[i], levels[i], scale) for i, scale in zip(rising, scales, strict=True)]
+    lengths = _rise_lengths_mm(own, [12.0 * scale for scale in scales], scales, LENGTHS, [not one for one in slow])
+    made = [Rise(0.0)] * len(starts)
+    unsettled = []
+    for k, (i, is_slow, length) in enumerate(zip(rising, slow, lengths, strict=True)):
+        end = MARGIN * _arrival_mm(*starts[i][:2]) if is_slow else _settled_mm(starts[i], levels[i], length)
+        made[i] = Rise(end)
+        ramp = starts[i].plateau_mm if starts[i].plateau_mm > length else 0.0  # along a short one nothing else happens
+        if 0.0 < end < ramp + 0.99 * SETTLED * length:
+            unsettled.append(k)
+    left = _left_over([own[k] for k in unsettled], [lengths[k] for k in unsettled])
+    for k, parts in zip(unsettled, left, strict=True):
+        made[rising[k]] = Rise(made[rising[k]].end_mm, *parts)
+    return made
+
+
+def _left_over(starts: Sequence[Start], lengths_mm: Sequence[float]) -> list[tuple[float, float]]:
+    """Return C and x_0 of F = A + B x + C exp(-x / x_0) of every start, from its rows of constant speed.
+
+    C is 0 where the force does not follow that law: where a rise that is over at some distance fits better.
+    """
+    plateaus = []
+    for start in starts:
+        distance = start.distance_mm[start.ramp_end :]
+        plateaus.append(Start(distance - distance[0], start.force_N[start.ramp_end :], 0))
+    reaches = [REACH * length for length in lengths_mm]
+    sloped = [min(p.distance_mm[-1], r) >= SLOPED * x for p, r, x in zip(plateaus, reaches, lengths_mm, strict=True)]
+    near = _rise_lengths_mm(plateaus, reaches, lengths_mm, REFINED, sloped)
+    ends = [_rise_lengths_mm(plateaus, reaches, near, ENDS, sloped, power) for power in POWERS]
+    made = []
+    for i, (start, plateau, length, has_slope) in enumerate(zip(starts, plateaus, near, sloped, strict=True)):
+        n = _rows_within(plateau, reaches[i])
+        x, beside = plateau.distance_mm[:n], _Beside(plateau.distance_mm[:n], has_slope)
+        force = beside.free(plateau.force_N[:n])
+        length *= _step_to_least([beside.fitted(_shape(x, length * step), force)[1] for step in (1 / STEP, 1, STEP)])
+        left, squares = beside.fitted(_shape(x, length), force)
+        rival = min(beside.fitted(_shape(x, end[i], p), force)[1] for p, end in zip(POWERS, ends, strict=True))
+        if n * math.log(max(squares, 1e-300) / max(rival, 1e-300)) > UNLIKELY:
+            left = 0.0
+        made.append((left * math.exp(min(start.plateau_mm / length, FAR)), length))
+    return made
+
+
+class _Beside:
+    """What stands beside a rise, A + B x, and is taken out of what is fitted; B is 0 where there is no slope."""
+
+    def __init__(self, x_mm: np.ndarray, has_slope: bool) -> None:
+        self.x = x_mm - np.add.reduce(x_mm) / len(x_mm) if has_slope else None
+
+    def free(self, values: np.ndarray) -> np.ndarray:
+        """Return values without the A + B x that fits them best, shape (n,)."""
+        values = values - np.add.reduce(values) / len(values)
+        return values if self.x is None else values - (self.x @ values) / (self.x @ self.x) * self.x
+
+    def fitted(self, shape: np.ndarray, force_N: np.ndarray) -> tuple[float, float]:
+        """Return C of A + B x + C shape by least squares, and the sum of squares it leaves of a force that is free."""
+        shape = self.free(shape)
+        square = float(shape @ shape)
+        left = float(shape @ force_N) / square if square > 0.0 else 0.0
+        residual = force_N - left * shape
+        return left, float(residual @ residual)
+
+
+def _shape(x_mm: np.ndarray, length_mm: np.ndarray | float, power: int | None = None) -> np.ndarray:
+    """Return exp(-x / length), or with a power (1 - x / length)^power up to where it is 0."""
+    share = x_mm / length_mm
+    return np.exp(-share) if power is None else np.maximum(1.0 - share, 0.0) ** power
+
+
+def _step_to_least(squares: Sequence[float]) -> float:
+    """Return the factor, between 1 / STEP and STEP, at which a parabola through the values at these and 1 is least."""
+    before, here, after = squares
+    bend = before - 2.0 * here + after
+    if not bend > 0.0:
+        return 1.0
+    return float(STEP ** min(max(0.5 * (before - after) / bend, -1.0), 1.0))
 
 
 def _level_N(start: Start) -> float | None:
@@ -99,7 +198,7 @@ def _settled_mm(start: Start, level_N: float, fitted_mm: float) -> float:
     if float(start.force_N[0]) > HALF_WAY * level_N and fitted_mm > SHORT * length:
         return 0.0
     settled = min(SETTLED * fitted_mm, max(length / 3.0, ENOUGH * fitted_mm))
-    ramp = float(distance[min(start.ramp_end, len(distance) - 1)])
+    ramp = start.plateau_mm
     return float(max(settled, ramp + AFTER_RAMP * fitted_mm if ramp > 0.0 else 0.0))
 
 
@@ -138,44 +237,66 @@ def _scale_mm(start: Start, level_N: float | None) -> float:
     return float(distance[after - 1] + share * (distance[after] - distance[after - 1]))
 
 
-def _rise_lengths_mm(starts: Sequence[Start], scales_mm: Sequence[float]) -> list[float]:
+def _rows_within(start: Start, reach_mm: float) -> int:
+    """Return how many rows lie within a distance; at least 16 where there are so many."""
+    return min(max(int(start.distance_mm.searchsorted(reach_mm)), 16), len(start.distance_mm))
+
+
+def _rise_lengths_mm(
+    starts: Sequence[Start],
+    reaches_mm: Sequence[float],
+    scales_mm: Sequence[float],
+    multiples: np.ndarray,
+    sloped: Sequence[bool],
+    power: int | None = None,
+) -> list[float]:
     """Return x_0 of F = A + B x - C exp(-x / x_0) of every start, by least squares on a grid around its scale.
 
     What A + B x explains is the same for every x_0. So both are taken out of the force and of each exponential, and
-    the best x_0 is the one whose exponential's rest explains most of the force's rest.
+    the best x_0 is the one whose exponential's rest explains most of the force's rest. B is 0 where a start is not
+    `sloped`; with a `power`, the exponential is that of `_shape`.
     """
     alike: dict[int, list[int]] = {}
     rows = []
-    for i, (start, scale) in enumerate(zip(starts, scales_mm, strict=True)):
-        rows.append(min(max(int(start.distance_mm.searchsorted(12.0 * scale)), 16), len(start.distance_mm)))
+    for i, (start, reach) in enumerate(zip(starts, reaches_mm, strict=True)):
+        rows.append(_rows_within(start, reach))
         alike.setdefault(rows[-1].bit_length(), []).append(i)
     made = [0.0] * len(starts)
     for bits, members in alike.items():
         size = max(GRID_ROWS >> bits, 1)
         for group in (members[i : i + size] for i in range(0, len(members), size)):
-            lengths = np.array([scales_mm[i] for i in group])[:, None] * LENGTHS
-            best = _best_of_grid([starts[i] for i in group], [rows[i] for i in group], lengths)
+            lengths = np.array([scales_mm[i] for i in group])[:, None] * multiples
+            parts = [starts[i] for i in group], [rows[i] for i in group], [sloped[i] for i in group]
+            best = np.argmax(_explained(*parts, lengths, power), axis=1)
             for i, choices, place in zip(group, lengths, best.tolist(), strict=True):
                 made[i] = float(choices[place])
     return made
 
 
-def _best_of_grid(starts: Sequence[Start], rows: Sequence[int], lengths_mm: np.ndarray) -> np.ndarray:
-    """Return which of the lengths, shape (starts, lengths), fits best the first `rows` rows of every start."""
+def _explained(
+    starts: Sequence[Start],
+    rows: Sequence[int],
+    sloped: Sequence[bool],
+    lengths_mm: np.ndarray,
+    power: int | None,
+) -> np.ndarray:
+    """Return the sum of squares that each of the lengths, shape (starts, lengths), explains in the first `rows` rows of
+    every start."""
     shape = len(starts), max(rows)
-    distance, x, y = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)  # beyond its rows exp(-x / x_0) is 0
-    square = np.empty((len(starts), 1))
-    for i, (start, n) in enumerate(zip(starts, rows, strict=True)):
+    distance, x, y = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)  # beyond its rows the shape is 0
+    square = np.ones((len(starts), 1))
+    for i, (start, n, has_slope) in enumerate(zip(starts, rows, sloped, strict=True)):
         own, force = start.distance_mm[:n], start.force_N[:n]
         distance[i, :n] = own
-        own = own - np.add.reduce(own) / n
         force = force - np.add.reduce(force) / n
-        square[i] = own @ own
-        x[i, :n], y[i, :n] = own, force - (float(own @ force) / float(square[i, 0])) * own
-    rise = np.exp(distance[:, None, :] / -lengths_mm[:, :, None])
+        if has_slope:
+            own = own - np.add.reduce(own) / n
+            square[i] = own @ own
+            x[i, :n], force = own, force - (float(own @ force) / float(square[i, 0])) * own
+        y[i, :n] = force
+    rise = _shape(distance[:, None, :], lengths_mm[:, :, None], power)
     whole = np.einsum("kij,kij->ki", rise, rise)
     total, slope, explained = rise.sum(axis=2), (rise @ x[:, :, None])[:, :, 0], (rise @ y[:, :, None])[:, :, 0]
     rest = whole - total**2 / np.array(rows)[:, None] - slope**2 / square
     # Of two different distances only (a coarse sensor), a straight line explains all that an exponential can.
-    gained = np.divide(explained**2, rest, out=np.zeros(rest.shape), where=rest > 1e-12 * whole)
-    return np.argmax(gained, axis=1)
+    return np.divide(explained**2, rest, out=np.zeros(rest.shape), where=rest > 1e-12 * whole)

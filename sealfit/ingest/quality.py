@@ -27,6 +27,7 @@ COARSE = 0.6
 FEW_LEVELS = 5
 NEXT_LEVELS = 30
 BY_CHANCE = 1e-4  # that so many samples lie at the extreme; few strokes come so far that it is asked
+STILL_RISING = 0.01  # share of the force that may be missing where a stroke ends: more, and it was never steady
 FINE_FILE = {"check": "ok", "severity": "info", "action": "kept", "reason": "nothing found.", "mend": ""}
 
 
@@ -96,6 +97,36 @@ def stroke_faults(
         *(_saturated(force_N[steady], line[steady], settings) or _stuck(force_N[steady], line[steady], settings)),
     ]
     return [Fault(**{**fault.as_dict(), "file": file, "stroke": number}) for fault in found]
+
+
+def rising_faults(file: str, number: int | None, left_N: float, force_N: float, unit: str) -> list[Fault]:
+    """Return that a stroke ends before its friction is steady, if it does.
+
+    Parameters
+    ----------
+    number : int or None
+        What findings call the stroke; None in a file of one stroke.
+    left_N, force_N : float
+        What is left of the pre-sliding rise where the steady window ends, and the mean force without it.
+    unit : str
+        Unit of the force.
+    """
+    if not abs(left_N) > STILL_RISING * abs(force_N):
+        return []
+    return [
+        Fault(
+            "never_steady",
+            f"the stroke ends before its friction is steady: {abs(left_N):.3g} of {abs(force_N):.4g} {unit} are still "
+            "to come. Its steady force is what the bristles of the model lead to.",
+            file=file,
+            stroke=number,
+            column="force_N",
+            value=abs(left_N),
+            severity="info",
+            action="kept",
+            mend="Slide further at this speed: five times the rise's length to 63 %, better eleven times.",
+        )
+    ]
 
 
 def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault]:

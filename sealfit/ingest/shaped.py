@@ -9,7 +9,7 @@ import pandas as pd
 
 from sealfit.tables import BINS, FLOAT, INT, RUNS, STEADY, TEXT, Schema
 
-INNER = ("several", "equal", "extreme", "run", "sliding", "row", "by_itself")  # columns that serve the ingest only
+INNER = ("several", "left", "equal", "extreme", "run", "sliding", "row", "by_itself")  # serve the ingest only
 STEADY_ONLY = tuple(
     {column.name for column in STEADY.columns}
     - {column.name for column in RUNS.columns}

@@ -12,8 +12,11 @@ from sealfit.errors import Fault
 from sealfit.ingest.pieces import Pieces, quantile
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.speed_unit import speed_factor
+from sealfit.ingest.strokes import displacement_noises_mm
 
 BLOCKS = 100  # pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke
+FEWEST = 6  # pieces of which a noisy trace is cut at least: a rest at either end, and sliding between
+NOISE_OF_PATH = 0.1  # noise of a step between the means of two pieces, as a share of the step
 GROSS = 1.5  # beyond this factor the file contradicts itself and is left out; below, the commanded speed may be nominal
 
 
@@ -136,9 +139,14 @@ def _disagreement(
     displacement: np.ndarray,
     config: Config,
 ) -> Fault | None:
-    measured = min(max(commanded, min(mean, plateau)), max(mean, plateau))  # the nearest to the commanded one
-    ratio = measured / commanded
     tolerance = config.quality.speed_disagreement
+    measured = _nearest(commanded, mean, plateau)
+    if abs(measured / commanded - 1) <= tolerance:
+        return None
+    of_means = speed_factor(config.units) * np.array(_speeds_of_means(time_s, displacement))
+    if np.isfinite(of_means).all():
+        measured = _nearest(commanded, *of_means.tolist())
+    ratio = measured / commanded
     if abs(ratio - 1) <= tolerance:
         return None
     unit = config.units.unit("speed")
@@ -157,6 +165,30 @@ def _disagreement(
         action="file left out" if gross else "kept",
         mend=mend,
     )
+
+
+def _nearest(commanded: float, mean: float, plateau: float) -> float:
+    """Return what lies between the mean and the plateau speed and nearest to the commanded one."""
+    return min(max(commanded, min(mean, plateau)), max(mean, plateau))
+
+
+def _speeds_of_means(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
+    """Return mean and plateau speed of one trace from the means of pieces, as few as its noise asks for; else nan.
+
+    The mean of a piece of m samples has a noise of sd / sqrt(m), and two make a step; the path of `count` steps is
+    longer by noise that must stay small beside the travel.
+    """
+    n, travel = len(time_s), float(np.ptp(displacement_mm))
+    noise = float(displacement_noises_mm(displacement_mm, Pieces([n]))[0])
+    if noise <= 0.0 or n < 2 * FEWEST:
+        return math.nan, math.nan
+    count = int((NOISE_OF_PATH * travel / noise * math.sqrt(n / 2.0)) ** (2.0 / 3.0))
+    if not FEWEST <= count < BLOCKS:
+        return math.nan, math.nan
+    cut = np.linspace(0, n, count + 1).astype(np.int64)
+    means = [np.add.reduceat(values, cut[:-1]) / np.diff(cut) for values in (time_s, displacement_mm)]
+    mean, plateau = _of_cuts(*(values[None, :] for values in means))
+    return float(mean[0]), float(plateau[0])
 
 
 def _mix_up(ratio: float, time_s: np.ndarray, displacement: np.ndarray, tolerance: float) -> str:

@@ -31,7 +31,7 @@ from sealfit.staging import PARQUET, disk, file_size, sync
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
 ARROW = ".arrow"
-FORMAT = 3  # of a part's files; those of another one are made again
+FORMAT = 4  # of a part's files; those of another one are made again
 _ABOUT = b"part"
 
 Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each column, as Arrow spells it

@@ -13,7 +13,14 @@ from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.average import standard_errors
 from sealfit.ingest.pieces import Pieces
-from sealfit.ingest.quality import equal_neighbours, load_faults, speed_column_faults, stroke_faults, suspects
+from sealfit.ingest.quality import (
+    equal_neighbours,
+    load_faults,
+    rising_faults,
+    speed_column_faults,
+    stroke_faults,
+    suspects,
+)
 from sealfit.ingest.read import Trace
 from sealfit.ingest.refs import TraceRef
 from sealfit.ingest.speed_unit import speed_factor
@@ -149,6 +156,7 @@ def _finished(bundle: _Bundle, found: Found, config: Config, skip: Sequence[int]
     rows = _stroke_rows(samples, files, found, strokes, speed_factor(config.units))
     time_s, _, force = bundle.slots()
     suspected = suspects(time_s, force, found.steady, strokes, config.quality)
+    unit = config.units.unit("force")
     made, first = [], 0
     for i, own in enumerate(bundle.traces.slices):
         mine = range(first, first + int(count[i]))
@@ -165,6 +173,8 @@ def _finished(bundle: _Bundle, found: Found, config: Config, skip: Sequence[int]
                 wrong = stroke_faults(ref.file, number, stroke, time_s[own], force[own], bundle.line[own], config)
             used = not any(fault.action == "stroke left out" for fault in wrong)
             row = rows[k] = {**ref.channels, **rows[k], "several": several_here, "used": used}
+            if used:
+                wrong = wrong + rising_faults(ref.file, number, row["left"], row["force_N"], unit)
             if used and OWN_SPEED in row:
                 wrong = wrong + speed_column_faults(ref.file, number, row["speed_mm_s"], row[OWN_SPEED], config)
             faults.extend(wrong)
@@ -199,6 +209,7 @@ def _samples(
         "force_N": columns["force_N"],
         "steady": found.steady,
         "sliding": found.sliding,
+        "presliding_N": found.presliding_N,
         "distance_mm": np.abs(displacement - strokes.spread(displacement[found.origin])),
         **{name: values for name, values in columns.items() if name not in SLOTS},
     }
@@ -217,13 +228,13 @@ def _stroke_rows(
         made[some] = per_window
         return made.tolist()
 
-    force, place = samples["force_N"][rows], samples["displacement_mm"][rows]
+    force, place = (samples["force_N"] - samples["presliding_N"])[rows], samples["displacement_mm"][rows]
     columns: dict[str, list] = {"stroke": found.number.tolist()}
     for name, values in samples.items():
         if name in columns or name in ("steady", "sliding"):
             continue
         if values.dtype.kind in "fiub":
-            columns[name] = of_strokes(windows.mean(values[rows]))
+            columns[name] = of_strokes(windows.mean(force if name == "force_N" else values[rows]))
         else:
             own = values[rows]
             labels = [_most_frequent(own[slots]) for slots in windows.slices]
@@ -241,6 +252,7 @@ def _stroke_rows(
         "n": count.tolist(),
         "displacement_from_mm": of_strokes(place[windows.start]),
         "displacement_to_mm": of_strokes(place[windows.stop - 1]),
+        "left": of_strokes(samples["presliding_N"][rows][windows.stop - 1]),
         "equal": of_strokes(equal_neighbours(force, windows), 0.0),
         "extreme": of_strokes(windows.max(size[rows]) >= strokes.max(size)[some], False),
     }

@@ -52,7 +52,8 @@ class Found:
 
     Arrays of shape (strokes,), in order: `trace` (its place among the traces) and what a `Stroke` has, with `start`,
     `stop` and `origin` as rows of the flat arrays. `steady` and `sliding` are of shape (rows,), false in traces
-    without strokes.
+    without strokes; so is `presliding_N`, what is left of the pre-sliding rise in the steady windows, with the sign
+    of the force, 0 elsewhere.
     """
 
     trace: np.ndarray
@@ -65,6 +66,7 @@ class Found:
     short: list[str | None]
     steady: np.ndarray
     sliding: np.ndarray
+    presliding_N: np.ndarray
 
     def of_trace(self, trace: int, first_row: int) -> list[Stroke]:
         """Return the strokes of one trace, whose first row is given, with rows counted from there."""
@@ -125,7 +127,10 @@ def find_all(
     smooth = smoothed(displacement_mm, traces, settings.smooth_samples)
     span = traces.max(smooth) - traces.min(smooth)
     moves &= ~(span <= 8.0 * noise)  # the range of some hundred samples of noise alone is about six SDs
-    travel = np.full(len(traces), settings.min_travel_mm) if settings.min_travel_mm is not None else 0.05 * span
+    # The smoothed noise of a thousand samples comes back by three SDs of one sample: no turn.
+    travel = np.maximum(0.05 * span, 4.0 * noise)
+    if settings.min_travel_mm is not None:
+        travel = np.full(len(traces), settings.min_travel_mm)
     cut = _cut(smooth, traces, moves, travel, np.maximum(3.0 * noise, 1e-3 * span), settings.smooth_samples)
     moves = np.isin(np.arange(len(traces)), cut.trace)
     rows = slice(None) if moves.all() else traces.spread(moves)
@@ -133,15 +138,16 @@ def find_all(
     way = strokes.spread(cut.direction)
     filtered = running_median(force_N, traces, 3)  # single spikes must not decide where a rise ends
     time_s, along, displacement_mm = time_s[rows], way * displacement_mm[rows], displacement_mm[rows]
-    steady, sliding = np.zeros(traces.rows, bool), np.zeros(traces.rows, bool)
+    steady, sliding, left = np.zeros(traces.rows, bool), np.zeros(traces.rows, bool), np.zeros(traces.rows)
     if not len(strokes):
-        return Found(*cut, np.empty(0), [], steady, sliding)
-    steady[rows], sliding[rows] = steady_windows(
+        return Found(*cut, np.empty(0), [], steady, sliding, left)
+    steady[rows], sliding[rows], against = steady_windows(
         time_s, along, way * filtered[rows], strokes, cut.origin - cut.start, noise[cut.trace], settings.speed_tolerance
     )
+    left[rows] = way * against
     count, share = strokes.sum(steady[rows]), _share_covered(along, steady[rows], strokes)
     short = [_too_short(n, part, settings) for n, part in zip(count.tolist(), share.tolist(), strict=True)]
-    return Found(*cut, slopes(time_s, displacement_mm, steady[rows], strokes), short, steady, sliding)
+    return Found(*cut, slopes(time_s, displacement_mm, steady[rows], strokes), short, steady, sliding, left)
 
 
 def smoothed(values: np.ndarray, traces: Pieces, samples: int) -> np.ndarray:
@@ -270,7 +276,7 @@ def _whole_files(
     short = [None if n >= least else f"only {n} samples; at least {least} are needed" for n in size.tolist()]
     strokes = Pieces(size)
     speed = slopes(time_s[moves], displacement_mm[moves], np.ones(strokes.rows, bool), strokes)
-    return Found(*cut, speed, short, moves, moves.copy())
+    return Found(*cut, speed, short, moves, moves.copy(), np.zeros(len(moves)))
 
 
 def _too_short(samples: int, share: float, settings: Strokes) -> str | None:

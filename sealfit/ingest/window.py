@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from sealfit.ingest.pieces import Pieces, median, weighted_medians
-from sealfit.ingest.presliding import Start, rise_ends_mm
+from sealfit.ingest.presliding import Start, rises
 from sealfit.ingest.running import running_median
 
 REST = 0.5  # slower than this share of the plateau is a rest, not a ripple of the speed
@@ -17,6 +18,7 @@ STANDSTILL = 0.05  # slower than this share of the plateau: not moving yet, or n
 # for 50 %; a first-order lag three times as long for 99.9 %, and 3.3 times. In between, in between.
 STRAIGHT, LAG = (1.8, 0.25), (3.3, 2.0)
 BEFORE_STOP = 0.5  # an S-shaped stop leaves the plateau earlier than a straight one, by less than half its length
+ONSET, HALF_UP = 0.05, 0.5  # shares of the rise below which a force is at rest, and above which it has come up
 SPEED_NOISE = 0.25  # noise of the local speed, as a share of the tolerance: a false exit is then a matter of four SDs
 
 
@@ -28,8 +30,9 @@ def steady_windows(
     origin: np.ndarray,
     noise_mm: np.ndarray,
     tolerance: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return which rows of strokes are in their steady window, and in which they slide at all, shape (n,) each.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which rows of strokes are in their steady window, in which they slide at all, and what is left there of
+    the pre-sliding rise (in N, positive against the motion; 0 outside the window), shape (n,) each.
 
     Parameters
     ----------
@@ -45,7 +48,7 @@ def steady_windows(
         Share by which the speed may be off its plateau.
     """
     # A glitch of one sample is not a rest.
-    speed, half = local_speeds(time_s, running_median(along_mm, strokes, 5), strokes, noise_mm, tolerance)
+    speed, half, blurred = local_speeds(time_s, running_median(along_mm, strokes, 5), strokes, noise_mm, tolerance)
     plateau = plateau_speeds(time_s, speed, strokes)
     steady = np.zeros(len(time_s), bool)
     usual = strokes.spread(plateau)
@@ -56,53 +59,133 @@ def steady_windows(
     for start, rows in zip(strokes.start[origin > 0].tolist(), origin[origin > 0].tolist(), strict=True):
         sliding[start : start + rows] = moves[start : start + rows] = False
     begins, ends = (strokes.split(rows) for rows in _edges(moves, strokes))
-    stretches: list[tuple[int, int, int]] = []  # standstill, and where the speed is steady
+    stretches: list[_Stretch] = []
     for i, rows in enumerate(strokes.slices):
         if plateau[i] <= 0.0:
             continue
         own = (values[rows] for values in (time_s, along_mm, speed, slow, fast))
-        stroke, since = _Motion(*own, float(plateau[i]), int(half[i])), int(origin[i])
+        stroke, since = _Motion(*own, float(plateau[i]), int(half[i])), 0 if blurred[i] else int(origin[i])
         for first, last in stroke.moving(begins[i].tolist(), ends[i].tolist()):
             still = stroke.standstill(since, first)
             begin, end = stroke.ramp_end(still, first, last), stroke.stop_begin(first, last)
+            if blurred[i]:  # neither the rest nor the ramp can be seen: the force says better when the motion begins
+                still = max(still, first_motion(force_N[rows][:end], still))
+                begin = max(begin, still)
             if end - begin >= 4:
-                stretches.append((rows.start + still, rows.start + begin, rows.start + end))
+                places = (rows.start + row for row in (still, begin, end))
+                stretches.append(_Stretch(*places, 0 if blurred[i] else int(half[i])))
             since = last
-    for begin, end in _past_rises(along_mm, force_N, stretches):
+    left = np.zeros(len(time_s))
+    for begin, end, left_N in _past_rises(time_s, along_mm, force_N, stretches):
         steady[begin:end] = True
-    return steady, sliding
+        left[begin:end] = left_N
+    return steady, sliding, left
+
+
+class _Stretch(NamedTuple):
+    """A stretch of motion: rows of its standstill and of where the speed is steady (the last one exclusive), and over
+    how many rows the displacement is to be averaged; 0 where its noise hides how the stretch starts."""
+
+    still: int
+    begin: int
+    end: int
+    averaged: int
 
 
 def _past_rises(
-    along_mm: np.ndarray, force_N: np.ndarray, stretches: Sequence[tuple[int, int, int]]
-) -> list[tuple[int, int]]:
-    """Return the rows of each stretch from where the force is past its pre-sliding rise."""
+    time_s: np.ndarray, along_mm: np.ndarray, force_N: np.ndarray, stretches: Sequence[_Stretch]
+) -> list[tuple[int, int, np.ndarray]]:
+    """Return the rows of each stretch from where the force is past its pre-sliding rise, and what is left of it."""
     starts = []
-    for still, begin, end in stretches:
-        distance = np.maximum.accumulate(along_mm[still:end]) - along_mm[still]
+    for still, begin, end, averaged in stretches:
+        distance = _distance(time_s[still:end], along_mm[still:end], begin - still, averaged)
         starts.append(Start(distance, force_N[still:end], begin - still))
-    return [
-        (max(begin, still + int(start.distance_mm.searchsorted(past))), end)
-        for (still, begin, end), start, past in zip(stretches, starts, rise_ends_mm(starts), strict=True)
-    ]
+    made = []
+    for (still, begin, end, _), start, rise in zip(stretches, starts, rises(starts), strict=True):
+        past = int(start.distance_mm.searchsorted(rise.end_mm)) if rise.end_mm > 0.0 else 0
+        first = max(begin, still + past)
+        made.append((first, end, rise.at(start.distance_mm[first - still :])))
+    return made
+
+
+def _distance(time_s: np.ndarray, along_mm: np.ndarray, ramp_end: int, averaged: int) -> np.ndarray:
+    """Return the distance from standstill, never falling, in mm; free of noise on the plateau of the speed.
+
+    There it is a straight line over time, and what the displacement is off that line, averaged: noise of the
+    displacement would be noise of the rise's share that is left. With `averaged` 0 time says all of it.
+    """
+    rows = slice(ramp_end, None)
+    middle, now = along_mm[rows].mean(), time_s[rows].mean()
+    along, time = along_mm[rows] - middle, time_s[rows] - now
+    speed = float(time @ along) / float(time @ time)
+    if not averaged:
+        return speed * (time_s - time_s[0])
+    line = speed * time
+    line = middle - along_mm[0] + line + _averaged(along - line, averaged)
+    ramp = np.maximum.accumulate(along_mm[:ramp_end]) - along_mm[0]
+    return np.maximum.accumulate(np.r_[np.clip(ramp, 0.0, max(line[0], 0.0)), line])
+
+
+def _averaged(values: np.ndarray, rows: int) -> np.ndarray:
+    """Return the mean over `rows` rows to either side of each, or as many as there are."""
+    sums, place = np.concatenate(([0.0], np.cumsum(values))), np.arange(len(values))
+    low, high = np.maximum(place - rows, 0), np.minimum(place + rows + 1, len(values))
+    return (sums[high] - sums[low]) / (high - low)
 
 
 def local_speeds(
     time_s: np.ndarray, along_mm: np.ndarray, strokes: Pieces, noise_mm: np.ndarray, tolerance: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the speed over `half` rows to either side of each row, and each stroke's `half`: wide enough for noise.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the speed over `half` rows to either side of each row, each stroke's `half`: wide enough for noise; and
+    in which strokes a rest or a ramp shorter than that cannot be seen.
 
-    Differences of displacement over differences of time: a gap does no harm.
+    Differences of displacement over differences of time: a gap does no harm. Of single samples, or, where these would
+    have to be more than a quarter of the stroke apart, of the means of all samples to either side.
     """
     last = strokes.stop - 1
     mean_step = np.abs(along_mm[last] - along_mm[strokes.start]) / np.maximum(strokes.size - 1, 1)
     # The speed's SD is sqrt(2) noise over the width, wanted below SPEED_NOISE * tolerance of the speed itself.
     wanted = np.sqrt(2.0) * noise_mm / np.maximum(2.0 * SPEED_NOISE * tolerance * mean_step, 1e-300)
-    half = np.minimum(np.maximum(np.ceil(wanted), 1), np.maximum(strokes.size // 8, 1)).astype(np.int64)
+    most = np.maximum(strokes.size // 8, 1)
+    half = np.minimum(np.maximum(np.ceil(wanted), 1), most).astype(np.int64)
+    blurred = wanted > most
+    # Of means of `half` samples each, `half` apart, it is sqrt(2 / half) noise over `half` steps.
+    half[blurred] = np.minimum(np.ceil((2.0 * wanted[blurred]) ** (2.0 / 3.0)), most[blurred]).astype(np.int64)
     rows, width = np.arange(strokes.rows), strokes.spread(half)
     low = np.maximum(rows - width, strokes.spread(strokes.start))
     high = np.minimum(rows + width, strokes.spread(last))
-    return (along_mm[high] - along_mm[low]) / (time_s[high] - time_s[low]), half
+    speed = (along_mm[high] - along_mm[low]) / (time_s[high] - time_s[low])
+    for i in np.flatnonzero(blurred).tolist():
+        own = strokes.slices[i]
+        speed[own] = _speeds_of_means(time_s[own], along_mm[own], int(half[i]))
+    return speed, half, blurred
+
+
+def _speeds_of_means(time_s: np.ndarray, along_mm: np.ndarray, half: int) -> np.ndarray:
+    """Return the speed at every row of a stroke from the means of `half` rows before and after it; near the ends that
+    of the nearest row which has so many."""
+    sums = [np.concatenate(([0.0], np.cumsum(values - values[0]))) for values in (along_mm, time_s)]
+    place = np.clip(np.arange(len(time_s)), half, len(time_s) - half)
+    moved, lasted = (total[place + half] - 2.0 * total[place] + total[place - half] for total in sums)
+    return moved / lasted
+
+
+def first_motion(force_N: np.ndarray, since: int) -> int:
+    """Return the row, from `since` on, from which the force comes up to its level: the last at which it is at rest.
+
+    Examples
+    --------
+    >>> first_motion(np.r_[np.zeros(50), 30.0 * (1.0 - np.exp(-np.arange(200) / 20.0))], 0)
+    51
+    """
+    own = force_N[since:]
+    if len(own) < 8:
+        return since
+    begin, level = median(own[: max(len(own) // 100, 3)]), median(own)
+    share = (own - begin) / (level - begin) if level != begin else np.ones(len(own))
+    up = _first(share > HALF_UP)
+    still = _last(share[:up] < ONSET) if up else None
+    return since if still is None else since + still
 
 
 def plateau_speeds(time_s: np.ndarray, speed: np.ndarray, strokes: Pieces) -> np.ndarray:

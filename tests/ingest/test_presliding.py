@@ -1,0 +1,92 @@
+"""Strokes of 3 to 300 bristle lengths: what is left of the rise in the steady window is known, and taken out."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sealfit.config import Config, Strokes
+from sealfit.ingest.campaign import ingest_campaign
+from sealfit.ingest.pieces import Pieces
+from sealfit.ingest.strokes import find_all
+
+LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
+
+
+def bristle_trace(ratio, *, hertz=100.0, ramp=0.2, blur=0.002, begin=0.0, seed=1, shape="straight"):
+    """Return time, displacement and force of a stroke `ratio` bristle lengths long, after a rest of a second.
+
+    At constant G the force is an exponential of the distance whatever the speed does: Eq. 2 divided by v.
+    """
+    random = np.random.default_rng(seed)
+    time = np.arange(0.0, 1.0 + ratio * LENGTH / SPEED, 1.0 / hertz)
+    since = np.maximum(time - 1.0, 0.0)
+    if shape == "straight":
+        slid = SPEED * np.where(since < ramp, 0.5 * since**2 / ramp, since - 0.5 * ramp)
+    else:
+        slid = SPEED * (since - ramp * -np.expm1(-since / ramp))
+    force = LEVEL + (begin - LEVEL) * np.exp(-slid / LENGTH)
+    return time, slid + random.normal(0.0, blur, time.size), force + random.normal(0.0, NOISE, time.size)
+
+
+def steady_forces(ratio, many=12, **more):
+    """Return the mean force of the steady windows of several strokes, as measured and with the rise taken out."""
+    made = []
+    for seed in range(many):
+        time, place, force = bristle_trace(ratio, seed=seed, **more)
+        found = find_all(time, place, force, Pieces([time.size]), Strokes())
+        assert found.short == [None]
+        made.append((force[found.steady].mean(), (force - found.presliding_N)[found.steady].mean()))
+    return np.array(made).T
+
+
+@pytest.mark.parametrize("ratio", [3.0, 6.0, 11.0, 30.0, 100.0, 300.0])
+@pytest.mark.parametrize(
+    "more",
+    [{}, {"hertz": 500.0}, {"begin": -LEVEL}, {"begin": 0.3 * LEVEL}, {"ramp": 0.4}, {"ramp": 0.1, "shape": "lag"}],
+    ids=str,
+)
+def test_the_steady_force_does_not_depend_on_where_the_window_begins(ratio, more):
+    measured, steady = steady_forces(ratio, **more)
+    error = steady.std(ddof=1) / np.sqrt(steady.size)
+    assert abs(steady.mean() - LEVEL) < 4 * error + 1e-4 * LEVEL
+    assert steady.std() < 0.002 * LEVEL
+    if ratio <= 6:
+        assert measured.mean() < LEVEL - 0.2
+
+
+@pytest.mark.parametrize("ratio", [6.0, 11.0, 30.0])
+def test_noise_of_the_displacement_does_not_hide_the_rise(ratio):
+    _, steady = steady_forces(ratio, blur=0.3, hertz=500.0)
+    assert abs(steady.mean() - LEVEL) < 4 * steady.std(ddof=1) / np.sqrt(steady.size) + 1e-4 * LEVEL
+
+
+def test_twenty_samples_a_second_are_enough_where_the_window_holds_twenty():
+    _, steady = steady_forces(11.0, hertz=20.0)
+    assert abs(steady.mean() - LEVEL) < 4 * steady.std(ddof=1) / np.sqrt(steady.size) + 1e-4 * LEVEL
+
+
+def test_a_rise_along_a_straight_line_is_no_bristle_and_is_not_corrected():
+    time, place, _ = bristle_trace(40.0)
+    force = np.minimum(place / 3.0, 1.0) * LEVEL  # elastic over 3 of 18 mm
+    found = find_all(time, place, force, Pieces([time.size]), Strokes())
+    assert not found.presliding_N.any()
+    assert place[found.steady].min() > 2.9
+
+
+def test_a_stroke_that_ends_before_it_is_steady_says_so_and_is_used(tmp_path):
+    for name, ratio in (("short.csv", 3.0), ("long.csv", 40.0)):
+        columns = dict(zip(("time_s", "displacement_mm", "force_N"), bristle_trace(ratio), strict=True))
+        pd.DataFrame(columns).to_csv(tmp_path / name, index=False)
+    runs = pd.DataFrame({"file": ["short.csv", "long.csv"], "aging_days": 0.0, "load_N": 49.0, "speed_mm_s": SPEED})
+    runs.to_csv(tmp_path / "runs.csv", index=False)
+    tables = ingest_campaign(tmp_path, Config(condition=["aging_days"])).tables
+    said = tables["quality"].set_index("file")["check"]
+    assert said.to_dict() == {"short.csv": "never_steady", "long.csv": "ok"}
+    steady = tables["steady"].set_index("file")
+    assert steady["used"].all()
+    assert steady["force_N"].to_numpy() == pytest.approx([LEVEL, LEVEL], rel=2e-3)
+    assert steady.loc["short.csv", "presliding_N"] < -1.0
+    bins = tables["bins"]
+    short = bins[bins["file"] == "short.csv"]
+    assert short["force_N"].to_numpy() == pytest.approx(LEVEL, abs=1.0)
+    assert short["presliding_N"].iloc[0] < 1.5 * short["presliding_N"].iloc[-1] < 0
