@@ -23,7 +23,18 @@ OF_INGEST = {  # columns that its summary counts
     "quality": ["action", "severity"],
     "steady": ["condition"],
 }
-EFFECT_KEYS = ("id", "label", "form", "acts_on", "operation", "channels", "named", "candidate", "parameters")
+EFFECT_KEYS = (
+    "id",
+    "label",
+    "form",
+    "acts_on",
+    "operation",
+    "channels",
+    "named",
+    "candidate",
+    "parameters",
+    "reference",
+)
 
 
 def of_steps(store: Store, steps: Iterable[str]) -> dict:

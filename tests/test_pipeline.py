@@ -16,7 +16,7 @@ import pytest
 
 from sealfit.fingerprint import STEPS
 from sealfit.simulate import load_truth, true_force
-from sealfit.steps import CLOSED, FITTED, INGESTED
+from sealfit.steps import AFTER, CLOSED, FITTED, INGESTED
 from sealfit.store import Store
 from sealfit.tables import SCHEMAS
 
@@ -61,7 +61,7 @@ def started(*arguments):
 
 
 def tables(out):
-    return {name: pd.read_parquet(out / f"{name}.parquet") for name in (*INGESTED, *FITTED, *CLOSED)}
+    return {name: pd.read_parquet(out / f"{name}.parquet") for name in (*INGESTED, *FITTED, *CLOSED, *AFTER)}
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_ingest_does_without_scipy_where_no_repeat_lies_outside(campaign, tmp_pa
 
 def test_a_run_gives_every_table_with_its_schema(first):
     out, _ = first
-    for name in (*INGESTED, *FITTED, *CLOSED):
+    for name in (*INGESTED, *FITTED, *CLOSED, *AFTER):
         schema = ds.dataset(out / f"{name}.parquet", partitioning=None).schema
         fixed = SCHEMAS[name].columns
         assert schema.names[: len(fixed)] == [column.name for column in fixed]

@@ -13,6 +13,7 @@ from sealfit.closure.forms import describe, free_term
 from sealfit.closure.grow import Grown
 from sealfit.closure.intervals import effect_intervals
 from sealfit.closure.judge import Candidate, Judge
+from sealfit.closure.reference import reference_of
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import search
 from sealfit.config import Config
@@ -59,6 +60,7 @@ def _entry(after: Fitted, number: int, item: Added, config: Config) -> dict:
         "channels": channels_of(term, after.rows),
         "acts_on": term.acts_on,
         "operation": term.operation,
+        "reference": reference_of(term, after.model.values[number], config),
         "form": form_of(term)
         + ("" if term.smoothness is None else f"; held smooth, worth {worth(after, number):.1f} numbers"),
         "named": proposal.named,

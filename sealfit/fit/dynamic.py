@@ -51,9 +51,9 @@ def fit_dynamic(
     traces : DataFrame or sequence of StoredTraces
         Table `traces`, or where it lies: then no more of it is read at once than some conditions have.
     steady : DataFrame
-        Table `steady`; rows with `used` false are left out.
+        Table `steady` or `steady_after`; rows with `used` false are left out.
     steady_fit : DataFrame
-        Table `steady_fit`: the Stribeck curve of each condition; flat where that is not identified.
+        Its table `steady_fit`: the Stribeck curve of each condition; flat where that is not identified.
     config : Config
         Names the condition columns, the units and the sensor's accuracy.
     workers : int
@@ -84,7 +84,7 @@ def fit_dynamic(
     ]
     keys = condition_keys(steady, config)
     table = pd.concat([part for part in rows if len(part)], ignore_index=True)
-    table = table.merge(keys, on="condition", how="left", validate="many_to_one")
+    table = table.merge(keys, on="condition", how="left", validate="many_to_one").assign(model="before")
     fixed = DYNAMIC_FIT.names()
     table = table.reindex(columns=[*fixed, *(name for name in keys.columns if name not in fixed)])
     return Dynamic(table.astype({"direction": "Int64"}), curves.reindex(columns=DYNAMIC_CURVES.names()))
@@ -150,6 +150,7 @@ class _Strokes:
 def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
     traces = asked.traces if isinstance(asked.traces, pd.DataFrame) else asked.traces.read(OF_TRACES, coded=["file"])
     table = asked.steady.reset_index(drop=True)
+    traces = _less_effects(traces, table)
     along = strokes_along(traces, table)
     starts = {start.row: start for start in starts_of(along)}
     wholes = {whole.row: whole for whole in whole_strokes(along)}
@@ -175,6 +176,15 @@ def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
             )
         )
     return made
+
+
+def _less_effects(traces: pd.DataFrame, steady: pd.DataFrame) -> pd.DataFrame:
+    """Return the traces less the effects' force at each stroke's start, where table `steady` holds it."""
+    if "effects_start_N" not in steady:
+        return traces
+    known = steady.set_index(["file", "stroke"])["effects_start_N"]
+    keys = pd.MultiIndex.from_arrays([traces["file"].astype(object), traces["stroke"]])
+    return traces.assign(force_N=traces["force_N"] - known.reindex(keys).fillna(0.0).to_numpy())
 
 
 class _Grouped:
