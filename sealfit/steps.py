@@ -32,7 +32,7 @@ AFTER = (
     "master_curve_after", "dynamic_fit_after", "dynamic_curves_after",
 )  # fmt: skip
 FITTED = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
-UNREPORTED = ("traces", "bins")  # as many rows as samples, and nothing in the report needs them
+UNREPORTED = ("traces", "bins", "steady_after")  # of many rows, and nothing in the report needs them
 TRACE = ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"]
 REPORTED = {  # of tables with a row per bin, what the report looks at
     f"residuals_{stage}": ["condition", "run_id", "file", "residual_N", "heldout_residual_N"]
@@ -251,7 +251,8 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent, early:
 
     progress.say("drawing the report")
     with timed("reading tables"):
-        tables = {**(early.tables or _reported(store, (*INGESTED, *FITTED))), **_reported(store, CLOSED)}
+        closed = _reported(store, (*CLOSED, *AFTER))
+        tables = {**(early.tables or _reported(store, (*INGESTED, *FITTED))), **closed}
     with timed("page"):
         about = store.read_json("closure"), store.provenance(), store.seen_config("report")
         report = build_report(tables, *about, drawn=early.figures)
