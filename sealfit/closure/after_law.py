@@ -40,9 +40,9 @@ def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple
 
     Notes
     -----
-    mu_0, a and b are numbers of the joint fit, and so are their intervals: Student's t on the degrees of freedom of the
-    coarsest level that scatters; that of b is symmetric in its logarithm. Effects that are part of the condition (of
-    days) multiply or change the law; the curves hold them.
+    mu_0, a and b are numbers of the joint fit, and so are their standard errors. Their intervals have Student's t on
+    specimens less the numbers of one coefficient; that of b is symmetric in its logarithm. Effects that are part of the
+    condition (of days) multiply or change the law; the curves hold them.
     """
     rows, curves = [], []
     open_columns = [name for name in config.series_columns if name in steady_fit.columns]
@@ -56,6 +56,15 @@ def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple
     keys = steady_fit.groupby("series", sort=True)[open_columns].first().reset_index()
     table = pd.DataFrame(rows).merge(keys, on="series", how="left", validate="many_to_one")
     return table.assign(model="after")[columns], pd.concat(curves, ignore_index=True)
+
+
+def law_df(after: Fitted) -> float:
+    """Return the degrees of freedom of the laws' intervals: specimens less the numbers fitted to one coefficient.
+
+    Few specimens show their scatter badly, often as none at all; that of the runs then has too many degrees of freedom.
+    """
+    left = after.rows.groups.starts["specimen"].size - after.model.declared.numbers_of_mu
+    return min(degrees_of_freedom(after), float(max(left, 1)))
 
 
 def _laws(after: Fitted, config: Config) -> Iterator[_Law]:
@@ -88,7 +97,7 @@ class _Law:
         number = [int(declared.index[name][self.conditions[0]]) for name in names]
         self.place = number if min(number) >= 0 else None
         self.curve_of = Curve(series, self.quantity, 0, np.unique(days[self.conditions]))
-        self.df = degrees_of_freedom(after)
+        self.df = law_df(after)
 
     def rows(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
         """Yield the rows of `aging_fit_after`."""

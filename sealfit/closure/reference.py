@@ -86,7 +86,7 @@ def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.D
     reference = at_reference(model, config)
     effects = force - evaluate(reference, rows, jacobian=False)[0]
     taken = [k for k, term in enumerate(model.terms) if not is_kept(term, config)]
-    places = np.concatenate([np.arange(model.size)[model.place(k)] for k in taken])
+    places = np.array([i for k in taken for i in range(*model.place(k).indices(model.size))], int)
     last = tangent.values.shape[1] - model.size
     principal = _principal(tangent.values[:, last + places], after.covariance[np.ix_(places, places)], rows)
     columns = {"effects_N": effects, "effects_start_N": _at_start(model, reference, rows)}
@@ -105,13 +105,15 @@ def _principal(columns: np.ndarray, covariance: np.ndarray, rows: Rows) -> np.nd
 
     Directions whose mean over the strokes is small are dropped: a fit to the strokes does not see them.
     """
+    if not columns.size:
+        return columns
     size, axes = np.linalg.eigh(covariance)
     spread = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))
     stroke = rows.codes("stroke")
     means = np.column_stack([np.bincount(stroke, column) for column in spread.T]) / np.bincount(stroke)[:, None]
     _, singular, turned = np.linalg.svd(means, full_matrices=False)
     share = np.cumsum(singular[::-1] ** 2)[::-1]
-    kept = share > SMALL * share[0] if share.size else share > 0
+    kept = share > SMALL * share[0]
     return spread @ turned[kept].T
 
 
