@@ -116,6 +116,19 @@ def test_closure_json_has_every_key_and_no_nan(first):
     assert closure["noise_floor_N"] > 0
 
 
+def test_where_nothing_is_missing_after_is_before(first):
+    out, _ = first
+    assert all(pd.read_parquet(out / f"{name}.parquet").empty for name in AFTER)
+    assert set(pd.read_parquet(out / "aging_fit.parquet")["model"]) == {"before"}
+    asked = ("lifetime", out, "--threshold", "0.75", "--json")
+    after, before = (json.loads(sealfit(*asked, *model).stdout) for model in ((), ("--model", "before")))
+    assert (after.pop("model"), before.pop("model")) == ("after", "before")
+    assert after == before
+    said = sealfit(*asked[:-1]).stdout
+    assert said.startswith("model       after: no effect was added, so it is the declared model\n")
+    assert sealfit(*asked[:-1], "--model", "both", code=1).stderr.startswith("sealfit: there is no model 'both'.")
+
+
 def test_a_run_ends_with_a_short_summary(first):
     out, run = first
     lines = run.stdout.splitlines()

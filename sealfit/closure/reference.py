@@ -39,11 +39,12 @@ def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str
     values : mapping of str to float
         Its fitted parameters.
     config : Config
-        Names the condition columns.
+        Names the condition columns, and gives channels their true units.
     """
     if is_kept(term, config):
         return KEPT
-    known = {"x": term.channels[0], "z": term.channels[-1]}
+    labels = {name: config.units.label(name) for name in term.channels}
+    known = {"x": labels[term.channels[0]], "z": labels[term.channels[-1]], **labels}
     known |= {name: f"{value:.4g}" for name, value in (*term.fixed.items(), *values.items()) if np.isscalar(value)}
     words = term.effect.reference or f"where {term.effect.form} = 0"
     return re.sub(r"\{(\w+)\}", lambda found: str(known.get(found[1], found[1])), words)

@@ -174,9 +174,11 @@ def test_an_effect_of_days_alone_stays_in_the_values():
     [
         ("warming_distance", ("distance_mm",), {}, {}, "cold contact (distance 0)"),
         ("zero_offset", ("direction",), {}, {}, "zero offset removed"),
-        ("linear", ("oil_ppm",), {"x_ref": 50.25}, {}, "oil_ppm = 50.25"),
-        ("product", ("oil_ppm", "dust_mg"), {"x_ref": 50.0, "z_ref": 5.0}, {}, "oil_ppm = 50 or dust_mg = 5"),
-        ("step", ("run_order",), {}, {"A": 1.0, "x_0": 33.5}, "run_order below 33.5"),
+        ("linear", ("oil_ppm",), {"x_ref": 50.25}, {}, "oil ppm = 50.25"),
+        ("product", ("oil_ppm", "dust_mg"), {"x_ref": 50.0, "z_ref": 5.0}, {}, "oil ppm = 50 or dust mg = 5"),
+        ("log_rate", ("speed_mm_s",), {"speed_mm_s_ref": 7.25}, {}, "sliding speed (mm/s) = 7.25"),
+        ("exponential_approach", ("distance_mm",), {}, {}, "sliding distance (mm) = 0"),
+        ("step", ("run_order",), {}, {"A": 1.0, "x_0": 33.5}, "run order below 33.5"),
     ],
 )
 def test_the_reference_is_said_in_words(id, channels, fixed, values, words):
