@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -16,7 +16,7 @@ from sealfit.fit.bristle_rows import bristle_rows
 from sealfit.fit.cells import Cells, mean_over
 from sealfit.fit.rises import Curve, Stroke
 from sealfit.fit.rows import nesting_run
-from sealfit.fit.starts import Part, Start, starts_of, strokes_along, whole_strokes
+from sealfit.fit.starts import Along, Part, Start, starts_of, strokes_along, whole_strokes
 from sealfit.fit.steady import condition_keys
 from sealfit.fit.stiffness import fit_stiffness
 from sealfit.samples import StoredTraces
@@ -150,8 +150,7 @@ class _Strokes:
 def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
     traces = asked.traces if isinstance(asked.traces, pd.DataFrame) else asked.traces.read(OF_TRACES, coded=["file"])
     table = asked.steady.reset_index(drop=True)
-    traces = _less_effects(traces, table)
-    along = strokes_along(traces, table)
+    along = _less_effects(strokes_along(traces, table), table)
     starts = {start.row: start for start in starts_of(along)}
     wholes = {whole.row: whole for whole in whole_strokes(along)}
     strokes, fitted = _Strokes(table), _fitted(asked.steady_fit)
@@ -178,13 +177,12 @@ def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
     return made
 
 
-def _less_effects(traces: pd.DataFrame, steady: pd.DataFrame) -> pd.DataFrame:
-    """Return the traces less the effects' force at each stroke's start, where table `steady` holds it."""
+def _less_effects(strokes: Sequence[Along], steady: pd.DataFrame) -> Sequence[Along]:
+    """Return strokes less the effects' force where they start, if table `steady` holds it."""
     if "effects_start_N" not in steady:
-        return traces
-    known = steady.set_index(["file", "stroke"])["effects_start_N"]
-    keys = pd.MultiIndex.from_arrays([traces["file"].astype(object), traces["stroke"]])
-    return traces.assign(force_N=traces["force_N"] - known.reindex(keys).fillna(0.0).to_numpy())
+        return strokes
+    size = (steady["effects_start_N"] * steady["direction"]).tolist()
+    return [replace(stroke, force_N=stroke.force_N - size[stroke.row]) for stroke in strokes]
 
 
 class _Grouped:

@@ -13,6 +13,7 @@ from sealfit.closure.reference import KEPT, at_reference, reference_of, without_
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.all_series import law_of
+from sealfit.fit.dynamic import fit_dynamic
 from sealfit.fit.estimate import fit, fit_declared
 from sealfit.fit.joint import evaluate
 from sealfit.fit.lifetime import Goal, lifetime
@@ -21,7 +22,7 @@ from sealfit.fit.shared_curve import shared_levels
 from sealfit.fit.steady import fit_conditions
 from sealfit.fit.terms import Term
 from sealfit.fit.uncertainty import shifts_of
-from sealfit.tables import AFTER
+from sealfit.tables import AFTER, STEADY_FIT
 
 SCATTER = {"setup": 0.003, "specimen": 0.005, "bins": 10}
 WARMING = (Term(EFFECTS["warming_time"], ("time_s",), "mu", "multiply"), {"A": 0.05, "tau": 3.0})
@@ -142,6 +143,19 @@ def test_an_offset_is_taken_out_of_both_directions():
     one = fit_conditions(free, Config())
     unaged = one[(one["condition"] == "unaged") & (one["parameter"] == "mu_s") & (one["quantity"] == "steady")].iloc[0]
     assert unaged["value"] == pytest.approx(TRUE["mu_s0"], rel=0.015)
+
+
+def test_starts_are_fitted_to_forces_without_the_offset():
+    """A straight rise over 1 mm to 30 N, and 2 N more shown by the sensor."""
+    distance = np.linspace(0.0, 10.0, 400)
+    force = 30.0 * np.minimum(distance, 1.0) + 2.0
+    keys = {"file": "a.csv", "stroke": 1, "condition": "unaged", "direction": 1}
+    trace = pd.DataFrame({**keys, "time_s": distance, "displacement_mm": distance, "force_N": force})
+    steady = {**keys, "series": "unaged", "rubber": "rubber", "run_id": "r", "speed_mm_s": 1.0, "speed_set_mm_s": 1.0}
+    steady = pd.DataFrame([{**steady, "load_N": 50.0, "force_N": 30.0, "effects_start_N": 2.0, "used": True}])
+    asked = trace.assign(steady=distance > 3.0), steady, pd.DataFrame(columns=STEADY_FIT.names()), Config()
+    curve = fit_dynamic(*asked).curves
+    assert curve["force_N"].max() == pytest.approx(30.0, abs=0.01)
 
 
 def test_an_effect_of_days_alone_stays_in_the_values():
