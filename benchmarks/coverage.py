@@ -225,11 +225,11 @@ def report(title: str, campaigns: Sequence[Sequence[Entry]]) -> None:
             continue
         known = 100 * np.mean([e.known for e in entries])
         width = 100 * np.nanmedian([(e.high - e.low) / 2 / abs(e.truth) for e in entries])
-        held = coverage([_held(c, name) for c in campaigns])
-        print(f"  {name:46s} {held:44s} identified {known:5.1f} %  +- {width:.2g} %")
+        share = coverage([held(c, name) for c in campaigns])
+        print(f"  {name:46s} {share:44s} identified {known:5.1f} %  +- {width:.2g} %")
 
 
-def _held(entries: Sequence[Entry], name: str | None = None) -> tuple[int, int]:
+def held(entries: Sequence[Entry], name: str | None = None) -> tuple[int, int]:
     """Return how many of a campaign's intervals hold the truth, and how many there are."""
     own = [e for e in entries if e.low is not None and name in (None, e.name)]
     low, high = (np.array([e[k] for e in own], float) for k in (2, 3))
@@ -254,7 +254,7 @@ def main() -> None:
                 found = list(pool.map(_job, [(part, title, seed) for seed in seeds]))
                 report(f"{part}: {title}", found)
                 everything += found
-            print(f"\n{part}, all designs: {coverage([_held(c) for c in everything])}", flush=True)
+            print(f"\n{part}, all designs: {coverage([held(c) for c in everything])}", flush=True)
 
 
 if __name__ == "__main__":

@@ -169,12 +169,13 @@ def lifetime(
     compression: Annotated[float | None, typer.Option("--compression", help="Height in use, in percent.")] = None,
     years: Annotated[float | None, typer.Option("--years", help="Find the temperature that lasts so long.")] = None,
     law: Annotated[str | None, typer.Option("--law", help="log, stretched, power, induction.")] = None,
+    model: Annotated[str, typer.Option("--model", help="after (with the loop's effects) or before.")] = "after",
     as_json: Json = False,
 ) -> None:
     """Tell the days until a quantity reaches a threshold."""
     from sealfit import requests, summary_life
 
-    asked = {"quantity": quantity, "threshold": threshold, "loss_pct": loss, "law": law}
+    asked = {"quantity": quantity, "threshold": threshold, "loss_pct": loss, "law": law, "model": model}
     asked |= {"temperature_C": temperature, "compression_pct": compression, "years": years}
     end("lifetime", requests.lifetime(out, **asked), summary_life.lifetime_lines, as_json)
 

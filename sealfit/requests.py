@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sealfit.engine import on_cluster
-from sealfit.errors import CampaignError, Fault, OutError
+from sealfit.errors import CampaignError, Fault, OutError, RequestError, StaleError
 from sealfit.own_effects import OPTION, own_effects_folder, what_differs
 from sealfit.places import RUNS, campaign_folder, existing_file, existing_out
 from sealfit.progress import Silent
@@ -13,6 +15,11 @@ from sealfit.state import ConfigCopy
 from sealfit.steps import FAULTY
 from sealfit.store import Store
 from sealfit.units import Units
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MODELS = ("after", "before")  # with the loop's effects taken out at their reference, and without effects
 
 
 def check(
@@ -88,13 +95,14 @@ def lifetime(
     compression_pct: float | None,
     years: float | None,
     law: str | None,
+    model: str = "after",
 ) -> dict:
     """Return the days until a quantity reaches a threshold by the likeliest law and by its rivals, with intervals.
 
     Raises
     ------
     StaleError
-        If the conditions are not fitted, or stale.
+        If the conditions are not fitted, or the loop is not closed (`model` "after"), or stale.
     RequestError
         If the request does not fit the campaign.
     """
@@ -104,15 +112,38 @@ def lifetime(
     from sealfit.fit.lifetime_answer import answer, finite_ends, goal_of
 
     store = Store.open(existing_out(out))
-    store.require("fit-steady")
+    if model not in MODELS:
+        raise RequestError(f"there is no model '{model}'.", mend=f"Choose one of: {', '.join(MODELS)}.")
     goal = goal_of(threshold, loss_pct)
-    laws = law_of(store.read("steady"), store.read("steady_fit"), quantity, law)
+    tables, taken_out = _fits_of(store, model)
+    laws = law_of(*tables, quantity, law)
     place = {"temperature_C": temperature_C, "compression_pct": compression_pct}
     chosen = answer(laws[0], goal, years, resample=True, **place)
     rivals = [answer(rival, goal, years, **place) for rival in rivals_of(laws)] if law is None else []
     if law is None and years is None:
         chosen["ci95_over_laws"] = finite_ends(over_laws(laws, goal, **place))
-    return {"out": str(store.out), "quantity": quantity, **chosen, "rivals": rivals}
+    asked = {"out": str(store.out), "quantity": quantity, "model": model, "effects": taken_out}
+    before = None
+    if taken_out:
+        with suppress(RequestError):  # the declared model may have no answer where this one has
+            before = answer(law_of(*_fits_of(store, "before")[0], quantity, law)[0], goal, years, **place)
+    return {**asked, **chosen, "rivals": rivals, "before": before}
+
+
+def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame], list[dict]]:
+    """Return tables `steady` and `steady_fit` of a model, and the effects that were taken out of them."""
+    if model == "before":
+        store.require("fit-steady")
+        return (store.read("steady"), store.read("steady_fit")), []
+    try:
+        store.require("close-loop")
+    except StaleError as error:
+        other = "or ask the declared model, without effects: --model before"
+        raise StaleError(error.message, file=error.file, mend=f"{error.mend} ({other})") from error
+    added = [effect for effect in store.read_json("closure")["effects"] if not effect["candidate"]]
+    suffix = "_after" if added else ""
+    taken_out = [{key: effect[key] for key in ("id", "label", "reference")} for effect in added]
+    return (store.read(f"steady{suffix}"), store.read(f"steady_fit{suffix}")), taken_out
 
 
 def _own_effects(folder: Path | None) -> dict:

@@ -28,8 +28,12 @@ if TYPE_CHECKING:
 
 INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
+AFTER = (
+    "steady_after", "steady_fit_after", "aging_fit_after", "aging_curves_after", "aging_laws_after",
+    "master_curve_after", "dynamic_fit_after", "dynamic_curves_after",
+)  # fmt: skip
 FITTED = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
-UNREPORTED = ("traces", "bins")  # as many rows as samples, and nothing in the report needs them
+UNREPORTED = ("traces", "bins", "steady_after")  # of many rows, and nothing in the report needs them
 TRACE = ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"]
 REPORTED = {  # of tables with a row per bin, what the report looks at
     f"residuals_{stage}": ["condition", "run_id", "file", "residual_N", "heldout_residual_N"]
@@ -216,14 +220,18 @@ def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -
 
 
 def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+    from sealfit.closure.after_fits import after_fits
     from sealfit.closure.loop import close_loop
 
     store.require_effects()
     config = store.seen_config("close-loop")
     closure = close_loop(store.read("bins"), store.traces(), config, workers=workers, on_progress=progress.say)
+    if closure.tables["effects"].size:
+        progress.say("the fits with the effects taken out")
+    after = after_fits(closure.after, store.read("steady"), store.traces(), config, workers=workers)
     with timed("writing tables"):
-        for name in CLOSED:
-            staged.table(name, closure.tables[name])
+        for name, table in {**closure.tables, **after}.items():
+            staged.table(name, table)
     started = store.read("runs", ["started_at"])["started_at"].dropna()
     staged.json("model", {**closure.model, "first_started_at": min(started) if len(started) else None})
     staged.json("closure", closure.document)
@@ -251,7 +259,8 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent, early:
 
     progress.say("drawing the report")
     with timed("reading tables"):
-        tables = {**(early.tables or _reported(store, (*INGESTED, *FITTED))), **_reported(store, CLOSED)}
+        closed = _reported(store, (*CLOSED, *AFTER))
+        tables = {**(early.tables or _reported(store, (*INGESTED, *FITTED))), **closed}
     with timed("page"):
         about = store.read_json("closure"), store.provenance(), store.seen_config("report")
         report = build_report(tables, *about, drawn=early.figures)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sealfit.effects.contract import Effect
     from sealfit.store import Store
 
-NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift")  # `quantity` of rows about the fit itself
+NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift", "effect_shift")  # `quantity` of rows about the fit itself
 
 OF_INGEST = {  # columns that its summary counts
     "inputs": ["status"],
@@ -23,7 +23,18 @@ OF_INGEST = {  # columns that its summary counts
     "quality": ["action", "severity", "check", "column", "value", "reason"],
     "steady": ["condition"],
 }
-EFFECT_KEYS = ("id", "label", "form", "acts_on", "operation", "channels", "named", "candidate", "parameters")
+EFFECT_KEYS = (
+    "id",
+    "label",
+    "form",
+    "acts_on",
+    "operation",
+    "channels",
+    "named",
+    "candidate",
+    "parameters",
+    "reference",
+)
 
 
 def of_steps(store: Store, steps: Iterable[str]) -> dict:
@@ -33,7 +44,7 @@ def of_steps(store: Store, steps: Iterable[str]) -> dict:
         "fit-steady": lambda: of_fit(store.read("steady_fit"), "condition"),
         "fit-aging": lambda: of_fit(store.read("aging_fit"), "series"),
         "fit-dynamic": lambda: of_dynamic(store.read("dynamic_fit")),
-        "close-loop": lambda: of_closure(store.read_json("closure"), store.config.units),
+        "close-loop": lambda: of_closure(store.read_json("closure"), store.config.units) | {"fits": of_after(store)},
         "report": lambda: {"file": str(store.out / "report.html")},
     }
     return {step.replace("-", "_"): make[step]() for step in steps}
@@ -111,6 +122,17 @@ def of_closure(closure: Mapping, units: Units) -> dict:
     )  # fmt: skip
     effects = [{key: effect[key] for key in EFFECT_KEYS} for effect in closure["effects"]]
     return {**{key: closure[key] for key in kept}, "sentence": verdict_sentence(closure, units), "effects": effects}
+
+
+def of_after(store: Store) -> dict:
+    """Return the summaries of the fits with the loop's effects taken out; empty where none was added."""
+    if all(effect["candidate"] for effect in store.read_json("closure")["effects"]):
+        return {}
+    return {
+        "fit_steady": of_fit(store.read("steady_fit_after"), "condition"),
+        "fit_aging": of_fit(store.read("aging_fit_after"), "series"),
+        "fit_dynamic": of_dynamic(store.read("dynamic_fit_after")),
+    }
 
 
 def verdict_sentence(closure: Mapping, units: Units) -> str:

@@ -9,15 +9,27 @@ from sealfit.summary_lines import line
 
 def lifetime_lines(part: Mapping) -> list[str]:
     """Return the lines of a lifetime, the rivals' answers below it."""
-    found = [line("law", f"{part['quantity']} = {part['form']}, {_change(part)}")]
+    found = [line("model", text) for text in _model(part)]
+    found.append(line("law", f"{part['quantity']} = {part['form']}, {_change(part)}"))
     found.append(line("life" if "days" in part else "use", _life(part)))
     if part.get("ci95_resampled"):
         found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
     if part.get("ci95_over_laws") and part["rivals"] and part["days"]:
         found.append(line("", f"95 % interval over all laws by their weight: {_days_between(part['ci95_over_laws'])}"))
+    if part.get("before"):
+        found.append(line("before", f"{_life(part['before'])}, without the effects"))
     for rival in part["rivals"]:
         found.append(line("rival", f"{rival['form']}, {_change(rival)}: {_life(rival)}"))
     return found
+
+
+def _model(part: Mapping) -> list[str]:
+    """Return which model answers, and the state in which each of its effects is zero."""
+    if part["model"] == "before":
+        return ["before: declared model, without the effects of the loop"]
+    if not part["effects"]:
+        return ["after: no effect was added, so it is the declared model"]
+    return [f"after, {effect['reference']}: {effect['label']}" for effect in part["effects"]]
 
 
 def _change(part: Mapping) -> str:

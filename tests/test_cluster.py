@@ -21,7 +21,7 @@ from sealfit.fit.estimate import fit_declared
 from sealfit.ingest import parts
 from sealfit.progress import Silent
 from sealfit.simulate import load_spec, simulate
-from sealfit.steps import CLOSED, FITTED, INGESTED, STEPS, run
+from sealfit.steps import AFTER, CLOSED, FITTED, INGESTED, STEPS, run
 from sealfit.store import Store
 
 HERE = Path(__file__).resolve().parent
@@ -157,7 +157,7 @@ class KillsAt(Silent):
 
 def results(out):
     store = Store.open(out)
-    tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED)}
+    tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED, *AFTER)}
     return tables, json.loads((out / "closure.json").read_text("utf-8"))
 
 

@@ -12,7 +12,7 @@ from sealfit.fingerprint import FITS, STEPS
 from sealfit.profiling import as_dicts, lines, profiled
 from sealfit.progress import Relayed
 from sealfit.simulate import load_spec, simulate
-from sealfit.steps import CLOSED, FITTED, run
+from sealfit.steps import AFTER, CLOSED, FITTED, run
 from sealfit.store import Store
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -79,7 +79,7 @@ def test_two_workers_say_and_make_the_same_as_one(tmp_path):
     said = [said_in(run, tmp_path / "c", folder, workers=workers) for folder, workers in ((alone, 1), (out, 2))]
     assert said[0] == said[1]
     assert any(line.startswith("round 1") for line in said[0])
-    for name in (*FITTED, *CLOSED):
+    for name in (*FITTED, *CLOSED, *AFTER):
         one, two = (pd.read_parquet(folder / f"{name}.parquet") for folder in (alone, out))
         pd.testing.assert_frame_equal(one, two, check_exact=True)
     plots = [path.relative_to(alone) for path in alone.glob("plots/*")]

@@ -16,7 +16,7 @@ import pytest
 
 from sealfit.fingerprint import STEPS
 from sealfit.simulate import load_truth, true_force
-from sealfit.steps import CLOSED, FITTED, INGESTED
+from sealfit.steps import AFTER, CLOSED, FITTED, INGESTED
 from sealfit.store import Store
 from sealfit.tables import SCHEMAS
 
@@ -64,7 +64,7 @@ def started(*arguments):
 
 
 def tables(out):
-    return {name: pd.read_parquet(out / f"{name}.parquet") for name in (*INGESTED, *FITTED, *CLOSED)}
+    return {name: pd.read_parquet(out / f"{name}.parquet") for name in (*INGESTED, *FITTED, *CLOSED, *AFTER)}
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_ingest_does_without_scipy_where_no_repeat_lies_outside(campaign, tmp_pa
 
 def test_a_run_gives_every_table_with_its_schema(first):
     out, _ = first
-    for name in (*INGESTED, *FITTED, *CLOSED):
+    for name in (*INGESTED, *FITTED, *CLOSED, *AFTER):
         schema = ds.dataset(out / f"{name}.parquet", partitioning=None).schema
         fixed = SCHEMAS[name].columns
         assert schema.names[: len(fixed)] == [column.name for column in fixed]
@@ -117,6 +117,19 @@ def test_closure_json_has_every_key_and_no_nan(first):
     assert closure["verdict"] == "nothing_missing"
     assert closure["before"] == closure["after"]
     assert closure["noise_floor_N"] > 0
+
+
+def test_where_nothing_is_missing_after_is_before(first):
+    out, _ = first
+    assert all(pd.read_parquet(out / f"{name}.parquet").empty for name in AFTER)
+    assert set(pd.read_parquet(out / "aging_fit.parquet")["model"]) == {"before"}
+    asked = ("lifetime", out, "--threshold", "0.75", "--json")
+    after, before = (json.loads(sealfit(*asked, *model).stdout) for model in ((), ("--model", "before")))
+    assert (after.pop("model"), before.pop("model")) == ("after", "before")
+    assert after == before
+    said = sealfit(*asked[:-1]).stdout
+    assert said.startswith("model       after: no effect was added, so it is the declared model\n")
+    assert sealfit(*asked[:-1], "--model", "both", code=1).stderr.startswith("sealfit: there is no model 'both'.")
 
 
 def test_a_run_ends_with_a_short_summary(first):

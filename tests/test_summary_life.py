@@ -21,7 +21,8 @@ def laws():
 
 
 def said(laws, goal, years=None, **place):
-    part = {"quantity": "mu_s", **answer(laws[0], goal, years, resample=True, **place)}
+    part = {"quantity": "mu_s", "model": "after", "effects": []}
+    part |= answer(laws[0], goal, years, resample=True, **place)
     part["rivals"] = [answer(rival, goal, years, **place) for rival in rivals_of(laws)]
     if years is None:
         part["ci95_over_laws"] = finite_ends(over_laws(laws, goal, **place))

@@ -16,6 +16,7 @@ from sealfit.closure.intervals import effect_intervals
 from sealfit.closure.judge import Candidate, Judge
 from sealfit.closure.levels import errors, lack_of_fit, noise_floor, scatter_list
 from sealfit.closure.next_runs import next_runs
+from sealfit.closure.reference import reference_of
 from sealfit.closure.ripple import Peak
 from sealfit.closure.search import search
 from sealfit.closure.sensitivity import LEVEL_NAMES, cannot_tell, sensitivity
@@ -158,6 +159,7 @@ def _entry(after: Fitted, number: int, item: Added, config: Config) -> dict:
         "channels": channels_of(term, after.rows),
         "acts_on": term.acts_on,
         "operation": term.operation,
+        "reference": reference_of(term, after.model.values[number], config),
         "form": form_of(term)
         + ("" if term.smoothness is None else f"; held smooth, worth {worth(after, number):.1f} numbers"),
         "named": proposal.named,

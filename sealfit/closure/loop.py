@@ -34,11 +34,12 @@ from sealfit.samples import StoredTraces
 
 @dataclass(frozen=True)
 class Closure:
-    """closure.json as a dict, the model that predict needs, and the loop's tables."""
+    """closure.json as a dict, the model that predict needs, the loop's tables, and the after-model on all bins."""
 
     document: dict
     model: dict
     tables: dict[str, pd.DataFrame]
+    after: Fitted
 
 
 def close_loop(
@@ -121,7 +122,7 @@ def close_loop(
         "residuals_after": _residual_table(bins, after, held_after),
         **drawn,
     }
-    return Closure(document, to_record(before, after, config), tables)
+    return Closure(document, to_record(before, after, config), tables, after)
 
 
 def _drawn_tables(grown: Grown, before: Fitted, after: Fitted, config: Config) -> dict[str, pd.DataFrame]:

@@ -25,6 +25,7 @@ AGING_FLOOR = Effect(
     label="aging with a floor",
     equation=r"h = A \ln \max(1, t / t_f)",
     form="A ln(max(1, t / t_f))",
+    reference="no more than {t_f} days",
     reads=("aging_days",),
     acts_on=(("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply")),
     parameters=(

@@ -26,6 +26,7 @@ AGING_INDUCTION = Effect(
     label="aging with an induction time",
     equation=r"h = A (t / t_i) e^{1 - t / t_i}",
     form="A (t / t_i) exp(1 - t / t_i)",
+    reference="unaged",
     reads=("aging_days",),
     acts_on=(("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply")),
     parameters=(

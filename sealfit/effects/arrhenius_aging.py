@@ -38,6 +38,7 @@ ARRHENIUS_AGING = Effect(
     label="Arrhenius acceleration of aging with temperature",
     equation=r"h = A [e^{E / R\, (1 / T_{ref} - 1 / T)} - 1]",
     form="A (exp(E / R (1 / T_ref - 1 / T)) - 1)",
+    reference="{temperature_C} = {temperature_C_ref}",
     reads=("temperature_C",),
     acts_on=(("a", "multiply"), ("b", "multiply")),
     parameters=(

@@ -25,6 +25,7 @@ ASYMMETRY = Effect(
     label="direction asymmetry",
     equation=r"h = A d / 2",
     form="A d / 2, d = +1 forward, -1 backward",
+    reference="mean of the two directions",
     reads=("direction",),
     acts_on=(
         ("mu", "multiply"),

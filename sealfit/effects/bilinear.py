@@ -22,6 +22,7 @@ BILINEAR = Effect(
     label="product of {x} and {z}, and each alone",
     equation=r"h = A u w + B u + C w, \quad u = x - x_{ref}, \; w = z - z_{ref}",
     form="A u w + B u + C w, u = x - x_ref, w = z - z_ref",
+    reference="{x} = {x_ref} and {z} = {z_ref}",
     reads=(CHANNEL, SECOND),
     acts_on=ANYWHERE,
     parameters=(

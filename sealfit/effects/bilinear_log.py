@@ -24,6 +24,7 @@ BILINEAR_LOG = Effect(
     label="product of log {x} and {z}, and each alone",
     equation=r"h = A u w + B u + C w, \quad u = \ln(x / x_{ref}), \; w = z - z_{ref}",
     form="A u w + B u + C w, u = ln(x / x_ref), w = z - z_ref",
+    reference="{x} = {x_ref} and {z} = {z_ref}",
     reads=(CHANNEL, SECOND),
     acts_on=ANYWHERE,
     parameters=(

@@ -34,6 +34,7 @@ BILINEAR_LOGS = Effect(
     label="product of log {x} and log of 1 + {z}, and each alone",
     equation=r"h = A u w + B u + C w, \quad u = \ln(x / x_{ref}), \; w = \ln((1 + z) / (1 + z_{ref}))",
     form="A u w + B u + C w, u = ln(x / x_ref), w = ln((1 + z) / (1 + z_ref))",
+    reference="{x} = {x_ref} and {z} = {z_ref}",
     reads=(CHANNEL, SECOND),
     acts_on=ANYWHERE,
     parameters=(

@@ -20,6 +20,7 @@ BUMP = Effect(
     label="local bump in {x}",
     equation=r"h = A e^{-((x - x_0) / w)^2}",
     form="A exp(-((x - x_0) / w)^2)",
+    reference="away from {x} = {x_0}",
     reads=(CHANNEL,),
     acts_on=ANYWHERE,
     parameters=(

@@ -26,6 +26,7 @@ CAMPAIGN_DRIFT = Effect(
     label="drift along the campaign",
     equation=r"h = A t",
     form="A t",
+    reference="start of the campaign",
     reads=("elapsed_h",),
     acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
     parameters=(Parameter("A", "{y}/{x}", 1e-4, AMPLITUDE, "change per time of the campaign", linear=True),),

@@ -18,6 +18,7 @@ from sealfit.errors import ParameterError
 
 LEVELS, SLOPES = "levels", "slopes"
 LESS_MEAN = "; less its mean over the campaign"
+MEAN_OF_CAMPAIGN = "mean over {x} in the campaign"  # the reference of a shape less its mean
 
 
 def levels_effect(categories: Sequence[str], means: Sequence[float] | None = None) -> Effect:
@@ -46,6 +47,7 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
         label="levels of {x}",
         equation=r"h = \sum_k d_k [x = k]",
         form=f"d_k for category k of {listed(names)}; 0 for {names[0]}" + LESS_MEAN * (means is not None),
+        reference=MEAN_OF_CAMPAIGN if means is not None else f"{{x}} = {names[0]}",
         reads=(CHANNEL,),
         acts_on=ANYWHERE,
         parameters=tuple(
@@ -105,6 +107,7 @@ def slopes_effect(categories: Sequence[str]) -> Effect:
         label="linear in {x}, by {z}",
         equation=r"h = \sum_k e_k [z = k] (x - x_{ref})",
         form=f"e_k (x - x_ref) for category k of {listed(names)}",
+        reference="{x} = {x_ref}",
         reads=(CHANNEL, SECOND),
         acts_on=ANYWHERE,
         parameters=tuple(

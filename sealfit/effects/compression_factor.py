@@ -30,6 +30,7 @@ COMPRESSION_FACTOR = Effect(
     label="compression while aging",
     equation=r"h = A (100 - c) / 100",
     form="A (100 - c) / 100",
+    reference="not compressed (100 %)",
     reads=("compression_ratio_pct",),
     acts_on=(("a", "multiply"), ("b", "multiply"), ("mu", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
     parameters=(Parameter("A", "{y}", 0.5, AMPLITUDE, "relative change per whole height taken away", linear=True),),

@@ -29,6 +29,7 @@ CONDITIONING = Effect(
     label="conditioning over repeats (Mullins)",
     equation=r"h = A (1 - e^{-(n - 1) / n_0})",
     form="A (1 - exp(-(n - 1) / n_0))",
+    reference="first repeat",
     reads=("repeat",),
     acts_on=(("mu", "multiply"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
     parameters=(

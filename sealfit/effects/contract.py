@@ -88,6 +88,9 @@ class Effect:
     and it returns the added force, the factor minus one, or the change of the parameter, shape (n,). It is zero where
     all amplitudes are zero, and NaN (without a warning) where the form says nothing, such as the logarithm of zero.
 
+    `reference` is the state in which the shape is zero, in words: there the after-model's mu_0, a and b hold. `{x}`,
+    `{z}` and `{load_N}` stand for channels, `{x_ref}` and the like for fixed reference values, `{x_0}` for a parameter.
+
     `inputs` also holds `<name>_ref`, a fixed reference per channel (its mean over the campaign), so `x_ref` for
     CHANNEL. A shape asks for it by `reference`.
     """
@@ -103,6 +106,7 @@ class Effect:
     source: str
     worked: tuple[Mapping[str, float], Mapping[str, float], float]  # inputs, values, result: by hand
     physical: bool = True  # false for a closed form that names no mechanism
+    reference: str = ""  # where the shape is zero, in words
 
     def __post_init__(self) -> None:
         for target, operation in self.acts_on:

@@ -23,6 +23,7 @@ DRIFT = Effect(
     label="sensor drift in time",
     equation=r"h = A t",
     form="A t",
+    reference="time 0 of the file",
     reads=("time_s",),
     acts_on=(("force", "add"),),
     parameters=(Parameter("A", "{y}/{x}", 0.01, AMPLITUDE, "drift of the force per time", linear=True),),

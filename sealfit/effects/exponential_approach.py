@@ -22,6 +22,7 @@ EXPONENTIAL_APPROACH = Effect(
     label="exponential approach in {x}",
     equation=r"h = A (1 - e^{-x / \tau})",
     form="A (1 - exp(-x / tau))",
+    reference="{x} = 0",
     reads=(CHANNEL,),
     acts_on=ANYWHERE,
     parameters=(

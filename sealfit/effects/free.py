@@ -16,7 +16,16 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from sealfit.effects.categories import LESS_MEAN, LEVELS, SLOPES, levels_effect, listed, shares, slopes_effect
+from sealfit.effects.categories import (
+    LESS_MEAN,
+    LEVELS,
+    MEAN_OF_CAMPAIGN,
+    SLOPES,
+    levels_effect,
+    listed,
+    shares,
+    slopes_effect,
+)
 from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter
 from sealfit.errors import ParameterError
 
@@ -66,6 +75,7 @@ def smooth_effect(
         equation=r"h = \sum_j c_j B_j(x)",
         form=f"natural cubic spline through (x_j, c_j), knots {listed(places)}, zero at {places[zero]:.6g}"
         + LESS_MEAN * (means is not None),
+        reference=MEAN_OF_CAMPAIGN if means is not None else f"{{x}} = {places[zero]:.6g}",
         reads=(CHANNEL,),
         acts_on=ANYWHERE,
         parameters=tuple(
@@ -169,6 +179,7 @@ def surface_effect(x_knots: Sequence[float], z_knots: Sequence[float]) -> Effect
         equation=r"h = \sum_{jk} c_{jk} u^j w^k",
         form="c_jk u^j w^k summed over j, k = 1, 2; u, w = {x}, {z} mapped to -1..1 at "
         + " and ".join(listed(given) for given in knots),
+        reference="middle of {x} or of {z}",
         reads=(CHANNEL, SECOND),
         acts_on=ANYWHERE,
         parameters=tuple(

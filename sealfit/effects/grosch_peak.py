@@ -27,6 +27,7 @@ GROSCH_PEAK = Effect(
     label="viscoelastic peak over log speed (Grosch)",
     equation=r"h = A \exp[-(\log_{10}(|v| / v_p) / w)^2]",
     form="A exp(-(log10(|v| / v_p) / w)^2)",
+    reference="peak over speed removed",
     reads=("speed_mm_s",),
     acts_on=(("mu", "multiply"), ("mu", "add"), ("mu_c", "multiply"), ("mu_c", "add")),
     parameters=(

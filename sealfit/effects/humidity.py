@@ -26,6 +26,7 @@ HUMIDITY = Effect(
     label="humidity of the laboratory",
     equation=r"h = A (H - H_{ref})",
     form="A (H - H_ref)",
+    reference="{humidity_pct} = {humidity_pct_ref}",
     reads=("humidity_pct",),
     acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
     parameters=(Parameter("A", "{y}/{x}", -0.001, AMPLITUDE, "change per per cent of relative humidity", linear=True),),

@@ -26,6 +26,7 @@ HYPERBOLIC = Effect(
     label="hyperbolic decay in {x}",
     equation=r"h = A / (1 + x / x_{half})",
     form="A / (1 + x / x_half)",
+    reference="limit of large {x}",
     reads=(CHANNEL,),
     acts_on=(("force", "add"),),
     parameters=(

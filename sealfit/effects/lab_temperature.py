@@ -27,6 +27,7 @@ LAB_TEMPERATURE = Effect(
     label="laboratory temperature",
     equation=r"h = A (T - T_{ref})",
     form="A (T - T_ref)",
+    reference="{lab_temperature_C} = {lab_temperature_C_ref}",
     reads=("lab_temperature_C",),
     acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
     parameters=(Parameter("A", "{y}/{x}", -0.005, AMPLITUDE, "change per degree", linear=True),),

@@ -22,6 +22,7 @@ LINEAR = Effect(
     label="linear in {x}",
     equation=r"h = A (x - x_{ref})",
     form="A (x - x_ref)",
+    reference="{x} = {x_ref}",
     reads=(CHANNEL,),
     acts_on=ANYWHERE,
     parameters=(Parameter("A", "{y}/{x}", 0.01, AMPLITUDE, "slope", linear=True),),

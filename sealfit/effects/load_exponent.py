@@ -29,6 +29,7 @@ LOAD_EXPONENT = Effect(
     label="load exponent of rubber",
     equation=r"h = A \ln(N / N_{ref}),\ A \approx n - 1",
     form="A ln(N / N_ref), A = n - 1 to first order in mu ~ N^(n-1)",
+    reference="{load_N} = {load_N_ref}",
     reads=("load_N",),
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply")),
     parameters=(Parameter("A", "{y}", -0.1, (-2.0, 2.0), "load exponent of friction minus one", linear=True),),

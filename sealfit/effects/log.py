@@ -22,6 +22,7 @@ LOG = Effect(
     label="logarithmic in {x}",
     equation=r"h = A \ln(x / x_{ref})",
     form="A ln(x / x_ref)",
+    reference="{x} = {x_ref}",
     reads=(CHANNEL,),
     acts_on=ANYWHERE,
     parameters=(Parameter("A", "{y}", 0.05, AMPLITUDE, "change per factor e of the channel", linear=True),),

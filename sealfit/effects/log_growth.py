@@ -22,6 +22,7 @@ LOG_GROWTH = Effect(
     label="logarithmic growth in {x}",
     equation=r"h = A \ln(1 + x / x_0)",
     form="A ln(1 + x / x_0)",
+    reference="{x} = 0",
     reads=(CHANNEL,),
     acts_on=ANYWHERE,
     parameters=(

@@ -25,6 +25,7 @@ LOG_RATE = Effect(
     label="logarithmic rate dependence",
     equation=r"h = A \ln(|v| / v_{ref})",
     form="A ln(|v| / v_ref)",
+    reference="{speed_mm_s} = {speed_mm_s_ref}",
     reads=("speed_mm_s",),
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu", "add"), ("mu_c", "add")),
     parameters=(Parameter("A", "{y}", 0.02, (-2.0, 2.0), "change per factor e of the speed", linear=True),),

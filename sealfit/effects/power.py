@@ -24,6 +24,7 @@ POWER = Effect(
     label="power of {x}",
     equation=r"h = A [(x / x_{ref})^n - 1]",
     form="A ((x / x_ref)^n - 1)",
+    reference="{x} = {x_ref}",
     reads=(CHANNEL,),
     acts_on=ANYWHERE,
     parameters=(

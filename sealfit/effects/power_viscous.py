@@ -27,6 +27,7 @@ POWER_VISCOUS = Effect(
     label="viscous friction by a power of the speed",
     equation=r"h = A\, \mathrm{sgn}(v)\, (|v| / v_{ref})^n",
     form="A sgn(v) (|v| / v_ref)^n",
+    reference="additional viscous force removed",
     reads=("speed_mm_s",),
     acts_on=(("force", "add"),),
     parameters=(

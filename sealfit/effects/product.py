@@ -21,6 +21,7 @@ PRODUCT = Effect(
     label="product of {x} and {z}",
     equation=r"h = A (x - x_{ref}) (z - z_{ref})",
     form="A (x - x_ref) (z - z_ref)",
+    reference="{x} = {x_ref} or {z} = {z_ref}",
     reads=(CHANNEL, SECOND),
     acts_on=ANYWHERE,
     parameters=(Parameter("A", "{y}/({x} {z})", 0.01, AMPLITUDE, "slope of a slope", linear=True),),

@@ -22,6 +22,7 @@ PRODUCT_LOG = Effect(
     label="product of log {x} and {z}",
     equation=r"h = A \ln(x / x_{ref}) (z - z_{ref})",
     form="A ln(x / x_ref) (z - z_ref)",
+    reference="{x} = {x_ref} or {z} = {z_ref}",
     reads=(CHANNEL, SECOND),
     acts_on=ANYWHERE,
     parameters=(Parameter("A", "{y}/{z}", 0.01, AMPLITUDE, "slope in z of the slope in ln x", linear=True),),

@@ -31,6 +31,7 @@ PRODUCT_LOGS = Effect(
     label="product of log {x} and log of 1 + {z}",
     equation=r"h = A \ln(x / x_{ref}) \ln((1 + z) / (1 + z_{ref}))",
     form="A ln(x / x_ref) ln((1 + z) / (1 + z_ref))",
+    reference="{x} = {x_ref} or {z} = {z_ref}",
     reads=(CHANNEL, SECOND),
     acts_on=ANYWHERE,
     parameters=(Parameter("A", "{y}", 0.01, AMPLITUDE, "slope of a slope, in logarithms", linear=True),),

@@ -21,6 +21,7 @@ QUADRATIC = Effect(
     label="quadratic in {x}",
     equation=r"h = A (x - x_{ref}) + B (x - x_{ref})^2",
     form="A (x - x_ref) + B (x - x_ref)^2",
+    reference="{x} = {x_ref}",
     reads=(CHANNEL,),
     acts_on=ANYWHERE,
     parameters=(

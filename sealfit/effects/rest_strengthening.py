@@ -25,6 +25,7 @@ REST_STRENGTHENING = Effect(
     label="strengthening at rest",
     equation=r"h = A \ln(1 + t / t_0)",
     form="A ln(1 + t / t_0)",
+    reference="no rest before the stroke",
     reads=("rest_s",),
     acts_on=(("mu_s", "multiply"), ("mu", "multiply"), ("mu_c", "multiply")),
     parameters=(

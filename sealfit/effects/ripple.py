@@ -30,6 +30,7 @@ RIPPLE = Effect(
     label="ripple along the rig's position",
     equation=r"h = A \sin(2 \pi x / \lambda + \varphi)",
     form="A sin(2 pi x / lambda + phi)",
+    reference="mean over a wavelength",
     reads=("displacement_mm",),
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(

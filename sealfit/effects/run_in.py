@@ -27,6 +27,7 @@ RUN_IN = Effect(
     label="run-in over strokes",
     equation=r"h = A (1 - e^{-(n - 1) / n_0})",
     form="A (1 - exp(-(n - 1) / n_0))",
+    reference="first stroke",
     reads=("stroke",),
     acts_on=(("mu", "multiply"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
     parameters=(

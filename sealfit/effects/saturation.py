@@ -22,6 +22,7 @@ SATURATION = Effect(
     label="saturation in {x}",
     equation=r"h = A x / (x + x_{half})",
     form="A x / (x + x_half)",
+    reference="{x} = 0",
     reads=(CHANNEL,),
     acts_on=ANYWHERE,
     parameters=(

@@ -24,6 +24,7 @@ SINUSOID = Effect(
     label="periodic in {x}",
     equation=r"h = A \sin(2 \pi x / \lambda + \varphi)",
     form="A sin(2 pi x / lambda + phi)",
+    reference="mean over a wavelength",
     reads=(CHANNEL,),
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(

@@ -29,6 +29,7 @@ SINUSOID_HARMONICS = Effect(
     label="periodic in {x}, with a second harmonic",
     equation=r"h = A \sin(2 \pi x / \lambda + \varphi) + B \sin(4 \pi x / \lambda + \varphi_2)",
     form="A sin(2 pi x / lambda + phi) + B sin(4 pi x / lambda + phi_2)",
+    reference="mean over a wavelength",
     reads=(CHANNEL,),
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(

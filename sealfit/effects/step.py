@@ -23,6 +23,7 @@ STEP = Effect(
     label="step in {x}",
     equation=r"h = A\,[x \ge x_0]",
     form="A if x >= x_0, else 0",
+    reference="{x} below {x_0}",
     reads=(CHANNEL,),
     acts_on=ANYWHERE,
     parameters=(

@@ -33,6 +33,7 @@ STRIBECK_EXPONENT = Effect(
     label="Stribeck exponent other than 2",
     equation=r"h = A [e^{-(|v| / v_s)^n} - e^{-(v / v_s)^2}]",
     form="A (exp(-(|v| / v_s)^n) - exp(-(v / v_s)^2))",
+    reference="Stribeck exponent 2",
     reads=("speed_mm_s",),
     acts_on=(("mu", "add"), ("mu", "multiply")),
     parameters=(

@@ -25,6 +25,7 @@ STRIBECK_SPEED_AGING = Effect(
     label="Stribeck speed changing with age",
     equation=r"h = A \ln(1 + t / t_0)",
     form="A ln(1 + t / t_0)",
+    reference="unaged",
     reads=("aging_days",),
     acts_on=(("v_s", "multiply"),),
     parameters=(

@@ -25,6 +25,7 @@ VISCOSITY_AGING = Effect(
     label="viscous coefficient changing with age",
     equation=r"h = A \ln(1 + t / t_0)",
     form="A ln(1 + t / t_0)",
+    reference="unaged",
     reads=("aging_days",),
     acts_on=(("sigma_2", "add"), ("sigma_2", "multiply")),
     parameters=(

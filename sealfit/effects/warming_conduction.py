@@ -30,6 +30,7 @@ WARMING_CONDUCTION = Effect(
     label="warming by sliding (conduction-limited: speed times distance)",
     equation=r"h = -A \sqrt{|v| s / (v_{ref} s_{ref})}",
     form="-A sqrt(|v| s / (v_ref s_ref))",
+    reference="cold contact (distance 0)",
     reads=("distance_mm", "speed_mm_s"),
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
     parameters=(

@@ -28,6 +28,7 @@ WARMING_CONDUCTION_LOAD = Effect(
     label="warming by sliding (conduction-limited, at several loads)",
     equation=r"h = -A \frac{N}{N_{ref}} \sqrt{|v| s / (v_{ref} s_{ref})}",
     form="-A (N / N_ref) sqrt(|v| s / (v_ref s_ref))",
+    reference="cold contact (distance 0)",
     reads=("distance_mm", "speed_mm_s", "load_N"),
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
     parameters=(

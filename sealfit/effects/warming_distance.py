@@ -27,6 +27,7 @@ WARMING_DISTANCE = Effect(
     label="warming by sliding (distance)",
     equation=r"h = -A (1 - e^{-s / s_0})",
     form="-A (1 - exp(-s / s_0))",
+    reference="cold contact (distance 0)",
     reads=("distance_mm",),
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
     parameters=(

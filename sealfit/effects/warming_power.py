@@ -29,6 +29,7 @@ WARMING_POWER = Effect(
     label="warming by sliding (power)",
     equation=r"h = -A \frac{N |v|}{N_{ref} v_{ref}} (1 - e^{-t / \tau})",
     form="-A (N |v| / (N_ref v_ref)) (1 - exp(-t / tau))",
+    reference="cold contact (time 0)",
     reads=("time_s", "speed_mm_s", "load_N"),
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
     parameters=(

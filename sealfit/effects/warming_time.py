@@ -29,6 +29,7 @@ WARMING_TIME = Effect(
     label="warming by sliding (time)",
     equation=r"h = -A (1 - e^{-t / \tau})",
     form="-A (1 - exp(-t / tau))",
+    reference="cold contact (time 0)",
     reads=("time_s",),
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
     parameters=(

@@ -24,6 +24,7 @@ ZERO_OFFSET = Effect(
     label="zero offset of the force",
     equation=r"h = A",
     form="A",
+    reference="zero offset removed",
     reads=("direction",),
     acts_on=(("force", "add"),),
     parameters=(Parameter("A", "{y}", 0.1, AMPLITUDE, "force shown when none acts", linear=True),),

@@ -12,7 +12,7 @@ from sealfit.config import Config
 from sealfit.fit.condition import FULL
 from sealfit.fit.law import LawFit, Values, between_scatter, fit_law
 from sealfit.fit.lawprofile import curve_intervals
-from sealfit.fit.lawrows import DAYS_FOR_LAW, Curve, covariance_rows, law_rows, statistics_rows, without_law
+from sealfit.fit.lawrows import DAYS_FOR_LAW, Curve, Estimate, covariance_rows, law_rows, statistics_rows, without_law
 from sealfit.physics import aging_law
 from sealfit.tables import AGING_CURVES, AGING_FIT
 
@@ -193,10 +193,11 @@ def _rubber_rows(values, curves, fitted, used, own, unit, unaged) -> Iterator[di
             yield from without_law(curve, unit, curve.quantity in unaged)
             continue
         q = fitted.index(curve.quantity)
-        yield from law_rows(curve, joint, q, t[q], intervals[curve.place], shift, unit, curve.quantity in unaged)
+        found = Estimate.of(joint, curve, q, shift)
+        yield from law_rows(curve, found, t[q], intervals[curve.place], unit, curve.quantity in unaged)
         share = len({c.series for c in curves if c.place >= 0 and c.quantity == curve.quantity})
         yield from statistics_rows(curve, joint, plain[curve.quantity], values, q, taus[q], dfs[q], share, unit)
-        yield from covariance_rows(curve, joint, q, unit)
+        yield from covariance_rows(curve, found.covariance, unit)
 
 
 def _shift(joint: LawFit, used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:

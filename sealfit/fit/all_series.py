@@ -84,7 +84,7 @@ def joint_laws(
                 curves.append(told[1].assign(**at))
     curves = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
     return (
-        pd.DataFrame(rows).reindex(columns=AGING_LAWS.names()),
+        pd.DataFrame(rows).assign(model="before").reindex(columns=AGING_LAWS.names()),
         curves.reindex(columns=MASTER_CURVE.names()),
     )
 

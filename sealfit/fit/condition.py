@@ -11,7 +11,7 @@ import pandas as pd
 from sealfit.fit.batch import project
 from sealfit.fit.interval import constrained_ends
 from sealfit.fit.stribeck import NAMES, flat_p_value, solve_stribeck, stribeck_intervals, tangent
-from sealfit.fit.uncertainty import speed_levels
+from sealfit.fit.uncertainty import shifts_of, speed_levels
 from sealfit.physics import stribeck_force
 
 FULL, VISCOUS, CONSTANT = 4, 2, 1  # speed levels within one direction that each model needs
@@ -41,6 +41,11 @@ class Condition:
         """|v|, N (1 without load), F sgn v and weight of each run, shape (n,)."""
         load = self.runs["load"].to_numpy(float) if self.has_load else np.ones(len(self.runs))
         return self.runs["speed"].to_numpy(float), load, self.runs["force"].to_numpy(float), self.runs["weight"].values
+
+    @property
+    def shifts(self) -> np.ndarray:
+        """Change of F sgn v of each run along the directions of the effects' uncertainty, shape (n, k)."""
+        return self.runs[shifts_of(self.runs)].to_numpy(float)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -16,7 +16,7 @@ from sealfit.fit.bristle_rows import bristle_rows
 from sealfit.fit.cells import Cells, mean_over
 from sealfit.fit.rises import Curve, Stroke
 from sealfit.fit.rows import nesting_run
-from sealfit.fit.starts import Part, Start, starts_of, strokes_along, whole_strokes
+from sealfit.fit.starts import Along, Part, Start, starts_of, strokes_along, whole_strokes
 from sealfit.fit.steady import condition_keys
 from sealfit.fit.stiffness import fit_stiffness
 from sealfit.samples import StoredTraces
@@ -51,9 +51,9 @@ def fit_dynamic(
     traces : DataFrame or sequence of StoredTraces
         Table `traces`, or where it lies: then no more of it is read at once than some conditions have.
     steady : DataFrame
-        Table `steady`; rows with `used` false are left out.
+        Table `steady` or `steady_after`; rows with `used` false are left out.
     steady_fit : DataFrame
-        Table `steady_fit`: the Stribeck curve of each condition; flat where that is not identified.
+        Its table `steady_fit`: the Stribeck curve of each condition; flat where that is not identified.
     config : Config
         Names the condition columns, the units and the sensor's accuracy.
     workers : int
@@ -84,7 +84,7 @@ def fit_dynamic(
     ]
     keys = condition_keys(steady, config)
     table = pd.concat([part for part in rows if len(part)], ignore_index=True)
-    table = table.merge(keys, on="condition", how="left", validate="many_to_one")
+    table = table.merge(keys, on="condition", how="left", validate="many_to_one").assign(model="before")
     fixed = DYNAMIC_FIT.names()
     table = table.reindex(columns=[*fixed, *(name for name in keys.columns if name not in fixed)])
     return Dynamic(table.astype({"direction": "Int64"}), curves.reindex(columns=DYNAMIC_CURVES.names()))
@@ -150,7 +150,7 @@ class _Strokes:
 def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
     traces = asked.traces if isinstance(asked.traces, pd.DataFrame) else asked.traces.read(OF_TRACES, coded=["file"])
     table = asked.steady.reset_index(drop=True)
-    along = strokes_along(traces, table)
+    along = _less_effects(strokes_along(traces, table), table)
     starts = {start.row: start for start in starts_of(along)}
     wholes = {whole.row: whole for whole in whole_strokes(along)}
     strokes, fitted = _Strokes(table), _fitted(asked.steady_fit)
@@ -176,6 +176,14 @@ def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
             )
         )
     return made
+
+
+def _less_effects(strokes: Sequence[Along], steady: pd.DataFrame) -> Sequence[Along]:
+    """Return strokes less the effects' force where they start, if table `steady` holds it."""
+    if "effects_start_N" not in steady:
+        return strokes
+    size = (steady["effects_start_N"] * steady["direction"]).tolist()
+    return [replace(stroke, force_N=stroke.force_N - size[stroke.row]) for stroke in strokes]
 
 
 class _Grouped:

@@ -28,24 +28,42 @@ class Curve:
     days: np.ndarray  # aged days tested, rising
 
 
-def _places(joint: LawFit, curve: Curve, q: int) -> list[int]:
-    m, k = joint.values.origins, joint.values.curves
-    return [q, m + curve.place, m + k + curve.place]
+@dataclass(frozen=True)
+class Estimate:
+    """mu_0, a and ln b of one curve.
+
+    Attributes
+    ----------
+    x, shift : ndarray, shape (3,)
+        Estimates, and their change when the sensor reads one standard uncertainty too high.
+    covariance : ndarray, shape (3, 3)
+        Of x.
+    """
+
+    x: np.ndarray
+    covariance: np.ndarray
+    shift: np.ndarray
+
+    @classmethod
+    def of(cls, joint: LawFit, curve: Curve, q: int, shift: np.ndarray) -> Estimate:
+        """Return those of a curve of a joint fit; `shift`, shape (p,), is of all its parameters."""
+        m, k = joint.values.origins, joint.values.curves
+        at = [q, m + curve.place, m + k + curve.place]
+        return cls(joint.x[at], joint.covariance[np.ix_(at, at)], shift[at])
+
+    def error_of_c(self) -> float:
+        """Return the standard error of c = -a ln b."""
+        gradient = np.array([0.0, -self.x[2], -self.x[1]])
+        with np.errstate(invalid="ignore"):
+            return float(np.sqrt(gradient @ self.covariance @ gradient))
 
 
-def law_rows(
-    curve: Curve, joint: LawFit, q: int, t: float, ends: CurveInterval, shift, unit: str, unaged: bool
-) -> Iterator[dict]:
+def law_rows(curve: Curve, found: Estimate, t: float, ends: CurveInterval, unit: str, unaged: bool) -> Iterator[dict]:
     """Return the rows of mu_0, a, b and c."""
-    at = _places(joint, curve, q)
-    mu_0, a, u = joint.x[at]
-    covariance = joint.covariance[np.ix_(at, at)]
-    se = np.sqrt(np.diag(covariance))
-    b = np.exp(u)
-    gradient = np.array([0.0, -u, -a])  # of c = -a ln b
-    with np.errstate(invalid="ignore"):
-        se_c = np.sqrt(gradient @ covariance @ gradient)
-    move = np.where(np.abs(shift[at]) > 1e-12 * np.abs(joint.x[at]), shift[at], 0.0)  # less is rounding
+    mu_0, a, u = found.x
+    se = np.sqrt(np.diag(found.covariance))
+    b, se_c = np.exp(u), found.error_of_c()
+    move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # less is rounding
     judged = _judge(curve, a, b, ends, unaged)
     limits = {"mu_0": (mu_0 - t * se[0], mu_0 + t * se[0]), "a": ends.a, "b": ends.b, "c": ends.c}
     numbers = {
@@ -151,16 +169,15 @@ def statistics_rows(curve, joint, plain, values, q, tau, df, share, unit) -> Ite
         ) | {"series": curve.series}
 
 
-def covariance_rows(curve: Curve, joint: LawFit, q: int, unit: str) -> Iterator[dict]:
-    """Return the covariance of mu_0, a and ln b."""
-    at = _places(joint, curve, q)
+def covariance_rows(curve: Curve, covariance: np.ndarray, unit: str) -> Iterator[dict]:
+    """Return the covariance of mu_0, a and ln b, shape (3, 3)."""
     names, units = ("mu_0", "a", "ln b"), (unit, unit, "")
     for i in range(3):
         for j in range(i + 1):
             yield table_row(
                 quantity="covariance",
                 parameter=f"{curve.quantity}:{names[j]},{curve.quantity}:{names[i]}",
-                value=joint.covariance[at[j], at[i]],
+                value=covariance[j, i],
                 unit=" ".join(f"({u})" for u in (units[j], units[i]) if u),
-                identified=bool(np.isfinite(joint.covariance[at[j], at[i]])),
+                identified=bool(np.isfinite(covariance[j, i])),
             ) | {"series": curve.series}

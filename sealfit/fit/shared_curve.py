@@ -28,7 +28,7 @@ from sealfit.fit.declared import series_of_curve
 from sealfit.fit.polish import covariance_of
 from sealfit.fit.steady import FORCES, solve_conditions
 from sealfit.fit.stribeck import search_grid
-from sealfit.fit.uncertainty import UnitVariance
+from sealfit.fit.uncertainty import UnitVariance, shifts_of
 from sealfit.tables import STEADY_FIT
 
 SHARED_P = 0.01  # below, the days of a series do not share v_s and sigma_2
@@ -69,7 +69,7 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
     """
     rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["aging_days"].notna()]
     of_parameters = [name for name in STEADY_FIT.names() if name not in ("condition", "series", "rubber")]
-    about = rows.drop(columns=of_parameters).drop_duplicates("condition")
+    about = rows.drop(columns=of_parameters, errors="ignore").drop_duplicates("condition")
     known = rows[rows["identified"].to_numpy(bool) & rows["value"].notna()]
     curved = set(known.loc[known["parameter"] == "v_s", "condition"])
     free = known[known["parameter"].isin([name for pair in PAIRS for name in pair])]
@@ -77,8 +77,9 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
     conditions, _, variance = solve_conditions(steady)
     place = {c.name: k for k, c in enumerate(conditions)}
     series = series_of_curve(about.reset_index(drop=True), aging=True)
-    known_covariances = values_of(steady_fit, "covariance")
-    tables, covariances = [], []
+    known_covariances, known_shifts = values_of(steady_fit, "covariance"), values_of(steady_fit, "effect_shift")
+    count = len(shifts_of(steady))
+    tables, covariances, shifts = [], [], []
     for names in (about["condition"].to_numpy(object)[series == s] for s in dict.fromkeys(series)):
         places = [place[name] for name in names]
         found = _shared([conditions[k] for k in places], variance, variance.value[places], curved)
@@ -86,18 +87,27 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
         if found is not None:
             tables.append(found[0])
             covariances.append(found[1])
-            covered = found[2]
+            shifts.append(found[2])
+            covered = found[3]
         own = free[free["condition"].isin(set(names) - covered)]
         tables.append(own)
-        covariances.append(steady_covariance(own, known_covariances))
+        keys = list(zip(own["condition"], own["quantity"], strict=True))
+        shift = np.array([[known_shifts.get((c, f"{q}:{k + 1}"), 0.0) for k in range(count)] for c, q in keys])
+        shift = shift.reshape(len(own), count)
+        shifts.append(shift)
+        same = own["condition"].to_numpy()[:, None] == own["condition"].to_numpy()[None, :]
+        covariances.append(steady_covariance(own, known_covariances) - same * (shift @ shift.T))  # it comes in below
     table = pd.concat(tables, ignore_index=True) if tables else free
-    return Levels(table.merge(about, on="condition", how="left", validate="many_to_one"), block_diag(*covariances))
+    together = np.concatenate(shifts) if shifts else np.zeros((0, count))
+    covariance = block_diag(*covariances) + together @ together.T  # the effects are those of all conditions
+    return Levels(table.merge(about, on="condition", how="left", validate="many_to_one"), covariance)
 
 
 def _shared(
     own: Sequence[Condition], variance: UnitVariance, widened: np.ndarray, curved: set[str]
-) -> tuple[pd.DataFrame, np.ndarray, set[str]] | None:
-    """Return the values of a series, their covariance and the conditions that it speaks for; None for no shared curve.
+) -> tuple[pd.DataFrame, np.ndarray, np.ndarray, set[str]] | None:
+    """Return the values of a series, their covariance, how they move along the directions of the effects' uncertainty,
+    shape (values, k), and the conditions that it speaks for; None for no shared curve.
 
     `widened`, shape (conditions,), is each condition's factor on the stated variances.
     """
@@ -122,7 +132,10 @@ def _shared(
     keep = np.isfinite(variances) & (variances > 0) & (value > 0) & (variances < (DETERMINED * value) ** 2)
     table = pd.DataFrame(names, columns=["condition", "quantity"]).assign(value=value)
     places = np.flatnonzero(keep)
-    return table[keep].reset_index(drop=True), covariance[np.ix_(places, places)], {c.name for c in curve.own}
+    sure = np.where(np.isfinite(covariance), covariance, 0.0)
+    shift = sure[places] @ curve.tangent().T @ curve.shifts()
+    known = {c.name for c in curve.own}
+    return table[keep].reset_index(drop=True), covariance[np.ix_(places, places)], shift, known
 
 
 def _worse(rise: float, more: int, df: float) -> bool:
@@ -204,3 +217,8 @@ class _Curve:
         shared = [bend.ravel()] + ([(self.speed * self.root).ravel()] if self.sigma_2 > 0 else [])
         there = (self.root > 0).ravel()
         return np.column_stack([block_diag(*columns), *shared])[there]
+
+    def shifts(self) -> np.ndarray:
+        """Return the weighted changes of the forces along the directions of the effects' uncertainty, (runs, k)."""
+        weighted = [c.shifts * root[: len(c.runs), None] for c, root in zip(self.own, self.root, strict=True)]
+        return np.concatenate(weighted)

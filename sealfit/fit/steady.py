@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 import pandas as pd
+from scipy.special import stdtrit
 
 from sealfit.conditions import condition_columns
 from sealfit.config import Config
@@ -54,8 +55,10 @@ def fit_conditions(steady: pd.DataFrame, config: Config, *, workers: int = 1) ->
     -------
     DataFrame
         Table `steady_fit` plus the condition columns. `quantity` is "steady" (one row per parameter), "statistics",
-        "covariance" (`parameter` "mu_s,mu_c": type A, for the aging fit) or "sensor_shift" (change of the parameter if
-        the sensor reads the size of every force one standard uncertainty too high; `u_sys` is its size).
+        "covariance" (`parameter` "mu_s,mu_c": type A, for the aging fit), "sensor_shift" (change of the parameter if
+        the sensor reads the size of every force one standard uncertainty too high; `u_sys` is its size) or, where
+        effects were taken out of the forces, "effect_shift" (`parameter` "mu_s:1": change along each direction of the
+        effects' uncertainty; it is in the covariance and the intervals, and common to all conditions).
 
     Raises
     ------
@@ -156,7 +159,8 @@ def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter
     unit_of = parameter_units(config.units, condition.has_load)
     _, _, force, weight = condition.arrays
     covariance, shift = linearised(condition.jacobian(), weight, condition.values, condition.names)
-    covariance = covariance * variance.value[k]
+    _, effects = linearised(condition.jacobian(), weight, condition.values, condition.names, condition.shifts)
+    covariance = covariance * variance.value[k] + effects @ effects.T
     shift = np.where(np.abs(shift) > 1e-12 * np.abs(condition.values), shift * config.sensor.u, 0.0)  # else rounding
     judged = judge(condition)
     spelled = {name: name if condition.has_load else FORCES.get(name, name) for name in NAMES}
@@ -168,6 +172,9 @@ def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter
             j = condition.names.index(name)
             low, high = (None, None) if condition.low is None else (condition.low[j], condition.high[j])
             open_below = name == "v_s" and low == 0.0
+            if effects.any() and low is not None:
+                reach = stdtrit(variance.df[k], 0.975) * float(np.sqrt((effects[j] ** 2).sum()))
+                low, high = _widened(condition.values[j], low, high, reach)
             stuck = name in ("mu_s", "mu_c") and condition.values[j] == 0.0  # at its limit: not known with error zero
             se = None if stuck else _finite(np.sqrt(covariance[j, j]))
             row |= {"value": condition.values[j], "se": se, "u_sys": abs(shift[j])}
@@ -193,6 +200,19 @@ def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter
             unit=unit_of[name],
             identified=judged[name][0],
         )
+        for number, moved in enumerate(effects[j], start=1):
+            yield table_row(
+                quantity="effect_shift",
+                parameter=f"{spelled[name]}:{number}",
+                value=moved,
+                unit=unit_of[name],
+                identified=judged[name][0],
+            )
+
+
+def _widened(value: float, low: float, high: float, reach: float) -> tuple[float, float]:
+    """Return an interval's ends, a half-width added in quadrature to each side; these numbers are not negative."""
+    return max(value - float(np.hypot(value - low, reach)), 0.0), value + float(np.hypot(high - value, reach))
 
 
 def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterator[dict]:
@@ -260,6 +280,7 @@ def table_row(
     """Return one row of a fit table; None, and an end that is open, become null."""
     numbers = {"value": value, "se": se, "lo95": lo95, "hi95": hi95, "u_sys": u_sys}
     return {
+        "model": "before",
         "quantity": quantity,
         "parameter": parameter,
         **{name: np.nan if _finite(number) is None else float(number) for name, number in numbers.items()},

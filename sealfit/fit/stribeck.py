@@ -196,8 +196,10 @@ def tangent(speed, load, values) -> np.ndarray:
     return np.stack([load * decay, load * (1 - decay), load * (mu_s - mu_c) * decay * 2 * square / v_s, speed], axis=1)
 
 
-def linearised(jacobian, weight, values, names):
-    """Covariance at unit variance, and the change of the parameters when every force is 1 larger, shape (p, p), (p,).
+def linearised(jacobian, weight, values, names, moved=None):
+    """Covariance at unit variance, shape (p, p), and the change of the parameters when the forces move.
+
+    Without `moved`, shape (n, k), every force is 1 larger and the change has shape (p,), else (p, k).
 
     A coefficient at its limit 0 is held there: zero variance, no change.
     """
@@ -205,7 +207,7 @@ def linearised(jacobian, weight, values, names):
     root = np.sqrt(weight)
     covariance, _ = covariance_of(jacobian * root[:, None], free)
     known = np.where(np.isfinite(covariance), covariance, 0.0)
-    return covariance, known @ (jacobian.T @ weight)
+    return covariance, known @ (jacobian.T @ (weight if moved is None else weight[:, None] * moved))
 
 
 def flat_p_value(speed, load, weight, grid, statistic, df, *, viscous: bool = True) -> float:

@@ -23,6 +23,7 @@ POOLING_P = 0.25  # Bancroft's level for "is there set-up scatter at all": at 5 
 WORSE_P = 0.01  # a condition that disagrees more than the others at this level is widened by its own ratio
 SMALLEST_SD = 1e-9  # of the largest force: repeats that agree to the last digit do not make a run infinitely certain
 SMALLEST_SHARE = 0.05  # of the largest force: a scatter in proportion to the force does not vanish with it
+SHIFT = "effects_u"  # columns of `steady_after`: directions in which the effects taken out are uncertain
 NEEDED = ("condition", "series", "rubber", "run_id", "file", "direction", "speed_mm_s", "load_N", "force_N", "used")
 
 
@@ -39,7 +40,7 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     DataFrame
         `condition`, `run_id`, `direction`, `speed` (|v|), `set` (commanded |v|, NaN where unknown), `load` (NaN where
         unknown), `force` (F sgn v), `half` (half of the difference between the two ways, where a row stands for both)
-        and `files`, sorted by the first three.
+        and `files`, sorted by the first three; and the columns of `SHIFT`.
 
     Raises
     ------
@@ -65,6 +66,7 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
             "load": rows["load_N"].astype(float),
             "force": rows["force_N"].astype(float) * rows["direction"].astype(int).replace(BOTH, 1),
             "half": rows["half_N"],
+            **{name: rows[name].astype(float) for name in shifts_of(rows)},
         }
     )
     keys = ["condition", "run_id", "direction"]
@@ -79,6 +81,11 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
             mend="Leave it out of the campaign, or look at its steady window.",
         )
     return runs
+
+
+def shifts_of(table: pd.DataFrame) -> list[str]:
+    """Return the columns along which the effects that were taken out are uncertain; none before the loop."""
+    return [name for name in table.columns if str(name).startswith(SHIFT)]
 
 
 def run_weights(runs: pd.DataFrame, scatter: Scatter) -> np.ndarray:

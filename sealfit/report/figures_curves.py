@@ -22,7 +22,9 @@ MOST_TRACES = 6
 
 
 # ---------------------------------------------------------------- aging
-def draw_aging(ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Units) -> None:
+def draw_aging(
+    ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Units, before: pd.DataFrame | None = None
+) -> None:
     """Draw what aging does to the coefficients of one series: the law with its band, and each condition's fit.
 
     Parameters
@@ -35,6 +37,8 @@ def draw_aging(ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Unit
         Rows of table `aging_curves`.
     units : Units
         Give the labels their true units.
+    before : DataFrame, optional
+        Rows of the same table without the loop's effects.
     """
     quantities = list(dict.fromkeys([*curves["quantity"], *points["quantity"]]))
     for k, quantity in enumerate(quantities):
@@ -42,6 +46,9 @@ def draw_aging(ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Unit
         curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
         draw_band(ax, curve["aging_days"], curve["lo95"], curve["hi95"], colour, 0.18)
         ax.plot(curve["aging_days"], curve["value"], color=colour)
+        if before is not None:
+            earlier = before[before["quantity"] == quantity].sort_values("aging_days")
+            ax.plot(earlier["aging_days"], earlier["value"], color=colour, linestyle=":", linewidth=1.1)
         here = points[points["quantity"] == quantity]
         spread = np.nan_to_num(np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float))
         draw_bars(ax, here["aging_days"], here["value"], *np.abs(spread), colour=colour, width=0.8, cap=1.5)
@@ -72,17 +79,18 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     if note:
         note += " All stand in steady_fit.parquet and aging_curves.parquet."
     rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
-    shown = pd.concat([curves["value"], curves["lo95"], curves["hi95"], points["value"]]).dropna()
+    before = tables.get("aging_curves_before", curves.iloc[:0])
+    shown = pd.concat([curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"]]).dropna()
     span = padded(shown.quantile(0.002), shown.quantile(0.998))
     right = max(curves["aging_days"].max(), points["aging_days"].max() if len(points) else 0.0)
     unaged = points["series"].map(is_unaged).astype(bool)
     panels = []
     for name in series:
-        curve = curves[curves["series"] == name]
+        curve, earlier = curves[curves["series"] == name], before[before["series"] == name]
         here = points[(points["series"] == name) | (unaged & (points["rubber"] == rubber.get(name)))]
 
-        def draw(ax: Axes, here=here, curve=curve) -> None:
-            draw_aging(ax, here, curve, config.units)
+        def draw(ax: Axes, here=here, curve=curve, earlier=earlier) -> None:
+            draw_aging(ax, here, curve, config.units, earlier)
             ax.set_ylim(*span)
             ax.set_xlim(-0.03 * right, 1.03 * right)
 
@@ -92,6 +100,8 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         panels.append(Panel(short(names(name)), alt, draw))
     legend = [Key(q, CYCLE[k % len(CYCLE)], symbol=True) for k, q in enumerate(quantities)]
     legend += [Key("fit per condition, 95 %", FLOOR, "point"), Key("aging law, 95 % band", FLOOR, "band")]
+    if len(before):
+        legend.append(Key("before, without the effects", FLOOR, "dotted"))
     return Plot("aging", "Aging", tuple(panels), tuple(legend), note)
 
 

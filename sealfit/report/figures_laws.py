@@ -22,7 +22,9 @@ MARKERS = "os^Dv<>"
 SCALED = "scaled aging time"
 
 
-def draw_master_curve(ax: Axes, rows: pd.DataFrame, colours: Mapping[float, str], units: Units) -> None:
+def draw_master_curve(
+    ax: Axes, rows: pd.DataFrame, colours: Mapping[float, str], units: Units, before: pd.DataFrame | None = None
+) -> None:
     """Draw one quantity's values over scaled aging time, and the law with its 95 % band.
 
     Parameters
@@ -35,6 +37,8 @@ def draw_master_curve(ax: Axes, rows: pd.DataFrame, colours: Mapping[float, str]
         Of each aging temperature.
     units : Units
         Give the labels their true units.
+    before : DataFrame, optional
+        Rows of the same table without the loop's effects: their law is drawn.
     """
     values, law = rows[rows["kind"] == "value"], rows[rows["kind"] == "law"].sort_values("scaled_days")
     aged = values[values["scaled_days"] > 0]
@@ -42,6 +46,9 @@ def draw_master_curve(ax: Axes, rows: pd.DataFrame, colours: Mapping[float, str]
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], FLOOR, 0.2)
     ax.plot(law["scaled_days"], law["value"], color=FLOOR)
+    if before is not None:
+        earlier = before[before["kind"] == "law"].sort_values("scaled_days")
+        ax.plot(earlier["scaled_days"], earlier["value"], color=FLOOR, linestyle=":")
     fresh = values[values["scaled_days"] == 0]
     ax.plot(fresh["scaled_days"], fresh["value"], linestyle="", marker="o", color=BLACK, clip_on=False)
     percents = np.sort(aged["compression_ratio_pct"].dropna().unique())
@@ -69,11 +76,14 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
     colours = dict(zip(celsius.tolist(), shades(len(celsius)), strict=True))
     several = table["rubber"].nunique() > 1
     panels, groups = [], list(table.groupby(["rubber", "quantity"], sort=False))
+    before = tables.get("master_curve_before", table.iloc[:0])
     for (rubber, quantity), rows in spread(groups, MOST_PANELS):
-        span = padded(rows["value"].min(), rows["value"].max())
+        earlier = before[(before["rubber"] == rubber) & (before["quantity"] == quantity)]
+        shown = pd.concat([rows["value"], earlier.loc[earlier["kind"] == "law", "value"]])
+        span = padded(shown.min(), shown.max())
 
-        def draw(ax: Axes, rows=rows, span=span) -> None:
-            draw_master_curve(ax, rows, colours, config.units)
+        def draw(ax: Axes, rows=rows, span=span, earlier=earlier) -> None:
+            draw_master_curve(ax, rows, colours, config.units, earlier)
             ax.set_ylim(*span)
 
         title = f"{rubber}, {symbol_plain(quantity)}" if several else symbol_plain(quantity)
@@ -81,5 +91,6 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
         panels.append(Panel(title, alt, draw))
     legend = [Key(f"{given(t)} °C", colour, "point") for t, colour in spread(list(colours.items()), MOST_KEYS)]
     legend += [Key("unaged", BLACK, "point"), Key("law, 95 % band", FLOOR, "band")]
+    legend += [Key("before, without the effects", FLOOR, "dotted")] if len(before) else []
     note = "" if len(groups) == len(panels) else f"{len(panels)} of {len(groups)}; all stand in master_curve.parquet."
     return Plot("master_curve", "Master curve", tuple(panels), tuple(legend), note)

@@ -10,15 +10,18 @@ from sealfit.report.symbols import symbol_html
 MOST_LAWS = 4  # of each quantity
 
 
-def law_rows(aging_laws: pd.DataFrame) -> list[dict]:
+def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> list[dict]:
     """Return the likeliest laws of each quantity, and separate laws, as plain values for the page.
 
     Parameters
     ----------
     aging_laws : DataFrame
         Table `aging_laws`, perhaps empty.
+    before : DataFrame, optional
+        The same without the loop's effects: its likeliest law follows that of `aging_laws`.
     """
     found = []
+    earlier = {} if before is None else {row["key"]: row for row in law_rows(before) if row["chosen"]}
     several = aging_laws["rubber"].nunique() > 1 if len(aging_laws) else False
     for (rubber, quantity), own in aging_laws.groupby(["rubber", "quantity"], sort=False):
         last = own["rank"].max()
@@ -41,8 +44,12 @@ def law_rows(aging_laws: pd.DataFrame) -> list[dict]:
                     if known(first["heldout_last_day"])
                     else NOTHING,
                     "chosen": rank == 1,
+                    "before": False,
+                    "key": (rubber, quantity),
                 }
             )
+            if rank == 1 and (rubber, quantity) in earlier:
+                found.append({**earlier[rubber, quantity], "criterion": NOTHING, "chosen": False, "before": True})
     return found
 
 

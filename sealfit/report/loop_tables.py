@@ -75,6 +75,7 @@ def effect_cards(closure: Mapping, config: Config) -> list[dict]:
                 "acts": acts(effect, config),
                 "given": "factor minus one" if effect["operation"] == "multiply" else f"added {_added(effect, config)}",
                 "form": effect["form"],
+                "reference": effect.get("reference") or "",
                 "level": PARTS.get(effect["level"], effect["level"]),
                 "channels": channels,
                 "parameters": [_parameter(p, effect) for p in effect["parameters"]],
@@ -85,6 +86,15 @@ def effect_cards(closure: Mapping, config: Config) -> list[dict]:
             }
         )
     return cards
+
+
+def references(closure: Mapping, config: Config) -> list[dict]:
+    """Return every effect of the after-model and the state in which it is zero, in words."""
+    return [
+        {"label": effect_label(effect, config.units), "state": effect["reference"]}
+        for effect in closure["effects"]
+        if not effect["candidate"]
+    ]
 
 
 def _added(effect: Mapping, config: Config) -> str | Markup:

@@ -18,7 +18,7 @@ from sealfit.report.drawn import Drawn, data_uri, draw_plots
 from sealfit.report.figures import draw_all, draw_fits
 from sealfit.report.figures_residual import MOST_CHANNELS
 from sealfit.report.law_tables import law_rows
-from sealfit.report.loop_tables import channel_tests, effect_cards, error_rows, next_runs, scatter_rows
+from sealfit.report.loop_tables import channel_tests, effect_cards, error_rows, next_runs, references, scatter_rows
 from sealfit.report.numbers import count, given, number
 from sealfit.report.parameters import break_away_rows, parameter_tables
 from sealfit.report.style import Plot
@@ -30,6 +30,9 @@ TABLES = (
     "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves", "effects",
     "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves",
 )  # fmt: skip
+FITS = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
+BEFORE = "{}_before"  # name of such a table without the loop's effects, beside that of the after-model
+OF_FITS = ("aging", "master_curve", "starts")  # figures that show them
 EMPTY: Mapping[str, Drawn] = MappingProxyType({})
 VERDICTS = {
     "closed": "Closed",
@@ -80,10 +83,12 @@ def build_report(
     Report
         The page asks for nothing outside itself. Figures are drawn once; the page shows their panels.
     """
-    tables = facts.complete(tables, TABLES)
+    tables = with_answer(tables)
     if closure is not None:
         closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
     plots = draw_all(tables, closure, config)
+    if BEFORE.format("steady_fit") in tables:  # drawn without effects
+        drawn = {name: figure for name, figure in drawn.items() if name not in OF_FITS}
     left = {name: plot for name, plot in plots.items() if name not in drawn}
     with timed("plots", rows=len(left), of="plots"):
         figures = {**draw_plots(left), **drawn}
@@ -94,16 +99,30 @@ def build_report(
     return Report(html, figures)
 
 
+def with_answer(tables: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Return the report's tables, with the fits of the after-model in place of those before where there are any.
+
+    Those before then stand under their names and `_before`.
+    """
+    complete = facts.complete(tables, TABLES)
+    if not len(tables.get("steady_fit_after", ())):
+        return complete
+    before = {BEFORE.format(name): complete[name] for name in FITS}
+    after = facts.complete({name: tables[f"{name}_after"] for name in FITS}, FITS)
+    return {**complete, **after, **before}
+
+
 def _content(
     tables: Mapping[str, pd.DataFrame],
     closure: Mapping | None,
     provenance: Mapping,
     config: Config,
 ) -> dict:
-    fitted = parameter_tables(tables["steady_fit"], "condition", config)
-    fitted += parameter_tables(tables["aging_fit"], "series", config)
+    before = {name: tables.get(BEFORE.format(name)) for name in FITS}
+    fitted = parameter_tables(tables["steady_fit"], "condition", config, before["steady_fit"])
+    fitted += parameter_tables(tables["aging_fit"], "series", config, before["aging_fit"])
     dynamic = tables["dynamic_fit"]
-    fitted += parameter_tables(dynamic[dynamic["quantity"] == "dynamic"], "condition", config)
+    fitted += parameter_tables(dynamic[dynamic["quantity"] == "dynamic"], "condition", config, before["dynamic_fit"])
     break_aways, break_aways_in_all = break_away_rows(dynamic, config)
     findings, in_all = facts.quality_findings(tables["quality"], config)
     return {
@@ -121,7 +140,8 @@ def _content(
         "parameter_tables": sorted(fitted, key=lambda table: table.single),  # how well the fits do comes last
         "aging_fitted": len(tables["aging_fit"]) > 0,
         "aging": config.aging,
-        "laws": law_rows(tables["aging_laws"]),
+        "laws": law_rows(tables["aging_laws"], before["aging_laws"]),
+        "references": references(closure, config) if before["steady_fit"] is not None else [],
         "break_aways": break_aways,
         "break_aways_in_all": break_aways_in_all,
         "condition_key": ConditionNames.of(config).key,

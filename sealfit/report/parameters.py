@@ -20,7 +20,7 @@ STATISTICS = (
 )  # fmt: skip
 ENDS = ("value", "lo95", "hi95")
 MOST_BREAK_AWAYS = 600
-HIDDEN = ("covariance", "sensor_shift")  # for programs; they stand in the Parquet tables
+HIDDEN = ("covariance", "sensor_shift", "effect_shift")  # for programs; they stand in the Parquet tables
 
 Rows = dict[tuple[str, str], dict]  # of one condition or series, by parameter and unit
 
@@ -33,6 +33,7 @@ class Cell:
     interval: str = NOTHING
     u_sys: str = NOTHING
     words: str = ""
+    before: str = NOTHING  # the value without the loop's effects
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,12 @@ class ParameterTable:
     rows: tuple[tuple[tuple[str | Markup, ...], tuple[Cell, ...], Markup], ...]
     single: bool = False  # values only: statistics have neither interval nor u_sys
     note: str = ""  # which of how many there are, where they are too many
+    compared: bool = False  # whether cells say what they were before
+
+    @property
+    def width(self) -> int:
+        """Number of columns of a parameter."""
+        return 1 if self.single else 4 if self.compared else 3
 
 
 def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
@@ -86,7 +93,9 @@ def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> tuple[list[dic
     return found, len(above)
 
 
-def parameter_tables(fit: pd.DataFrame, key: str, config: Config) -> list[ParameterTable]:
+def parameter_tables(
+    fit: pd.DataFrame, key: str, config: Config, before: pd.DataFrame | None = None
+) -> list[ParameterTable]:
     """Return the tables of `steady_fit` (key "condition") or `aging_fit` (key "series").
 
     Quantities with the same parameters share a table; units stand in the head, and where a parameter has another unit
@@ -100,10 +109,13 @@ def parameter_tables(fit: pd.DataFrame, key: str, config: Config) -> list[Parame
         Column that tells the rows apart.
     config : Config
         Names the conditions and gives the true units.
+    before : DataFrame, optional
+        The same table without the loop's effects, for its values beside those of `fit`.
     """
     fit = fit[~fit["quantity"].isin(HIDDEN)]
     if fit.empty:
         return []
+    earlier = _values(before, key) if before is not None else None
     names = ConditionNames.of(config)
     of_quantity = {
         quantity: tuple(dict.fromkeys(zip(rows["parameter"], rows["unit"].fillna(""), strict=True)))
@@ -117,8 +129,13 @@ def parameter_tables(fit: pd.DataFrame, key: str, config: Config) -> list[Parame
         if quantities == ["statistics"]:
             tables.append(_statistics(rows, key, names, config))
         else:
-            tables.append(_table(rows, key, quantities, parameters, names, config))
+            tables.append(_table(rows, key, quantities, parameters, names, config, earlier))
     return [replace(table, note=note) for table in tables]
+
+
+def _values(fit: pd.DataFrame, key: str) -> dict[tuple[str, str, str], dict]:
+    """Return the rows of a fit table by condition or series, quantity and parameter."""
+    return {(row[key], row["quantity"], row["parameter"]): row for row in _records(fit, key, "quantity")}
 
 
 def _readable(fit: pd.DataFrame, key: str, names: ConditionNames) -> tuple[pd.DataFrame, str]:
@@ -140,17 +157,20 @@ def _table(
     parameters: Sequence[tuple[str, str]],
     names: ConditionNames,
     config: Config,
+    earlier: Mapping[tuple[str, str, str], Mapping] | None,
 ) -> ParameterTable:
     several = len(quantities) > 1 or key == "series"
     found = []
     for (name, quantity), by in _rows_of(fit, key, "quantity", names):
         cells = tuple(_cell(by.get(parameter)) for parameter in parameters)
+        if earlier is not None:
+            olds = [_before(earlier.get((name, quantity, parameter))) for parameter, _ in parameters]
+            cells = tuple(replace(cell, before=old) for cell, old in zip(cells, olds, strict=True))
         keys = (names(name), symbol_html(quantity)) if several else (names(name),)
         found.append((keys, cells, _note(by, config)))
     heads = (_head(key), "of") if several else (_head(key),)
-    return ParameterTable(
-        _title(key, quantities), heads, tuple((symbol_html(p), u) for p, u in parameters), tuple(found)
-    )
+    groups = tuple((symbol_html(p), u) for p, u in parameters)
+    return ParameterTable(_title(key, quantities), heads, groups, tuple(found), compared=earlier is not None)
 
 
 def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Config) -> ParameterTable:
@@ -205,6 +225,13 @@ def _cell(row: Mapping | None) -> Cell:
         return Cell(words="not identified")
     value, interval = measured(row["value"], row["lo95"], row["hi95"])
     return Cell(value, interval, number(row["u_sys"], 2) if known(row["u_sys"]) else NOTHING)
+
+
+def _before(row: Mapping | None) -> str:
+    """Return a value without the loop's effects, in the digits of its own interval."""
+    if row is None or not row["identified"]:
+        return NOTHING
+    return measured(row["value"], row["lo95"], row["hi95"])[0]
 
 
 def _note(rows: Mapping[tuple[str, str], Mapping], config: Config, *, named: bool = True) -> Markup:

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import re
 import sys
 from pathlib import Path
 
@@ -205,6 +206,38 @@ def test_every_effect_file_is_registered():
 def test_closed_forms_read_any_channel_and_mechanisms_read_named_ones(effect):
     assert (effect.reads in ((CHANNEL,), (CHANNEL, SECOND))) != effect.physical
     assert ("{x}" in effect.label) != effect.physical
+
+
+ZERO_AT = {  # inputs of the states that effects name as their reference
+    "cold contact (time 0)": {"time_s": 0.0},
+    "cold contact (distance 0)": {"distance_mm": 0.0},
+    "time 0 of the file": {"time_s": 0.0},
+    "start of the campaign": {"elapsed_h": 0.0},
+    "first repeat": {"repeat": 1.0},
+    "first stroke": {"stroke": 1.0},
+    "no rest before the stroke": {"rest_s": 0.0},
+    "not compressed (100 %)": {"compression_ratio_pct": 100.0},
+    "unaged": {"aging_days": 0.0},
+    "{x} = 0": {"x": 0.0},
+}
+
+
+@every_effect
+def test_the_reference_is_said(effect):
+    assert effect.reference
+
+
+@pytest.mark.parametrize(
+    "effect", [e for e in EVERY.values() if e.reference in ZERO_AT or "_ref}" in e.reference], ids=lambda e: e.id
+)
+def test_the_shape_is_zero_at_the_reference_that_is_said(effect):
+    """Others say a mean, a limit, or a place that parameters or categories tell."""
+    named = re.findall(r"\{(\w+)_ref\}", effect.reference)
+    at = ZERO_AT.get(effect.reference) or dict.fromkeys(named[:1] if " or " in effect.reference else named, 1.5)
+    inputs = {name: np.array([at.get(name, 2.0)]) for name in effect.reads}
+    fixed = {f"{name}_ref": 1.5 for name in effect.reads}
+    values = {p.name: p.start for p in effect.parameters} | dict.fromkeys(effect.linear, 0.3)
+    npt.assert_allclose(effect.shape({**inputs, **fixed}, **values), 0.0, atol=1e-12)
 
 
 def test_symbols_are_printed_without_the_underscore_that_python_needs():

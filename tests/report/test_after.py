@@ -1,0 +1,65 @@
+"""The report where the loop added effects: numbers of the after-model, those before beside them."""
+
+import re
+
+import pytest
+from report.made_campaigns import Made, aging_campaign
+from report.test_page import Page
+
+from sealfit.report.law_tables import law_rows
+from sealfit.report.page import FITS, OF_FITS, build_report, figures_of_fits, with_answer
+from sealfit.report.parameters import parameter_tables
+
+HIGHER = 1.04
+
+
+@pytest.fixture(scope="module")
+def made():
+    before = aging_campaign()
+    tables = dict(before.tables)
+    for name in FITS:
+        table = before.tables[name]
+        numbers = [c for c in ("value", "lo95", "hi95") if c in table]
+        tables[f"{name}_after"] = table.assign(**{c: table[c] * HIGHER for c in numbers})
+    effects = [{**effect, "reference": "cold contact (time 0)"} for effect in before.closure["effects"]]
+    return Made(tables, {**before.closure, "effects": effects}, before.provenance, before.config)
+
+
+def test_values_before_stand_beside_those_after(made):
+    fit = made.tables["steady_fit"]
+    (table, _) = parameter_tables(made.tables["steady_fit_after"], "condition", made.config, fit)
+    assert table.compared
+    assert table.width == 4
+    _, cells, _ = table.rows[1]
+    row = fit.query("aging_days == 1 and compression_ratio_pct == 80 and parameter == 'mu_s'").iloc[0]
+    assert (cells[0].value, cells[0].before) == (f"{HIGHER * row['value']:.3f}", f"{row['value']:.3f}")
+    (plain, _) = parameter_tables(fit, "condition", made.config)
+    assert (plain.compared, plain.width) == (False, 3)
+
+
+def test_the_likeliest_law_before_follows_that_after(made):
+    rows = law_rows(made.tables["aging_laws_after"], made.tables["aging_laws"])
+    first = [row for row in rows if row["key"] == rows[0]["key"]][:2]
+    assert [(row["chosen"], row["before"]) for row in first] == [(True, False), (False, True)]
+    assert sum(row["before"] for row in rows) == len({row["key"] for row in rows})
+
+
+def test_the_page_is_of_the_after_model_and_says_its_reference(made):
+    early = figures_of_fits(made.tables, made.config)
+    report = build_report(*made.arguments, drawn=early)
+    page = Page(report.html)
+    assert "They hold where its effects are zero: cold contact (time 0)" in page.text
+    assert re.search(r"value 95 % u sys before", page.text)
+    assert "before, without the effects" in page.text
+    for name in OF_FITS:
+        assert report.figures[name].svg != early[name].svg or name == "starts"  # its force is no "value"
+    assert report.figures["traces_mean"] is early["traces_mean"]
+
+
+def test_without_effects_nothing_is_doubled():
+    made = aging_campaign(verdict="nothing_missing")
+    tables = with_answer(made.tables)
+    assert not any(name.endswith("_before") and name != "residuals_before" for name in tables)
+    page = Page(build_report(*made.arguments).html)
+    assert "without the effects" not in page.text
+    assert "They hold where its effects are zero" not in page.text
