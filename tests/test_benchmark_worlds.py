@@ -9,6 +9,7 @@ from worlds.campaign import draw_points, points_csv, truth_record, write_campaig
 from worlds.effects import FAMILIES, Effect
 from worlds.main import read
 from worlds.motion import batches, force_at, integrate
+from worlds.parameters import aged_series, laws_inside
 from worlds.priors import PRIORS
 from worlds.score import NONE, RIGHT, SAME_AT_DESIGN, Target, explained_by, grade, named_rightly, on_variables, scored
 from worlds.summary import alarmed, summarise
@@ -226,3 +227,17 @@ def test_the_summary_counts_what_the_records_say(tmp_path):
         "\n".join(json.dumps(r) for r in [*records, {"seed_text": "s", "index": 9, "size": "small", "error": "x"}])
     )
     assert [r["index"] for r in read(path)] == [0, 1, 2, 3, 4, 5]
+
+
+def test_intervals_of_the_law_are_held_to_the_series_truth(tmp_path):
+    world = next(w for w in (draw_world(SEED, k) for k in range(20)) if (w.days > 0).sum() >= 2)
+    own = aged_series(world)[0]
+    rows = [
+        ("mu_s", "mu_0", own["mu_0s"], 0.01, True), ("mu_c", "a", own["a_c"], 0.001, True),
+        ("mu_c", "b", own["b_c"] + 9.0, 0.1, True), ("mu_s", "b", own["b_s"], 0.1, False),
+    ]  # fmt: skip
+    table = pd.DataFrame(rows, columns=["quantity", "parameter", "value", "half", "identified"])
+    place = {name: own[name] for name in ("temperature_C", "compression_ratio_pct")}
+    table = table.assign(lo95=table["value"] - table["half"], hi95=table["value"] + table["half"], **place)
+    table.to_parquet(tmp_path / "aging_fit.parquet")
+    assert laws_inside(world, tmp_path) == {"mu_0": [1, 1], "a": [1, 1], "b": [0, 1]}
