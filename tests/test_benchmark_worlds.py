@@ -194,7 +194,8 @@ def record(index=0, effects=(), verdict="nothing_missing", extra=0, **more):
         "seed_text": "s", "index": index, "size": "small", "features": ["small"], "files": 9, "effects": list(effects),
         "verdict": verdict, "claims": [], "extra": extra, "extra_on_true_variable": 0, "exit": 0, "traceback": None,
         "seconds": 5.0, "peak_MB": 200.0, "predict_exit": 0, "points": 100, "inside": 95, "fit_quality": None,
-        "refused": None, "errors": {"before": 1.0, "after": 1.0, "true_form": 0.5}, **more,
+        "refused": None, "errors": {"before": 1.0, "after": 1.0, "true_form": 0.5},
+        "of_tested_specimens": {"points": 40, "inside": 38}, **more,
     }  # fmt: skip
 
 
@@ -221,6 +222,7 @@ def test_the_summary_counts_what_the_records_say(tmp_path):
     assert "cannot_tell 1" in text
     assert "traceback: KeyError: 'x'" in text
     assert "| effects of about the size that `sensitivity` states: found | 1/3" in text
+    assert "tested specimens' only | 190/200 = 95.0 %" in text
     assert not alarmed(records[0])
     path = tmp_path / "r.jsonl"
     path.write_text(
