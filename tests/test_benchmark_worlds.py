@@ -11,6 +11,7 @@ from worlds.main import read
 from worlds.motion import batches, force_at, integrate
 from worlds.parameters import aged_series, laws_inside
 from worlds.priors import PRIORS
+from worlds.run import read_closure, true_effects
 from worlds.score import NONE, RIGHT, SAME_AT_DESIGN, Target, explained_by, grade, named_rightly, on_variables, scored
 from worlds.summary import alarmed, summarise
 from worlds.true_form import make_rows, z_values
@@ -187,6 +188,27 @@ def test_a_copy_of_the_variable_explains_an_effect_and_noise_does_not():
     assert explained_by(copied, x**2, np.empty((400, 0)), scale) > 0.99
     assert explained_by({"noise": rng.normal(size=400)}, x**2, np.empty((400, 0)), scale) < 0.3
     assert explained_by(copied, x, np.column_stack([np.ones(400), x]), scale) < 0.01  # declared already
+
+
+@pytest.mark.parametrize("coming", [False, True])
+def test_a_closure_is_read_with_and_without_the_statement_of_power(coming):
+    world = quiet(5)
+    wave = {"period": world.rig["stroke_mm"] / 5, "phase": 0.3}
+    size = 0.2 * world.rig["mean_N"]
+    world.effects = [Effect("ripple", ("ripple",), ("displacement_mm",), "force", "add", "sine", wave, amplitude=size)]
+    rows, errors = make_rows(world), {"heldout_rmse_N": 1.0, "rmse_N": 1.0}
+    verdict = "cannot_tell" if coming else "closed"
+    closure = {"verdict": verdict, "effects": [claim()], "before": errors, "after": errors}
+    closure |= {"noise_floor_N": None, "left": {}}
+    if coming:
+        closure |= {
+            "sensitivity": [{"variable": "displacement_mm", "level": "trace", "smallest_N": 0.25}],
+            "refused": [],
+        }
+    found = read_closure(world, rows, closure, true_effects(world, rows))
+    assert (found["effects"][0]["grade"], found["extra"]) == (RIGHT, 0)
+    assert found["effects"][0]["smallest_N"] == (0.25 if coming else None)
+    assert found["has_sensitivity"] == coming
 
 
 def record(index=0, effects=(), verdict="nothing_missing", extra=0, **more):

@@ -94,6 +94,7 @@ def run_world(task: Task) -> dict:
             "seed_text": task.seed_text, "index": task.index, "size": task.size, "features": world.features,
             "files": len(world.files), "series": int(world.files["series"].nunique()), "days": int(world.days.size),
             "speeds": int(world.speeds_mm_s.size), "mean_N": world.rig["mean_N"],
+            "stroke_bristles": world.rig["stroke_bristles"],
             "effects": true_effects(world, rows), "simulated_s": time.monotonic() - started,
         }  # fmt: skip
         words = [task.python, "-m", "sealfit", "run", str(home / "campaign"), "--out", str(home / "out")]

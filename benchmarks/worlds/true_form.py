@@ -36,7 +36,7 @@ CLEAR = 8.0
 SECOND_ORDER = 1e-3  # of the force: what linearising leaves, at scatter of some percent
 VAGUE = 2.0  # relative standard deviation of what is known of a declared quantity beforehand: next to nothing
 LEAST_RUNS = 12  # with fewer, files are the clusters of an effect inside files
-MOST_ROWS = 1800  # of a specimen whose scatter is taken as one block: more are cut between files, for time
+MOST_ROWS = 1200  # of a specimen whose scatter is taken as one block: more are cut between files, for time
 WRONG_GAIN = 0.15  # of files that went wrong, about
 GAIN = ("mu_0s", "mu_0c", "a_s", "a_c", "sigma_2")  # quantities that a gain of the whole friction multiplies
 UNIT = {"repeat": "file", "run": "run_id", "specimen": "specimen_id"}
@@ -52,6 +52,7 @@ class Rows:
     columns: np.ndarray  # (n, k) nuisance first, then effects
     names: list[tuple]  # ("quantity", series) or ("effect", number)
     variance: np.ndarray  # of a bin's noise
+    fit: tuple[np.ndarray, np.ndarray] | None = None  # `fitted`, once asked for
 
     @property
     def effects(self) -> list[int]:
@@ -274,6 +275,12 @@ def error_at(world: World, rows: Rows, points: pd.DataFrame) -> np.ndarray:
 
 def fitted(world: World, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     """Return d of the true form and its covariance, by generalised least squares: scatter correlates a unit's rows."""
+    if rows.fit is None:
+        rows.fit = _fitted(world, rows)
+    return rows.fit
+
+
+def _fitted(world: World, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     table, units, mean = rows.table, codes(rows), friction_N(rows, world)
     along = (table["distance_mm"] / world.rig["stroke_mm"] - 0.5).to_numpy()
     moved = {q: sum(rows.columns[:, k] for k, n in enumerate(rows.names) if n[0] == q) for q in QUANTITIES}
