@@ -9,7 +9,9 @@ from worlds.campaign import draw_points, points_csv, truth_record, write_campaig
 from worlds.effects import FAMILIES, Effect
 from worlds.main import read
 from worlds.motion import batches, force_at, integrate
+from worlds.parameters import aged_series, laws_inside
 from worlds.priors import PRIORS
+from worlds.run import read_closure, true_effects
 from worlds.score import NONE, RIGHT, SAME_AT_DESIGN, Target, explained_by, grade, named_rightly, on_variables, scored
 from worlds.summary import alarmed, summarise
 from worlds.true_form import make_rows, z_values
@@ -188,12 +190,34 @@ def test_a_copy_of_the_variable_explains_an_effect_and_noise_does_not():
     assert explained_by(copied, x, np.column_stack([np.ones(400), x]), scale) < 0.01  # declared already
 
 
+@pytest.mark.parametrize("coming", [False, True])
+def test_a_closure_is_read_with_and_without_the_statement_of_power(coming):
+    world = quiet(5)
+    wave = {"period": world.rig["stroke_mm"] / 5, "phase": 0.3}
+    size = 0.2 * world.rig["mean_N"]
+    world.effects = [Effect("ripple", ("ripple",), ("displacement_mm",), "force", "add", "sine", wave, amplitude=size)]
+    rows, errors = make_rows(world), {"heldout_rmse_N": 1.0, "rmse_N": 1.0}
+    verdict = "cannot_tell" if coming else "closed"
+    closure = {"verdict": verdict, "effects": [claim()], "before": errors, "after": errors}
+    closure |= {"noise_floor_N": None, "left": {}}
+    if coming:
+        closure |= {
+            "sensitivity": [{"variable": "displacement_mm", "level": "trace", "smallest_N": 0.25}],
+            "refused": [],
+        }
+    found = read_closure(world, rows, closure, true_effects(world, rows))
+    assert (found["effects"][0]["grade"], found["extra"]) == (RIGHT, 0)
+    assert found["effects"][0]["smallest_N"] == (0.25 if coming else None)
+    assert found["has_sensitivity"] == coming
+
+
 def record(index=0, effects=(), verdict="nothing_missing", extra=0, **more):
     return {
         "seed_text": "s", "index": index, "size": "small", "features": ["small"], "files": 9, "effects": list(effects),
         "verdict": verdict, "claims": [], "extra": extra, "extra_on_true_variable": 0, "exit": 0, "traceback": None,
         "seconds": 5.0, "peak_MB": 200.0, "predict_exit": 0, "points": 100, "inside": 95, "fit_quality": None,
-        "refused": None, "errors": {"before": 1.0, "after": 1.0, "true_form": 0.5}, **more,
+        "refused": None, "errors": {"before": 1.0, "after": 1.0, "true_form": 0.5},
+        "of_tested_specimens": {"points": 40, "inside": 38}, **more,
     }  # fmt: skip
 
 
@@ -220,9 +244,24 @@ def test_the_summary_counts_what_the_records_say(tmp_path):
     assert "cannot_tell 1" in text
     assert "traceback: KeyError: 'x'" in text
     assert "| effects of about the size that `sensitivity` states: found | 1/3" in text
+    assert "tested specimens' only | 190/200 = 95.0 %" in text
     assert not alarmed(records[0])
     path = tmp_path / "r.jsonl"
     path.write_text(
         "\n".join(json.dumps(r) for r in [*records, {"seed_text": "s", "index": 9, "size": "small", "error": "x"}])
     )
     assert [r["index"] for r in read(path)] == [0, 1, 2, 3, 4, 5]
+
+
+def test_intervals_of_the_law_are_held_to_the_series_truth(tmp_path):
+    world = next(w for w in (draw_world(SEED, k) for k in range(20)) if (w.days > 0).sum() >= 2)
+    own = aged_series(world)[0]
+    rows = [
+        ("mu_s", "mu_0", own["mu_0s"], 0.01, True), ("mu_c", "a", own["a_c"], 0.001, True),
+        ("mu_c", "b", own["b_c"] + 9.0, 0.1, True), ("mu_s", "b", own["b_s"], 0.1, False),
+    ]  # fmt: skip
+    table = pd.DataFrame(rows, columns=["quantity", "parameter", "value", "half", "identified"])
+    place = {name: own[name] for name in ("temperature_C", "compression_ratio_pct")}
+    table = table.assign(lo95=table["value"] - table["half"], hi95=table["value"] + table["half"], **place)
+    table.to_parquet(tmp_path / "aging_fit.parquet")
+    assert laws_inside(world, tmp_path) == {"mu_0": [1, 1], "a": [1, 1], "b": [0, 1]}

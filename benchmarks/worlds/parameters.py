@@ -29,7 +29,7 @@ def laws_inside(world: World, out: Path) -> dict[str, list[int]]:
                and s["compression_ratio_pct"] == row.compression_ratio_pct]  # fmt: skip
         if end is None or not own:
             continue
-        true = own[0][f"{row.parameter}_{end}"]
+        true = own[0][("mu_0" if row.parameter == "mu_0" else f"{row.parameter}_") + end]
         if row.quantity.startswith("F_") and row.parameter != "b":
             true *= load
         counts[row.parameter][0] += int(row.lo95 <= true <= row.hi95)

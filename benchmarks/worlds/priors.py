@@ -74,7 +74,7 @@ PRIORS: dict[str, Prior] = {
     "mu_s_over_mu_c": Prior("uniform", (1.05, 1.8), "static above Coulomb friction"),
     "v_s_mm_s": Prior("log", (1.0, 50.0), "Stribeck speeds of rubber in the literature"),
     "viscous_share": Prior("log", (0.005, 0.5), "sigma_2 v at the fastest speed, share of Coulomb friction"),
-    "sigma_1_over_sigma_0_s": Prior("log", (1e-5, 5e-3), "bristle damping time"),
+    "sigma_1_over_sigma_0_s": Prior("log", (1e-5, 5e-3), "damping time; 3e-3 s in Canudas de Wit et al. 1995"),
     "aging_loss": Prior("uniform", (0.05, 0.4), "share of mu lost at the last day"),
     "aging_b_days": Prior("log", (0.05, 5.0), "b of Eq. 15 around the paper's 0.08 to 0.13 d, and slower"),
     "series_spread": Prior("uniform", (0.0, 0.3), "relative differences of a, b, v_s and sigma_2 between series"),

@@ -94,6 +94,7 @@ def run_world(task: Task) -> dict:
             "seed_text": task.seed_text, "index": task.index, "size": task.size, "features": world.features,
             "files": len(world.files), "series": int(world.files["series"].nunique()), "days": int(world.days.size),
             "speeds": int(world.speeds_mm_s.size), "mean_N": world.rig["mean_N"],
+            "stroke_bristles": world.rig["stroke_bristles"],
             "effects": true_effects(world, rows), "simulated_s": time.monotonic() - started,
         }  # fmt: skip
         words = [task.python, "-m", "sealfit", "run", str(home / "campaign"), "--out", str(home / "out")]
@@ -106,7 +107,7 @@ def run_world(task: Task) -> dict:
             "peak_MB": ended.peak_bytes / 1e6,
         }
         if ended.code != 0:
-            return record | {"said": ended.output[-1500:]}
+            return record | {"said": ended.output[-3000:]}
         closure = json.loads((home / "out" / "closure.json").read_text("utf-8"))
         record |= read_closure(world, rows, closure, record["effects"])
         record |= predicted(task, world, rows, home)
@@ -212,13 +213,15 @@ def predicted(task: Task, world: World, rows: Rows, home: Path) -> dict:
     words = [task.python, "-m", "sealfit", "predict", str(home / "out"), "--points", str(home / "points.csv")]
     ended = command([*words, "--output", str(home / "predicted.csv")], task.limit_s)
     if ended.code != 0:
-        return {"predict_exit": ended.code, "predict_traceback": ended.traceback, "predict_said": ended.output[-1500:]}
+        return {"predict_exit": ended.code, "predict_traceback": ended.traceback, "predict_said": ended.output[-3000:]}
     answer = pd.read_csv(home / "predicted.csv")
     before, after = (answer[f"force_{name}_N"].to_numpy(float) for name in ("before", "after"))
     low, high = (answer[f"force_after_{end}95_N"].to_numpy(float) for end in ("lo", "hi"))
     outside = answer["extrapolated"].astype(str).str.lower().isin(["true", "1"]).to_numpy()
     good = np.isfinite(after) & np.isfinite(before) & ~outside
     oracle = error_at(world, rows, points)
+    inside = (low <= exact) & (exact <= high) & good
+    own_only = answer["note"].astype(str).str.contains("those of the tested ones").to_numpy()
 
     def rms(error: np.ndarray) -> float | None:
         return float(np.sqrt(np.mean(error[good] ** 2))) if good.any() else None
@@ -229,7 +232,8 @@ def predicted(task: Task, world: World, rows: Rows, home: Path) -> dict:
         "unanswered": int((~np.isfinite(after)).sum()),
         "extrapolated": int(outside.sum()),
         "errors": {"before": rms(before - exact), "after": rms(after - exact), "true_form": rms(oracle)},
-        "inside": int(((low <= exact) & (exact <= high))[good].sum()),
+        "inside": int(inside.sum()),
+        "of_tested_specimens": {"points": int((good & own_only).sum()), "inside": int((inside & own_only).sum())},
         "with_interval": int((np.isfinite(low) & np.isfinite(high) & good).sum()),
         "half_width_N": float(np.median((high - low)[good] / 2)) if good.any() else None,
     }

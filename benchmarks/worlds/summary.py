@@ -97,6 +97,8 @@ def figures(records: list[dict], fine: list[dict]) -> str:
     nulls, clear = [r for r in fine if is_null(r)], clear_effects(fine)
     before, true_form = ratios(fine, "before"), ratios(fine, "true_form")
     pooled = sum(r.get("inside", 0) for r in fine), sum(r.get("points", 0) for r in fine)
+    noted = [r["of_tested_specimens"] for r in fine if r.get("of_tested_specimens")]
+    own = sum(n["inside"] for n in noted), sum(n["points"] for n in noted)
     stated = [(e["own_rms_N"] / e["smallest_N"], e["grade"] > 0) for r in fine for e in r["effects"] if e["smallest_N"]]
     near = [found for ratio, found in stated if NEAR_STATED[0] <= ratio <= NEAR_STATED[1]]
     seconds, memory = np.array([r["seconds"] for r in fine] or [0.0]), np.array([r["peak_MB"] for r in fine] or [0.0])
@@ -115,6 +117,8 @@ def figures(records: list[dict], fine: list[dict]) -> str:
         ("predict: error after above before by more than 5 %", share(int((before > WORSE).sum()), before.size)),
         ("predict: after over the true form, median, 95th percentile", _quantiles(true_form)),
         ("points inside the 95 % interval of the mean", share(*pooled)),
+        ("... that says it is the tested specimens' only", share(*own)),
+        ("... and the other points", share(pooled[0] - own[0], pooled[1] - own[1])),
         *((f"intervals of {name} of Eq. 15, nothing hidden", share(*_laws(fine, name))) for name in ("mu_0", "a", "b")),
         ("intervals of lifetimes, nothing hidden", share(*_lifetimes(fine))),
         ("effects of about the size that `sensitivity` states: found", share(sum(near), len(near))),
@@ -204,19 +208,27 @@ def family_of(effect: dict) -> str:
 
 def failures(records: list[dict]) -> str:
     """Return the worlds that were not answered, or whose points were not."""
-    rows = [(f"{r['size']} {r['index']}", str(r["files"]), why) for r in records if (why := failed(r))]
+    rows = [(name(r), str(r["files"]), why) for r in records if (why := failed(r))]
     return _table(("world", "files", "what happened"), rows) if rows else "No world was left without an answer."
 
 
 def worst(fine: list[dict], most: int = 15) -> str:
-    """Return the worlds whose predictions were made worse most, or that missed the clearest effects."""
+    """Return the worlds that hide nothing and gave alarm, those made worse most, and the clearest effects missed."""
+    rows = [(name(r), "alarm, nothing hidden", line(r)) for r in fine if is_null(r) and alarmed(r)]
     made = [(r["errors"]["after"] / r["errors"]["before"], r) for r in fine if (r.get("errors") or {}).get("before")]
     made = sorted((x for x in made if x[0] > WORSE), key=lambda x: -x[0])[:most]
+    rows += [(name(r), f"error {ratio:.2f} times before", line(r)) for ratio, r in made]
     missed = [(e["z"], r, e) for r in fine for e in r["effects"] if e["clear"] and not e["grade"]]
     missed = sorted(missed, key=lambda x: -x[0])[:most]
-    rows = [(f"{r['size']} {r['index']}", f"error {ratio:.2f} times before", line(r)[:200]) for ratio, r in made]
-    rows += [(f"{r['size']} {r['index']}", f"missed {e['family']}, z {z:.0f}", line(r)[:200]) for z, r, e in missed]
-    return _table(("world", "what", "in a line"), rows) if rows else "Nothing was made worse, nothing clear missed."
+    rows += [(name(r), f"missed {e['family']}, z {z:.0f}", line(r)) for z, r, e in missed]
+    return (
+        _table(("world", "what", "in a line"), rows) if rows else "No alarm, nothing made worse, nothing clear missed."
+    )
+
+
+def name(record: dict) -> str:
+    """Return the arguments that draw a world again."""
+    return f"--show {record['index']} --size {record['size']} --seed-text {record['seed_text']}"
 
 
 def _table(head: tuple, rows: list[tuple]) -> str:

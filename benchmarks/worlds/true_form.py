@@ -33,10 +33,12 @@ from worlds.world import World
 BINS = 60  # of a stroke: two of the shortest ripple's period
 NUDGE = 1e-3
 CLEAR = 8.0
+SECOND_ORDER = 1e-3  # of the force: what linearising leaves, at scatter of some percent
 VAGUE = 2.0  # relative standard deviation of what is known of a declared quantity beforehand: next to nothing
 LEAST_RUNS = 12  # with fewer, files are the clusters of an effect inside files
-MOST_ROWS = 1800  # of a specimen whose scatter is taken as one block: more are cut between files, for time
+MOST_ROWS = 1200  # of a specimen whose scatter is taken as one block: more are cut between files, for time
 WRONG_GAIN = 0.15  # of files that went wrong, about
+GAIN = ("mu_0s", "mu_0c", "a_s", "a_c", "sigma_2")  # quantities that a gain of the whole friction multiplies
 UNIT = {"repeat": "file", "run": "run_id", "specimen": "specimen_id"}
 LEVELS = ("stroke", "file", "run_id", "specimen_id")  # nesting, fine to coarse
 CLAIM_LEVEL = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run_id": "run", "specimen_id": "condition"}
@@ -50,6 +52,7 @@ class Rows:
     columns: np.ndarray  # (n, k) nuisance first, then effects
     names: list[tuple]  # ("quantity", series) or ("effect", number)
     variance: np.ndarray  # of a bin's noise
+    fit: tuple[np.ndarray, np.ndarray] | None = None  # `fitted`, once asked for
 
     @property
     def effects(self) -> list[int]:
@@ -132,9 +135,10 @@ def _binned(world: World, truth: Batch, forces: list[np.ndarray]) -> tuple[pd.Da
     table = table.assign(**along, **{f"_f{k}": mean(force) for k, force in enumerate(forces)})
     table["aging_days"] = table["aging_days"].fillna(0.0)
     colour = 1 + 2 * world.noise["samples"] * (world.noise["kind"] == "coloured")
-    variance = mean(noise_sd_N(world, truth.force_N, truth.speed_mm_s) ** 2) * np.minimum(colour / count, 1.0)
+    noise = mean(noise_sd_N(world, truth.force_N, truth.speed_mm_s) ** 2)
     step = world.noise["step_rel"] * world.rig["mean_N"]
-    return table, variance + step**2 / 12 / count
+    dithered = np.where(np.sqrt(noise) > 0.5 * step, count, 1)  # without noise a whole bin is rounded alike
+    return table, noise * np.minimum(colour / count, 1.0) + step**2 / 12 / dithered
 
 
 def codes(rows: Rows) -> dict[str, np.ndarray]:
@@ -271,18 +275,26 @@ def error_at(world: World, rows: Rows, points: pd.DataFrame) -> np.ndarray:
 
 def fitted(world: World, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     """Return d of the true form and its covariance, by generalised least squares: scatter correlates a unit's rows."""
+    if rows.fit is None:
+        rows.fit = _fitted(world, rows)
+    return rows.fit
+
+
+def _fitted(world: World, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     table, units, mean = rows.table, codes(rows), friction_N(rows, world)
     along = (table["distance_mm"] / world.rig["stroke_mm"] - 0.5).to_numpy()
-    moved = {q: sum(rows.columns[:, k] for k, n in enumerate(rows.names) if n[0] == q) for q in ("v_s", "sigma_2")}
-    bases = {"gain": mean, "level": world.rig["mean_N"] * table["direction"].to_numpy(), "slope": mean * along, **moved}
+    moved = {q: sum(rows.columns[:, k] for k, n in enumerate(rows.names) if n[0] == q) for q in QUANTITIES}
+    gain = sum(moved[q] for q in GAIN)  # not the force itself: a larger friction bends the bristles further first
+    level = world.rig["mean_N"] * table["direction"].to_numpy()
+    bases = {"gain": gain, "level": level, "slope": gain * along, "v_s": moved["v_s"], "sigma_2": moved["sigma_2"]}
     terms = [(s["sd"] ** 2, bases[s["kind"]], units[UNIT[s["level"]]]) for s in world.scatter]
     wrong = world.files["_wrong"].to_numpy()[world.files["file"].searchsorted(table["file"])]
-    terms.append((WRONG_GAIN**2, np.where(wrong, mean, 0.0), units["file"]))
+    terms.append((WRONG_GAIN**2, np.where(wrong, gain, 0.0), units["file"]))
     inner = np.diag([1e-6 if name[0] == "effect" else VAGUE**-2 for name in rows.names])
     right = np.zeros(rows.columns.shape[1])
     for block in blocks(units["specimen_id"], units["file"]):
         x, y = rows.columns[block], table["y"].to_numpy()[block]
-        v = np.diag(rows.variance[block] + 1e-10 * mean[block] ** 2)
+        v = np.diag(rows.variance[block] + (SECOND_ORDER * mean[block]) ** 2)
         for variance, base, unit in terms:
             v += variance * np.outer(base[block], base[block]) * (unit[block][:, None] == unit[block])
         solved = cho_solve(cho_factor(v), np.column_stack([x, y]))
