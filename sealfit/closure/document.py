@@ -30,8 +30,8 @@ from sealfit.units import Units
 WORTH_A_LOOK = 0.05  # p-value of a channel by itself, not adjusted for the search
 EVEN = 0.5  # adjusted p-value from which chance is the likelier explanation
 OFFSET = "zero_offset"
-SAME_ERROR = 1.001
-"""Ratio of errors in sample up to which they are equal: effects are fitted by whitened, not by plain, squares."""
+SAME_ERROR = 1.005
+"""Ratio of errors up to which they are equal: effects are fitted by whitened, not by plain, squares."""
 
 SLOTS = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
 UNSTEADY = 0.2  # share of an offset by which it may differ from run to run and still be one offset
@@ -58,11 +58,11 @@ class Ends:
 
     @property
     def gains(self) -> bool:
-        """Whether after has lower errors than before, held out, and no higher ones in sample."""
+        """Whether after has no higher errors than before, in sample and held out."""
         weight = self.before.rows.weight
         inside = [float(np.sqrt(weight @ f.residual**2)) for f in (self.before, self.after)]
         held = [self.heldout_rmse_N(h) for h in (self.held_before, self.held_after)]
-        return inside[1] <= SAME_ERROR * inside[0] and (held[0] is None or held[1] < held[0])
+        return inside[1] <= SAME_ERROR * inside[0] and (held[0] is None or held[1] <= SAME_ERROR * held[0])
 
 
 def closure_document(
