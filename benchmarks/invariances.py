@@ -330,12 +330,28 @@ def moves(before: dict, after: dict, change: Change) -> list[str]:
     found = []
     if before["verdict"] != after["verdict"]:
         found.append(f"verdict {before['verdict']} -> {after['verdict']}")
-    old, new = ({_key(e, change.aliases): e for e in closure["effects"]} for closure in (before, after))
+    old, new = (_by_key(closure["effects"], change.aliases) for closure in (before, after))
     found += [f"lost {_words(key)}" for key in old if key not in new]
     found += [f"new {_words(key)}" for key in new if key not in old]
     for key in old.keys() & new.keys():
         found += _numbers(old[key], new[key], change)
     return found
+
+
+def _by_key(effects: list[dict], aliases: Mapping[str, str]) -> dict[tuple, dict]:
+    """Return effects by what they are; several of one kind (ripples) are numbered by their wavelengths."""
+    groups: dict[tuple, list[dict]] = {}
+    for effect in effects:
+        groups.setdefault(_key(effect, aliases), []).append(effect)
+    return {
+        (*key, number): effect
+        for key, group in groups.items()
+        for number, effect in enumerate(sorted(group, key=_wavelength))
+    }
+
+
+def _wavelength(effect: dict) -> float:
+    return next((p["value"] * factor(p["unit"]) for p in effect["parameters"] if p["name"] == "lambda"), 0.0)
 
 
 def _key(effect: dict, aliases: Mapping[str, str]) -> tuple:
@@ -344,7 +360,7 @@ def _key(effect: dict, aliases: Mapping[str, str]) -> tuple:
 
 
 def _words(key: tuple) -> str:
-    id, channels, acts_on, operation, candidate = key
+    id, channels, acts_on, operation, candidate, *_ = key
     return f"{id}({', '.join(channels)}) {operation} {acts_on}{' candidate' if candidate else ''}"
 
 

@@ -9,6 +9,12 @@ from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import LEVELS
 from sealfit.fit.tangent import Tangent
 
+Interval = tuple[float, float, float]
+"""Value and both ends of its 95 % interval."""
+
+PHASES = {"A": "phi", "B": "phi_2"}
+"""Amplitudes of sines, and the phase of each."""
+
 
 def degrees_of_freedom(fitted: Fitted) -> float:
     """Return the degrees of freedom of the coarsest level that scatters: units there less the levels they estimate."""
@@ -30,7 +36,7 @@ def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
     return fitted.covariance @ scores.gram() @ fitted.covariance
 
 
-def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, tuple[float, float, float]]:
+def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Interval]:
     """Return {parameter: (value, lo95, hi95)} of one effect.
 
     The wider of two standard errors counts: that of the fitted scatter, and the one that whole units of the effect's
@@ -49,7 +55,26 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, tuple
     for p, r in zip(term.effect.parameters, reach, strict=True):
         low, high = held.get(p.name, (values[p.name] - r, values[p.name] + r))
         result[p.name] = (values[p.name], float(low), float(high))
-    return result
+    return waves_upright(result)
+
+
+def waves_upright(intervals: dict[str, Interval]) -> dict[str, Interval]:
+    """Return intervals with the amplitude of every sine positive and its phase above -pi and at most pi.
+
+    -A at a phase is A half a turn on: without a choice, where the position is counted from decides on the sign.
+    """
+    made = dict(intervals)
+    for amplitude, phase in PHASES.items():
+        if amplitude not in made or phase not in made:
+            continue
+        value, low, high = made[amplitude]
+        turn = np.pi if value < 0 else 0.0
+        if value < 0:
+            made[amplitude] = (-value, -high, -low)
+        value, low, high = made[phase]
+        turn += 2 * np.pi * np.floor((np.pi - value - turn) / (2 * np.pi))
+        made[phase] = (value + turn, low + turn, high + turn)
+    return made
 
 
 def mean_se(tangent: Tangent, covariance: np.ndarray) -> np.ndarray:
