@@ -54,6 +54,7 @@ class Rig:
     lag: bool = False  # the speed comes up as by a first-order lag of ramp_s / 3
     force_sd_N: float = 0.1
     all_short: bool = False
+    sag: float = 0.0  # share by which the speed is higher where cruising begins; half of it is left 3 mm further
 
 
 DESIGNS: Mapping[str, Rig] = {
@@ -66,6 +67,7 @@ DESIGNS: Mapping[str, Rig] = {
     "slow_ramp": Rig(ramp_s=1.0),
     "lag": Rig(ramp_s=0.6, lag=True),
     "all_short": Rig(all_short=True),
+    "sag": Rig(sag=0.06),
 }
 
 
@@ -90,6 +92,7 @@ def trace(rig: Rig, speed: float, length: float, days: float, gain: float, rando
     fine = np.arange(int(total / step) * STEPS + 1) * (step / STEPS)
     since = np.maximum(fine - rest, 0.0)
     share = 1.0 - np.exp(-3.0 * since / ramp) if rig.lag else np.minimum(since / ramp, 1.0)
+    share = share * (1.0 + rig.sag * 0.5 ** (since * speed / 3.0))
     middle = (share[1:] + share[:-1]) / 2 * speed
     slid = middle * (step / STEPS)
     level = limit_N(middle, days, gain)

@@ -157,6 +157,7 @@ BINS = Schema(
         *KEYS,
         Column("bin", "", INT, "number of the bin along its stroke, from 0"),
         SPEED,
+        Column("speed_bin_mm_s", "mm/s", FLOAT, "sliding speed in the bin; the stroke's where no difference is seen"),
         SPEED_SET,
         LOAD,
         Column("force_N", "N", FLOAT, "friction force: mean in the bin, without presliding_N"),

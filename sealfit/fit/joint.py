@@ -171,7 +171,7 @@ def _state(model: Model, rows: Rows, *, slopes: bool = True) -> dict:
     for end in "sc":
         now[f"mu_{end}"] = now[f"mu_0{end}"] - now[f"a_{end}"] * np.log1p(days / now[f"b_{end}"])
         change(f"mu_{end}", (f"mu_{end}",))
-    speed, sign = rows.speed, np.sign(rows.speed)
+    speed, sign = rows.pace, np.sign(rows.pace)
     has_stribeck = (declared.index["v_s"] >= 0)[rows.condition]
     ratio = speed / now["v_s"]
     decay = np.where(has_stribeck, np.exp(-(ratio**2)), 0.0)

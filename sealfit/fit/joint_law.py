@@ -180,7 +180,7 @@ def _scatter(aged: Aged, residual: np.ndarray, df: int) -> float:
     def excess(tau):
         return aged.spread.chi2(residual, tau) - df
 
-    if excess(0.0) <= 0:
+    if not excess(0.0) > 0:  # also where a start gives no number
         return 0.0
     high = float(np.sqrt(np.mean((residual / aged.value) ** 2))) + 1e-9
     while excess(high) > 0:

@@ -158,7 +158,7 @@ class RestrictedLikelihood:
             square = (q[0] * left[0] + q[1] * left[2], q[0] * left[1] + q[1] * left[3], q[1] * left[1] + q[2] * left[3])
             cross = tuple(x - y for x, y in zip(t, _applied(q, mt), strict=True))
             steps.append((square, cross))
-        chol = np.linalg.cholesky(gram[:-1, :-1] + 1e-12 * np.eye(gram.shape[0] - 1))
+        chol = _root_of(gram[:-1, :-1])
         half = solve_triangular(chol, gram[:-1, -1], lower=True)
         value += 2.0 * float(np.log(np.diag(chol)).sum()) + float(gram[-1, -1] - half @ half)
         # Columns that are orthonormal under V, and what is left of the residual: the gradient is in their loads.
@@ -191,6 +191,18 @@ class RestrictedLikelihood:
                 taken = np.vdot(self.layout[level].gram(cross[kind], cross[kind]), turned)
                 slope[level, kind] = float(square[2 * kind].sum()) - float(taken)
         return 0.5 * value, 0.5 * np.array([slope[place] for place in self.places])
+
+
+def _root_of(gram: np.ndarray) -> np.ndarray:
+    """Return the lower Cholesky root of a Gram matrix; directions that only rounding holds are given a little size."""
+    ridge = 1e-12
+    while True:
+        try:
+            return np.linalg.cholesky(gram + ridge * np.eye(gram.shape[0]))
+        except np.linalg.LinAlgError:
+            if not np.isfinite(gram).all() or ridge > 1:
+                raise
+            ridge = max(100 * ridge, 1e-12 * float(np.diag(gram).max()))
 
 
 Symmetric = tuple[np.ndarray, np.ndarray, np.ndarray]

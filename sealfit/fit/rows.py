@@ -29,6 +29,7 @@ NOT_CHANNELS = {
     "force_N",
     "force_sd_N",
     "presliding_N",
+    "speed_bin_mm_s",
     "specimen_id",
     "condition",
     "series",
@@ -49,7 +50,8 @@ class Rows:
     order: np.ndarray
     groups: Groups
     force: np.ndarray  # (n,) measured
-    speed: np.ndarray  # (n,) signed
+    speed: np.ndarray  # (n,) signed, of the stroke
+    pace: np.ndarray  # (n,) signed, of the bin, where it is seen to differ: what the model's force depends on
     load: np.ndarray  # (n,) 1 where no load is known
     days: np.ndarray  # (n,) 0 where there is no aging
     condition: np.ndarray  # (n,) number in `conditions`
@@ -124,6 +126,7 @@ class Rows:
             groups=Groups.of({level: code[mask] for level, code in self.groups.codes.items()}),
             force=self.force[mask],
             speed=self.speed[mask],
+            pace=self.pace[mask],
             load=self.load[mask],
             days=self.days[mask],
             condition=self.condition[mask],
@@ -182,12 +185,14 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
         condition = pd.Index(conditions["condition"]).get_indexer(names)[condition]
     files = groups.codes["file"]
     per_file = np.bincount(files)[files]
+    pace = table["speed_bin_mm_s"] if "speed_bin_mm_s" in table else table["speed_mm_s"]
     return Rows(
         table=table,
         order=order,
         groups=groups,
         force=table["force_N"].to_numpy(dtype=float),
         speed=table["speed_mm_s"].to_numpy(dtype=float),
+        pace=pace.to_numpy(dtype=float),
         load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(len(table)),
         days=days,
         condition=condition,
@@ -302,6 +307,7 @@ def point_rows(
         groups=Groups.of({level: every for level in LEVELS}),
         force=np.zeros(n),
         speed=table["speed_mm_s"].to_numpy(dtype=float),
+        pace=table["speed_mm_s"].to_numpy(dtype=float),
         load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(n),
         days=days,
         condition=np.asarray(condition),

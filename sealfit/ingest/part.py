@@ -19,6 +19,7 @@ from sealfit.ingest.average import bin_table
 from sealfit.ingest.mean_traces import mean_traces
 from sealfit.ingest.refs import Listing
 from sealfit.ingest.shaped import INNER, STEADY_ONLY
+from sealfit.ingest.stroke_means import ALONG
 from sealfit.ingest.text import as_number
 from sealfit.ingest.trace_file import FileStrokes, read_files
 from sealfit.parquet import as_dictionary, to_arrow
@@ -158,7 +159,7 @@ def _stacked(parts: list[np.ndarray | None], length: list[int]) -> np.ndarray:
 
 def _traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
     """Return table `traces`."""
-    measured = {name: values for name, values in samples.items() if name not in ("row", "sliding")}
+    measured = {name: values for name, values in samples.items() if name not in ("row", "sliding", ALONG)}
     words = {name: as_dictionary(_array(strokes[name]), samples["row"]) for name in ("file", "condition")}
     return to_arrow({**measured, **words}, TRACES, config.units)
 

@@ -49,16 +49,16 @@ class Rise(NamedTuple):
     """Where the rise of one start is over, and what is left of it: `left_N * exp(-distance / length_mm)`.
 
     `left_N` is the force at distance 0 less that of steady sliding, negative where the force comes up; 0 where there
-    is no rise, or none that follows the bristles' law.
+    is no rise, or none that follows the bristles' law. `length_mm` is 0 where there is no rise.
     """
 
     end_mm: float
     left_N: float = 0.0
-    length_mm: float = 1.0
+    length_mm: float = 0.0
 
     def at(self, distance_mm: np.ndarray) -> np.ndarray:
         """Return what is left of the rise, in N, shape (n,)."""
-        return self.left_N * np.exp(-distance_mm / self.length_mm)
+        return self.left_N * np.exp(-distance_mm / self.length_mm) if self.left_N else np.zeros(len(distance_mm))
 
 
 def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> float:
@@ -103,7 +103,7 @@ def rises(starts: Sequence[Start]) -> list[Rise]:
     unsettled = []
     for k, (i, is_slow, length) in enumerate(zip(rising, slow, lengths, strict=True)):
         end = MARGIN * _arrival_mm(*starts[i][:2]) if is_slow else _settled_mm(starts[i], levels[i], length)
-        made[i] = Rise(end)
+        made[i] = Rise(end, 0.0, length if end > 0.0 else 0.0)
         ramp = starts[i].plateau_mm if starts[i].plateau_mm > length else 0.0  # along a short one nothing else happens
         if 0.0 < end < ramp + 0.99 * SETTLED * length:
             unsettled.append(k)

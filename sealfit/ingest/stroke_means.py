@@ -28,6 +28,7 @@ from sealfit.ingest.spikes import displacement_spikes, displacement_suspects, fo
 from sealfit.ingest.strokes import Found, displacement_noises_mm, find_all
 
 OWN_SPEED = "speed_file_mm_s"  # what the reader calls a speed column of the trace itself
+ALONG = "speed_bin_mm_s"  # the speed at a sample, of which bins have the mean
 BUNDLE_ROWS = 65_536  # traces computed at once: enough that numpy's calls cost little, few enough for the cache
 SLOTS = ("time_s", "displacement_mm", "force_N")
 
@@ -151,9 +152,10 @@ def _finished(bundle: _Bundle, found: Found, config: Config, skip: Sequence[int]
     """Return the strokes of a bundle whose every trace has some; nothing is made of those in `skip`."""
     strokes, count = Pieces(found.stop - found.start), np.bincount(found.trace, minlength=len(bundle.refs))
     several = count > 1
-    samples = _samples(bundle.columns, found, strokes, several)
+    factor = speed_factor(config.units)
+    samples = _samples(bundle.columns, found, strokes, several, factor)
     files = [bundle.refs[i].file for i in found.trace.tolist()]
-    rows = _stroke_rows(samples, files, found, strokes, speed_factor(config.units))
+    rows = _stroke_rows(samples, files, found, strokes, factor)
     time_s, _, force = bundle.slots()
     suspected = suspects(time_s, force, found.steady, strokes, config.quality)
     unit = config.units.unit("force")
@@ -196,7 +198,7 @@ def _load_faults(
 
 
 def _samples(
-    columns: Mapping[str, np.ndarray], found: Found, strokes: Pieces, several: np.ndarray
+    columns: Mapping[str, np.ndarray], found: Found, strokes: Pieces, several: np.ndarray, factor: float
 ) -> dict[str, np.ndarray]:
     """Return the samples of traces with stroke, distance, and flags; time from the stroke's start if a trace has
     several."""
@@ -210,6 +212,7 @@ def _samples(
         "steady": found.steady,
         "sliding": found.sliding,
         "presliding_N": found.presliding_N,
+        ALONG: factor * found.speed_along_mm_s,
         "distance_mm": np.abs(displacement - strokes.spread(displacement[found.origin])),
         **{name: values for name, values in columns.items() if name not in SLOTS},
     }
@@ -231,7 +234,7 @@ def _stroke_rows(
     force, place = (samples["force_N"] - samples["presliding_N"])[rows], samples["displacement_mm"][rows]
     columns: dict[str, list] = {"stroke": found.number.tolist()}
     for name, values in samples.items():
-        if name in columns or name in ("steady", "sliding"):
+        if name in columns or name in ("steady", "sliding", ALONG):
             continue
         if values.dtype.kind in "fiub":
             columns[name] = of_strokes(windows.mean(force if name == "force_N" else values[rows]))

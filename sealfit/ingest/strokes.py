@@ -17,7 +17,7 @@ import numpy as np
 from sealfit.config import Strokes
 from sealfit.ingest.pieces import Pieces, quantile
 from sealfit.ingest.running import running_mean, running_median
-from sealfit.ingest.window import slopes, steady_windows
+from sealfit.ingest.window import slopes, speeds_along, steady_windows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +53,8 @@ class Found:
     Arrays of shape (strokes,), in order: `trace` (its place among the traces) and what a `Stroke` has, with `start`,
     `stop` and `origin` as rows of the flat arrays. `steady` and `sliding` are of shape (rows,), false in traces
     without strokes; so is `presliding_N`, what is left of the pre-sliding rise in the steady windows, with the sign
-    of the force, 0 elsewhere.
+    of the force, 0 elsewhere. `speed_along_mm_s` is the speed at every row, where it is seen to differ from the
+    stroke's.
     """
 
     trace: np.ndarray
@@ -67,6 +68,7 @@ class Found:
     steady: np.ndarray
     sliding: np.ndarray
     presliding_N: np.ndarray
+    speed_along_mm_s: np.ndarray
 
     def of_trace(self, trace: int, first_row: int) -> list[Stroke]:
         """Return the strokes of one trace, whose first row is given, with rows counted from there."""
@@ -140,14 +142,16 @@ def find_all(
     time_s, along, displacement_mm = time_s[rows], way * displacement_mm[rows], displacement_mm[rows]
     steady, sliding, left = np.zeros(traces.rows, bool), np.zeros(traces.rows, bool), np.zeros(traces.rows)
     if not len(strokes):
-        return Found(*cut, np.empty(0), [], steady, sliding, left)
-    steady[rows], sliding[rows], against = steady_windows(
+        return Found(*cut, np.empty(0), [], steady, sliding, left, np.zeros(traces.rows))
+    steady[rows], sliding[rows], against, lag = steady_windows(
         time_s, along, way * filtered[rows], strokes, cut.origin - cut.start, noise[cut.trace], settings.speed_tolerance
     )
     left[rows] = way * against
     count, share = strokes.sum(steady[rows]), _share_covered(along, steady[rows], strokes)
     short = [_too_short(n, part, settings) for n, part in zip(count.tolist(), share.tolist(), strict=True)]
-    return Found(*cut, slopes(time_s, displacement_mm, steady[rows], strokes), short, steady, sliding, left)
+    speed, along_it = slopes(time_s, displacement_mm, steady[rows], strokes), np.zeros(traces.rows)
+    along_it[rows] = speeds_along(time_s, displacement_mm, steady[rows], strokes, speed, noise[cut.trace], lag)
+    return Found(*cut, speed, short, steady, sliding, left, along_it)
 
 
 def smoothed(values: np.ndarray, traces: Pieces, samples: int) -> np.ndarray:
@@ -276,7 +280,9 @@ def _whole_files(
     short = [None if n >= least else f"only {n} samples; at least {least} are needed" for n in size.tolist()]
     strokes = Pieces(size)
     speed = slopes(time_s[moves], displacement_mm[moves], np.ones(strokes.rows, bool), strokes)
-    return Found(*cut, speed, short, moves, moves.copy(), np.zeros(len(moves)))
+    along_it = np.zeros(len(moves))
+    along_it[moves] = strokes.spread(speed)
+    return Found(*cut, speed, short, moves, moves.copy(), np.zeros(len(moves)), along_it)
 
 
 def _too_short(samples: int, share: float, settings: Strokes) -> str | None:

@@ -19,6 +19,10 @@ STANDSTILL = 0.05  # slower than this share of the plateau: not moving yet, or n
 STRAIGHT, LAG = (1.8, 0.25), (3.3, 2.0)
 BEFORE_STOP = 0.5  # an S-shaped stop leaves the plateau earlier than a straight one, by less than half its length
 ONSET, HALF_UP = 0.05, 0.5  # shares of the rise below which a force is at rest, and above which it has come up
+SPEED_PIECES = (8, 64)  # of a steady window, whose speeds are compared: at least, and at most
+LEAST_ROWS = 8  # of such a piece
+SAME_SPEED = 0.001  # share by which speeds may differ without a word: errors of screws and scales are of that size
+CLEAR = 3.0  # times the scatter by chance that speeds must show: under it, 3 strokes of 1,000 do
 SPEED_NOISE = 0.25  # noise of the local speed, as a share of the tolerance: a false exit is then a matter of four SDs
 
 
@@ -30,9 +34,10 @@ def steady_windows(
     origin: np.ndarray,
     noise_mm: np.ndarray,
     tolerance: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return which rows of strokes are in their steady window, in which they slide at all, and what is left there of
-    the pre-sliding rise (in N, positive against the motion; 0 outside the window), shape (n,) each.
+    the pre-sliding rise (in N, positive against the motion; 0 outside the window), shape (n,) each; and the length of
+    the rise of each stroke in mm, shape (strokes,), 0 without one.
 
     Parameters
     ----------
@@ -75,11 +80,12 @@ def steady_windows(
                 places = (rows.start + row for row in (still, begin, end))
                 stretches.append(_Stretch(*places, 0 if blurred[i] else int(half[i])))
             since = last
-    left = np.zeros(len(time_s))
-    for begin, end, left_N in _past_rises(time_s, along_mm, force_N, stretches):
+    left, length = np.zeros(len(time_s)), np.zeros(len(strokes))
+    for begin, end, left_N, length_mm in _past_rises(time_s, along_mm, force_N, stretches):
         steady[begin:end] = True
         left[begin:end] = left_N
-    return steady, sliding, left
+        length[strokes.of[begin]] = length_mm
+    return steady, sliding, left, length
 
 
 class _Stretch(NamedTuple):
@@ -94,8 +100,9 @@ class _Stretch(NamedTuple):
 
 def _past_rises(
     time_s: np.ndarray, along_mm: np.ndarray, force_N: np.ndarray, stretches: Sequence[_Stretch]
-) -> list[tuple[int, int, np.ndarray]]:
-    """Return the rows of each stretch from where the force is past its pre-sliding rise, and what is left of it."""
+) -> list[tuple[int, int, np.ndarray, float]]:
+    """Return the rows of each stretch from where the force is past its pre-sliding rise, what is left of it there, and
+    its length in mm."""
     starts = []
     for still, begin, end, averaged in stretches:
         distance = _distance(time_s[still:end], along_mm[still:end], begin - still, averaged)
@@ -104,7 +111,7 @@ def _past_rises(
     for (still, begin, end, _), start, rise in zip(stretches, starts, rises(starts), strict=True):
         past = int(start.distance_mm.searchsorted(rise.end_mm)) if rise.end_mm > 0.0 else 0
         first = max(begin, still + past)
-        made.append((first, end, rise.at(start.distance_mm[first - still :])))
+        made.append((first, end, rise.at(start.distance_mm[first - still :]), rise.length_mm))
     return made
 
 
@@ -213,6 +220,63 @@ def slopes(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray, 
     with np.errstate(invalid="ignore"):  # rows that are all single pieces have no slope
         made[enough] = sums[enough, 1] / sums[enough, 2]
     return made
+
+
+def speeds_along(
+    time_s: np.ndarray,
+    displacement_mm: np.ndarray,
+    steady: np.ndarray,
+    strokes: Pieces,
+    speed: np.ndarray,
+    noise_mm: np.ndarray,
+    lag_mm: np.ndarray,
+) -> np.ndarray:
+    """Return the speed that the friction at every row of the steady windows follows, shape (n,): the stroke's, and how
+    it changes along it, `lag_mm` before: bristles follow a slow change by the length of their rise behind (Eq. 2).
+
+    A window is cut into pieces of equal time, each with a slope by least squares; where these differ clearly, the
+    speed is straight between their middles. `speed` is that of each stroke; it is returned as it is elsewhere, and
+    where a window is short or has rests. `noise_mm` of a displacement sample decides how many pieces a stroke has.
+    """
+    made = strokes.spread(speed)
+    firsts, lasts = _edges(steady, strokes)
+    stroke = strokes.of[firsts]
+    count = np.bincount(stroke, minlength=len(strokes))
+    for i, first, last in zip(stroke.tolist(), firsts.tolist(), lasts.tolist(), strict=True):
+        if count[i] == 1 and last + 1 - first >= SPEED_PIECES[0] * LEAST_ROWS and abs(speed[i]) > 0.0:
+            rows = slice(first, last + 1)
+            lag_s = float(lag_mm[i] / abs(speed[i]))
+            made[rows] += _off_speed(time_s[rows], displacement_mm[rows], float(speed[i]), float(noise_mm[i]), lag_s)
+    return made
+
+
+def _off_speed(
+    time_s: np.ndarray, displacement_mm: np.ndarray, speed: float, noise_mm: float, lag_s: float
+) -> np.ndarray:
+    """Return by how much the speed, so long before, differs from the stroke's at every row of a window, shape (n,)."""
+    n, error = len(time_s), SAME_SPEED * abs(speed)
+    # k slopes of n / k samples over 1/k of the time have errors of sqrt(12 k^3 / n) noise over the whole of it.
+    noise = max(noise_mm / (time_s[-1] - time_s[0]), 1e-9 * error)
+    least, most = SPEED_PIECES
+    pieces = int(min(max((n * (error / noise) ** 2 / 12.0) ** (1.0 / 3.0), least), most, n // LEAST_ROWS))
+    rows = n // pieces * pieces
+    time, place = (values[:rows].reshape(pieces, -1) for values in (time_s, displacement_mm))
+    middle = time.mean(axis=1)
+    t, x = time - middle[:, None], place - place.mean(axis=1)[:, None]
+    square = (t * t).sum(axis=1)
+    slope = (t * x).sum(axis=1) / square
+    residual = x - slope[:, None] * t
+    # Neighbours that err alike (steps of a coarse sensor) count as one: a sign lasts for two of independent ones.
+    alike = residual.size / max(2 * np.count_nonzero(np.diff(np.sign(residual), axis=1)), 1)
+    variance = (residual**2).mean() * max(alike, 1.0) / square + error**2
+    scatter = float(((slope - slope.mean()) ** 2 / variance).sum())
+    if not scatter > CLEAR * (pieces - 1):
+        return np.zeros(n)
+    off = slope - speed
+    # A whole piece further at either end, along a straight line.
+    at = np.r_[2.0 * middle[0] - middle[1], middle, 2.0 * middle[-1] - middle[-2]]
+    off = np.r_[2.0 * off[0] - off[1], off, 2.0 * off[-1] - off[-2]]
+    return np.interp(time_s - lag_s, at, off)
 
 
 def _edges(mask: np.ndarray, strokes: Pieces) -> tuple[np.ndarray, np.ndarray]:

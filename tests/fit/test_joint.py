@@ -179,3 +179,15 @@ def test_a_wave_is_smaller_in_bins_of_many_samples_than_in_bins_of_few(n, waves)
     samples = rows.values("displacement_mm")[:, None] + width * ((np.arange(n) + 0.5) / n - 0.5)
     exact = term.effect.shape({"displacement_mm": samples, "x_ref": 0.0}, A=1.0, lambda_=length, phi=0.0).mean(axis=1)
     npt.assert_allclose(found, exact, atol=1e-9)
+
+
+def test_the_force_depends_on_the_speed_of_the_bin_and_the_channel_stays_that_of_the_stroke():
+    bins = bins_helpers.make_bins(repeats=1, bins=6)
+    factor = 1 + 0.05 * np.cos(np.arange(len(bins)))
+    rows = make_rows(bins.assign(speed_bin_mm_s=bins["speed_mm_s"] * factor), has_aging=True)
+    as_if = make_rows(bins.assign(speed_mm_s=bins["speed_mm_s"] * factor), has_aging=True)
+    model = start_model(rows)
+    npt.assert_array_equal(evaluate(model, rows, jacobian=False)[0], evaluate(model, as_if, jacobian=False)[0])
+    npt.assert_array_equal(rows.values("speed_mm_s"), make_rows(bins, has_aging=True).speed)
+    assert "speed_bin_mm_s" not in rows.channels
+    npt.assert_array_equal(rows.subset(rows.days > 0).pace, rows.pace[rows.days > 0])

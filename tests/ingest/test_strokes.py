@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from sealfit.config import Strokes
 from sealfit.ingest.pieces import Pieces
 from sealfit.ingest.presliding import rise_end_mm
-from sealfit.ingest.strokes import find_strokes, turning_rows
+from sealfit.ingest.strokes import find_all, find_strokes, turning_rows
 from sealfit.ingest.window import slopes
 
 
@@ -49,6 +49,32 @@ def there_and_back(turns=4, v=5.0, length=40.0, rest=0.0, dt=0.01, noise=0.05, b
     x, force = np.array(x), np.array(force)
     time = np.arange(len(x)) * dt
     return time, x + rng.normal(0, blur, len(x)), force + rng.normal(0, noise, len(x)), onsets
+
+
+def speeds_along(time, x, force):
+    found = find_all(time, x, force, Pieces([time.size]), Strokes())
+    return found.speed_along_mm_s[found.steady], found.steady
+
+
+@pytest.mark.parametrize("blur", [0.002, 0.02])
+def test_a_speed_that_sags_along_the_stroke_is_that_of_its_bins(blur):
+    rng = np.random.default_rng(2)
+    time = np.linspace(0.0, 8.0, 1600)
+    x = 5.0 * time + 0.08 * 5.0 * 1.5 * (1.0 - np.exp(-time / 1.5))
+    speed, steady = speeds_along(time, x + rng.normal(0.0, blur, 1600), np.full(1600, 30.0) + rng.normal(0, 0.1, 1600))
+    true = (5.0 * (1.0 + 0.08 * np.exp(-time / 1.5)))[steady]
+    assert np.abs(speed / true - 1.0).max() < 0.02
+    assert np.abs(speed / true - 1.0).mean() < 0.003
+
+
+@pytest.mark.parametrize(("blur", "step"), [(0.0, 0.0), (0.002, 0.0), (0.3, 0.0), (0.0, 0.05), (0.002, 0.5)])
+def test_noise_and_resolution_of_the_displacement_are_no_change_of_speed(blur, step):
+    changed = 0
+    for seed in range(20):
+        time, x, force, _ = stroke(blur=blur, seed=seed)
+        speed, _ = speeds_along(time, np.round(x / step) * step if step else x, force)
+        changed += np.ptp(speed) > 0.0
+    assert changed <= 1
 
 
 def test_the_window_begins_where_the_rise_and_the_ramp_are_over_and_no_later_than_needed():
