@@ -51,11 +51,11 @@ def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple
         if law.place is not None:
             curves.append(law.curve())
     columns = [*AGING_FIT.names(), *open_columns]
+    drawn = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=AGING_CURVES.names())
     if not rows:
-        return pd.DataFrame(columns=columns), pd.DataFrame(columns=AGING_CURVES.names())
+        return pd.DataFrame(columns=columns), drawn
     keys = steady_fit.groupby("series", sort=True)[open_columns].first().reset_index()
     table = pd.DataFrame(rows).merge(keys, on="series", how="left", validate="many_to_one")
-    drawn = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=AGING_CURVES.names())
     return table.assign(model="after")[columns], drawn
 
 

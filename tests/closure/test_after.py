@@ -200,6 +200,22 @@ def test_the_reference_is_said_in_words(id, channels, fixed, values, words):
     assert reference_of(term, values, Config()) == words
 
 
+@pytest.mark.parametrize("columns", [["temperature_C", "compression_ratio_pct"], None], ids=["no aging", "two days"])
+def test_without_a_law_there_are_still_conditions(columns):
+    bins = make_bins(3, effect=warm, days=(2.0,), temperatures=(60.0,), bins=3)
+    config = Config() if columns is None else Config(condition=columns)
+    before = fit_declared(make_rows(bins, has_aging=config.aging))
+    after = fit(before.model.with_term(*WARMING), before.rows, before.scatter, turns=1)
+    table = steady_of(bins) if config.aging else steady_of(bins).drop(columns="aging_days")
+    tables = after_fits(after, table, made_traces(bins), config)
+    law = tables["aging_fit_after"]
+    assert not law["identified"].any()
+    assert (law["value"].notna().sum(), len(tables["aging_curves_after"])) == (0, 0)
+    values = tables["steady_fit_after"].query("quantity == 'steady' and parameter == 'mu_s'")
+    assert values["identified"].all()
+    assert len(values) == 2
+
+
 def test_nothing_is_doubled_where_nothing_was_added():
     bins = make_bins(1, temperatures=(60.0,), bins=2)
     tables = after_fits(fitted(bins), steady_of(bins), made_traces(bins), Config())
