@@ -27,6 +27,7 @@ UNITS_PER_KNOT = 3
 APART = 1e-3  # of a channel scaled to -1..1: knots that are nearer are one value measured twice
 MOST_PLACES = 60  # between neighbouring values that are tried
 REACH = 4.0  # spans of a channel that a width or a time constant may have
+NUMBERS_ALONG_SPEED = {"full": 4, "viscous": 2, "constant": 1}  # mu_s, mu_c, v_s and sigma_2, or fewer
 PHASES = tuple(np.arange(4) * np.pi / 4)
 PERIODIC = ("ripple", "sinusoid", "sinusoid_harmonics")  # sought in the spectrum, not along a grid of wavelengths
 
@@ -55,6 +56,37 @@ def terms_of(
         return
     name = candidate.channels[-1]
     channel = channels[name]
+    knots = min(MOST_KNOTS, candidate.judgement.units // UNITS_PER_KNOT)
+    for term, grid in _terms_of_single(channel, target, channels, fitted, effects, knots):
+        fits = len(term.effect.parameters) <= room_along(channel, fitted)
+        if fits or len(term.channels) > 1 or term.smoothness is not None:  # a smoothing spline has fewer than its knots
+            yield term, grid
+
+
+def room_along(channel: Channel, fitted: Fitted) -> int:
+    """Return how many numbers of an effect along a channel its settings can hold beside those of the declared model.
+
+    Eq. 14 has up to four numbers along speed and Eq. 15 three along days; along any other channel there is a level.
+    """
+    declared = fitted.model.declared
+    own = 1
+    if channel.name == "speed_mm_s":
+        own = max(NUMBERS_ALONG_SPEED[form] for form in declared.stribeck.values())
+    elif channel.name == "aging_days" and any(declared.law.values()):
+        own = 3
+    return np.unique(channel.values).size - own
+
+
+def _terms_of_single(
+    channel: Channel,
+    target: tuple[str, str],
+    channels: Mapping[str, Channel],
+    fitted: Fitted,
+    effects: Mapping[str, Effect],
+    knots: int,
+) -> Iterator[tuple[Term, dict]]:
+    """Yield every form of one channel on a quantity, with the values to try for each searched parameter."""
+    name = channel.name
     for effect in effects.values():
         if effect.id in PERIODIC:
             continue
@@ -75,7 +107,7 @@ def terms_of(
             if target == ("mu", "multiply") and ("mu", "add") in effect.acts_on:  # the search tries the factor for both
                 yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids
     if name != "direction":
-        yield free_term(channel, *target, knots=min(MOST_KNOTS, candidate.judgement.units // UNITS_PER_KNOT)), {}
+        yield free_term(channel, *target, knots=knots), {}
 
 
 def _all_read(effect: Effect, channels: Mapping[str, Channel], rows: Rows, effects: Mapping[str, Effect]) -> bool:
