@@ -44,6 +44,8 @@ class Units:
             return self.unit("displacement")
         if column.startswith("speed") and column.endswith("_mm_s"):
             return self.unit("speed")
+        if column == "time_s":
+            return self.unit("time")
         if column.startswith("load") and column.endswith("_N"):
             return self.unit("load")
         if column.endswith("_N"):
@@ -72,7 +74,7 @@ class Units:
 
 
 _ENDINGS = {"_C": "°C", "_pct": "%", "_days": "d", "_h": "h", "_s": "s", "_mm": "mm", "_N": "N", "_bar": "bar"}
-_KNOWN = {"aging_days": "d", "temperature_C": "°C", "compression_ratio_pct": "%", "elapsed_h": "h", "time_s": "s"}
+_KNOWN = {"aging_days": "d", "temperature_C": "°C", "compression_ratio_pct": "%", "elapsed_h": "h"}
 _MEANING = {
     "distance_mm": "sliding distance",
     "run_order": "run order",
