@@ -170,7 +170,8 @@ def _table(
         found.append((keys, cells, _note(by, config)))
     heads = (_head(key), "of") if several else (_head(key),)
     groups = tuple((symbol_html(p), u) for p, u in parameters)
-    return ParameterTable(_title(key, quantities), heads, groups, tuple(found), compared=earlier is not None)
+    title = _title(key, quantities, after=earlier is not None)
+    return ParameterTable(title, heads, groups, tuple(found), compared=earlier is not None)
 
 
 def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Config) -> ParameterTable:
@@ -253,13 +254,13 @@ def _head(key: str) -> str:
     return {"condition": "condition", "series": "series"}.get(key, key)
 
 
-def _title(key: str, quantities: Sequence[str]) -> str:
+def _title(key: str, quantities: Sequence[str], *, after: bool) -> str:
     if quantities == ["dynamic"]:
         return "Bristles, fitted to the starts of each condition"
     if key == "condition":
         return "Steady friction, fitted to each condition on its own"
     return (
-        "Aging law, fitted to each series"
+        ("Aging law of each series, from the joint fit" if after else "Aging law, fitted to each series")
         if set(quantities) <= {"mu_s", "mu_c", "F_s", "F_c"}
         else ", ".join(quantities)
     )

@@ -33,6 +33,8 @@ def test_values_before_stand_beside_those_after(made):
     _, cells, _ = table.rows[1]
     row = fit.query("aging_days == 1 and compression_ratio_pct == 80 and parameter == 'mu_s'").iloc[0]
     assert (cells[0].value, cells[0].before) == (f"{HIGHER * row['value']:.3f}", f"{row['value']:.3f}")
+    law = parameter_tables(made.tables["aging_fit_after"], "series", made.config, made.tables["aging_fit"])[0]
+    assert law.title == "Aging law of each series, from the joint fit"
     (plain, _) = parameter_tables(fit, "condition", made.config)
     assert (plain.compared, plain.width) == (False, 3)
 
@@ -48,7 +50,7 @@ def test_the_page_is_of_the_after_model_and_says_its_reference(made):
     early = figures_of_fits(made.tables, made.config)
     report = build_report(*made.arguments, drawn=early)
     page = Page(report.html)
-    assert "They hold where its effects are zero: cold contact (time 0)" in page.text
+    assert "at the reference state of its effects: cold contact (time 0)" in page.text
     assert re.search(r"value 95 % u sys before", page.text)
     assert "before, without the effects" in page.text
     for name in OF_FITS:
@@ -62,4 +64,4 @@ def test_without_effects_nothing_is_doubled():
     assert not any(name.endswith("_before") and name != "residuals_before" for name in tables)
     page = Page(build_report(*made.arguments).html)
     assert "without the effects" not in page.text
-    assert "They hold where its effects are zero" not in page.text
+    assert "at the reference state of its effects" not in page.text
