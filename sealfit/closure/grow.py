@@ -150,6 +150,8 @@ def grow(
         # What came and went does not come again.
         refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}
         added = kept
+    if left is not None and left.p_value > alpha * DISAGREE and any(item.p_value == left.p_value for item in not_confirmed):
+        left = None
     unsure = None
     doubtful = [c for c in (*last, *(c for c, _ in laws)) if c.p_value <= alpha and not c.sure]
     if left is None and doubtful:
