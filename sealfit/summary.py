@@ -148,7 +148,9 @@ def verdict_sentence(closure: Mapping, units: Units) -> str:
     if closure["verdict"] == "cannot_tell":
         return f"{quality}, and these files cannot tell why: {untold_clause(closure, units)}"
     if closure["verdict"] == "closed":
-        return f"{added}; no significant structure is left; {quality}"
+        untold = untold_clause(closure, units)
+        beside = f"; these files cannot tell of {untold}" if untold else ""
+        return f"{added}; no significant structure is left; {quality}{beside}"
     return f"{added}, and something is left that no model holds{_where(closure['left'], units)}; {quality}"
 
 

@@ -32,9 +32,9 @@ def power_clause(closure: Mapping, units: Units) -> str:
 
 
 def untold_clause(closure: Mapping, units: Units) -> str:
-    """Return which variables the campaign could not tell of, and what would do, in a clause."""
+    """Return which variables the campaign could not tell of, and what would do, in a clause; empty for none."""
     texts = []
-    for entry in [s for s in closure["sensitivity"] if s["cannot_tell"]][:NAMED]:
+    for entry in [s for s in closure.get("sensitivity") or () if s["cannot_tell"]][:NAMED]:
         name, smallest, files = entry["variable"], entry["smallest_pct"], entry["files_needed"]
         size = "no effect" if smallest is None else f"no effect below {smallest:.2g} % of the force"
         more = f"; about {files} files like these would show one of 1 %" if files and smallest is not None else ""

@@ -36,16 +36,34 @@ SAME = 0.01
 REPEATED = 10.0
 """Samples for each value of the force from which its steps are those of the recorder, not of chance."""
 
-LEAST_SETTINGS, MOST_SETTINGS = 4, 15
+LEAST_SETTINGS, MOST_SETTINGS = 3, 15
 """Settings of a channel between which a shape interpolates: with fewer none is inside, with more they lie densely."""
+
+LEAST_SIZE = 2e-4
+"""Of the RMS force: the smallest effect that counts. What is smaller may as well be the sensor's nonlinearity."""
 
 
 def heldout_level(rows: Rows) -> str:
     """Return the level whose groups are held out: run, or file or stroke where there are fewer than six."""
     for level in ("run", "file"):
         if rows.groups.starts[level].size >= LEAST_UNITS:
-            return level
+            return foldable(rows, level)
     return "stroke"
+
+
+def foldable(rows: Rows, level: str) -> str:
+    """Return a level, or the next finer one at which conditions keep some groups while others are held out.
+
+    A condition with one file and no law that reaches it cannot be predicted without that file: its strokes are held
+    out then, and say how well these very files are predicted.
+    """
+    for finer in reversed(LEVELS[: LEVELS.index(level) + 1]):
+        start = rows.groups.starts[finer]
+        groups = np.bincount(rows.condition[start], minlength=len(rows.conditions))
+        lost = [c for c in np.flatnonzero(groups == 1) if _edge(rows, int(c))]
+        if len(lost) <= np.count_nonzero(groups) / 2:
+            return finer
+    return LEVELS[0]
 
 
 def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]:
@@ -186,9 +204,10 @@ def heldout_gain(
         return _gain_within_files(before, proposal, samples)
     rows = before.rows
     calendar = [name for name in proposal.term.channels if name in CALENDAR]
-    masks = blocks(rows, proposal.unit, count, calendar[0]) if calendar else folds(rows, proposal.unit, count, seed)
+    level = foldable(rows, proposal.unit)
+    masks = blocks(rows, level, count, calendar[0]) if calendar else folds(rows, level, count, seed)
     around = None if calendar else _around(proposal)  # a block of time is asked for whole
-    return _gain(before, proposal, masks, around, (proposal.unit, *calendar[:1]), known)
+    return _gain(before, proposal, masks, around, (level, *calendar[:1]), known)
 
 
 def gain_between_settings(before: Fitted, proposal: Proposal, known: dict[tuple, np.ndarray]) -> Iterator[Gain]:
@@ -368,7 +387,7 @@ def confirmed(
     """
     reasons = []
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
-    least = unseen_N(samples)
+    least = max(unseen_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
     for proposal in proposals[:TRIES]:
         gain = heldout_gain(fitted, proposal, *folds_of)
         reason = _why_not(fitted, proposal, gain, least, folds_of[-1])
@@ -390,7 +409,7 @@ def _why_not(fitted: Fitted, proposal: Proposal, gain: Gain, least: float, known
     if not gain.real:
         return "it does not predict the data that were held out better than the model without it"
     if _size(proposal) <= least:
-        return "it is smaller than the rounding error of the recorded force"
+        return "it is smaller than the recorded force can show"
     if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
         return "it does not predict whole settings that were held out, between those it was fitted to"
     return None

@@ -29,6 +29,9 @@ from sealfit.fit.whitening import Scatter
 from sealfit.samples import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
 
 SAMPLED = ("displacement_mm", "time_s", "force_N")  # what the ripple search reads of a sample
+DISAGREE = 0.1
+"""Of the level of the search: what held-out data do not confirm is structure only if its p-value is below that."""
+
 DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at: a far surer one may show in it
 
 
@@ -150,8 +153,9 @@ def grow(
         # What came and went does not come again.
         refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}
         added = kept
-    if left is not None and left.p_value > alpha * DISAGREE and any(item.p_value == left.p_value for item in not_confirmed):
-        left = None
+    failed = {item.p_value for item in not_confirmed}
+    if left is not None and left.p_value in failed and left.p_value > DISAGREE * alpha:
+        left = None  # it is listed as refused
     unsure = None
     doubtful = [c for c in (*last, *(c for c, _ in laws)) if c.p_value <= alpha and not c.sure]
     if left is None and doubtful:

@@ -60,7 +60,9 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
         if not missed:
             return _sentence(errors)
         them = "them" if len(added) > 1 else "it"
-        return Markup("The declared model missed {}; with {} {}.").format(lead, them, errors)
+        text = Markup("The declared model missed {}; with {} {}.").format(lead, them, errors)
+        untold = untold_clause(closure, config.units)
+        return text + Markup(" These files cannot tell of {}.").format(untold) if untold else text
     where = _where(closure["left"], config)
     if missed:
         return Markup(
