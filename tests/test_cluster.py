@@ -13,7 +13,7 @@ pytest.importorskip("distributed")
 
 from dask_here import DaskHere
 
-from sealfit.closure import spectrum
+from sealfit.closure import loop, spectrum
 from sealfit.cluster import Cluster
 from sealfit.engine import on_cluster, run_map
 from sealfit.errors import RequestError, WorkerError
@@ -178,6 +178,7 @@ def campaign(tmp_path_factory):
     simulate(spec.model_copy(update={"design": design}), folder / "c")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(parts, "PART_FILES", 12)
+        patch.setattr(loop, "JACKKNIFE_UNITS", 6)  # so that the folds search, few runs as there are
         run(folder / "c", folder / "here", steps=STEPS[:-1], workers=1)
     return folder / "c", results(folder / "here")
 
@@ -188,6 +189,7 @@ def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
 ):
     folder, (here, closure) = campaign
     monkeypatch.setattr(parts, "PART_FILES", 12)
+    monkeypatch.setattr(loop, "JACKKNIFE_UNITS", 6)
     kills = KillsAt(dask.workers[1], at)
     run(folder, tmp_path / "there", steps=STEPS[:-1], scheduler=str(dask.file), progress=kills)
     assert kills.killed
@@ -198,6 +200,7 @@ def test_the_search_on_a_cluster_gives_the_same_although_a_worker_is_killed(camp
     folder, (here, closure) = campaign
     monkeypatch.setattr(parts, "PART_FILES", 12)
     monkeypatch.setattr(spectrum, "WORTHWHILE", 0)
+    monkeypatch.setattr(loop, "JACKKNIFE_UNITS", 6)
     killed = []
 
     def fit_while_spectra_are_made(rows):

@@ -69,7 +69,8 @@ def test_pneumatic_seal_lacks_an_offset_run_in_and_ripples(pneuseal):
     effects = {e["id"]: e for e in reversed(document["effects"])}
     offset = effects["zero_offset"]["parameters"][0]
     assert offset["value"] == pytest.approx(3.1, abs=0.5)  # 1.2 to 4.4 N, by pressure and set-up
-    assert any(e["channels"] == ["stroke"] for e in document["effects"])  # grows over ten cycles in 18 of 20 files
+    # Friction grows over ten cycles in 18 of 20 files, by a size that differs: between 12 runs it is not significant.
+    assert not any(e["channels"] == ["stroke"] for e in document["effects"])
     ripples = [{p["name"]: p for p in e["parameters"]} for e in document["effects"] if e["id"] == "ripple"]
     for length in (3.0, 1.5):
         found = [r for r in ripples if r["lambda"]["value"] == pytest.approx(length, rel=0.01)]

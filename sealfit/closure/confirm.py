@@ -419,7 +419,8 @@ def _size(proposal: Proposal) -> float:
     """Return the RMS of what a proposal adds to the force."""
     fitted = proposal.fitted
     without = fitted.model.without_term(len(fitted.model.terms) - 1)
-    return float(np.std(fitted.force - evaluate(without, fitted.rows, jacobian=False)[0]))
+    added = fitted.force - evaluate(without, fitted.rows, jacobian=False)[0]
+    return float(np.sqrt(np.mean(added**2)))
 
 
 def unseen_N(samples: pd.DataFrame) -> float:

@@ -33,6 +33,9 @@ OFFSET = "zero_offset"
 SAME_ERROR = 1.005
 """Ratio of errors up to which they are equal: effects are fitted by whitened, not by plain, squares."""
 
+LACK_OF_FIT = 0.05
+"""P-value of the lack of fit from which the error is called larger than the scatter of repeats."""
+
 SLOTS = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
 UNSTEADY = 0.2  # share of an offset by which it may differ from run to run and still be one offset
 
@@ -83,7 +86,7 @@ def closure_document(
             "lack_of_fit_p": lack_of_fit(fitted),
         }
     floor, scatter = noise_floor(after), scatter_list(after)
-    quality = fit_quality(numbers["after"], floor, config.loop.family_error)
+    quality = fit_quality(numbers["after"], floor)
     seen = sensitivity(grown, config.loop.family_error)
     untold = set(cannot_tell(grown, seen, scatter))
     if grown.left is not None or grown.worse:
@@ -110,12 +113,12 @@ def closure_document(
     }
 
 
-def fit_quality(errors_after: Mapping, floor_N: float | None, alpha: float) -> dict:
+def fit_quality(errors_after: Mapping, floor_N: float | None) -> dict:
     """Return closure.json's `fit_quality`: whether the error is what repeats scatter by, or how many times that."""
     p_value = errors_after["lack_of_fit_p"]
     if floor_N is None or p_value is None:
         return {"state": "unknown", "ratio": None, "p_value": None}
-    state = "above_scatter" if p_value < alpha else "within_scatter"
+    state = "above_scatter" if p_value < LACK_OF_FIT else "within_scatter"
     return {"state": state, "ratio": errors_after["rmse_N"] / max(floor_N, 1e-300), "p_value": p_value}
 
 

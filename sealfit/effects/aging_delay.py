@@ -36,6 +36,7 @@ AGING_DELAY = Effect(
         Parameter("b", "{x}", 0.1, (1e-3, 1e3), "time constant of the law", search=(0.03, 0.1, 0.3, 1.0)),
     ),
     shape=shape,
+    reference="unaged",
     source="Eq. 15 with a later start; the induction period of oxidation: Celina, Gillen & Assink 2005, Polymer "
     "Degradation and Stability 90(3), 395-404, doi:10.1016/j.polymdegradstab.2005.05.004.",
     # By hand: day 4, start at day 2, b = 1: ln 5 - ln 3 = 1.6094379124341003 - 1.0986122886681098.

@@ -241,7 +241,7 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
     --------
     >>> effect = free_effect("smooth", {"knots": [0.0, 1.0, 2.0], "x_ref": 0.0})
     >>> effect.linear, [float(h) for h in effect.shape({"x": [0.0, 2.0, 3.0]}, c_2=1.0, c_3=2.0)]
-    (('c_2', 'c_3'), [0.0, 2.0, 3.0])
+    (('c_2', 'c_3'), [0.0, 2.0, 2.0])
     """
     if id not in FREE:
         raise ParameterError(f"'{id}' is no free shape.", mend=f"Use one of {', '.join(FREE)}.")
