@@ -52,6 +52,32 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
     return [*found, {"label": "lack of fit, p", "unit": "", "before": texts[0], "after": texts[1], "change": ""}]
 
 
+def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
+    """Return a row per variable: its label and the smallest effect that the campaign would have shown."""
+    unit = config.units.unit("force")
+    return [
+        {
+            "variable": channel_label(entry["variable"], config.units),
+            "smallest": of_unit(number(entry["smallest_N"], 2), unit) if known(entry["smallest_N"]) else "none",
+            "share": of_unit(number(entry["smallest_pct"], 2), "%") if known(entry["smallest_pct"]) else NOTHING,
+            "files": f"{entry['files_needed']:,}" if known(entry["files_needed"]) else NOTHING,
+        }
+        for entry in closure.get("sensitivity") or ()
+    ]
+
+
+def refused_rows(closure: Mapping, config: Config) -> list[dict]:
+    """Return what was found and is in no model: its label, p-value and the reason."""
+    return [
+        {
+            "label": f"{entry['id']} along {joined([channel_label(c, config.units) for c in entry['channels']])}",
+            "p": p_value(entry["p_value"]),
+            "reason": entry["reason"],
+        }
+        for entry in closure.get("refused") or ()
+    ]
+
+
 def _change(before: float, after: float) -> str:
     percent = round(100 * (after / before - 1))
     return f"{percent:+d}\u00a0%".replace("-", "−") if percent else "0\u00a0%"

@@ -18,7 +18,16 @@ from sealfit.report.drawn import Drawn, data_uri, draw_plots
 from sealfit.report.figures import draw_all, draw_fits
 from sealfit.report.figures_residual import MOST_CHANNELS
 from sealfit.report.law_tables import law_rows
-from sealfit.report.loop_tables import channel_tests, effect_cards, error_rows, next_runs, references, scatter_rows
+from sealfit.report.loop_tables import (
+    channel_tests,
+    effect_cards,
+    error_rows,
+    next_runs,
+    references,
+    refused_rows,
+    scatter_rows,
+    sensitivity_rows,
+)
 from sealfit.report.numbers import count, given, number
 from sealfit.report.parameters import break_away_rows, parameter_tables
 from sealfit.report.style import Plot
@@ -133,6 +142,8 @@ def _content(
         "errors": error_rows(closure, config) if closure else [],
         "cards": effect_cards(closure, config) if closure else [],
         "scatter": scatter_rows(closure, config) if closure else [],
+        "sensitivity": sensitivity_rows(closure, config) if closure else [],
+        "refused": refused_rows(closure, config) if closure else [],
         "left": left_over(closure, config) if closure else "",
         "next_runs": next_runs(closure, config) if closure else [],
         "tests": channel_tests(tables["levels"], tables["channels"]["channel"].dropna(), config),
