@@ -110,3 +110,9 @@ def test_sliding_power_is_a_channel_where_loads_differ():
     rows = make_rows(bins, has_aging=True)
     assert rows.values("power") == pytest.approx(rows.load * np.abs(rows.speed))
     assert "power" in {c.name for c in find_channels(rows)}
+
+
+def test_three_speeds_show_no_effect_of_speed_beside_the_stribeck_curve_they_cannot_hold():
+    rows = rows_of(speeds=(1.0, 8.0, 64.0), bins=6)
+    found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    assert not any(c.channels == ("speed_mm_s",) for c in found)
