@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from sealfit.fit.estimate import Fitted
-from sealfit.fit.rows import LEVELS
+from sealfit.fit.rows import LEVELS, Rows
 from sealfit.fit.tangent import Tangent
 
 Interval = tuple[float, float, float]
@@ -14,6 +14,9 @@ Interval = tuple[float, float, float]
 
 PHASES = {"A": "phi", "B": "phi_2"}
 """Amplitudes of sines, and the phase of each."""
+
+ROBUST_UNITS = 10
+"""Groups of a level from which its scatter is asked for a sandwich covariance."""
 
 
 def degrees_of_freedom(fitted: Fitted) -> float:
@@ -34,6 +37,14 @@ def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
     """Return the sandwich covariance from whole groups of a level (CR2), shape (p, p)."""
     scores = fitted.white_jacobian.sums(fitted.rows.groups, level, fitted.unit_residual(level))
     return fitted.covariance @ scores.gram() @ fitted.covariance
+
+
+def robust_level(rows: Rows) -> str:
+    """Return the coarsest level with ten groups: its whole groups say how far the fit's numbers scatter.
+
+    Specimens and runs may differ in numbers that no variance component holds, such as v_s.
+    """
+    return next((level for level in reversed(LEVELS) if rows.groups.starts[level].size >= ROBUST_UNITS), LEVELS[0])
 
 
 def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Interval]:

@@ -72,7 +72,9 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         )
         mean, tangent = evaluate(after, at)
         reach = t_quantile(model["df"])
-        half = reach * np.sqrt(mean_se(tangent, np.array(model["covariance"])) ** 2 + _of_unknown_phase(after, mean))
+        # The wider of two errors: by the variance components, and by what whole units differ in beyond them.
+        errors = [mean_se(tangent, np.array(model[name])) for name in ("covariance", "robust_covariance")]
+        half = reach * np.sqrt(np.maximum(*errors) ** 2 + _of_unknown_phase(after, mean))
         spread = reach * np.sqrt((half / reach) ** 2 + _one_measurement(model["scatter"], mean))
         answer.loc[good, list(ANSWERS)] = np.column_stack(
             [evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half, mean - spread, mean + spread]

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.intervals import degrees_of_freedom
+from sealfit.closure.intervals import degrees_of_freedom, robust_covariance, robust_level
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
@@ -38,6 +38,7 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
         "before": _model(before.model),
         "after": _model(after.model),
         "covariance": after.covariance.tolist(),
+        "robust_covariance": robust_covariance(after, robust_level(after.rows)).tolist(),
         "df": degrees_of_freedom(after),
         "scatter": {
             "s0": float(after.scatter.s0),

@@ -1,23 +1,27 @@
 import numpy as np
-import pytest
+from bins_helpers import make_bins, make_traces
 
-from sealfit.closure.intervals import waves_upright
-
-X = np.linspace(0.0, 7.0, 40)
-
-
-@pytest.mark.parametrize("amplitude", [-1.5, 1.5])
-@pytest.mark.parametrize("phase", [-9.0, -3.2, -np.pi, -0.3, 0.0, 2.8, np.pi, 6.5, 12.0])
-def test_a_wave_told_upright_is_the_same_wave(amplitude, phase):
-    told = waves_upright({"A": (amplitude, amplitude - 0.2, amplitude + 0.3), "phi": (phase, phase - 0.1, phase + 0.1)})
-    (a, a_low, a_high), (phi, phi_low, phi_high) = told["A"], told["phi"]
-    assert a == 1.5
-    assert (a_low, a_high) == pytest.approx((1.3, 1.8) if amplitude > 0 else (1.2, 1.7))
-    assert -np.pi < phi <= np.pi + 1e-12
-    assert (phi_low - phi, phi_high - phi) == pytest.approx((-0.1, 0.1))
-    np.testing.assert_allclose(a * np.sin(X + phi), amplitude * np.sin(X + phase), atol=1e-12)
+from sealfit.closure.intervals import robust_level
+from sealfit.closure.loop import close_loop
+from sealfit.closure.predict import predict
+from sealfit.config import Config
+from sealfit.fit.rows import make_rows
 
 
-def test_what_is_no_wave_is_let_be():
-    drift = {"A": (-0.1, -0.2, 0.0), "tau": (3.0, 2.0, 4.0)}
-    assert waves_upright(drift) == drift
+def test_the_interval_of_the_mean_is_the_wider_of_two():
+    bins = make_bins(2, bins=6, setup=0.005)
+    model = close_loop(bins, make_traces(bins), Config()).model
+    points = bins.groupby("condition").head(1)
+    narrow = predict({**model, "robust_covariance": model["covariance"]}, points)
+    both = predict(model, points)
+    width = [(p["force_after_hi95_N"] - p["force_after_lo95_N"]).to_numpy() for p in (narrow, both)]
+    assert np.all(width[1] >= width[0] * (1 - 1e-12))
+    doubled = predict({**model, "robust_covariance": (4 * np.array(model["covariance"])).tolist()}, points)
+    wide = (doubled["force_after_hi95_N"] - doubled["force_after_lo95_N"]).to_numpy()
+    np.testing.assert_allclose(wide, 2 * width[0], rtol=1e-9)
+
+
+def test_whole_runs_say_how_far_numbers_scatter_where_there_are_fewer_than_ten_specimens():
+    rows = make_rows(make_bins(bins=4), has_aging=True)
+    assert rows.groups.starts["specimen"].size == 9
+    assert robust_level(rows) == "run"
