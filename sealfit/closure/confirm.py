@@ -100,12 +100,17 @@ def _masks(rows: Rows, level: str, number: np.ndarray) -> Iterator[np.ndarray]:
     start, code = rows.groups.starts[level], rows.codes(level)
     condition = rows.condition[start]
     for k in range(number.max() + 1):
-        out = number == k
-        for c in np.unique(condition[out]):
-            if not (~out & (condition == c)).any() and _edge(rows, c):
-                out = out & (condition != c)
+        out = _without_lost_edges(number == k, condition, rows)
         if out.any():
             yield out[code]
+
+
+def _without_lost_edges(out: np.ndarray, condition: np.ndarray, rows: Rows) -> np.ndarray:
+    """Return what is held out less the edge conditions that would be held out whole, shape of `out`."""
+    for c in np.unique(condition[out]):
+        if not (~out & (condition == c)).any() and _edge(rows, c):
+            out = out & (condition != c)
+    return out
 
 
 def _edge(rows: Rows, condition: int) -> bool:
@@ -167,10 +172,7 @@ def whole_settings(rows: Rows, values: np.ndarray) -> Iterator[np.ndarray]:
     A free shape through every setting fits those it was given, and says nothing of what lies between them.
     """
     for setting in np.unique(values)[1:-1]:
-        out = values == setting
-        for c in np.unique(rows.condition[out]):
-            if not (~out & (rows.condition == c)).any() and _edge(rows, c):
-                out = out & (rows.condition != c)
+        out = _without_lost_edges(values == setting, rows.condition, rows)
         if out.any():
             yield out
 
@@ -265,12 +267,10 @@ def _left_in(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.nd
 
 def _around(proposal: Proposal) -> str | None:
     """Return the finest level within whose groups most of what the effect adds to the force varies; None for none."""
-    fitted = proposal.fitted
-    rows = fitted.rows
+    rows = proposal.fitted.rows
     if proposal.term.channels == ("direction",):
         return None
-    without = fitted.model.without_term(len(fitted.model.terms) - 1)
-    added = fitted.force - evaluate(without, rows, jacobian=False)[0]
+    added = _added_force(proposal)
     least = MOSTLY * float(np.var(added))
     return next((level for level in LEVELS if np.mean(_about(added, rows, level) ** 2) >= least), None)
 
@@ -387,10 +387,9 @@ def confirmed(
     """
     reasons = []
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
-    least = max(unseen_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
     for proposal in proposals[:TRIES]:
         gain = heldout_gain(fitted, proposal, *folds_of)
-        reason = _why_not(fitted, proposal, gain, least, folds_of[-1])
+        reason = _why_not(fitted, proposal, gain, samples, folds_of[-1])
         reasons.append(reason)
         unit = config.units.unit("force")
         say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
@@ -404,23 +403,23 @@ def confirmed(
     return None
 
 
-def _why_not(fitted: Fitted, proposal: Proposal, gain: Gain, least: float, known: dict) -> str | None:
+def _why_not(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame, known: dict) -> str | None:
     """Return why a proposal is not confirmed; None where it is."""
     if not gain.real:
         return "it does not predict the data that were held out better than the model without it"
-    if _size(proposal) <= least:
+    least = max(unseen_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
+    if np.sqrt(np.mean(_added_force(proposal) ** 2)) <= least:
         return "it is smaller than the recorded force can show"
     if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
         return "it does not predict whole settings that were held out, between those it was fitted to"
     return None
 
 
-def _size(proposal: Proposal) -> float:
-    """Return the RMS of what a proposal adds to the force."""
+def _added_force(proposal: Proposal) -> np.ndarray:
+    """Return what a fitted proposal adds to the force of the model without it, shape (n,)."""
     fitted = proposal.fitted
     without = fitted.model.without_term(len(fitted.model.terms) - 1)
-    added = fitted.force - evaluate(without, fitted.rows, jacobian=False)[0]
-    return float(np.sqrt(np.mean(added**2)))
+    return fitted.force - evaluate(without, fitted.rows, jacobian=False)[0]
 
 
 def unseen_N(samples: pd.DataFrame) -> float:
