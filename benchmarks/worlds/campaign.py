@@ -10,10 +10,12 @@ import numpy as np
 import pandas as pd
 
 from worlds.motion import Batch, batches, coloured
-from worlds.world import World
+from worlds.world import KINDS, World
 
 START = pd.Timestamp("2025-03-03T08:00:00")
 POINTS = 200
+CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
+OWN = [f"_specimen_{kind}" for kind in KINDS]  # scatter of specimens
 EDGE = 0.1  # share of the stroke at both ends where no point is asked for
 WITHOUT_AGING = 'condition = ["temperature_C", "compression_ratio_pct"]\n'
 
@@ -121,7 +123,10 @@ def draw_points(world: World, count: int = POINTS) -> pd.DataFrame:
     """
     rng, rig = world.streams("points"), world.rig
     table = world.files.iloc[rng.integers(len(world.files), size=count)].reset_index(drop=True)
-    table = table[[name for name in table if not name.startswith("_")]].copy()
+    pieces = world.files.groupby([*CONDITION, "specimen_id"], dropna=False)[OWN].first()
+    own = pieces.groupby(CONDITION, dropna=False).mean()  # what the tested specimens of a condition differ by
+    table = table[[name for name in table if not name.startswith("_")]]
+    table = table.merge(own.reset_index(), on=CONDITION, how="left")
     stroke = rng.integers(rig["strokes"], size=count)
     direction = table["direction"] * (-1.0) ** stroke
     keys = ["series", "direction"]  # points keep to the speeds tested there
@@ -139,6 +144,7 @@ def draw_points(world: World, count: int = POINTS) -> pd.DataFrame:
             if days.size >= 2 + (world.days[0] > 0):
                 between = np.exp(rng.uniform(np.log(days.min()), np.log(days.max()), count))
                 table["aging_days"] = np.where(here, np.round(between, 3), table["aging_days"])
+                table.loc[here, OWN] = 0.0  # no specimen was tested there
     table = table.assign(
         speed_mm_s=direction * speed, direction=direction, stroke=stroke + 1.0, distance_mm=distance,
         displacement_mm=begin + direction * distance,
@@ -152,7 +158,7 @@ def draw_points(world: World, count: int = POINTS) -> pd.DataFrame:
 
 def points_csv(world: World, points: pd.DataFrame) -> pd.DataFrame:
     """Return the points as `predict` reads them."""
-    drop = ["file", "run_id", "specimen_id", "series", "start_mm"]
+    drop = ["file", "run_id", "specimen_id", "series", "start_mm", *OWN]
     drop += [] if world.days.size else ["aging_days"]
     drop += [] if world.rig["calendar"] else ["elapsed_h", "run_order"]
     drop += [] if world.rig["load_column"] else ["load_N"]

@@ -201,11 +201,14 @@ def coloured(count: int, length: float, rng: np.random.Generator) -> np.ndarray:
     return lfilter([np.sqrt(1 - keep**2)], [1.0, -keep], white, zi=start)[0]
 
 
-def force_at(world: World, points: pd.DataFrame, *, without: Collection[int] = (), nudge=None) -> np.ndarray:
+def force_at(
+    world: World, points: pd.DataFrame, *, without: Collection[int] = (), nudge=None, tested: bool = False
+) -> np.ndarray:
     """Return the noise-free mean force at points, bristles settled where each stroke began: shape (points,).
 
     Each point is reached by sliding at its speed from its stroke's start; the force is integrated along the way, so
-    what lags behind a place by a bristle length lags here, too. The rise from rest is left out.
+    what lags behind a place by a bristle length lags here, too. The rise from rest is left out. With `tested` the mean
+    is that of the tested specimens of each condition, otherwise that of the population.
     """
     steps, nudge = LEAST_STEPS, dict(nudge or {})
     sigma_0 = world.rig["sigma_0"] * (1 + nudge.pop("sigma_0", 0.0))
@@ -214,13 +217,14 @@ def force_at(world: World, points: pd.DataFrame, *, without: Collection[int] = (
     speed, distance = np.abs(column["speed_mm_s"]), column["distance_mm"]
     begin = column["displacement_mm"] - direction * distance
     dwell = column["time_s"] - distance / speed
-    shared = {**column, "direction": direction}
-    none = dict.fromkeys(("gain", "level", "slope", "v_s", "sigma_2"), 0.0)
+    shared = {**{k: x for k, x in column.items() if not k.startswith("_")}, "direction": direction}
+    own = {k: column[f"_specimen_{k}"] if tested else 0.0 for k in ("gain", "level", "slope", "v_s", "sigma_2")}
     places = distance * (np.arange(steps) + 0.5) / steps
     g, _ = _deflection(
-        world, shared, begin, places, dwell + places / speed, speed + 0 * places, none, sigma_0, without, nudge
+        world, shared, begin, places, dwell + places / speed, speed + 0 * places, own, sigma_0, without, nudge
     )
     bent = _followed(g[:, 0], g, distance / steps / g)[:, -1]
-    _, p = _deflection(world, shared, begin, distance, column["time_s"], speed, none, sigma_0, without, nudge)
-    friction = sigma_0 * bent[:, None] + p["sigma_2"] * speed
-    return (direction * friction * p["factor"] + p["added_N"])[:, 0]
+    _, p = _deflection(world, shared, begin, distance, column["time_s"], speed, own, sigma_0, without, nudge)
+    along = 1 + own["gain"] + own["slope"] * (distance / world.rig["stroke_mm"] - 0.5)
+    friction = sigma_0 * bent[:, None] + p["sigma_2"] * (1 + own["sigma_2"]) * speed * along
+    return (direction * friction * p["factor"] + p["added_N"] + direction * own["level"] * world.rig["mean_N"])[:, 0]

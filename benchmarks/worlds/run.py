@@ -220,8 +220,9 @@ def predicted(task: Task, world: World, rows: Rows, home: Path) -> dict:
     outside = answer["extrapolated"].astype(str).str.lower().isin(["true", "1"]).to_numpy()
     good = np.isfinite(after) & np.isfinite(before) & ~outside
     oracle = error_at(world, rows, points)
-    inside = (low <= exact) & (exact <= high) & good
     own_only = answer["note"].astype(str).str.contains("those of the tested ones").to_numpy()
+    meant = np.where(own_only, force_at(world, points, tested=True), exact)  # what each interval says it is of
+    inside = (low <= meant) & (meant <= high) & good
 
     def rms(error: np.ndarray) -> float | None:
         return float(np.sqrt(np.mean(error[good] ** 2))) if good.any() else None

@@ -329,7 +329,10 @@ def _scatter_and_noise(world: World, rng) -> None:
                 continue
             sd = draw(f"scatter_{kind}", rng)
             world.scatter.append({"level": level, "kind": kind, "sd": sd})
-            drawn[kind] += sd * rng.normal(size=units[level].max() + 1)[units[level]]
+            values = sd * rng.normal(size=units[level].max() + 1)[units[level]]
+            drawn[kind] += values
+            if level == "specimen":
+                files[f"_specimen_{kind}"] = values
     world.noise = {
         "rel": draw("noise_rel", rng),
         "kind": draw("noise_kind", rng),
@@ -346,6 +349,7 @@ def _scatter_and_noise(world: World, rng) -> None:
         drawn["gain"][wrong] += rng.choice([-1, 1], wrong.size) * rng.uniform(0.05, 0.2, wrong.size)
     for kind, values in drawn.items():
         files[f"_{kind}"] = np.clip(values, -0.5, None)
+        files[f"_specimen_{kind}"] = files.get(f"_specimen_{kind}", 0.0)
     world.rig["mean_N"] = float(np.sqrt(np.mean(quasi_steady_N(world, scale_points(world)) ** 2)))
 
 
