@@ -87,12 +87,39 @@ def rises(starts: Sequence[Start]) -> list[Rise]:
     of it then is known from the same law, fitted once more to the rows of constant speed.
 
     Only a force that begins below everything the plateau later shows is a rise: the trough of a ripple, or a force
-    that warming lets fall, is not.
+    that warming lets fall, is not. With much damping of the bristles (sigma_1) a fast stroke's force comes up at once,
+    to more than its level, and falls to it by the same law; then the fall from its peak is what has to be over.
 
     Notes
     -----
     Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10.1109/9.376053.
     """
+    made = _rises(starts)
+    over = [(i, *found) for i, start in enumerate(starts) if (found := _overshoot(start))]
+    for (i, peak, _), fall in zip(over, _rises([fall for *_, fall in over]), strict=True):
+        if fall.end_mm > 0.0:
+            left = -fall.left_N * math.exp(min(peak / fall.length_mm, FAR))
+            made[i] = Rise(peak + fall.end_mm, left, fall.length_mm)
+    return made
+
+
+def _overshoot(start: Start) -> tuple[float, Start] | None:
+    """Return where the force peaks in the first half, in mm, and the fall from there turned upside down; None where the
+    force is highest at the end of that half."""
+    distance, force = start.distance_mm, start.force_N
+    early, late = (int(distance.searchsorted(share * distance[-1])) for share in EARLY)
+    if late < 2:
+        return None
+    peak = int(force[:late].argmax())
+    if peak >= late - 1:
+        return None
+    level = median(force[max(early, peak) : late])
+    fall = Start(distance[peak:] - distance[peak], 2.0 * level - force[peak:], max(start.ramp_end - peak, 0))
+    return float(distance[peak]), fall
+
+
+def _rises(starts: Sequence[Start]) -> list[Rise]:
+    """Return the rise of every start whose force comes up, and none for the others."""
     levels = [_level_N(start) for start in starts]
     scales = [_scale_mm(start, level) for start, level in zip(starts, levels, strict=True)]
     rising = [i for i, scale in enumerate(scales) if scale > 0.0]

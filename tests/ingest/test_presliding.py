@@ -12,7 +12,7 @@ from sealfit.ingest.strokes import find_all
 LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
 
 
-def bristle_trace(ratio, *, hertz=100.0, ramp=0.2, blur=0.002, begin=0.0, seed=1, shape="straight"):
+def bristle_trace(ratio, *, hertz=100.0, ramp=0.2, blur=0.002, begin=0.0, damping=0.0, seed=1, shape="straight"):
     """Return time, displacement and force of a stroke `ratio` bristle lengths long, after a rest of a second.
 
     At constant G the force is an exponential of the distance whatever the speed does: Eq. 2 divided by v.
@@ -24,7 +24,8 @@ def bristle_trace(ratio, *, hertz=100.0, ramp=0.2, blur=0.002, begin=0.0, seed=1
         slid = SPEED * np.where(since < ramp, 0.5 * since**2 / ramp, since - 0.5 * ramp)
     else:
         slid = SPEED * (since - ramp * -np.expm1(-since / ramp))
-    force = LEVEL + (begin - LEVEL) * np.exp(-slid / LENGTH)
+    bent = np.exp(-slid / LENGTH)  # damping: sigma_1 dz/dt, in N at the stroke's speed
+    force = LEVEL + (begin - LEVEL) * bent + damping * np.gradient(slid, time) / SPEED * bent
     return time, slid + random.normal(0.0, blur, time.size), force + random.normal(0.0, NOISE, time.size)
 
 
@@ -90,3 +91,11 @@ def test_a_stroke_that_ends_before_it_is_steady_says_so_and_is_used(tmp_path):
     short = bins[bins["file"] == "short.csv"]
     assert short["force_N"].to_numpy() == pytest.approx(LEVEL, abs=1.0)
     assert short["presliding_N"].iloc[0] < 1.5 * short["presliding_N"].iloc[-1] < 0
+
+
+@pytest.mark.parametrize("ratio", [6.0, 11.0, 30.0])
+@pytest.mark.parametrize("damping", [1.5, 3.0, 6.0])
+def test_damped_bristles_that_overshoot_are_over_too(ratio, damping):
+    _, corrected = steady_forces(ratio, damping=damping * LEVEL)
+    assert abs(corrected.mean() - LEVEL) < 4 * corrected.std(ddof=1) / np.sqrt(corrected.size) + 1e-4 * LEVEL
+    assert corrected.std() < 0.002 * LEVEL
