@@ -82,8 +82,8 @@ def with_own_effect(out: Path) -> None:
             "fixed": {}, "values": {"A": -0.5, "x_0": 20.0}, "smoothness": None,
         }
     )  # fmt: skip
-    for name in ("covariance", "robust_covariance"):
-        model[name] = np.pad(np.array(model[name]), (0, 2)).tolist()
+    for holder in (model, *model["sandwiches"]):
+        holder["covariance"] = np.pad(np.array(holder["covariance"]), (0, 2)).tolist()
     keep(out, model=model)
 
 

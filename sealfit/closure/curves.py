@@ -9,7 +9,14 @@ from sealfit.closure.channels import Channel, unit_of
 from sealfit.closure.document import parameter_unit
 from sealfit.closure.forms import free_term
 from sealfit.closure.grow import Grown
-from sealfit.closure.intervals import degrees_of_freedom, mean_se, robust_covariance, t_quantile
+from sealfit.closure.intervals import (
+    degrees_of_freedom,
+    mean_half_width,
+    mean_se,
+    robust_covariance,
+    sandwiches,
+    t_quantile,
+)
 from sealfit.config import Config
 from sealfit.effects.contract import SECOND
 from sealfit.fit.estimate import Fitted, fit
@@ -153,7 +160,7 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     codes = np.repeat(rows.condition[first], counts)
     at = point_rows(points, codes, rows.conditions, has_load=rows.has_load, has_aging=rows.has_aging)
     mean, tangent = evaluate(after.model, at)
-    reach = t_quantile(degrees_of_freedom(after)) * mean_se(tangent, after.covariance)
+    reach = mean_half_width(tangent, after.covariance, degrees_of_freedom(after), sandwiches(after))
     points = points.assign(
         force_before_N=evaluate(before.model, at, jacobian=False)[0],
         force_after_N=mean,

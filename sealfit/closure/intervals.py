@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from scipy.special import stdtrit
 
+from sealfit.closure.slopes import LARGEST_LEVERAGE, satterthwaite_df
 from sealfit.fit.estimate import Fitted
-from sealfit.fit.rows import LEVELS, Rows
+from sealfit.fit.rows import LEVELS
 from sealfit.fit.tangent import Tangent
 
 Interval = tuple[float, float, float]
@@ -15,8 +19,16 @@ Interval = tuple[float, float, float]
 PHASES = {"A": "phi", "B": "phi_2"}
 """Amplitudes of sines, and the phase of each."""
 
-ROBUST_UNITS = 10
-"""Groups of a level from which its scatter is asked for a sandwich covariance."""
+FEW_UNITS = 30
+"""Groups of a level below which a sandwich covariance is itself uncertain, and has degrees of freedom of its own."""
+
+
+class Sandwich(NamedTuple):
+    """Covariance of the fitted numbers that whole groups of a level show, whatever it is that these differ in."""
+
+    covariance: np.ndarray  # (p, p)
+    information: Sequence[tuple[np.ndarray, np.ndarray]]
+    """Of each group the numbers it depends on, shape (k,), and their information, shape (k, k); empty if many."""
 
 
 def degrees_of_freedom(fitted: Fitted) -> float:
@@ -25,7 +37,7 @@ def degrees_of_freedom(fitted: Fitted) -> float:
     level = active[-1] if active else "file"
     units = fitted.rows.groups.starts[LEVELS[max(LEVELS.index(level), 1)]].size
     between = len({(p.quantity, p.owner) for p in fitted.model.declared.parameters if p.quantity in ("mu_0c", "a_c")})
-    return float(max(units - (between if level == "specimen" else fitted.basis.shape[1]), 3))
+    return float(max(units - (between if level == "specimen" else fitted.basis.shape[1]), 1))
 
 
 def t_quantile(df: float) -> float:
@@ -39,12 +51,25 @@ def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
     return fitted.covariance @ scores.gram() @ fitted.covariance
 
 
-def robust_level(rows: Rows) -> str:
-    """Return the coarsest level with ten groups: its whole groups say how far the fit's numbers scatter.
+def sandwiches(fitted: Fitted) -> list[Sandwich]:
+    """Return the sandwich covariances of whole files, runs and specimens, and of one level with many groups at most.
 
     Specimens and runs may differ in numbers that no variance component holds, such as v_s.
     """
-    return next((level for level in reversed(LEVELS) if rows.groups.starts[level].size >= ROBUST_UNITS), LEVELS[0])
+    found, rows = [], fitted.rows
+    for level in reversed(LEVELS[1:]):
+        starts = rows.groups.starts[level]
+        if starts.size < 2:
+            continue
+        information = []
+        if starts.size < FEW_UNITS:
+            for own in np.split(fitted.white_jacobian.toarray(), starts[1:]):
+                numbers = np.flatnonzero(own.any(axis=0))
+                information.append((numbers, own[:, numbers].T @ own[:, numbers]))
+        found.append(Sandwich(robust_covariance(fitted, level), information))
+        if starts.size >= FEW_UNITS:
+            break
+    return found
 
 
 def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Interval]:
@@ -91,3 +116,31 @@ def waves_upright(intervals: dict[str, Interval]) -> dict[str, Interval]:
 def mean_se(tangent: Tangent, covariance: np.ndarray) -> np.ndarray:
     """Return the standard error of the model's force from its tangent, of shape (n, p), and covariance -> (n,)."""
     return np.sqrt(np.maximum(tangent.squares(covariance), 0.0))
+
+
+def mean_half_width(tangent: Tangent, covariance: np.ndarray, df: float, others: Sequence[Sandwich]) -> np.ndarray:
+    """Return half the 95 % interval of the model's force, shape (n,): the widest of several.
+
+    One is that of the variance components. The others are those of whole groups, each with the degrees of freedom by
+    Satterthwaite that its groups leave at this point; one group that decides on a force alone says nothing of it.
+
+    Parameters
+    ----------
+    tangent : Tangent, shape (n, p)
+        Of the model at the points.
+    covariance : ndarray, shape (p, p)
+        By the variance components.
+    df : float
+        Its degrees of freedom.
+    others : sequence of Sandwich
+        By whole groups.
+    """
+    half = t_quantile(df) * mean_se(tangent, covariance)
+    for covariance_of_groups, information in others:
+        reach = np.full(half.shape, t_quantile(df))
+        if len(information):
+            share = np.stack([tangent.squares(covariance[:, k] @ own @ covariance[k]) for k, own in information])
+            share /= np.maximum(share.sum(axis=0), 1e-300)
+            reach = np.where(share.max(axis=0) > LARGEST_LEVERAGE, 0.0, stdtrit(satterthwaite_df(share), 0.975))
+        half = np.maximum(half, reach * mean_se(tangent, covariance_of_groups))
+    return half

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.intervals import mean_se, t_quantile
+from sealfit.closure.intervals import Sandwich, mean_half_width, t_quantile
 from sealfit.closure.record import from_record
 from sealfit.conditions import add_keys
 from sealfit.config import Config
@@ -25,6 +25,7 @@ from sealfit.fit.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.whitening import Component, Scatter
 from sealfit.ingest.incomplete import NO_VALUE
 
+SAME_SPEED = 0.05  # relative difference within which a speed counts as a tested one
 BEYOND = 1e-6  # relative slack before a value counts as outside the tested range
 ANSWERS = (
     "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N", "meas_lo95_N", "meas_hi95_N",
@@ -58,7 +59,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     _check_values(table, after, model, notes)
     good = np.array([not note for note in notes]) & (code >= 0)
     answer = pd.DataFrame({name: np.full(len(table), np.nan) for name in ANSWERS})
-    if model["has_aging"] and not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
+    if not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
         for k in np.flatnonzero(good):
             notes[k].append("how specimens scatter is not known: the intervals are those of the tested ones")
     extrapolated = _outside(table, conditions, code, model, notes, after)
@@ -72,9 +73,12 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         )
         mean, tangent = evaluate(after, at)
         reach = t_quantile(model["df"])
-        # The wider of two errors: by the variance components, and by what whole units differ in beyond them.
-        errors = [mean_se(tangent, np.array(model[name])) for name in ("covariance", "robust_covariance")]
-        half = reach * np.sqrt(np.maximum(*errors) ** 2 + _of_unknown_phase(after, mean))
+        others = [
+            Sandwich(np.array(own["covariance"]), [(np.array(k), np.array(block)) for k, block in own["information"]])
+            for own in model["sandwiches"]
+        ]
+        half = mean_half_width(tangent, np.array(model["covariance"]), model["df"], others)
+        half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, mean))
         spread = reach * np.sqrt((half / reach) ** 2 + _one_measurement(model["scatter"], mean))
         answer.loc[good, list(ANSWERS)] = np.column_stack(
             [evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half, mean - spread, mean + spread]
@@ -209,6 +213,14 @@ def _outside(
         for k in np.flatnonzero(code >= tested_count):
             own = days[:tested_count][series[:tested_count] == series[code[k]]]
             outside[k] |= bool(days[code[k]] > own.max())
+    speed = np.abs(pd.to_numeric(table["speed_mm_s"], errors="coerce").to_numpy(dtype=float))
+    for k in np.flatnonzero((code >= 0) & (after.declared.index["v_s"][code] < 0)):
+        tested = np.array(model["speeds_mm_s"][series[code[k]]])
+        if not (np.abs(speed[k] / tested - 1) < SAME_SPEED).any():
+            outside[k] = True
+            notes[k].append(
+                f"too few speeds for a Stribeck curve: only {', '.join(f'{v:g}' for v in tested)} are known"
+            )
     read = {"speed_mm_s"} | {name for term in after.terms for name in term.channels}
     if model["has_load"]:
         read.add("load_N")

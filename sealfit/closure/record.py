@@ -7,12 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.intervals import degrees_of_freedom, robust_covariance, robust_level
+from sealfit.closure.intervals import degrees_of_freedom, sandwiches
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
 from sealfit.effects.free import FREE, free_effect
-from sealfit.fit.declared import QUANTITIES, Declared, JointParameter
+from sealfit.fit.declared import QUANTITIES, Declared, JointParameter, tested_speeds
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows
@@ -38,7 +38,13 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
         "before": _model(before.model),
         "after": _model(after.model),
         "covariance": after.covariance.tolist(),
-        "robust_covariance": robust_covariance(after, robust_level(after.rows)).tolist(),
+        "sandwiches": [
+            {
+                "covariance": own.covariance.tolist(),
+                "information": [[numbers.tolist(), block.tolist()] for numbers, block in own.information],
+            }
+            for own in sandwiches(after)
+        ],
         "df": degrees_of_freedom(after),
         "scatter": {
             "s0": float(after.scatter.s0),
@@ -50,6 +56,7 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
             ],
         },
         "ranges": _ranges(rows),
+        "speeds_mm_s": _speeds(rows),
     }
 
 
@@ -92,6 +99,12 @@ def _ranges(rows: Rows) -> dict:
         else:
             ranges[name] = sorted({str(v) for v in values})
     return ranges
+
+
+def _speeds(rows: Rows) -> dict[str, list[float]]:
+    """Return the tested speeds of each series, without signs."""
+    series = rows.conditions["series"].to_numpy(dtype=object)[rows.condition]
+    return {name: tested_speeds(rows, np.flatnonzero(series == name)).tolist() for name in pd.unique(series)}
 
 
 def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[Model, Model, pd.DataFrame]:

@@ -89,10 +89,8 @@ def slope_test(fitted: Fitted, left: np.ndarray, level: str) -> SlopeTest | None
     leverage = groups.sums(left**2, level)
     slope = left.T @ fitted.white_residual
     scores = groups.sums(left * fitted.unit_residual(level)[:, None], level)
-    room = 1 - np.minimum(leverage, LARGEST_LEVERAGE)
-    deviations = (scores - leverage * slope) / np.sqrt(room)
-    shared = leverage**2 / room
-    df = 1 / ((leverage**2).sum(axis=0) + shared.sum(axis=0) ** 2 - (shared**2).sum(axis=0))
+    deviations = (scores - leverage * slope) / np.sqrt(1 - np.minimum(leverage, LARGEST_LEVERAGE))
+    df = satterthwaite_df(leverage)
     inside = groups.sums(left, "stroke") ** 2 / groups.sums(np.ones(len(left)), "stroke")[:, None]
     known = df >= LEAST_DF
     if not known.any():
@@ -100,6 +98,15 @@ def slope_test(fitted: Fitted, left: np.ndarray, level: str) -> SlopeTest | None
     agree = _agree(groups.sums(left**2, "specimen"), groups.sums(left * fitted.white_residual[:, None], "specimen"))
     parts = (slope, (deviations**2).sum(axis=0), df, inside.sum(axis=0) < 0.5)
     return SlopeTest(level, *(part[known] for part in parts), deviations[:, known], agree[known])
+
+
+def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
+    """Return the degrees of freedom of CR2 variances of contrasts, shape (m,), from leverages, shape (units, m).
+
+    The leverages of a contrast add up to 1.
+    """
+    shared = leverage**2 / (1 - np.minimum(leverage, LARGEST_LEVERAGE))
+    return 1 / ((leverage**2).sum(axis=0) + shared.sum(axis=0) ** 2 - (shared**2).sum(axis=0))
 
 
 def _agree(leverage: np.ndarray, scores: np.ndarray) -> np.ndarray:

@@ -118,7 +118,7 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
     key = 2 * number[rows.condition] + (rows.speed > 0)
     order = np.argsort(key, kind="stable")
     ends = np.searchsorted(key[order], np.arange(2 * names.size + 1))
-    levels = [speed_levels(rows, order[first:last]) for first, last in itertools.pairwise(ends)]
+    levels = [tested_speeds(rows, order[first:last]).size for first, last in itertools.pairwise(ends)]
     most = np.reshape(levels, (names.size, 2)).max(axis=1)  # of the two directions
     return {
         name: "full" if m >= SPEEDS_FOR_STRIBECK else "viscous" if m >= SPEEDS_FOR_VISCOUS else "constant"
@@ -126,19 +126,20 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
     }
 
 
-def speed_levels(rows: Rows, chosen: np.ndarray) -> int:
-    """Return how many speeds chosen rows have: commanded ones, or measured ones that differ by more than 25 %."""
-    commanded = rows.values("speed_set_mm_s")[chosen]
+def tested_speeds(rows: Rows, chosen: np.ndarray) -> np.ndarray:
+    """Return the speeds of chosen rows: commanded ones, or means of measured ones that lie within 25 %, ascending."""
+    commanded = np.abs(rows.values("speed_set_mm_s")[chosen])
     if np.isfinite(commanded).all():
-        return np.unique(np.round(np.abs(commanded), 9)).size
+        return np.unique(np.round(commanded, 9))
     _, stroke = np.unique(rows.codes("stroke")[chosen], return_inverse=True)
-    return levels_of(np.sort(np.bincount(stroke, np.abs(rows.speed[chosen])) / np.bincount(stroke)))
+    return speed_clusters(np.sort(np.bincount(stroke, np.abs(rows.speed[chosen])) / np.bincount(stroke)))
 
 
-def levels_of(speeds: np.ndarray) -> int:
-    """Return the number of clusters of sorted positive speeds, each within 25 % of its slowest."""
-    count, base = 0, 0.0
-    for speed in speeds:
-        if count == 0 or speed > SAME_SPEED * base:
-            count, base = count + 1, speed
-    return count
+def speed_clusters(speeds: np.ndarray) -> np.ndarray:
+    """Return the means of clusters of sorted positive speeds, each within 25 % of its slowest."""
+    cuts, base = [], 0.0
+    for place, speed in enumerate(speeds):
+        if place == 0 or speed > SAME_SPEED * base:
+            base = speed
+            cuts.append(place)
+    return np.array([part.mean() for part in np.split(speeds, cuts[1:])]) if speeds.size else speeds

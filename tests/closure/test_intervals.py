@@ -1,27 +1,49 @@
 import numpy as np
 from bins_helpers import make_bins, make_traces
 
-from sealfit.closure.intervals import robust_level
+from sealfit.closure.intervals import FEW_UNITS, Sandwich, mean_half_width, sandwiches, t_quantile
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.config import Config
+from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
+from sealfit.fit.tangent import Tangent
 
 
-def test_the_interval_of_the_mean_is_the_wider_of_two():
+def width(model: dict, points) -> np.ndarray:
+    answer = predict(model, points)
+    return (answer["force_after_hi95_N"] - answer["force_after_lo95_N"]).to_numpy()
+
+
+def test_the_interval_of_the_mean_is_the_widest_of_several():
     bins = make_bins(2, bins=6, setup=0.005)
     model = close_loop(bins, make_traces(bins), Config()).model
     points = bins.groupby("condition").head(1)
-    narrow = predict({**model, "robust_covariance": model["covariance"]}, points)
-    both = predict(model, points)
-    width = [(p["force_after_hi95_N"] - p["force_after_lo95_N"]).to_numpy() for p in (narrow, both)]
-    assert np.all(width[1] >= width[0] * (1 - 1e-12))
-    doubled = predict({**model, "robust_covariance": (4 * np.array(model["covariance"])).tolist()}, points)
-    wide = (doubled["force_after_hi95_N"] - doubled["force_after_lo95_N"]).to_numpy()
-    np.testing.assert_allclose(wide, 2 * width[0], rtol=1e-9)
+    narrow = width({**model, "sandwiches": []}, points)
+    assert np.all(width(model, points) >= narrow * (1 - 1e-12))
+    wide = [{"covariance": (4 * np.array(model["covariance"])).tolist(), "information": []}]
+    np.testing.assert_allclose(width({**model, "sandwiches": wide}, points), 2 * narrow, rtol=1e-9)
 
 
-def test_whole_runs_say_how_far_numbers_scatter_where_there_are_fewer_than_ten_specimens():
+def test_a_few_groups_have_degrees_of_freedom_of_their_own():
+    tangent = Tangent.dense(np.array([[1.0], [2.0]]))
+    groups = [(np.array([0]), np.array([[1.0]]))] * 4  # four groups that count the same: 3 degrees of freedom
+    few = Sandwich(np.array([[4.0]]), groups)
+    half = mean_half_width(tangent, np.array([[0.25]]), 1e6, [few])
+    np.testing.assert_allclose(half, 2 * t_quantile(3) * np.array([1.0, 2.0]))
+
+
+def test_a_group_that_decides_alone_says_nothing_of_its_scatter():
+    tangent = Tangent.dense(np.array([[1.0]]))
+    groups = [(np.array([0]), np.array([[99.0]])), (np.array([0]), np.array([[1.0]]))]
+    half = mean_half_width(tangent, np.array([[0.01]]), 1e6, [Sandwich(np.array([[4.0]]), groups)])
+    np.testing.assert_allclose(half, t_quantile(1e6) * 0.1)
+
+
+def test_files_runs_and_specimens_are_asked_down_to_the_first_of_which_there_are_many():
     rows = make_rows(make_bins(bins=4), has_aging=True)
-    assert rows.groups.starts["specimen"].size == 9
-    assert robust_level(rows) == "run"
+    counts = [rows.groups.starts[level].size for level in ("specimen", "run", "file")]
+    assert counts[0] == 9
+    assert counts[1] >= FEW_UNITS
+    found = sandwiches(fit_declared(rows))
+    assert [len(own.information) for own in found] == [9, 0]

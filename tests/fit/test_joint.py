@@ -5,7 +5,7 @@ import pytest
 
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
-from sealfit.fit.declared import declare, levels_of
+from sealfit.fit.declared import declare, speed_clusters
 from sealfit.fit.estimate import fit, fit_declared
 from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import make_rows, thin
@@ -89,8 +89,9 @@ def test_law_needs_three_days():
 
 
 def test_levels_of_measured_speeds():
-    assert levels_of(np.array([6.7, 7.0, 7.9])) == 1
-    assert levels_of(np.array([6.7, 7.9, 14.0, 16.0])) == 2
+    npt.assert_allclose(speed_clusters(np.array([6.7, 7.0, 7.9])), [7.2])
+    npt.assert_allclose(speed_clusters(np.array([6.7, 7.9, 14.0, 16.0])), [7.3, 15.0])
+    assert speed_clusters(np.empty(0)).size == 0
 
 
 def test_subset_keeps_conditions_and_fits_the_same_numbers():
