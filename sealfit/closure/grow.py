@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel, channels_of
-from sealfit.closure.confirm import TRIES, Added, Refused, confirmed
+from sealfit.closure.confirm import TRIES, WEAK, Added, Refused, confirmed
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.judge import Candidate, Judge
 from sealfit.closure.laws import AGING, richer_laws
@@ -29,9 +29,6 @@ from sealfit.fit.whitening import Scatter
 from sealfit.samples import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
 
 SAMPLED = ("displacement_mm", "time_s", "force_N")  # what the ripple search reads of a sample
-DISAGREE = 0.1
-"""Of the level of the search: what held-out data do not confirm is structure only if its p-value is below that."""
-
 DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at: a far surer one may show in it
 
 
@@ -154,7 +151,7 @@ def grow(
         refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}
         added = kept
     failed = {item.p_value for item in not_confirmed}
-    if left is not None and left.p_value in failed and left.p_value > DISAGREE * alpha:
+    if left is not None and left.p_value in failed and left.p_value > WEAK:
         left = None  # it is listed as refused
     unsure = None
     doubtful = [c for c in (*last, *(c for c, _ in laws)) if c.p_value <= alpha and not c.sure]
