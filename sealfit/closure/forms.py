@@ -148,6 +148,10 @@ def _terms_of_pair(
                 good = np.isfinite(effect.shape(inputs, **effect.start())).all()
             if good and (effect.id not in ("product", "bilinear") or x is one):  # the same either way round
                 yield Term(effect, (x.name, z.name), *target, fixed=fixed), {}
+    for effect in effects.values():
+        if set(effect.reads) == {one.name, other.name} and target in effect.acts_on:
+            fixed = {f"{c.name}_ref": reference(np.abs(c.values)) for c in (one, other)}
+            yield Term(effect, effect.reads, *target, fixed=fixed), grid_of(effect, np.abs(one.values))
     fixed = {f"{name}_knots": even_knots(c.values) for name, c in (("x", one), ("z", other))}
     yield Term(free_effect(SURFACE, fixed), (one.name, other.name), *target, fixed=fixed), {}
 

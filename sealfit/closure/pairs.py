@@ -65,18 +65,23 @@ def pairs_in_disguise(
     channels : mapping
         Channels by name.
     """
-    best: dict[frozenset, Candidate] = {}
+    best: dict[frozenset, list[Candidate]] = {}
     for single in significant:
         pair = frozenset((*single.channels, BEHIND.get(single.acts_on)))
         if single.pair or len(pair) != 2 or not pair <= channels.keys() or pair in best:
             continue
         members = _usable([channels[name] for name in sorted(pair)])
         found = _of_pair(judge, *members) if len(members) == 2 else []
-        if found:
-            strongest = max(found, key=lambda c: c.chi2)
-            judgement = strongest.judgement._replace(chi2=max(strongest.chi2, single.chi2))
-            best[pair] = replace(strongest, judgement=judgement, p_value=single.p_value)
-    return list(best.values())
+        strongest = [max(own, key=lambda c: c.chi2) for t in MAIN_TARGETS if (own := [c for c in found if _on(c, t)])]
+        best[pair] = [
+            replace(c, judgement=c.judgement._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value)
+            for c in strongest
+        ]
+    return list(itertools.chain.from_iterable(best.values()))
+
+
+def _on(candidate: Candidate, target: tuple[str, str]) -> bool:
+    return (candidate.acts_on, candidate.operation) == target
 
 
 def _usable(channels: Sequence[Channel]) -> list[Channel]:
