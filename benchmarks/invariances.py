@@ -6,8 +6,8 @@
 A campaign is changed (measured numbers jittered by 1e-6 to 1e-3 of themselves, files renamed, shuffled and split into
 strokes, other units and signs through the config, idle columns, another seed, ...) and analysed again. Verdict and
 effects (id, channels, acts_on, operation) must stay, and numbers move by at most a tenth of a standard error, after
-conversion of units. The table says, per campaign and change, what moved. Pairs that are in the file already are not
-run again.
+conversion of units; the error after over that before by at most a tenth. The table says, per campaign and change, what
+moved. Pairs that are in the file already are not run again.
 
 Two kinds of change do alter what the data say, and their numbers are held to what must follow from that.
 
@@ -50,6 +50,7 @@ OF_SE = 0.1  # of a standard error, by which a number may move
 BINNED = 0.5  # where the bins are others
 CHANCE = 3.0  # standard deviations by which an estimate from fewer data may differ
 ROUNDING = 1e-5  # of a number that has no interval
+ERROR = 0.1  # of the ratio of the errors after and before
 PREFIXES = {"N": 1.0, "mN": 1e-3, "mm": 1e-3, "m": 1.0, "s": 1.0, "ms": 1e-3}
 
 # ---------------------------------------------------------------- campaigns
@@ -392,6 +393,9 @@ def moves(before: dict, after: dict, change: Change) -> list[str]:
     found = []
     if before["verdict"] != after["verdict"]:
         found.append(f"verdict {before['verdict']} -> {after['verdict']}")
+    ratios = [closure["after"]["rmse_N"] / closure["before"]["rmse_N"] for closure in (before, after)]
+    if abs(np.log(ratios[1] / ratios[0])) > ERROR:
+        found.append(f"error after over before {ratios[0]:.3g} -> {ratios[1]:.3g}")
     old, new = (_by_key(closure["effects"], change.aliases) for closure in (before, after))
     found += [f"lost {_words(key)}" for key in old if key not in new]
     found += [f"new {_words(key)}" for key in new if key not in old]

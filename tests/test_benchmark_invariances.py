@@ -19,8 +19,8 @@ EFFECT = {
 AS_IS = Change(lambda given, rng: given)
 
 
-def closure(*effects, verdict="closed"):
-    return {"verdict": verdict, "effects": list(effects)}
+def closure(*effects, verdict="closed", after=0.1):
+    return {"verdict": verdict, "effects": list(effects), "before": {"rmse_N": 0.5}, "after": {"rmse_N": after}}
 
 
 def with_values(**values):
@@ -43,6 +43,7 @@ def test_what_moved_is_said():
         "verdict closed -> nothing_missing",
         "lost ripple(displacement_mm) add force",
     ]
+    assert moves(closure(EFFECT), closure(EFFECT, after=0.2), AS_IS) == ["error after over before 0.2 -> 0.4"]
     # the standard error of A is 0.1 N
     assert moves(closure(EFFECT), closure(with_values(A={"value": 0.509})), AS_IS) == []
     assert moves(closure(EFFECT), closure(with_values(A={"value": 0.52})), AS_IS) == ["ripple A by 0.2 se"]
@@ -100,10 +101,13 @@ SHORT = {
     "short": ("jitter_time_1e-6", "jitter_position_1e-4", "jitter_position_1e-3", "jitter_samples_1e-6",
               "jitter_commanded_1e-3", "renamed", "mN", "ms", "serial_number"),
     "there_and_back": ("split",),
+    "zero_offset": ("jitter_time_1e-4", "jitter_time_1e-3"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "effect"), [("short", "ripple"), ("there_and_back", "zero_offset")])
+@pytest.mark.parametrize(
+    ("name", "effect"), [("short", "ripple"), ("there_and_back", "zero_offset"), ("zero_offset", "zero_offset")]
+)
 def test_claims_do_not_hang_on_what_does_not_matter(name, effect):
     given = campaign(name)
     changed = {change: CHANGES[change].make(given, np.random.default_rng(5)) for change in SHORT[name]}
