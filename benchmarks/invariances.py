@@ -12,8 +12,8 @@ moved. Pairs that are in the file already are not run again.
 Two kinds of change do alter what the data say, and their numbers are held to what must follow from that.
 
 A clock or a scale that is off by 1e-3 in each file is another measurement: a wavelength known to 3e-4 follows it. The
-numbers must follow smoothly, without a decision that flips: they move ten times as far as under the same jitter of
-1e-4, within a tenth of a standard error, and under that one by less than this at all.
+numbers must follow smoothly, without a decision that flips: they stay, or move ten times as far as under the same
+jitter of 1e-4, within a tenth of a standard error; under that one they stay.
 
 Estimates from all data and from all but a share f of them differ by chance, with a standard deviation of
 sqrt(f / (1 - f)) standard errors (Hausman 1978, doi:10.2307/1913827: the variance of the difference is the difference
@@ -365,11 +365,12 @@ def _inline(value: object) -> str:
 def moved_by(name: str, closures: Mapping[str, dict], runs: int) -> list[str]:
     """Return what a change moved, from the closures of a campaign of so many runs by change."""
     before, change = closures["as it is"], CHANGES[name]
-    if change.tenth in closures:
-        before = in_proportion(before, closures[change.tenth])
     if change.lost:
         change = replace(change, tolerance=CHANCE * float(np.sqrt(change.lost / (runs - change.lost))))
-    return moves(before, closures[name], change)
+    found = moves(before, closures[name], change)
+    if found and change.tenth in closures:
+        return moves(in_proportion(before, closures[change.tenth]), closures[name], change)
+    return found
 
 
 def in_proportion(before: dict, tenth: dict) -> dict:
