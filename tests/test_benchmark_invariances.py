@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from invariances import CHANGES, Campaign, Change, campaign, closed, factor, moves
+from invariances import CHANGES, Campaign, Change, campaign, closed, factor, in_proportion, moved_by, moves
 
 from sealfit.config import parse_config
 
@@ -19,8 +19,8 @@ EFFECT = {
 AS_IS = Change(lambda given, rng: given)
 
 
-def closure(*effects, verdict="closed"):
-    return {"verdict": verdict, "effects": list(effects)}
+def closure(*effects, verdict="closed", after=0.1):
+    return {"verdict": verdict, "effects": list(effects), "before": {"rmse_N": 0.5}, "after": {"rmse_N": after}}
 
 
 def with_values(**values):
@@ -43,6 +43,7 @@ def test_what_moved_is_said():
         "verdict closed -> nothing_missing",
         "lost ripple(displacement_mm) add force",
     ]
+    assert moves(closure(EFFECT), closure(EFFECT, after=0.2), AS_IS) == ["error after over before 0.2 -> 0.4"]
     # the standard error of A is 0.1 N
     assert moves(closure(EFFECT), closure(with_values(A={"value": 0.509})), AS_IS) == []
     assert moves(closure(EFFECT), closure(with_values(A={"value": 0.52})), AS_IS) == ["ripple A by 0.2 se"]
@@ -58,6 +59,19 @@ def test_numbers_are_compared_after_units_shifts_and_mirrors():
     assert moves(closure(EFFECT), closure(mirrored), Change(AS_IS.make, mirrored=True)) == []
 
 
+def test_a_jitter_ten_times_as_large_moves_numbers_ten_times_as_far():
+    closures = [closure(with_values(A={"value": a}, phi={"value": phi})) for a, phi in ((0.5, 3.1), (0.51, -3.1))]
+    (moved,) = in_proportion(*closures)["effects"]
+    assert [p["value"] for p in moved["parameters"]] == pytest.approx([0.6, 5.0, 3.1 + 10 * (2 * np.pi - 6.2)])
+
+
+def test_fewer_data_move_numbers_by_chance():
+    # Half of one of five runs: 3 sqrt(0.1 / 0.9) = 1 standard error, 0.1 N.
+    for value, what in ((0.59, []), (0.61, ["ripple A by 1.1 se"])):
+        closures = {"as it is": closure(EFFECT), "half_rate": closure(with_values(A={"value": value}))}
+        assert moved_by("half_rate", closures, runs=5) == what
+
+
 def test_a_copy_counts_as_the_column():
     own, copy = ({**EFFECT, "channels": [name]} for name in ("oil_ppm", "oil_ppm_again"))
     assert moves(closure(own), closure(copy), CHANGES["copied_column"]) == []
@@ -69,7 +83,9 @@ def test_every_change_leaves_a_campaign_that_its_config_reads(name):
     runs = pd.DataFrame(
         {"file": [f"f{k}.csv" for k in range(4)], "speed_mm_s": 5.0, "load_N": 50.0, "oil_ppm": [1.0, 2.0, 3.0, 4.0]}
     )
-    trace = pd.DataFrame({"time_s": [0.0, 0.1], "displacement_mm": [1.0, 1.5], "force_N": [20.0, 21.0]})
+    time = np.linspace(0.0, 2.0, 201)
+    place = 11.0 - np.abs(10.0 * time - 10.0)  # there and back
+    trace = pd.DataFrame({"time_s": time, "displacement_mm": place, "force_N": np.where(time < 1.0, 20.0, -20.0)})
     given = Campaign(runs, dict.fromkeys(runs["file"], trace), "")
     made = CHANGES[name].make(given, np.random.default_rng(0))
     assert set(made.runs["file"]) == set(made.traces)
@@ -81,15 +97,21 @@ def test_every_change_leaves_a_campaign_that_its_config_reads(name):
 
 
 # ---------------------------------------------------------------- the short form
-SHORT = ("jitter_time_1e-6", "jitter_commanded_1e-3", "renamed", "mN", "ms", "serial_number")
+SHORT = {
+    "short": ("jitter_time_1e-6", "jitter_position_1e-4", "jitter_position_1e-3", "jitter_samples_1e-6",
+              "jitter_commanded_1e-3", "renamed", "mN", "ms", "serial_number"),
+    "there_and_back": ("split",),
+    "zero_offset": ("jitter_time_1e-4", "jitter_time_1e-3"),
+}  # fmt: skip
 
 
-def test_claims_do_not_hang_on_what_does_not_matter():
-    given = campaign("short")
-    before = closed(given)
-    assert [effect["id"] for effect in before["effects"]] == ["ripple"]
-    moved = {
-        change: moves(before, closed(CHANGES[change].make(given, np.random.default_rng(5))), CHANGES[change])
-        for change in SHORT
-    }
+@pytest.mark.parametrize(
+    ("name", "effect"), [("short", "ripple"), ("there_and_back", "zero_offset"), ("zero_offset", "zero_offset")]
+)
+def test_claims_do_not_hang_on_what_does_not_matter(name, effect):
+    given = campaign(name)
+    changed = {change: CHANGES[change].make(given, np.random.default_rng(5)) for change in SHORT[name]}
+    closures = {change: closed(made) for change, made in {"as it is": given, **changed}.items()}
+    assert [found["id"] for found in closures["as it is"]["effects"]] == [effect]
+    moved = {change: moved_by(change, closures, given.runs["run_id"].nunique()) for change in SHORT[name]}
     assert {change: what for change, what in moved.items() if what} == {}

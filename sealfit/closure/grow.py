@@ -145,7 +145,8 @@ def grow(
             continue
         added, accepted = revisit.one_for_two(fitted, added, accepted)
         added = [*added, accepted]
-        fitted = fit(accepted.proposal.fitted.model, rows, fitted.scatter, turns=2)
+        own = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
+        fitted = fit(own.model, rows, own.scatter, turns=2)
         fitted, kept = _drop_needless(fitted, added)
         # What came and went does not come again.
         refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}

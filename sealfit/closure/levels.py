@@ -77,7 +77,7 @@ def lack_of_fit(fitted: Fitted) -> float | None:
     """
     rows = fitted.rows
     clean = without_repeat_pattern(rows, fitted.residual)
-    keys = rows.table[["run_id", "file"]].assign(residual=clean, force=fitted.force)
+    keys = rows.table[["run_id"]].assign(file=rows.codes("file"), residual=clean, force=fitted.force)
     files = keys.groupby(["run_id", "file"], sort=False).mean().reset_index()
     spread = np.sqrt(fitted.scatter.level_variance("file", files["force"].to_numpy()) + 1e-300)
     noise = fitted.scatter.noise_sd(files["force"].to_numpy())
@@ -118,7 +118,7 @@ def _left_of_model(
         Number of a file of each run.
     """
     rows = fitted.rows
-    number = rows.table.groupby(["run_id", "file"], sort=False).ngroup().to_numpy()
+    number = rows.table.groupby(["run_id", rows.codes("file")], sort=False).ngroup().to_numpy()
     order = np.argsort(number, kind="stable")
     start = np.flatnonzero(np.r_[True, np.diff(number[order]) > 0])
     means = np.add.reduceat(fitted.jacobian.values[order], start, axis=0) / np.bincount(number)[:, None]

@@ -249,9 +249,9 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
         return []
     likeliest = sorted(found, key=lambda p: p.criterion)
     refitted = sorted((_joint(fitted, p) for p in likeliest[:LIKELIEST]), key=lambda p: p.criterion)
-    best = _settled(refitted[0])
-    if refitted[0].fitted.deviance - best.fitted.deviance > DOMINANT:
-        refitted = sorted(_from_anew(fitted, likeliest, best.fitted.scatter), key=lambda p: p.criterion)
+    best, alone = _settled(refitted[0]), _settled(refitted[0], noise=True)
+    if refitted[0].fitted.deviance - alone.fitted.deviance > DOMINANT:
+        refitted = sorted(_from_anew(fitted, likeliest, alone.fitted.scatter), key=lambda p: p.criterion)
         best = _settled(refitted[0])
     elif len(found) > LIKELIEST:
         refitted = sorted([*refitted, *(_joint(fitted, p) for p in likeliest[LIKELIEST:])], key=lambda p: p.criterion)
@@ -271,8 +271,8 @@ def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:
     return replace(proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction))
 
 
-def _settled(proposal: Proposal) -> Proposal:
-    return replace(proposal, fitted=settled(proposal.fitted))
+def _settled(proposal: Proposal, *, noise: bool = False) -> Proposal:
+    return replace(proposal, fitted=settled(proposal.fitted, noise=noise))
 
 
 def _from_anew(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:

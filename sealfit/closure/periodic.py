@@ -97,7 +97,8 @@ class Ripples:
                 self._found = None
                 break
             self.added.append(accepted)
-            own = fit(accepted.proposal.fitted.model, own.rows, own.scatter, turns=2)
+            found = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
+            own = fit(found.model, own.rows, found.scatter, turns=2)
             self.samples = without_ripples(self.samples, own)
             self._begun = self._begin(own.model)
         if fine is None:

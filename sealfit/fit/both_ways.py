@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from sealfit.fit.rows import nesting_run
+from sealfit.fit.rows import nesting_run, records
 
 BOTH = 0  # `direction` of a row that stands for both
 SAME_SPEED = 1.25  # measured speeds within 25 % are one setting: rigs without speed control wander that much
@@ -13,7 +13,7 @@ KEYS = ["file", "run_id"]
 
 
 def both_ways_together(steady: pd.DataFrame) -> pd.DataFrame:
-    """Return table `steady` with one row per file for runs that go both ways at one speed, other rows as they are.
+    """Return table `steady` with one row per record for runs that go both ways at one speed, other rows as they are.
 
     The size of the force is the mean of the two ways, so that an offset between them cancels; what gain and set-up do
     to a file they do to both, and neither tells anything that the other does not.
@@ -30,11 +30,11 @@ def both_ways_together(steady: pd.DataFrame) -> pd.DataFrame:
         `direction` is 0, `force_N` and `speed_mm_s` are sizes, and `run_id` has no sign.
     """
     rows = steady.assign(half_N=np.nan)
-    run = nesting_run(rows)
+    run, record = nesting_run(rows), records(rows)
     pace = rows["speed_mm_s"].abs()
     if "speed_set_mm_s" in rows.columns:
         pace = rows["speed_set_mm_s"].abs().fillna(pace)
-    extent = pd.DataFrame({"file": rows["file"], "run": run, "way": rows["direction"], "pace": pace})
+    extent = pd.DataFrame({"file": record, "run": run, "way": rows["direction"], "pace": pace})
     grouped = extent.groupby(["file", "run"])
     alike = grouped["way"].transform("nunique").eq(2)
     alike &= grouped["pace"].transform("max") <= SAME_SPEED * grouped["pace"].transform("min")
@@ -42,7 +42,7 @@ def both_ways_together(steady: pd.DataFrame) -> pd.DataFrame:
     if not alike.any():
         return rows
     size = {"force_N": rows["force_N"] * rows["direction"], "speed_mm_s": rows["speed_mm_s"].abs()}
-    own = rows.assign(run_id=run, **size)[alike]
+    own = rows.assign(run_id=run, file=record, **size)[alike]
     numbers = [c for c in own.columns if pd.api.types.is_float_dtype(own[c])]
     ways = own.groupby([*KEYS, "direction"], sort=False)[numbers].mean()
     force = ways["force_N"].unstack("direction")

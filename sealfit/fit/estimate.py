@@ -162,8 +162,8 @@ def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray |
     return Fitted(model, scatter, rows, force, friction, jacobian, residual, white, deviance, whitening)
 
 
-def settled(fitted: Fitted) -> Fitted:
-    """Return a fit with the variance components that its own residual shows, the row noise held.
+def settled(fitted: Fitted, *, noise: bool = False) -> Fitted:
+    """Return a fit with the variance components that its own residual shows, and the row noise if asked for.
 
     What a model leaves unexplained between units stands in their variance. Two models are told apart by their deviances
     only if each has its own; under the larger variance of what is missing they all look alike.
@@ -172,9 +172,11 @@ def settled(fitted: Fitted) -> Fitted:
     ----------
     fitted : Fitted
         A fit made under other components; what noise and gains load on is kept, as fits to be compared share it.
+    noise : bool
+        Whether the row noise is estimated anew too. Fits to be compared share it: it is that of the best.
     """
-    rows = fitted.rows
-    scatter = estimate_components(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
+    rows, estimate = fitted.rows, estimate_scatter if noise else estimate_components
+    scatter = estimate(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
     model = as_smooth_as_wanted(fitted.model, rows, scatter, fitted.friction)
     model = descend(model, rows, scatter, centre_of(model), fitted.friction, near=COMPARED)
     return fitted_at(model, rows, scatter, fitted.friction)

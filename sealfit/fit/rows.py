@@ -156,7 +156,7 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
         {
             "specimen": pd.factorize(table["specimen_id"], sort=True)[0],
             "run": pd.factorize(base_run, sort=True)[0],
-            "file": pd.factorize(table["file"], sort=True)[0],
+            "file": pd.factorize(records(table), sort=True)[0],
             "stroke": table["stroke"].to_numpy(),
         }
     )
@@ -270,10 +270,29 @@ def merge(bins: pd.DataFrame, together: int | np.ndarray) -> pd.DataFrame:
     return table.reset_index(level="place", drop=True).reset_index()[list(bins.columns)]
 
 
+def records(table: pd.DataFrame) -> pd.Series:
+    """Return each row's record, named by its first file.
+
+    A file is a record, unless the files of one repeat of a run each hold other strokes (column `stroke` of runs.csv):
+    these are one record that was split.
+    """
+    strokes = table.drop_duplicates(["file", "stroke"])
+    repeat = [strokes["specimen_id"], _unsigned(strokes["run_id"]), strokes["repeat"]]
+    again = pd.concat([*repeat, strokes["stroke"]], axis=1).duplicated(keep=False)
+    file = strokes["file"].astype(str)
+    first = file.groupby(repeat, dropna=False, sort=False).transform("first")
+    whole = again.groupby(repeat, dropna=False, sort=False).transform("any")
+    return table["file"].astype(str).map(dict(zip(file, file.where(whole, first), strict=True)))
+
+
 def nesting_run(table: pd.DataFrame) -> pd.Series:
-    """Return each row's run, without the sign that a file with strokes both ways adds to it."""
-    both_ways = table.groupby("file")["run_id"].transform("nunique") > 1
-    return table["run_id"].where(~both_ways, table["run_id"].str.replace(r"[+-]$", "", regex=True))
+    """Return each row's run, without the sign that a record with strokes both ways adds to it."""
+    both_ways = table.groupby(records(table))["run_id"].transform("nunique") > 1
+    return table["run_id"].where(~both_ways, _unsigned(table["run_id"]))
+
+
+def _unsigned(run: pd.Series) -> pd.Series:
+    return run.str.replace(r"[+-]$", "", regex=True)
 
 
 def open_columns(table: pd.DataFrame) -> list[str]:

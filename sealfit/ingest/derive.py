@@ -177,14 +177,17 @@ def add_runs(columns: Columns, conditions: Coded, measured: Sequence[float], uni
 
 
 def add_repeats(columns: Columns) -> Columns:
-    """Return the columns with a `repeat`: where missing by `started_at` if the whole run has it, else by file order."""
+    """Return the columns with a `repeat`: where missing by `started_at` if the whole run has it, else by file order.
+
+    Files that hold different strokes of a run, as their column `stroke` says, are numbered stroke by stroke.
+    """
     run = columns["run_id"]
     none = nothing(len(run.codes))
-    given, hours = columns.get("repeat", none), columns.get("elapsed_h", none)
+    given, hours, stroke = (columns.get(name, none) for name in ("repeat", "elapsed_h", "stroke"))
     if given.known.all():
         return columns
     runs = defaultdict(list)
-    for i, code in enumerate(run.codes.tolist()):
+    for i, code in enumerate(zip(run.codes.tolist(), stroke.codes.tolist(), strict=True)):
         runs[code].append(i)
     numbers: dict[int, int] = {}
     for members in runs.values():
@@ -200,10 +203,12 @@ def disagreements(entries: Entries, columns: Columns, conditions: Coded) -> list
     """Return faults of runs: a repeat that stands twice, or differs from its run in condition, speed or load."""
     none = nothing(len(entries))
     run, repeat, specimen = (columns[name] for name in ("run_id", "repeat", "specimen_id"))
+    stroke = columns.get("stroke", none)
     told = {"speed_mm_s": columns.get("speed_mm_s", none), "load_N": columns.get("load_N", none)}
     told["condition"] = conditions
     first = _first(run.codes)
     same_repeat = _first(run.codes.astype(np.int64) * (len(repeat.values) + 1) + repeat.codes)
+    same_repeat = _first(same_repeat * (len(stroke.values) + 1) + stroke.codes)
     odd = same_repeat != np.arange(len(entries))
     for column in (*told.values(), specimen):
         odd |= column.codes != column.codes[first]
@@ -212,7 +217,7 @@ def disagreements(entries: Entries, columns: Columns, conditions: Coded) -> list
         entry, j, other = entries[i], int(first[i]), int(same_repeat[i])
         if other != i:
             reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
-            mend = "Give every file of a run its own repeat number."
+            mend = "Give every file of a run its own repeat number, or each stroke of a repeat its number."
             faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], mend=mend))
         for name, column in told.items():
             mine, theirs = column[i], column[j]

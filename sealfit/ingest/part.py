@@ -141,7 +141,8 @@ def sample_columns(files: Sequence[FileStrokes], strokes: Mapping[str, list]) ->
     length = [len(made.samples["time_s"]) for made in parts]
     columns = {name: _stacked([made.samples.get(name) for made in parts], length) for name in names}
     first = np.concatenate(([0], np.cumsum([len(made.strokes) for made in parts])[:-1]))
-    columns["row"] = np.repeat(first, length) + columns["stroke"] - 1
+    first = first - [made.strokes[0]["stroke"] for made in parts]
+    columns["row"] = np.repeat(first, length) + columns["stroke"]
     used = np.array(strokes["used"], bool)
     if not used.all():
         for name in ("steady", "sliding"):

@@ -21,8 +21,7 @@ LONG = 0.1  # rise to 63 % over more than this share of the stroke: a stroke har
 LENGTHS = np.geomspace(0.3, 3.0, 25)  # rise lengths that are tried, as multiples of the distance to 63 %
 GRID_ROWS = 8192  # rows of starts fitted at once: bounds the memory, times the lengths that are tried
 MARGIN = 1.05  # the first arrival in the later band is early by a part of the last bend
-STEP = 1.06  # from one rise length to the next that is tried on the plateau of the speed; a parabola lies between
-REFINED = STEP ** np.arange(-16, 17)  # those lengths, as multiples of the first ones
+REFINED = 1.06 ** np.arange(-16, 17)  # those that are tried on the plateau of the speed, as multiples of the first ones
 REACH = 16.0  # rise lengths over which that fit reaches: nothing is left of the rise, a slow change is still straight
 SLOPED = 8.0  # rise lengths from which a slope beside the rise can be told from the rise itself
 POWERS = (1, 2)  # of the rivals (1 - x / k)^p: a straight rise (elasticity of the rig, fretting), and a rounded one
@@ -158,7 +157,6 @@ def _left_over(starts: Sequence[Start], lengths_mm: Sequence[float]) -> list[tup
         n = _rows_within(plateau, reaches[i])
         x, beside = plateau.distance_mm[:n], _Beside(plateau.distance_mm[:n], has_slope)
         force = beside.free(plateau.force_N[:n])
-        length *= _step_to_least([beside.fitted(_shape(x, length * step), force)[1] for step in (1 / STEP, 1, STEP)])
         left, squares = beside.fitted(_shape(x, length), force)
         rival = min(beside.fitted(_shape(x, end[i], p), force)[1] for p, end in zip(POWERS, ends, strict=True))
         if n * math.log(max(squares, 1e-300) / max(rival, 1e-300)) > UNLIKELY:
@@ -191,15 +189,6 @@ def _shape(x_mm: np.ndarray, length_mm: np.ndarray | float, power: int | None = 
     """Return exp(-x / length), or with a power (1 - x / length)^power up to where it is 0."""
     share = x_mm / length_mm
     return np.exp(-share) if power is None else np.maximum(1.0 - share, 0.0) ** power
-
-
-def _step_to_least(squares: Sequence[float]) -> float:
-    """Return the factor, between 1 / STEP and STEP, at which a parabola through the values at these and 1 is least."""
-    before, here, after = squares
-    bend = before - 2.0 * here + after
-    if not bend > 0.0:
-        return 1.0
-    return float(STEP ** min(max(0.5 * (before - after) / bend, -1.0), 1.0))
 
 
 def _level_N(start: Start) -> float | None:
@@ -277,7 +266,7 @@ def _rise_lengths_mm(
     sloped: Sequence[bool],
     power: int | None = None,
 ) -> list[float]:
-    """Return x_0 of F = A + B x - C exp(-x / x_0) of every start, by least squares on a grid around its scale.
+    """Return x_0 of F = A + B x - C exp(-x / x_0) of every start, by least squares on a grid around its scale, refined.
 
     What A + B x explains is the same for every x_0. So both are taken out of the force and of each exponential, and
     the best x_0 is the one whose exponential's rest explains most of the force's rest. B is 0 where a start is not
@@ -294,10 +283,27 @@ def _rise_lengths_mm(
         for group in (members[i : i + size] for i in range(0, len(members), size)):
             lengths = np.array([scales_mm[i] for i in group])[:, None] * multiples
             parts = [starts[i] for i in group], [rows[i] for i in group], [sloped[i] for i in group]
-            best = np.argmax(_explained(*parts, lengths, power), axis=1)
-            for i, choices, place in zip(group, lengths, best.tolist(), strict=True):
-                made[i] = float(choices[place])
+            for i, length in zip(group, _at_most(lengths, _explained(*parts, lengths, power)), strict=True):
+                made[i] = length
     return made
+
+
+def _at_most(lengths_mm: np.ndarray, explained: np.ndarray) -> list[float]:
+    """Return for every start the length at which most is explained: the vertex of the parabola, over the logarithm,
+    through the best of its lengths and the two beside it. It moves without a jump from one length to the next.
+
+    Examples
+    --------
+    >>> _at_most(np.array([[1.0, 2.0, 4.0, 8.0]]), np.array([[0.0, 3.0, 3.0, 0.0]]))  # the square root of 8
+    [2.8284271247461903]
+    """
+    rows, best = np.arange(len(lengths_mm)), np.argmax(explained, axis=1)
+    middle = np.clip(best, 1, lengths_mm.shape[1] - 2)
+    before, here, after = (explained[rows, middle + k] for k in (-1, 0, 1))
+    bend = before - 2.0 * here + after
+    inside = (middle == best) & (bend < 0.0)
+    step = np.where(inside, 0.5 * (before - after) / np.where(inside, bend, 1.0), 0.0)
+    return (lengths_mm[rows, best] * (lengths_mm[:, 1] / lengths_mm[:, 0]) ** step).tolist()
 
 
 def _explained(

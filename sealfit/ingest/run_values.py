@@ -14,6 +14,7 @@ from sealfit.ingest.runs_csv import Entries
 from sealfit.ingest.text import as_number
 
 NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
+COUNTS = {"repeat": "repeats", "stroke": "strokes"}  # whole numbers
 _MOSTLY = 0.8  # a column with this share of numbers is one of numbers, and the rest of its cells are slips
 
 
@@ -39,7 +40,7 @@ def _column(name: str, cells: Coded, entries: Entries, config: Config) -> tuple[
     bad = [value is None or not math.isfinite(value) for value in number]
     wrong = np.flatnonzero(np.array([*bad, False], bool)[cells.codes])
     count = int(cells.known.sum())
-    known = name in NUMBERS or name == "repeat"
+    known = name in NUMBERS or name in COUNTS
     if len(wrong) and not known and len(wrong) >= (1 - _MOSTLY) * count:
         return labels, []
     if len(wrong) and not known and name not in config.condition:
@@ -54,9 +55,9 @@ def _column(name: str, cells: Coded, entries: Entries, config: Config) -> tuple[
     ]
     # nan: not missing, but wrong
     values = Coded(cells.codes, [math.nan if value is None else value for value in number])
-    if name != "repeat":
+    if name not in COUNTS:
         return values, faults
-    mend = "Number the repeats 1, 2, 3."
+    mend = f"Number the {COUNTS[name]} 1, 2, 3."
     faults += [
         entries[i].fault("not_a_number", "is no whole number.", name, value=values[i], mend=mend)
         for i in np.flatnonzero(values.where(lambda value: math.isfinite(value) and value != int(value))).tolist()

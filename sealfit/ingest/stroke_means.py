@@ -167,6 +167,7 @@ def _finished(bundle: _Bundle, found: Found, config: Config, skip: Sequence[int]
             made.append(Made(()))
             continue
         ref, faults, several_here = bundle.refs[i], bundle.faults[i], bool(several[i])
+        before = int(ref.channels.get("stroke", 1)) - 1  # strokes of the record that other files hold
         for k in mine:
             number = int(found.number[k]) if several_here else None
             wrong: list[Fault] = []
@@ -175,13 +176,14 @@ def _finished(bundle: _Bundle, found: Found, config: Config, skip: Sequence[int]
                 wrong = stroke_faults(ref.file, number, stroke, time_s[own], force[own], bundle.line[own], config)
             used = not any(fault.action == "stroke left out" for fault in wrong)
             row = rows[k] = {**ref.channels, **rows[k], "several": several_here, "used": used}
+            row["stroke"] += before
             if used:
                 wrong = wrong + rising_faults(ref.file, number, row["left"], row["force_N"], unit)
             if used and OWN_SPEED in row:
                 wrong = wrong + speed_column_faults(ref.file, number, row["speed_mm_s"], row[OWN_SPEED], config)
             faults.extend(wrong)
         faults.extend(_load_faults(ref, bundle.columns, [rows[k] for k in mine], config))
-        columns = {name: values[own] for name, values in samples.items()}
+        columns = {name: values[own] + before if name == "stroke" else values[own] for name, values in samples.items()}
         made.append(Made(tuple(faults), tuple(rows[k] for k in mine), columns))
     return made
 

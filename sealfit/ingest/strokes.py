@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealfit.config import Strokes
-from sealfit.ingest.pieces import Pieces, quantile
+from sealfit.ingest.pieces import Pieces, median, quantile
 from sealfit.ingest.running import running_mean, running_median
 from sealfit.ingest.window import slopes, speeds_along, steady_windows
 
@@ -165,23 +165,26 @@ def displacement_noises_mm(displacement_mm: np.ndarray, traces: Pieces) -> np.nd
     """Return the standard deviation of one displacement sample, noise and resolution together, of every trace.
 
     Second differences of a steady motion hold noise only: their variance is six times that of a sample. The 90th
-    percentile is blind to gaps, stops and spikes. Where many neighbours are equal the step between the others is the
-    resolution, whose rounding error is uniform: step / sqrt(12). 0 of less than three samples.
+    percentile is blind to gaps, stops and spikes. Where most of the way is covered by single steps between rows that
+    hardly differ, these are the resolution, whose rounding error is uniform: step / sqrt(12). A rest before or after
+    the motion is no such step, be its rows equal or not. 0 of less than three samples.
     """
     steps = traces.steps(displacement_mm)
     bend = np.zeros(len(steps))
     np.abs(steps[1:] - steps[:-1], out=bend[:-1])
     steps = np.abs(steps)
-    moving = traces.sum(steps > 0.0)
-    few = (moving > 0) & (moving < 0.9 * (traces.size - 1))
+    beside = np.zeros(len(steps))
+    beside[1:] += steps[:-1]
+    beside[:-1] += steps[1:]
+    single = steps > 2.0 * beside
+    coarse = traces.sum(np.where(single, steps, 0.0)) > 0.5 * traces.sum(steps)
     made = np.zeros(len(traces))
     for i, rows in enumerate(traces.slices):
         if rows.stop - rows.start < 3:
             continue
         made[i] = quantile(bend[rows.start : rows.stop - 2], 0.9) / (1.645 * np.sqrt(6.0))
-        if few[i]:
-            own = steps[rows]
-            made[i] = max(made[i], quantile(own[own > 0.0], 0.05) / np.sqrt(12.0))
+        if coarse[i]:
+            made[i] = max(made[i], median(steps[rows][single[rows]]) / np.sqrt(12.0))
     return made
 
 

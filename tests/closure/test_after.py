@@ -149,7 +149,7 @@ def test_starts_are_fitted_to_forces_without_the_offset():
     """A straight rise over 1 mm to 30 N, and 2 N more shown by the sensor."""
     distance = np.linspace(0.0, 10.0, 400)
     force = 30.0 * np.minimum(distance, 1.0) + 2.0
-    keys = {"file": "a.csv", "stroke": 1, "condition": "unaged", "direction": 1}
+    keys = {"file": "a.csv", "repeat": 1, "stroke": 1, "specimen_id": "s", "condition": "unaged", "direction": 1}
     trace = pd.DataFrame({**keys, "time_s": distance, "displacement_mm": distance, "force_N": force})
     steady = {**keys, "series": "unaged", "rubber": "rubber", "run_id": "r", "speed_mm_s": 1.0, "speed_set_mm_s": 1.0}
     steady = pd.DataFrame([{**steady, "load_N": 50.0, "force_N": 30.0, "effects_start_N": 2.0, "used": True}])

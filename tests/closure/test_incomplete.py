@@ -85,8 +85,9 @@ def test_a_column_that_many_files_lack_is_left_out_and_said(campaign, tmp_path):
 def bins(**columns):
     file = np.repeat([f"f{k}" for k in range(6)], 2)
     table = {
-        "file": file, "run_id": np.repeat(["a", "b", "c"], 4), "stroke": 1, "specimen_id": "s", "condition": "c",
-        "series": "", "rubber": "", "force_N": 1.0, "speed_mm_s": 1.0, "load_N": 2.0, "n": 9, "displacement_mm": 1.0,
+        "file": file, "run_id": np.repeat(["a", "b", "c"], 4), "repeat": np.tile([1, 1, 2, 2], 3), "stroke": 1,
+        "specimen_id": "s", "condition": "c", "series": "", "rubber": "", "force_N": 1.0, "speed_mm_s": 1.0,
+        "load_N": 2.0, "n": 9, "displacement_mm": 1.0,
     }  # fmt: skip
     return pd.DataFrame({**table, **{name: np.repeat(values, 2) for name, values in columns.items()}})
 

@@ -4,9 +4,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bins_helpers import make_bins
 
 from sealfit.closure import naming
+from sealfit.closure.grow import numbered
+from sealfit.closure.ripple import Peak
 from sealfit.effects import EFFECTS
+from sealfit.fit.estimate import fit_declared
+from sealfit.fit.rows import make_rows
 
 PRICE = 11.5  # of a number, where many strokes are the evidence
 
@@ -34,3 +39,19 @@ def test_a_mechanism_acts_on_what_the_strokes_say_where_they_say_it(behind, firs
     ]
     chosen = naming._ordered(None, found)[0]
     assert (chosen.term.effect.id, chosen.term.acts_on) == ("warming_distance", first)
+
+
+def test_rivals_are_told_apart_under_the_noise_that_the_effect_leaves():
+    """The friction of these strokes differs by a third, so a ripple that is an added force is no factor on it.
+
+    Strokes start at places of their own: the ripple stands in the noise of the rows while it is missing.
+    """
+    bins = numbered(make_bins(days=(), repeats=2, noise_N=0.05)).assign(n=1)
+    start = np.random.default_rng(1).uniform(0.0, 8.0, bins["file"].nunique())
+    place = bins["displacement_mm"] + start[bins["file"].factorize()[0]]
+    bins = bins.assign(displacement_mm=place, force_N=bins["force_N"] + np.sin(2 * np.pi * place / 8.0))
+    peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0, 1.0)
+    fitted = fit_declared(make_rows(bins, has_aging=True))
+    first, second = naming.propose_ripples(fitted, peak, bins.iloc[:0], EFFECTS)[:2]
+    assert (first.term.acts_on, first.term.operation) == ("force", "add")
+    assert second.criterion - first.criterion > 100

@@ -9,6 +9,7 @@ import pytest
 
 from sealfit.config import Bins, Config, Strokes, load_config
 from sealfit.errors import CampaignError
+from sealfit.fit.rows import LEVELS, make_rows
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.tables import SCHEMAS
 
@@ -150,6 +151,29 @@ def test_files_with_strokes_both_ways_are_two_runs(tmp_path):
     assert second["distance_mm"].iloc[0] == 0.0
     assert second["displacement_mm"].iloc[0] == pytest.approx(40.0, abs=0.1)
     assert set(tables["traces_mean"]["run_id"]) == {"swing+", "swing-"}
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+def test_a_record_split_into_files_of_one_stroke_is_one_record(tmp_path, numbered):
+    whole, split = [], []
+    for repeat in (1, 2, 3):
+        both = write_trace(tmp_path / "whole" / f"{repeat}.csv", seed=repeat, both=True)
+        whole.append(row(f"{repeat}.csv", "a", repeat))
+        for stroke, part in enumerate((both[:500], both[499:]), start=1):
+            file = f"{repeat}_{stroke}.csv"
+            (tmp_path / "split").mkdir(exist_ok=True)
+            part.assign(time_s=part["time_s"] - part["time_s"].iloc[0]).to_csv(tmp_path / "split" / file, index=False)
+            split.append(row(file, "a", repeat, stroke=stroke))
+    found = []
+    for name, rows in (("whole", whole), ("split", split)):
+        listed = pd.DataFrame(rows).drop(columns=[] if numbered else "repeat")
+        found.append(ingest_campaign(write_campaign(tmp_path / name, listed), Config(), workers=1).tables)
+    keys = ["run_id", "repeat", "stroke"]
+    one, other = (tables["steady"].sort_values(keys).reset_index(drop=True) for tables in found)
+    assert one[keys].equals(other[keys])
+    npt.assert_allclose(one["force_N"], other["force_N"], atol=0.01)
+    one, other = (make_rows(tables["bins"], has_aging=True).groups.starts for tables in found)
+    assert [len(one[level]) for level in LEVELS] == [len(other[level]) for level in LEVELS] == [6, 3, 1, 1]
 
 
 def test_runs_of_one_direction_keep_their_names(campaign):

@@ -7,6 +7,7 @@ import pytest
 from sealfit.config import Config, Strokes
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.pieces import Pieces
+from sealfit.ingest.presliding import Start, rises
 from sealfit.ingest.strokes import find_all
 
 LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
@@ -64,6 +65,14 @@ def test_noise_of_the_displacement_does_not_hide_the_rise(ratio):
 def test_twenty_samples_a_second_are_enough_where_the_window_holds_twenty():
     _, steady = steady_forces(11.0, hertz=20.0)
     assert abs(steady.mean() - LEVEL) < 4 * steady.std(ddof=1) / np.sqrt(steady.size) + 1e-4 * LEVEL
+
+
+def test_the_end_of_a_rise_follows_its_length_without_jumps():
+    lengths, x = np.geomspace(0.4, 0.6, 200), np.linspace(0.0, 40.0, 2001)
+    noise = np.random.default_rng(0).normal(0.0, NOISE, x.size)
+    starts = [Start(x, LEVEL * (1.0 - np.exp(-x / length)) + noise, 0) for length in lengths]
+    end = np.array([rise.end_mm for rise in rises(starts)])
+    assert np.abs(np.diff(np.log(end / lengths))).max() < 0.002
 
 
 def test_a_rise_along_a_straight_line_is_no_bristle_and_is_not_corrected():

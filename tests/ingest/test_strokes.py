@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from sealfit.config import Strokes
 from sealfit.ingest.pieces import Pieces
 from sealfit.ingest.presliding import rise_end_mm
-from sealfit.ingest.strokes import find_all, find_strokes, turning_rows
+from sealfit.ingest.strokes import displacement_noises_mm, find_all, find_strokes, turning_rows
 from sealfit.ingest.window import slopes
 
 
@@ -147,6 +147,16 @@ def test_noise_and_resolution_of_the_displacement_neither_split_a_stroke_nor_bia
     found = only(time, x, force)
     assert found.speed_mm_s == pytest.approx(5.0, rel=5e-3)
     assert found.steady.sum() > 800
+
+
+@pytest.mark.parametrize("step", [0.0, 0.5])
+def test_the_noise_of_the_displacement_does_not_rest_on_equal_neighbours(step):
+    _, x, *_ = stroke(lead=3.0, blur=0.0)  # a rest whose rows are equal to the last digit
+    x = np.round(x / step) * step if step else x
+    jittered = x + 1e-6 * np.random.default_rng(0).standard_normal(x.size)
+    noise = [displacement_noises_mm(values, Pieces([x.size]))[0] for values in (x, jittered)]
+    assert noise[0] == pytest.approx(step / np.sqrt(12.0), abs=1e-5)
+    assert noise[1] == pytest.approx(noise[0], abs=1e-5)
 
 
 def test_gaps_do_not_bias_the_speed():
