@@ -1,8 +1,10 @@
 """Measured campaigns by others, from files to report; SEALFIT_MEASURED names the folder of measured data."""
 
+import json
+
 import numpy as np
 import pytest
-from measured import emps_plateaus, kidney, measured
+from measured import emps_plateaus, kidney, kidney_plain, measured
 
 from sealfit.steps import run
 from sealfit.store import Store
@@ -46,3 +48,27 @@ def test_emps_plateaus_go_through(tmp_path):
         assert own.std() < 0.4
     assert sliding(tmp_path / "out")["value"].item() == pytest.approx(21.8, abs=1.5)
     assert np.isfinite(sliding(tmp_path / "out")["se"].item())
+    loop = json.loads((tmp_path / "out" / "closure.json").read_text())
+    # Over the six means of speed and direction the sum of squares is 67 N^2; with an offset 9.0, with an asymmetry of
+    # sigma_2 0.39, with both 0.36: what looks like an offset is the asymmetry, 154 forward and 229 N s/m backward.
+    (asymmetry,) = [e for e in loop["effects"] if e["channels"] == ["direction"]]
+    assert (asymmetry["id"], asymmetry["acts_on"]) == ("asymmetry", "sigma_2")
+    assert asymmetry["parameters"][0]["value"] == pytest.approx(-0.0744, abs=0.01)
+    ripples = [{p["name"]: p["value"] for p in e["parameters"]} for e in loop["effects"] if e["id"] == "ripple"]
+    strongest = max(ripples, key=lambda values: values["A"])
+    assert strongest["lambda"] == pytest.approx(2.50, abs=0.005)
+    assert strongest["A"] == pytest.approx(0.97, abs=0.1)
+    assert loop["after"]["heldout_rmse_N"] < 0.25 * loop["before"]["heldout_rmse_N"]
+
+
+def test_kidney_has_a_slope_along_the_stroke_that_follows_the_pressure(tmp_path):
+    config = kidney_plain(measured(), tmp_path / "campaign")
+    run(tmp_path / "campaign", tmp_path / "out", config)
+    loop = json.loads((tmp_path / "out" / "closure.json").read_text())
+    (slope,) = [e for e in loop["effects"] if e["id"] != "ripple"]
+    assert (slope["id"], slope["acts_on"]) == ("bilinear", "force")
+    assert slope["channels"] == ["displacement_mm", "pressure_bar"]
+    values = {p["name"]: p["value"] for p in slope["parameters"]}
+    at_7_bar = values["B"] + values["A"] * (7 - 4.24)
+    assert at_7_bar == pytest.approx(-0.57, abs=0.06)  # by hand, about -0.6 N/mm
+    assert loop["after"]["heldout_rmse_N"] < 0.5 * loop["before"]["heldout_rmse_N"]

@@ -35,8 +35,9 @@ def judged(judge: Judge, candidates: Sequence[Candidate], rng: np.random.Generat
     for k in many:
         if judgements[k].scores.shape[0] >= JACKKNIFE_UNITS:  # of two ways, each has half of the error
             p_values[k] = 2 * min(p_values[k], len(many) * np.exp(judgements[k].log_p_jackknife))
-    p_values = np.minimum(p_values, adjust_few(judge.few, judgements, rng))
-    p_values = np.minimum(p_values, adjust_slopes(judgements))
+    few_p = np.min([adjust_few(units, judgements, rng) for units in judge.few.values()], axis=0)
+    p_values = np.minimum(p_values, np.minimum(few_p, adjust_slopes(judgements)))
+    p_values[[j.few is not None and bool(j.slopes) for j in judgements]] *= 2  # of two ways, each has half of the error
     found = [replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)]
     return sorted(found, key=lambda c: -c.evidence)
 
@@ -78,16 +79,17 @@ def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.nda
 def adjust_few(
     units: FewUnits, judgements: Sequence[Judgement], rng: np.random.Generator, draws: int = FLIPS
 ) -> np.ndarray:
-    """Return the p-values of the tests on few specimens, adjusted over all of them, shape (m,); 1 for no test."""
+    """Return the p-values of the tests on few units of a level, adjusted over all of them, shape (m,); 1 for none."""
     p_values = np.ones(len(judgements))
-    tried = [k for k, j in enumerate(judgements) if j.few is not None]
+    tried = [k for k, j in enumerate(judgements) if j.few is not None and j.few.level == units.level]
     if tried:
         drawn = units.draws(draws, rng)
         least = np.zeros(draws)
         for k in tried:
             test = judgements[k].few
             least = np.minimum(least, few.log_p_of(drawn[test.target], test.basis, test.known))
-        p_values[tried] = _adjusted([judgements[k].few.log_p for k in tried], least)
+        logs = np.array([judgements[k].few.log_p for k in tried])
+        p_values[tried] = np.minimum(_adjusted(logs, least), len(tried) * np.exp(logs))  # below what draws resolve
     return p_values
 
 

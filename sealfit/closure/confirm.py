@@ -262,7 +262,7 @@ def _gain(
             known[*key, number] = _left_in(before, before.model, out, held)
         white = []
         for k, left in enumerate((known[*key, number], _left_in(before, after.model, out, held))):
-            residual = _about(left[inside], test, around)
+            residual = about_means(left[inside], test, around)
             squares[k] += float(weight @ residual**2)
             white.append(test.groups.sums(whitening(residual[:, None])[:, 0] ** 2, proposal.unit))
         falls.append(white[0] - white[1])
@@ -287,10 +287,10 @@ def _around(proposal: Proposal) -> str | None:
         return None
     added = _added_force(proposal)
     least = MOSTLY * float(np.var(added))
-    return next((level for level in LEVELS if np.mean(_about(added, rows, level) ** 2) >= least), None)
+    return next((level for level in LEVELS if np.mean(about_means(added, rows, level) ** 2) >= least), None)
 
 
-def _about(values: np.ndarray, rows: Rows, level: str | None) -> np.ndarray:
+def about_means(values: np.ndarray, rows: Rows, level: str | None) -> np.ndarray:
     """Return values less their mean in each group of a level and direction: an offset between these is no shape."""
     if level is None:
         return values

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import FINER, Channel, incomplete_channels, unit_of
-from sealfit.closure.confirm import Added, Refused
+from sealfit.closure.confirm import Added, Refused, about_means
 from sealfit.closure.forms import describe, free_term
 from sealfit.closure.grow import Grown
 from sealfit.closure.intervals import effect_intervals
@@ -59,13 +59,20 @@ class Ends:
             return None
         return float(np.sqrt(weight @ (rows.force - held)[chosen] ** 2 / weight.sum()))
 
-    @property
-    def gains(self) -> bool:
-        """Whether after has no higher errors than before, in sample and held out."""
-        weight = self.before.rows.weight
-        inside = [float(np.sqrt(weight @ f.residual**2)) for f in (self.before, self.after)]
-        held = [self.heldout_rmse_N(h) for h in (self.held_before, self.held_after)]
-        return inside[1] <= SAME_ERROR * inside[0] and (held[0] is None or held[1] <= SAME_ERROR * held[0])
+    def gains(self, around: str | None) -> bool:
+        """Whether after has no higher errors than before, in sample and held out.
+
+        Errors are about the means of a level's groups where one is named.
+        """
+        rows, weight = self.before.rows, self.before.rows.weight
+        inside = [weight @ about_means(f.residual, rows, around) ** 2 for f in (self.before, self.after)]
+        squares = [inside]
+        known = np.isfinite(self.held_before) & np.isfinite(self.held_after) & self.covered
+        if known.any():
+            test = rows.subset(known)
+            left = [about_means(test.force - h[known], test, around) for h in (self.held_before, self.held_after)]
+            squares.append([test.weight @ own**2 for own in left])
+        return all(after <= SAME_ERROR**2 * before for before, after in squares)
 
 
 def closure_document(
@@ -113,13 +120,13 @@ def closure_document(
     }
 
 
-def fit_quality(errors_after: Mapping, floor_N: float | None) -> dict:
+def fit_quality(squaresafter: Mapping, floor_N: float | None) -> dict:
     """Return closure.json's `fit_quality`: whether the error is what repeats scatter by, or how many times that."""
-    p_value = errors_after["lack_of_fit_p"]
+    p_value = squaresafter["lack_of_fit_p"]
     if floor_N is None or p_value is None:
         return {"state": "unknown", "ratio": None, "p_value": None}
     state = "above_scatter" if p_value < LACK_OF_FIT else "within_scatter"
-    return {"state": state, "ratio": errors_after["rmse_N"] / max(floor_N, 1e-300), "p_value": p_value}
+    return {"state": state, "ratio": squaresafter["rmse_N"] / max(floor_N, 1e-300), "p_value": p_value}
 
 
 def _refused(item: Refused, rows: Rows) -> dict:

@@ -1,4 +1,4 @@
-r"""Few units: does one number per specimen follow a channel, held against the specimens' own scatter?
+r"""Few units: does one number per specimen, or per run, follow a channel, held against the units' own scatter?
 
 What acts on a quantity and is constant within a specimen shifts each specimen along one direction, the slope of that
 quantity. With g_u that direction in specimen u (whitened, of length 1), :math:`\rho_u = g_u^T r_u` is one number a
@@ -6,6 +6,8 @@ specimen; what the current model has taken out of them is known, and without it 
 if specimens scatter alike. A channel's columns then stand against what is left of them by an F test. A few numbers may
 look quieter than they are: where runs and files explain their variance of 1, that counts as if eight more had been seen
 (moderated F: Smyth 2004, doi:10.2202/1544-6115.1027); where it is the specimens' own, it is known from nothing else.
+
+The same test holds what is constant in runs against their own scatter where there are few of these.
 
 A dozen specimens have too few sign flips for a search of hundreds of candidates, and a strong effect stands in its own
 denominator there. The F test needs normal scatter instead; its p-values are adjusted by the largest over all candidates
@@ -31,6 +33,7 @@ LEAST_LEFT = 0.01  # of a number's variance: what the model has taken out beyond
 KNOWN = 8.0  # degrees of freedom that a variance counts for which runs and files explain
 LEAST_KNOWN = 0.5  # of these degrees of freedom; with fewer the scale is free and no draw depends on it
 LEAST_ERROR = 4  # degrees of freedom left for the specimens' scatter, with fewer of which nothing is claimed
+LEAST_ERROR_OF_RUNS = 3  # the same for runs: three speeds both ways leave three
 
 
 class FewTest(NamedTuple):
@@ -43,6 +46,12 @@ class FewTest(NamedTuple):
     log_p: float  # not adjusted
     share: float  # of the columns' sum of squares that is one number a unit
     error_df: int  # numbers left for the units' own scatter
+    level: str = "specimen"  # of the units
+
+    @property
+    def sure(self) -> bool:
+        """Whether enough is left to show the units' own scatter."""
+        return self.error_df >= (LEAST_ERROR if self.level == "specimen" else LEAST_ERROR_OF_RUNS)
 
 
 class Numbers(NamedTuple):
@@ -114,25 +123,31 @@ class FewUnits:
     @cached_property
     def _finer(self) -> Whitening:
         """What whitens columns where the units themselves do not scatter."""
-        fitted = self.fitted
-        finer = tuple(c for c in fitted.scatter.components if c.level != self.level)
+        fitted, starts = self.fitted, self.fitted.rows.groups.starts
+        units = starts[self.level].size  # without repeats a run is a file, and their scatter is one
+        finer = tuple(c for c in fitted.scatter.components if starts[c.level].size > units)
         return Whitening(replace(fitted.scatter, components=finer), fitted.friction, fitted.rows.groups)
 
     def numbers(self, target: tuple[str, str]) -> Numbers:
         """Return the units' numbers along the direction of a quantity: (acts_on, operation)."""
         if target not in self._numbers:
             fitted, groups = self.fitted, self.fitted.rows.groups
-            white = fitted.whitening(fitted.slope(*target)[:, None])[:, 0]
-            size = np.sqrt(groups.sums(white**2, self.level))
-            direction = white * np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)[groups.codes[self.level]]
-            taken = fitted.basis.sums(groups, self.level, direction)
-            root = (Root if size.size > MANY else small_root)(taken, size > 0)
-            values = root @ groups.sums(direction * self._residual, self.level)
-            df = root.df if isinstance(root, Root) else values.size
-            finer = groups.sums(self._finer(fitted.slope(*target)[:, None])[:, 0] ** 2, self.level)
-            explained = float(np.mean((size**2)[finer > 0] / finer[finer > 0]))
-            self._numbers[target] = Numbers(direction, taken, root, values, df, KNOWN * min(explained, 1.0))
+            slope = fitted.slope(*target)[:, None]
+            white = fitted.whitening(slope)[:, 0]
+            size, finer = (groups.sums(w**2, self.level) for w in (white, self._finer(slope)[:, 0]))
+            explained = float(np.mean(size[finer > 0] / finer[finer > 0]))
+            self._numbers[target] = self.along(white)._replace(known=KNOWN * min(explained, 1.0))
         return self._numbers[target]
+
+    def along(self, white: np.ndarray) -> Numbers:
+        """Return the units' numbers along a whitened column, shape (n,); their scatter is known from them alone."""
+        groups = self.fitted.rows.groups
+        size = np.sqrt(groups.sums(white**2, self.level))
+        direction = white * np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)[groups.codes[self.level]]
+        taken = self.fitted.basis.sums(groups, self.level, direction)
+        root = (Root if size.size > MANY else small_root)(taken, size > 0)
+        values = root @ groups.sums(direction * self._residual, self.level)
+        return Numbers(direction, taken, root, values, root.df if isinstance(root, Root) else values.size, 0.0)
 
     def test(self, left: np.ndarray, target: tuple[str, str]) -> FewTest | None:
         """Return the F test of projected columns, shape (n, k), on a quantity; None with too few units for one."""
@@ -145,7 +160,7 @@ class FewUnits:
         chi2 = float(((numbers.values @ basis) ** 2).sum())
         log_p = float(log_p_of(numbers.values[None, :], basis, numbers.known, d)[0])
         share = float((columns**2).sum() / max((left**2).sum(), 1e-300))
-        return FewTest(target, basis, numbers.known, chi2, log_p, share, d - k)
+        return FewTest(target, basis, numbers.known, chi2, log_p, share, d - k, self.level)
 
     def draws(self, count: int, rng: np.random.Generator) -> dict[tuple[str, str], np.ndarray]:
         """Return numbers as chance alone would give them, for each quantity of shape (count, d), correlated as here."""

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, FREE_DF, Channel, even_knots, scaled
+from sealfit.closure.channels import CALENDAR, FINER, FREE_DF, Channel, even_knots, scaled
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.judge import Candidate, Judgement
 from sealfit.closure.linearised import middles
 from sealfit.closure.ripple import Peak
 from sealfit.closure.waves import common_wavelength, pass_shifts
 from sealfit.effects.categories import LEVELS, SLOPES
-from sealfit.effects.contract import CHANNEL, SECOND, Effect
+from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect
 from sealfit.effects.free import SMOOTH, SURFACE, WIDE, free_effect, natural
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import Rows
@@ -92,14 +92,16 @@ def _terms_of_single(
             continue
         if target not in effect.acts_on or not _all_read(effect, channels, fitted.rows, effects):
             continue
-        if effect.reads == (CHANNEL,):
+        if effect.reads in READS_ANY and SECOND not in effect.reads:
             if not channel.numeric or name == "direction":
                 continue
+            if effect.id == "offset_slope" and (FINER[channel.unit] <= FINER["stroke"] or _has_offset(fitted)):
+                continue  # the offset is an effect of its own inside strokes, or is in the model
             if not _in_domain(effect, channel.values) or (name in CALENDAR and effect.id in WAVY):
                 continue
             fixed = {"x_ref": reference(channel.values)}
             held = _within_reach(effect, channel.values)
-            yield Term(held, (name,), *target, fixed=fixed), grid_of(held, channel.values)
+            yield Term(held, (name, *effect.reads[1:]), *target, fixed=fixed), grid_of(held, channel.values)
         elif name in effect.reads:
             fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
             grids = grid_of(effect, np.abs(channel.values))
@@ -108,6 +110,10 @@ def _terms_of_single(
                 yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids
     if name != "direction":
         yield free_term(channel, *target, knots=knots), {}
+
+
+def _has_offset(fitted: Fitted) -> bool:
+    return any(term.effect.id == "zero_offset" for term in fitted.model.terms)
 
 
 def _all_read(effect: Effect, channels: Mapping[str, Channel], rows: Rows, effects: Mapping[str, Effect]) -> bool:
@@ -246,7 +252,7 @@ def _in_domain(effect: Effect, values: np.ndarray) -> bool:
     """Whether a form gives numbers at every value of the channel."""
     sample = np.unique(values)[:: max(1, np.unique(values).size // 50)]
     with np.errstate(all="ignore"):
-        result = effect.shape({CHANNEL: sample, "x_ref": reference(values)}, **effect.start())
+        result = effect.shape({CHANNEL: sample, "direction": 1.0, "x_ref": reference(values)}, **effect.start())
     return bool(np.isfinite(result).all())
 
 

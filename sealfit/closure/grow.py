@@ -12,8 +12,10 @@ import pandas as pd
 from sealfit.closure.channels import CALENDAR, Channel, channels_of
 from sealfit.closure.confirm import TRIES, WEAK, Added, Refused, confirmed
 from sealfit.closure.forms import PERIODIC
+from sealfit.closure.joint import Hidden, search_joint
 from sealfit.closure.judge import Candidate, Judge
 from sealfit.closure.laws import AGING, richer_laws
+from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import HALF, propose, rivals
 from sealfit.closure.pairs import pairs_in_disguise, search_pairs
 from sealfit.closure.periodic import Ripples
@@ -109,7 +111,12 @@ def grow(
     refused: set[tuple] = set()
     not_confirmed = ripples.refused
     left: Candidate | Peak | None = None
+    hidden: list[Hidden] = []  # effects that hide each other, until both are in the model
     again = False  # whether earlier effects have been asked again
+
+    def ask(base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[Refused]) -> Added | None:
+        return confirmed(base, proposals, ripples.samples, config, number, say, compare=compare, refused=failed)
+
     for number in range(len(added) + 1, config.loop.max_rounds + 3):
         if fitted is not judge.fitted:
             judge = Judge(fitted)
@@ -118,11 +125,23 @@ def grow(
         say(f"round {number}: {len(last)} candidates on {len(channels)} channels, {len(significant)} significant")
         aged = not significant or any(c.channels == (AGING,) for c in significant)
         laws = richer_laws(fitted, channels, effects) if aged else []
+        pairs = []
         if not significant or significant[0].p_value > DOUBTFUL:
             pairs = search_pairs(judge, list(channels.values()), last, rng)
             together = [c for c in pairs if c.p_value <= alpha * min((s.p_value for s in significant), default=1.0)]
             say(f"round {number}: {len(pairs)} pairs, {len(together)} significant")
             significant = sorted([*significant, *together], key=lambda c: c.p_value)
+            if not hidden:
+                level = alpha * min((c.p_value for c in significant), default=1.0)
+                hidden = search_joint(judge, channels, [*last, *pairs], level)
+                say(f"round {number}: {len(hidden)} pairs that hide each other")
+                two = next((pair for pair in hidden if {key[0] for key in pair.keys} == {("direction",)}), None)
+                if two is not None and (both := _both(fitted, _awaited([two], last), channels, effects, ask, number)):
+                    added, hidden = [*added, *both], []
+                    fitted = fit(added[-1].proposal.fitted.model, rows, fitted.scatter, turns=2)
+                    continue
+                hidden = [] if significant else [pair for pair in hidden if refused.isdisjoint(pair.keys)]
+        significant = _awaited(hidden, (*last, *pairs)) or significant
         significant += [c for c, _ in laws if c.p_value <= alpha and c.sure]
         left = significant[0] if significant else ripples.found
         significant += pairs_in_disguise(judge, significant, channels)
@@ -137,12 +156,13 @@ def grow(
             continue
         open_ += [c for c in _standing_for(open_, last) if c.key not in refused]
         proposals = propose(fitted, open_, channels, effects, [p for _, p in laws])
-        accepted = confirmed(
-            fitted, proposals, ripples.samples, config, number, say, compare=compare, refused=not_confirmed
-        )
+        accepted = ask(fitted, proposals, number, not_confirmed)
         if accepted is None:
             refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
+            hidden = []
             continue
+        source = accepted.proposal.source
+        hidden = [pair.without(source) for pair in hidden if source in pair.keys]
         added, accepted = revisit.one_for_two(fitted, added, accepted)
         added = [*added, accepted]
         own = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
@@ -164,6 +184,41 @@ def grow(
     return Grown(
         before, fitted if added else before, tuple(added), first, last, left, unsure, channels, tuple(not_confirmed)
     )
+
+
+def _both(
+    fitted: Fitted,
+    two: Sequence[Candidate],
+    channels: Mapping[str, Channel],
+    effects: Mapping[str, Effect],
+    ask: Callable[..., Added | None],
+    number: int,
+) -> list[Added]:
+    """Return two effects, each confirmed beside the other, as neither predicts held-out data alone; nothing if not."""
+    if len(two) < 2:
+        return []
+    first, second = two
+    base = propose(fitted, [first], channels, effects)[0].fitted
+    later = ask(base, propose(base, [second], channels, effects), number, [])
+    if later is None:
+        return []
+    alone = later.proposal.fitted.model.without_term(len(fitted.model.terms))
+    base = fit(alone, fitted.rows, fitted.scatter, turns=1)
+    earlier = ask(base, propose(base, [first], channels, effects), number, [])
+    return [] if earlier is None else [later, earlier]
+
+
+def _awaited(hidden: Sequence[Hidden], candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return the straight candidates of hidden pairs that are not in the model yet, with the p-value of the pair."""
+    pairs = {key: pair for pair in reversed(hidden) for key in pair.keys}
+    found = []
+    for c in candidates:
+        if c.key in pairs and c.columns.shape[1] == 1:
+            chi2 = max(c.chi2, *(pair.chi2 for pair in hidden if c.key in pair.keys))
+            p_value = min(c.p_value, pairs[c.key].p_value)
+            found.append(replace(c, judgement=c.judgement._replace(chi2=chi2), p_value=p_value))
+    found = [c for c in found if c.evidence > 0]  # else the effects in the model hold it
+    return sorted(found, key=lambda c: c.p_value)
 
 
 def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:

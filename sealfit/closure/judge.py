@@ -15,7 +15,8 @@ estimate is also held against its jackknife over whole units (CV3; MacKinnon, Ni
 doi:10.1016/j.jeconom.2022.04.001). A few runs may hold nearly all that columns say and agree by chance, so what the
 columns explain must count as well: by chi-squared, or by F against the runs' own scatter where they are one number a
 run. With fewer specimens than thirty, what is constant in them is held against their own scatter (`few`), and what
-varies within them against the scatter of their slopes (`slopes`).
+varies within them against the scatter of their slopes (`slopes`); with fewer runs than twenty to tell slopes apart,
+what is constant in runs against the scatter of these (`few`).
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import betainc, chdtrc, fdtrc
 
-from sealfit.closure.channels import FINER
-from sealfit.closure.few import LEAST_ERROR, FewTest, FewUnits
+from sealfit.closure.channels import FINER, MANY_UNITS
+from sealfit.closure.few import FewTest, FewUnits
 from sealfit.closure.slopes import SlopeTest, slope_test
 from sealfit.fit.estimate import Fitted
+from sealfit.fit.rows import LEVELS
 from sealfit.fit.tangent import OwnColumns, Tangent
 
 JACKKNIFE_UNITS = 30  # from which the jackknife is tried
@@ -78,7 +80,7 @@ class Candidate:
     def sure(self) -> bool:
         """Whether it may be claimed: too few specimens do not show their own scatter, or show that they differ."""
         agree = all(test.agree[np.argmax(np.abs(test.slope))] for test in self.judgement.slopes)
-        return agree and (self.judgement.few is None or self.judgement.few.error_df >= LEAST_ERROR)
+        return agree and (self.judgement.few is None or self.judgement.few.sure)
 
     @property
     def chi2(self) -> float:
@@ -118,8 +120,7 @@ class Judge:
 
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
-        self.few = FewUnits(fitted)
-        self._runs = FewUnits(fitted, "run")
+        self.few = {level: FewUnits(fitted, level) for level in LEVELS}
         self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
@@ -180,10 +181,26 @@ class Judge:
         if not few:
             return weakest
         if level == "specimen":
-            test = self.few.test(variants[0], target)
+            test = self.few[level].test(variants[0], target)
             return weakest if test is None else weakest._replace(chi2=test.chi2, df=test.basis.shape[1], few=test)
         tests = tuple(slope_test(self.fitted, left, between) for left in variants)
-        return None if any(test is None for test in tests) else weakest._replace(slopes=tests)
+        if any(test is None for test in tests):
+            return None
+        return weakest._replace(slopes=tests, few=self._of_few_runs(variants, between, level, target))
+
+    def _of_few_runs(
+        self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]
+    ) -> FewTest | None:
+        """Return the F test, of all variants that which says least, of columns constant in each of a few runs.
+
+        It is exact there, while the variance of a slope from half a dozen runs has two or three degrees of freedom.
+        """
+        if not between == level == "run" or self.fitted.rows.groups.starts["run"].size >= MANY_UNITS:
+            return None
+        tests = [self.few["run"].test(left, target) for left in variants]
+        if any(test is None or test.share <= CONSTANT for test in tests):
+            return None
+        return max(tests, key=lambda test: test.log_p)
 
     def _judge(self, left: np.ndarray, level: str, target: tuple[str, str]) -> Judgement | None:
         fitted = self.fitted
@@ -202,7 +219,7 @@ class Judge:
         if units >= JACKKNIFE_UNITS:
             explained = _log(chdtrc(left.shape[1], total @ total))
             if level == "run" and explained < np.log(WORTH_A_LOOK):
-                test = self._runs.test(left, target)
+                test = self.few["run"].test(left, target)
                 if test is not None and test.share > CONSTANT:
                     explained = min(explained, test.log_p)
             if explained < np.log(PROMISING):

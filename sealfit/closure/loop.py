@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import Refused, covered, folds, heldout_level
+from sealfit.closure.confirm import Added, Refused, covered, folds, heldout_level
 from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import Ends, closure_document, effect_table
-from sealfit.closure.forms import describe
+from sealfit.closure.forms import PERIODIC, describe
 from sealfit.closure.grow import Grown, Start, grow, numbered, predict_rows, steady_samples
 from sealfit.closure.judge import JACKKNIFE_UNITS
 from sealfit.closure.levels import level_table
@@ -287,7 +287,7 @@ def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], 
     What is left out was significant: it is put on record as refused, and the verdict says that something is left.
     """
     refused = []
-    while grown.added and not ends.gains:
+    while grown.added and not ends.gains(_around(grown.added)):
         last = grown.added[-1].proposal
         say(f"left out, as the error is no lower with it: {describe(last.term)}")
         refused.append(Refused(last.term, last.p_value, "with it the error is no lower, in sample or held out"))
@@ -300,6 +300,14 @@ def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], 
         else:
             ends = replace(ends, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model))
     return replace(grown, refused=(*grown.refused, *refused), worse=tuple(refused)), ends
+
+
+def _around(added: Sequence[Added]) -> str | None:
+    """Return the level about whose means the error is taken: that of the strokes where there are ripples alone.
+
+    Ripples change nothing that runs differ by, and that may be most of the error.
+    """
+    return "stroke" if all(a.proposal.term.effect.id in PERIODIC for a in added) else None
 
 
 def _residual_table(bins: pd.DataFrame, fitted: Fitted, held: np.ndarray) -> pd.DataFrame:

@@ -24,10 +24,12 @@ from sealfit.effects.humidity import HUMIDITY
 from sealfit.effects.hyperbolic import HYPERBOLIC
 from sealfit.effects.lab_temperature import LAB_TEMPERATURE
 from sealfit.effects.linear import LINEAR
+from sealfit.effects.linear_each_way import LINEAR_EACH_WAY
 from sealfit.effects.load_exponent import LOAD_EXPONENT
 from sealfit.effects.log import LOG
 from sealfit.effects.log_growth import LOG_GROWTH
 from sealfit.effects.log_rate import LOG_RATE
+from sealfit.effects.offset_slope import OFFSET_SLOPE
 from sealfit.effects.power import POWER
 from sealfit.effects.power_viscous import POWER_VISCOUS
 from sealfit.effects.product import PRODUCT
@@ -62,6 +64,7 @@ EFFECTS = {
         RIPPLE,
         DRIFT,
         ZERO_OFFSET,
+        OFFSET_SLOPE,
         ASYMMETRY,
         CONDITIONING,
         RUN_IN,
@@ -82,6 +85,7 @@ EFFECTS = {
         LAB_TEMPERATURE,
         HUMIDITY,
         LINEAR,
+        LINEAR_EACH_WAY,
         QUADRATIC,
         PRODUCT,
         PRODUCT_LOG,

@@ -20,6 +20,9 @@ CHANNEL = "x"
 SECOND = "z"
 """In `Effect.reads` after CHANNEL: any second channel, for the effects of a pair."""
 
+READS_ANY = ((CHANNEL,), (CHANNEL, "direction"), (CHANNEL, SECOND))
+"""What `Effect.reads` may be where it holds CHANNEL."""
+
 AMPLITUDE = (-1e9, 1e9)
 """Bounds of an amplitude that carries units: a free sign, and no size that a rig's numbers could reach."""
 

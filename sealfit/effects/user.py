@@ -17,7 +17,7 @@ from types import ModuleType
 import numpy as np
 
 from sealfit.effects import EFFECTS
-from sealfit.effects.contract import CHANNEL, SECOND, Effect
+from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect
 from sealfit.effects.free import FREE
 from sealfit.errors import ConfigError, ParameterError
 
@@ -140,8 +140,8 @@ def _description_fault(effect: Effect) -> str:
         return "acts_on is empty: say on what it may act"
     if not effect.reads:
         return "reads is empty: name the channels it depends on"
-    if {CHANNEL, SECOND} & set(effect.reads) and effect.reads not in ((CHANNEL,), (CHANNEL, SECOND)):
-        return "reads mixes 'x' or 'z' (any channel) with named channels"
+    if {CHANNEL, SECOND} & set(effect.reads) and effect.reads not in READS_ANY:
+        return "reads mixes 'x' or 'z' (any channel) with named channels other than the direction"
     names = [p.name for p in effect.parameters]
     if len(set(names)) != len(names):
         return "two parameters share a name"

@@ -72,3 +72,26 @@ def test_an_aging_that_stops_is_found_on_nineteen_specimens():
     best = min(search(Judge(fit_declared(rows)), days, np.random.default_rng(0)), key=lambda c: c.p_value)
     assert best.unit == "specimen"
     assert best.p_value < 0.005
+
+
+def softer_forward(table, force):
+    """Viscous friction that is larger one way than the other."""
+    return force + 0.015 * np.abs(table["speed_mm_s"].to_numpy())
+
+
+def test_an_asymmetry_of_viscous_friction_is_found_in_sixteen_runs_without_repeats():
+    found = []
+    for seed in range(6):
+        bins = make_bins(
+            seed, temperatures=(), days=(), directions=(1, -1), repeats=1, bins=4, setup=0.003, effect=softer_forward
+        )
+        rows = make_rows(bins, has_aging=True)
+        candidates = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+        best = min(candidates, key=lambda c: c.p_value)
+        found.append(best.key == (("direction",), "sigma_2", "add") and best.p_value < 0.005 and best.sure)
+    assert sum(found) >= 5
+
+
+def test_the_scatter_of_runs_is_its_own_where_each_run_is_a_file():
+    units = FewUnits(fit_declared(rows_of(setup=0.02)), "run")
+    assert units.numbers(("mu", "multiply")).known < 1

@@ -5,10 +5,13 @@ import numpy.testing as npt
 import pytest
 from bins_helpers import make_bins, make_traces, warm
 
+from sealfit.closure.document import Ends
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.config import Config
 from sealfit.errors import RequestError
+from sealfit.fit.estimate import fit_declared
+from sealfit.fit.rows import make_rows
 from sealfit.tables import RESIDUALS_AFTER, SCHEMAS
 
 CHANNELS = {"lab_temperature_C": lambda rng: 22 + rng.normal(), "batch": lambda rng: str(rng.choice(list("ABC")))}
@@ -173,3 +176,13 @@ def test_too_few_specimens_to_show_their_scatter_are_said_to_be(null):
     assert answer["note"].str.contains("how specimens scatter is not known").all()
     assert answer["force_after_N"].notna().all()
     assert not any("how specimens scatter" in run["why"] for run in null[1].document["next_runs"])
+
+
+def test_what_ripples_gain_is_seen_inside_strokes():
+    rows = make_rows(make_bins(0), has_aging=True)
+    fitted = fit_declared(rows)
+    run = np.random.default_rng(0).normal(0, 3, rows.groups.starts["run"].size)[rows.codes("run")]
+    wave = np.sin(rows.values("displacement_mm"))
+    ends = Ends(fitted, fitted, rows.force - run - wave, rows.force - 1.1 * run, np.ones(run.size, dtype=bool))
+    assert not ends.gains(None)
+    assert ends.gains("stroke")

@@ -1,0 +1,76 @@
+"""Effects that hide each other in few units."""
+
+import numpy as np
+import pytest
+from bins_helpers import make_bins, make_traces
+
+from sealfit.closure.channels import find_channels
+from sealfit.closure.joint import search_joint
+from sealfit.closure.judge import Judge
+from sealfit.closure.loop import close_loop
+from sealfit.closure.pairs import search_pairs
+from sealfit.closure.search import search
+from sealfit.config import Config
+from sealfit.fit.estimate import fit_declared
+from sealfit.fit.rows import make_rows
+
+FOUR = (1.0, 4.0, 16.0, 64.0)
+PRESSURE = {"pressure_bar": lambda rng: float(rng.integers(1, 8))}
+ONE = {"temperatures": (), "days": (), "directions": (1, -1), "setup": 0.003, "bins": 8}
+
+
+def hidden(bins, alpha=0.005):
+    rows = make_rows(bins, has_aging=True)
+    judge, channels, rng = Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
+    singles = search(judge, channels, rng)
+    pairs = search_pairs(judge, channels, singles, rng)
+    return search_joint(judge, {c.name: c for c in channels}, [*singles, *pairs], alpha)
+
+
+def one_way(table, force):
+    """Friction that grows by 4 % along the stroke, forward only."""
+    return force * (1 + 0.001 * table["distance_mm"].to_numpy() * (table["direction"].to_numpy() > 0))
+
+
+def test_a_slope_along_strokes_and_its_change_with_pressure_hide_each_other():
+    def tilt(table, force):
+        return force - 0.02 * table["pressure_bar"].to_numpy() * (table["displacement_mm"].to_numpy() - 20)
+
+    bins = make_bins(0, speeds=FOUR, repeats=1, run_channels=PRESSURE, effect=tilt, **ONE)
+    first, *_ = hidden(bins)
+    assert first.keys == ((("displacement_mm",), "force", "add"), (("displacement_mm", "pressure_bar"), "force", "add"))
+
+
+def test_pairs_of_chance_are_not_found_too_often():
+    bins = (make_bins(seed, speeds=FOUR, repeats=1, run_channels=PRESSURE, **ONE) for seed in range(30))
+    assert sum(bool(hidden(own, alpha=0.1)) for own in bins) <= 6  # 10 %: more than 6 of 30 with p 0.03
+
+
+def test_growth_in_one_direction_is_found_and_named():
+    bins = make_bins(1, repeats=1, effect=one_way, **ONE)
+    effects = close_loop(bins, make_traces(bins), Config()).document["effects"]
+    (effect,) = [e for e in effects if e["channels"] != ["direction"]]  # from one direction to the other, mu may differ
+    assert (effect["id"], effect["channels"][1]) == ("linear_each_way", "direction")
+    forward, backward = effect["parameters"]
+    assert forward["value"] == pytest.approx(0.001, rel=0.2)
+    assert backward["ci95"][0] < 0 < backward["ci95"][1]
+
+
+def test_a_wrong_piston_area_is_an_offset_that_changes_with_pressure():
+    bins = make_bins(
+        0, speeds=FOUR, temperatures=(60.0,), days=(1.0, 4.0, 16.0), directions=(1, -1), repeats=1, bins=8,
+        run_channels=PRESSURE, effect=lambda table, force: force + 0.35 * (table["pressure_bar"].to_numpy() - 4),
+    )  # fmt: skip
+    (effect,) = close_loop(bins, make_traces(bins), Config()).document["effects"]
+    assert effect["id"] in ("linear", "offset_slope")  # the offset is zero near the mean pressure
+    assert (set(effect["channels"]), effect["acts_on"]) == ({"pressure_bar", "direction"}, "force")
+    assert effect["parameters"][0]["value"] == pytest.approx(0.35, rel=0.1)
+
+
+def test_an_offset_and_an_asymmetry_of_sigma_2_enter_together():
+    def askew(table, force):
+        return force - 1 + 0.015 * np.abs(table["speed_mm_s"].to_numpy())
+
+    bins = make_bins(0, repeats=1, effect=askew, **ONE)
+    effects = close_loop(bins, make_traces(bins), Config()).document["effects"]
+    assert {(e["id"], e["acts_on"]) for e in effects} == {("zero_offset", "force"), ("asymmetry", "sigma_2")}
