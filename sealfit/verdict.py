@@ -6,6 +6,12 @@ from collections.abc import Mapping
 
 from sealfit.units import Units
 
+WITHIN = {
+    "trace": "along a stroke", "stroke": "from stroke to stroke", "repeat": "from repeat to repeat",
+    "run": "from run to run", "condition": "from specimen to specimen",
+}  # fmt: skip
+"""Words for the level at which a variable varies."""
+
 NAMED = 3
 """Variables whose smallest effect a sentence gives."""
 
@@ -27,7 +33,7 @@ def power_clause(closure: Mapping, units: Units) -> str:
     if not known:
         return ""
     largest = sorted(known, key=lambda s: -s["smallest_N"])[:NAMED]
-    texts = [f"{units.label(s['variable'])} {s['smallest_pct']:.2g} %" for s in largest]
+    texts = [f"{units.label(s['variable'])} {WITHIN[s['level']]} {s['smallest_pct']:.2g} %" for s in largest]
     return f"the least sensitive variables would have shown an effect of {', '.join(texts)} of the force"
 
 

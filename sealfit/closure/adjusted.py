@@ -16,9 +16,10 @@ from dataclasses import replace
 import numpy as np
 
 from sealfit.closure import few
-from sealfit.closure.few import FewUnits
+from sealfit.closure.few import FewTest, FewUnits
 from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge, Judgement, log_p_of, wald
 from sealfit.closure.slopes import slope_log_p
+from sealfit.fit.estimate import Fitted
 
 FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
 MOST_SIGNS = 1 << 22  # drawn at once: 34 MB
@@ -47,6 +48,24 @@ def adjust(judgements: Sequence[Judgement], rng: np.random.Generator, flips: int
 
     Those of as many units are flipped with the same signs, so that what they share counts once.
     """
+    return _adjusted([j.log_p for j in judgements], _least(judgements, rng, flips))
+
+
+def critical_many(judgements: Sequence[Judgement], level: float, rng: np.random.Generator) -> float:
+    """Return the log p-value, not adjusted, that the smallest of all judgements falls below by chance at a level."""
+    return float(np.quantile(_least(judgements, rng, FLIPS), level))
+
+
+def critical_few(fitted: Fitted, tests: Sequence[FewTest], level: float) -> float:
+    """Return the same for the tests on few units of one level."""
+    units = FewUnits(fitted, tests[0].level)
+    for test in tests:
+        units.numbers(test.target)
+    return float(np.quantile(_least_few(units, tests, np.random.default_rng(0), FLIPS), level))
+
+
+def _least(judgements: Sequence[Judgement], rng: np.random.Generator, flips: int) -> np.ndarray:
+    """Return the smallest log p-value of all judgements under each of many random flips."""
     alike = defaultdict(lambda: defaultdict(list))
     for judgement in judgements:
         units, df = judgement.scores.shape
@@ -62,7 +81,7 @@ def adjust(judgements: Sequence[Judgement], rng: np.random.Generator, flips: int
                 most = np.maximum(most, wald(totals[:, first : first + df], own))
                 first += df
             least = np.minimum(least, log_p_of(most, df, units))
-    return _adjusted([j.log_p for j in judgements], least)
+    return least
 
 
 def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.ndarray:
@@ -83,14 +102,17 @@ def adjust_few(
     p_values = np.ones(len(judgements))
     tried = [k for k, j in enumerate(judgements) if j.few is not None and j.few.level == units.level]
     if tried:
-        drawn = units.draws(draws, rng)
-        least = np.zeros(draws)
-        for k in tried:
-            test = judgements[k].few
-            least = np.minimum(least, few.log_p_of(drawn[test.target], test.basis, test.known))
-        logs = np.array([judgements[k].few.log_p for k in tried])
+        tests = [judgements[k].few for k in tried]
+        logs = np.array([test.log_p for test in tests])
+        least = _least_few(units, tests, rng, draws)
         p_values[tried] = np.minimum(_adjusted(logs, least), len(tried) * np.exp(logs))  # below what draws resolve
     return p_values
+
+
+def _least_few(units: FewUnits, tests: Sequence[FewTest], rng: np.random.Generator, draws: int) -> np.ndarray:
+    """Return the smallest log p-value of all tests on few units of one level in each of many draws."""
+    drawn = units.draws(draws, rng)
+    return np.min([few.log_p_of(drawn[test.target], test.basis, test.known) for test in tests], axis=0)
 
 
 def adjust_slopes(judgements: Sequence[Judgement]) -> np.ndarray:

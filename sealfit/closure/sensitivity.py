@@ -1,29 +1,60 @@
 """What a campaign could have shown: for each variable the smallest effect that it would have found.
 
-The effect is a straight line in the variable (an offset, for the direction), added to the force or a factor on mu,
-whichever shows sooner. It is found with 80 % chance where its size over its standard error exceeds the critical value
-of the search by the 80 % quantile of Student's t.
+The effect is a factor on mu, linear in the variable at one of the levels at which it varies, or an offset force for the
+direction. It is put into the residual, the scatter is estimated anew, as part of the effect is taken for scatter, and
+the search's own tests are asked: the size is sought that exceeds the critical value of the whole search with 80 %
+chance (noncentral F). What follows the search (naming, held-out data) is not asked, but for the least size that counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri
 
-from sealfit.closure.adjusted import SEARCHES
+from sealfit.closure.adjusted import SEARCHES, critical_few, critical_many
 from sealfit.closure.channels import Channel, scatter_level
+from sealfit.closure.confirm import LEAST_SIZE
+from sealfit.closure.few import FewTest, FewUnits
 from sealfit.closure.grow import Grown
-from sealfit.closure.judge import Candidate, project
-from sealfit.closure.search import MAIN_TARGETS
-from sealfit.closure.slopes import LEAST_UNITS, WAYS, moderated
+from sealfit.closure.judge import CONSTANT, JACKKNIFE_UNITS, Candidate, Judge, project
+from sealfit.closure.slopes import LEAST_UNITS, WAYS, SlopeTest, moderated, slope_test
+from sealfit.fit.estimate import Fitted
+from sealfit.fit.reml import orthonormal
+from sealfit.fit.rows import LEVELS
+from sealfit.fit.scatter import estimate_scatter
+from sealfit.fit.whitening import Whitening
 
 POWER = 0.8
 """Chance with which the smallest effect is found."""
 
+TINY = 1e-6
+"""Of the force: an effect that changes no estimate."""
+
+STEPS = 6
+"""Sizes tried, each nearer to the one that is found with `POWER`, until it is `CLOSE` (difference of logarithms)."""
+
+CLOSE = 0.03
+
+LEAST_POWER = 0.3
+"""Of the size, with which its margin is taken to grow at least."""
+
 WANTED_PCT = 1.0
 """Of the friction: the effect that `files_needed` refers to."""
+
+SHOWN = 1.25
+"""Times the smallest effect that counts: found with `POWER` to be larger, if its standard error is a fifth of it."""
+
+SPECIMEN, SPECIMENS = "specimen_id", "specimen"
+FRICTION = ("mu", "multiply")
+
+REAL = 0.1
+"""Of a variable's variance: a share at a level that is a real one."""
+
+CLEARLY = 3.0
+"""Times the mean square of finer levels: what varies less between groups does so because it varies within them."""
 
 ASIDE = ("run_order", "elapsed_h", "repeat")
 """Channels of the order of tests: what they show is no reason to doubt the model of friction."""
@@ -35,7 +66,9 @@ LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "
 
 
 def sensitivity(grown: Grown, alpha: float) -> list[dict]:
-    """Return per variable: variable, level, smallest_N, smallest_pct and files_needed.
+    """Return per variable and level: variable, level, acts_on, smallest_N, smallest_pct and files_needed.
+
+    A variable that varies at several levels has an entry for each, of an effect that follows it at that level only.
 
     Parameters
     ----------
@@ -54,66 +87,221 @@ def sensitivity(grown: Grown, alpha: float) -> list[dict]:
     fitted = grown.after
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))
     files = rows.groups.starts["file"].size
-    tested = _errors(grown.last)
+    search = _Search(grown, alpha)
     entries = []
     for name, channel in grown.channels.items():
-        own = [k for k, c in enumerate(grown.last) if not c.pair and c.channels[-1] == name and k in tested]
-        sizes = [_smallest(grown, grown.last[k], alpha, *tested[k]) for k in own if _main(grown.last[k])]
-        smallest = min((size for size in sizes if np.isfinite(size)), default=None)
-        if smallest is None:
-            units = rows.groups.starts[scatter_level([channel], rows)].size
-            needed = int(np.ceil(files * LEAST_UNITS / units)) if units < LEAST_UNITS else None
-        else:
-            needed = int(np.ceil(files * (100 * smallest / force / WANTED_PCT) ** 2))
-        entries.append(
-            {
-                "variable": name,
-                "level": LEVEL_NAMES[channel.unit],
-                "smallest_N": smallest,
-                "smallest_pct": None if smallest is None else 100 * smallest / force,
-                "files_needed": needed,
-            }
-        )
+        target = ("force", "add") if name == "direction" or channel.grouping else FRICTION
+        own = [c for c in grown.last if (c.channels[-1], c.acts_on, c.operation) == (name, *target) and not c.pair]
+        own = sorted(own, key=lambda c: c.columns.shape[1])[:1]  # a straight line
+        for level, part in _parts(grown, channel, own):
+            smallest = None
+            if own:
+                effect = part * fitted.slope(*target)
+                effect *= force / np.sqrt(rows.weight @ effect**2)
+                times = search.smallest(own[0], effect)
+                smallest = force * float(max(times, SHOWN * LEAST_SIZE)) if times < 1 else None
+            if smallest is None:
+                units = rows.groups.starts[scatter_level([channel], rows)].size
+                needed = int(np.ceil(files * LEAST_UNITS / units)) if units < LEAST_UNITS else None
+            else:
+                needed = int(np.ceil(files * (100 * smallest / force / WANTED_PCT) ** 2))
+            entries.append(
+                {
+                    "variable": name,
+                    "level": LEVEL_NAMES[level],
+                    "acts_on": target[0],
+                    "smallest_N": smallest,
+                    "smallest_pct": None if smallest is None else 100 * smallest / force,
+                    "files_needed": needed,
+                }
+            )
+    specimens = rows.groups.starts["specimen"].size
+    if len(rows.conditions) < specimens < LEAST_UNITS:  # they may differ, and no variable says how
+        needed = int(np.ceil(files * LEAST_UNITS / specimens))
+        unknown = {"variable": SPECIMEN, "level": "condition", "acts_on": "mu", "smallest_N": None}
+        entries.append({**unknown, "smallest_pct": None, "files_needed": needed})
     return entries
 
 
-def _main(candidate: Candidate) -> bool:
-    return (candidate.acts_on, candidate.operation) in MAIN_TARGETS
+def _parts(grown: Grown, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
+    """Yield each level at which a channel has a real share of its variance, and its first column's part there."""
+    groups, weight = grown.after.rows.groups, grown.after.rows.weight
+    if not own or not channel.numeric or channel.name == "direction":
+        yield channel.unit, (own[0].columns[:, 0] if own else None)
+        return
+    column = own[0].columns[:, 0]
+    means = [column, *(groups.means(column, level)[groups.codes[level]] for level in LEVELS), 0 * column]
+    sizes = [column.size, *(groups.starts[level].size for level in LEVELS), 1]
+    parts, real, finer = {}, [], 0.0
+    for k, level in enumerate(LEVEL_NAMES):
+        parts[level] = means[k] - means[k + 1]
+        square = weight @ parts[level] ** 2
+        each = square / max(sizes[k] - sizes[k + 1], 1)  # mean square
+        if square > REAL * (weight @ column**2) and each > CLEARLY * finer:
+            real.append(level)
+        finer = max(finer, each)
+    if len(real) < 2:
+        yield real[0] if real else channel.unit, column
+    else:
+        yield from ((level, parts[level]) for level in real)
 
 
-def _errors(candidates: Sequence[Candidate]) -> dict[int, tuple[float, float, int]]:
-    """Return by number of a candidate the variance of its first contrast, its df, and of how many tests it is one."""
-    slopes = [k for k, c in enumerate(candidates) if c.judgement.slopes]
-    count = WAYS * sum(candidates[k].judgement.slopes[0].slope.size for k in slopes)
-    found = {}
-    for k, (variance, df) in zip(slopes, moderated([candidates[k].judgement.slopes[0] for k in slopes]), strict=True):
-        found[k] = float(variance[0]), float(df[0]), count
-    few = [k for k, c in enumerate(candidates) if c.judgement.few is not None]
-    for k in few:
-        test = candidates[k].judgement.few
-        found[k] = 1.0, test.known + test.error_df, len(few)
-    many = [k for k in range(len(candidates)) if k not in found]
-    for k in many:
-        found[k] = 1.0, float(candidates[k].judgement.scores.shape[0] - 1), len(many)
-    return found
+class _Search:
+    """The last search of a loop, asked what it would say of an effect that is put into the residual.
+
+    The effect is in the residual when scatter is estimated, and raises it; and what of it differs between units stands
+    in the variance it is held against. Where the noise has been looser or quieter by chance counts as in the search:
+    the variance of a contrast in few units is moderated, and that of scores of many is 1 or more.
+    """
+
+    def __init__(self, grown: Grown, alpha: float) -> None:
+        self.fitted, self.channels, self.candidates = grown.after, grown.channels, grown.last
+        self.level = alpha / SEARCHES
+        judgements = [c.judgement for c in grown.last]
+        slopes = [j.slopes for j in judgements if j.slopes]
+        few = [j.few for j in judgements if j.few is not None]
+        many = [j for j in judgements if j.few is None and not j.slopes]
+        self.contrasts = WAYS * sum(own[0].slope.size for own in slopes)
+        tests = [test for own in slopes for test in own]
+        self.moderated = {id(t): m for t, m in zip(tests, moderated(tests), strict=True)}
+        lines = [c for c in grown.last if c.judgement.slopes and not c.pair and (c.acts_on, c.operation) == FRICTION]
+        self.lines = np.column_stack([c.columns[:, 0] for c in lines] or [np.ones(grown.after.force.size)])
+        self.lines = self.lines * grown.after.slope(*FRICTION)[:, None]
+        self.many = len(many)
+        self.critical_many = critical_many(many, self.level / 2, np.random.default_rng(0)) if many else 0.0
+        self.critical_few = {}
+        for name in {test.level for test in few}:
+            level = self.level / (1 if name == SPECIMENS else WAYS)  # runs are tested in two ways, by slopes as well
+            self.critical_few[name] = critical_few(self.fitted, [t for t in few if t.level == name], level)
+
+    def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
+        """Return by how much an effect, shape (n,), must be multiplied to be found with `POWER`; infinite for never."""
+        size, margin, before = TINY, self.margin(candidate, TINY * effect, self.fitted), None
+        for _ in range(STEPS):
+            if not 0 < margin < np.inf:
+                return np.inf
+            power = 1.0 if before is None else np.log(margin / before[1]) / np.log(size / before[0])
+            before = size, margin
+            size *= margin ** (-1 / min(max(power, LEAST_POWER), 1.0))
+            if size > 1:
+                return np.inf
+            margin = self.margin(candidate, size * effect, _under(self.fitted, size * effect))
+            if margin > 0 and abs(np.log(margin)) < CLOSE:
+                break
+        return size
+
+    def margin(self, candidate: Candidate, effect: np.ndarray, fitted: Fitted) -> float:
+        """Return how many times as long as needed an effect is."""
+        judge = Judge(fitted)
+        white = fitted.basis.freed(fitted.whitening(np.column_stack([self.fitted.residual, effect])))
+        noise, effect = (replace(fitted, white_residual=column) for column in white.T)
+        for one in (noise, effect):
+            one.__dict__["basis"] = fitted.basis
+        channel, judgement = self.channels[candidate.channels[-1]], candidate.judgement
+        columns = candidate.columns * noise.slope(candidate.acts_on, candidate.operation)[:, None]
+        variants = judge.variants(columns, channel.unit)
+        few = judgement.few
+        by_few = 0.0 if few is None else min(self._by_few(noise, effect, left, few) for left in variants)
+        if judgement.slopes:
+            tail = self.level / self.contrasts / (1 if few is None else WAYS)
+            pairs = zip(variants, judgement.slopes, strict=True)
+            return max(by_few, min(self._by_slopes(noise, effect, left, test, tail) for left, test in pairs))
+        if few is not None:
+            return by_few
+        level = candidate.unit if channel.grouping else scatter_level([channel], noise.rows)
+        return min(self._by_many(noise, effect, left, level, candidate) for left in variants)
+
+    def _by_slopes(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: SlopeTest, tail: float) -> float:
+        test, added = (slope_test(one, left, known.level) for one in (noise, effect))
+        if test is None or test.slope.size != known.slope.size:
+            return 0.0
+        variance, df = self.moderated[id(known)]
+        prior_df = df - known.df
+        prior = (df * variance - known.df * known.variance) / np.maximum(prior_df, 1e-9)
+        others = slope_test(effect, project(effect, self.lines), known.level)
+        for along in (False, True) if others is not None else ():
+            alike = others.variance[others.along == along]  # the effect stands in the scatter of other contrasts
+            prior[known.along == along] *= np.exp(np.mean(np.log1p(alike))) if alike.size else 1.0
+        own = variance * test.variance / known.variance
+        share = test.df / (prior_df + test.df)
+        both = (1 - share) * prior + share * own
+        margins = [
+            _margin(added.slope, quiet, differs, 1, d, tail)
+            for quiet, differs, d in (
+                (own, added.variance, test.df),
+                (both, share * added.variance, prior_df + test.df),
+            )
+        ]
+        return float(np.nanmax(margins))
+
+    def _by_few(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: FewTest) -> float:
+        units = (FewUnits(one, known.level) for one in (noise, effect))
+        return _by_numbers(*units, left, known.target, np.exp(self.critical_few[known.level]))
+
+    def _by_many(self, noise: Fitted, effect: Fitted, left: np.ndarray, level: str, candidate: Candidate) -> float:
+        basis = orthonormal(left)
+        seen = basis @ (basis.T @ effect.white_residual)
+        length = float(np.linalg.norm(seen))
+        if length == 0:
+            return 0.0
+        scores = candidate.judgement.scores
+        units, k = scores.shape
+        sums = noise.rows.groups.sums
+        own, added = (float((sums(seen / length * f.unit_residual(level), level) ** 2).sum()) for f in (noise, effect))
+        own *= max(1.0, k / float((scores**2).sum()))  # not quieter than noise is on average
+        beyond = ndtri(POWER) * np.sqrt(own)
+        share = 1 - betaincinv((units - k) / 2, k / 2, np.exp(self.critical_many))
+        margin = length / (np.sqrt(units * share * (own + added)) + beyond)
+        if units < JACKKNIFE_UNITS:
+            return margin
+        tail = self.level / 2 / self.many
+        spread = length / (np.sqrt(own * k * fdtri(k, units - k, 1 - tail)) + beyond)
+        explained = length / (np.sqrt(chdtri(k, tail)) + beyond)
+        if level == "run":
+            target = (candidate.acts_on, candidate.operation)
+            runs = FewUnits(noise, "run"), FewUnits(effect, "run")
+            explained = max(explained, _by_numbers(*runs, left, target, tail, least=CONSTANT))
+        return max(margin, min(spread, explained))
 
 
-def _smallest(grown: Grown, candidate: Candidate, alpha: float, variance: float, df: float, count: int) -> float:
-    """Return the RMS of the smallest effect along a candidate's first column; infinite where none can be found."""
-    fitted = grown.after
-    column = candidate.columns[:, :1] * fitted.slope(candidate.acts_on, candidate.operation)[:, None]
-    size = float(np.linalg.norm(project(fitted, column)))
-    if size == 0 or df < 1:
-        return np.inf
-    reach = stdtrit(df, 1 - alpha / (2 * SEARCHES * count)) + stdtrit(df, POWER)
-    return float(reach * np.sqrt(variance) / size * np.sqrt(fitted.rows.weight @ column[:, 0] ** 2))
+def _by_numbers(
+    noise: FewUnits, effect: FewUnits, left: np.ndarray, target: tuple[str, str], tail: float, least: float = 0.0
+) -> float:
+    """Return the margin by the F test of one number a unit, at a p-value; 0 where columns are not one number a unit."""
+    test, added = (units.test(left, target) for units in (noise, effect))
+    if test is None or test.share <= least:
+        return 0.0
+    k, df = test.basis.shape[1], test.known + test.error_df
+    quiet, differs = (
+        (float(np.sum(units.numbers(target).values ** 2)) - own.chi2) / df
+        for units, own in ((noise, test), (effect, added))
+    )
+    return float(_margin(np.sqrt(added.chi2), quiet + test.known / df, differs, k, df, tail))
+
+
+def _margin(length: np.ndarray, quiet: np.ndarray, differs: np.ndarray, k: int, df: np.ndarray, tail: float):
+    """Return how many times as long as needed an effect is, by F with k and df degrees of freedom at a p-value.
+
+    It is held against a variance: `quiet` without it, and what it adds to that itself.
+    """
+    critical = fdtri(k, df, 1 - tail)
+    return np.abs(length) / np.sqrt(quiet * ncfdtrinc(k, df, 1 - POWER, critical) + k * critical * differs)
+
+
+def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
+    """Return a fit under the scatter that is estimated where its residual holds an effect."""
+    rows, friction, residual = fitted.rows, fitted.friction, fitted.residual + effect
+    scatter = estimate_scatter(rows, residual, friction, fitted.jacobian, fitted.scatter)
+    whitening = Whitening(scatter, friction, rows.groups)
+    return replace(fitted, scatter=scatter, whitening=whitening, white_jacobian=whitening.of(fitted.jacobian))
 
 
 def cannot_tell(grown: Grown, entries: Sequence[dict], scatter: Sequence[dict]) -> list[str]:
     """Return the variables of which this campaign could not have told; empty where it could.
 
-    A variable cannot be told if it varies along strokes, or is speed or direction, and cannot be tested at all; or if
-    the units that it varies between scatter by much, and an effect that explains all of that would not have been seen.
+    A variable cannot be told if no effect of it can reach the required p-value, and it varies along strokes, is the
+    direction, or varies between fewer than five specimens; or if the units that it varies between scatter by much, and
+    an effect that explains all of that would not have been seen.
 
     Parameters
     ----------
@@ -127,12 +315,17 @@ def cannot_tell(grown: Grown, entries: Sequence[dict], scatter: Sequence[dict]) 
     starts = grown.after.rows.groups.starts
     open_ = []
     for entry in entries:
+        if entry["variable"] == SPECIMEN:
+            open_.append(SPECIMEN)
+            continue
         channel: Channel = grown.channels[entry["variable"]]
-        if channel.grouping or channel.name in ASIDE:
+        if channel.grouping or channel.name in ASIDE or entry["level"] != LEVEL_NAMES[channel.unit]:
             continue
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
         own = [s for s in scatter if channel.unit != "sample" and starts[s["level"]].size == starts[channel.unit].size]
         much = any(s["sd_rel"] > MATERIAL and s["sd_N"] < smallest for s in own)
-        if much or (channel.scatters and not np.isfinite(smallest)):
+        few = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS
+        decisive = channel.unit == "sample" or channel.name == "direction" or few
+        if much or (decisive and not np.isfinite(smallest)):
             open_.append(channel.name)
     return open_

@@ -21,6 +21,7 @@ from sealfit.report.symbols import (
     true_units,
 )
 from sealfit.report.words import PARTS, acts, meaning, target_html
+from sealfit.verdict import WITHIN
 
 MOST_TESTS = 40
 FREE = {
@@ -53,11 +54,12 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
 
 
 def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
-    """Return a row per variable: its label and the smallest effect that the campaign would have shown."""
+    """Return a row per variable and level: label, level and the smallest effect that the campaign would have shown."""
     unit = config.units.unit("force")
     return [
         {
             "variable": channel_label(entry["variable"], config.units),
+            "level": WITHIN[entry["level"]],
             "smallest": of_unit(number(entry["smallest_N"], 2), unit) if known(entry["smallest_N"]) else "none",
             "share": of_unit(number(entry["smallest_pct"], 2), "%") if known(entry["smallest_pct"]) else NOTHING,
             "files": f"{entry['files_needed']:,}" if known(entry["files_needed"]) else NOTHING,

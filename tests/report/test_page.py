@@ -242,10 +242,12 @@ def test_empty_tables_may_lack_columns():
 def test_the_page_says_what_would_have_been_seen_and_what_was_refused():
     from sealfit.report.loop_tables import refused_rows, sensitivity_rows
 
-    seen = {"variable": "displacement_mm", "smallest_N": 0.123, "smallest_pct": 0.31, "files_needed": 1200}
-    unseen = {"variable": "speed_mm_s", "smallest_N": None, "smallest_pct": None, "files_needed": None}
+    seen = {"variable": "displacement_mm", "level": "trace", "smallest_N": 0.123, "smallest_pct": 0.31}
+    seen["files_needed"] = 1200
+    unseen = {"variable": "speed_mm_s", "level": "run", "smallest_N": None, "smallest_pct": None, "files_needed": None}
     rows = sensitivity_rows({"sensitivity": [seen, unseen]}, Config())
     assert [row["smallest"].replace("\u00a0", " ") for row in rows] == ["0.12 N", "none"]
+    assert [row["level"] for row in rows] == ["along a stroke", "from run to run"]
     assert rows[0]["files"] == "1,200"
     refused = {"id": "ripple", "channels": ["displacement_mm"], "p_value": 1e-6, "reason": "it is too small"}
     (row,) = refused_rows({"refused": [refused]}, Config())

@@ -117,7 +117,7 @@ SEEN["cannot_tell"] = True
 
 def test_nothing_missing_says_what_would_have_been_seen():
     text = said({**document("nothing_missing", effects=()), "sensitivity": [SEEN]}, empty("shapes"))
-    assert text.endswith("would have shown an effect of displacement (mm) 1.2 % of the force.")
+    assert text.endswith("would have shown an effect of displacement (mm) along a stroke 1.2 % of the force.")
 
 
 def test_cannot_tell_says_of_what_and_what_would_do():

@@ -1,0 +1,88 @@
+import numpy as np
+import pandas as pd
+import pytest
+from bins_helpers import make_bins, make_traces
+
+from sealfit.closure.channels import channels_of
+from sealfit.closure.grow import Grown
+from sealfit.closure.judge import Judge
+from sealfit.closure.loop import close_loop
+from sealfit.closure.search import search
+from sealfit.closure.sensitivity import cannot_tell, sensitivity
+from sealfit.config import Config
+from sealfit.fit.estimate import fit_declared
+from sealfit.fit.rows import make_rows
+
+SMALL = {"temperatures": (60.0,), "days": (1.0, 4.0), "bins": 6, "noise_N": 0.1, "setup": 0.003}
+OIL = {"oil_ppm": lambda rng: rng.normal(100.0, 10.0)}
+
+
+def searched(bins):
+    """The end of a loop that finds nothing: one search."""
+    fitted = fit_declared(make_rows(bins, has_aging=True))
+    channels = {c.name: c for c in channels_of(fitted.rows, Config())}
+    found = tuple(search(Judge(fitted), list(channels.values()), np.random.default_rng(0)))
+    return Grown(fitted, fitted, (), found, found, None, None, channels)
+
+
+def entries(grown):
+    return {(e["variable"], e["level"]): e for e in sensitivity(grown, 0.005)}
+
+
+def p_with(bins, size_pct):
+    """The p-value of oil in a campaign where it acts on mu, straight."""
+    shape = bins["oil_ppm"] - bins["oil_ppm"].mean()
+    shape = shape * bins["force_N"]
+    rms = np.sqrt(np.mean(bins["force_N"] ** 2))
+    made = bins.assign(force_N=bins["force_N"] + size_pct / 100 * rms * shape / np.sqrt(np.mean(shape**2)))
+    return min(c.p_value for c in searched(made).last if c.channels[-1] == "oil_ppm")
+
+
+@pytest.mark.parametrize("repeats", [1, 2], ids=["twenty-four runs", "with repeats"])
+def test_half_the_stated_effect_is_missed_and_twice_as_much_is_found(repeats):
+    bins = make_bins(4, repeats=repeats, run_channels=OIL, **SMALL)
+    smallest = entries(searched(bins))["oil_ppm", "run"]["smallest_pct"]
+    fresh = [make_bins(4, repeats=repeats, run_channels=OIL, **{**SMALL, "noise_N": n}) for n in (0.1001, 0.0999)]
+    assert all(p_with(b, smallest / 2) > 0.005 for b in fresh)
+    assert all(p_with(b, 2 * smallest) < 0.005 for b in fresh)
+
+
+def test_a_variable_has_an_entry_for_each_level_at_which_it_varies():
+    bins = make_bins(4, repeats=2, run_channels={"chamber_C": lambda rng: rng.normal(22.0, 1.0)}, **SMALL)
+    bins["chamber_C"] += np.random.default_rng(0).normal(0.0, 1.0, len(bins))
+    found = entries(searched(bins))
+    assert ("chamber_C", "trace") in found
+    assert ("chamber_C", "run") in found
+    assert [level for name, level in found if name == "displacement_mm"] == ["trace"]
+    assert ("time_s", "run") in found  # a slow stroke takes long
+
+
+def test_four_files_cannot_tell_and_say_how_many_would_do():
+    bins = make_bins(1, temperatures=(), speeds=(1.0, 4.0, 16.0, 64.0), repeats=1, bins=6)
+    grown = searched(bins)
+    found = sensitivity(grown, 0.005)
+    untold = cannot_tell(grown, found, [])
+    assert "displacement_mm" in untold
+    assert all(e["files_needed"] == 5 for e in found if e["variable"] in untold)
+
+
+def test_what_differs_between_two_specimens_cannot_be_told():
+    bins = make_bins(1, temperatures=(60.0,), days=(4.0,), repeats=2, bins=6)
+    grown = searched(bins)
+    assert "aging_days" in cannot_tell(grown, sensitivity(grown, 0.005), [])
+
+
+def test_two_specimens_of_one_condition_that_differ_cannot_be_told():
+    bins = make_bins(1, temperatures=(), repeats=3, bins=6)
+    second = bins.assign(specimen_id="second", run_id=bins["run_id"] + "|2", file="2" + bins["file"])
+    second["force_N"] *= 1.05
+    both = pd.concat([bins, second], ignore_index=True)
+    document = close_loop(both, make_traces(both), Config()).document
+    assert document["verdict"] == "cannot_tell"
+    (untold,) = [e for e in document["sensitivity"] if e["variable"] == "specimen_id"]
+    assert (untold["cannot_tell"], untold["files_needed"]) == (True, 120)
+
+
+def test_a_campaign_of_nine_specimens_can_tell():
+    grown = searched(make_bins(3, repeats=2, bins=6, run_channels=OIL))
+    assert cannot_tell(grown, sensitivity(grown, 0.005), []) == []
