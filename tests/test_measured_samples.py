@@ -69,8 +69,8 @@ def test_pneumatic_seal_lacks_an_offset_run_in_and_ripples(pneuseal):
     effects = {e["id"]: e for e in reversed(document["effects"])}
     offset = effects["zero_offset"]["parameters"][0]
     assert offset["value"] == pytest.approx(3.1, abs=0.5)  # 1.2 to 4.4 N, by pressure and set-up
-    # Friction grows over ten cycles in 18 of 20 files, by a size that differs: between 12 runs it is not significant.
-    assert not any(e["channels"] == ["stroke"] for e in document["effects"])
+    # Friction grows over ten cycles in 18 of 20 files, by a size that differs: between 12 runs p is near 0.005.
+    assert all(e["parameters"][0]["value"] > 0 for e in document["effects"] if e["channels"] == ["stroke"])
     ripples = [{p["name"]: p for p in e["parameters"]} for e in document["effects"] if e["id"] == "ripple"]
     for length in (3.0, 1.5):
         found = [r for r in ripples if r["lambda"]["value"] == pytest.approx(length, rel=0.01)]

@@ -20,6 +20,8 @@ DAYS_FOR_LIFETIME = 4  # aged days; with fewer a law can hardly be told
 def laws_inside(world: World, out: Path) -> dict[str, list[int]]:
     """Return for each parameter of Eq. 15 how many intervals hold the truth, and how many there are."""
     counts = {name: [0, 0] for name in LAW}
+    steady = pd.read_parquet(out / "steady_fit.parquet")
+    flat = steady[steady["parameter"].isin(("mu_s", "F_s")) & ~steady["identified"]]  # mu_c is then no mu_c of Eq. 14
     table = pd.read_parquet(out / "aging_fit.parquet")
     table = table[table["identified"] & table["lo95"].notna() & table["parameter"].isin(LAW)]
     load = float(world.loads_N[0])
@@ -27,7 +29,7 @@ def laws_inside(world: World, out: Path) -> dict[str, list[int]]:
         end = {"mu_s": "s", "mu_c": "c", "F_s": "s", "F_c": "c"}.get(row.quantity)
         own = [s for s in aged_series(world) if s["temperature_C"] == row.temperature_C
                and s["compression_ratio_pct"] == row.compression_ratio_pct]  # fmt: skip
-        if end is None or not own:
+        if end is None or not own or (end == "c" and len(flat)):
             continue
         true = own[0][("mu_0" if row.parameter == "mu_0" else f"{row.parameter}_") + end]
         if row.quantity.startswith("F_") and row.parameter != "b":

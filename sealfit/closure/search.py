@@ -23,7 +23,7 @@ from sealfit.closure.channels import (
 )
 from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge
 from sealfit.fit.estimate import Fitted
-from sealfit.fit.rows import Rows
+from sealfit.fit.rows import POWER, Rows
 
 TARGETS = (
     ("mu", "multiply"),
@@ -85,7 +85,7 @@ def _of_shapes(
     for acts_on, operation in targets:
         if not (_allowed(channel, acts_on, operation, both_ways) and _declared(fitted, acts_on)):
             continue
-        if channel.name == "speed_mm_s" and not _declared(fitted, "v_s"):
+        if channel.name in ("speed_mm_s", POWER) and not _declared(fitted, "v_s"):
             continue  # too few speeds for a Stribeck curve: what depends on speed may be just that
         slope = fitted.slope(acts_on, operation)
         if np.abs(slope).max() <= 0:

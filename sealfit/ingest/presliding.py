@@ -15,6 +15,7 @@ AFTER_RAMP = 3.0  # rise lengths after the speed ramp: the bristles follow the c
 ENOUGH = np.log(100.0)  # where 1/50000 would take more than a third of the stroke, 1 % of the rise may stay
 HALF_WAY = 0.75  # a force that begins above this share of its level comes up, if at all, over a short distance:
 SHORT = 0.01  # this share of the stroke; a longer climb is an effect (run-in, warming), and stays inside
+SOON = 0.03  # share of the stroke in which the fall of an overshoot comes down by 63 %, at most
 EARLY = (0.05, 0.5)  # share of the distance in which the plateau is read: near the rise, past any ordinary rise
 LATE = (0.6, 0.95)  # the same where the rise takes so long that half of the stroke may still be part of it
 LONG = 0.1  # rise to 63 % over more than this share of the stroke: a stroke hardly longer than its pre-sliding
@@ -95,11 +96,21 @@ def rises(starts: Sequence[Start]) -> list[Rise]:
     """
     made = _rises(starts)
     over = [(i, *found) for i, start in enumerate(starts) if (found := _overshoot(start))]
-    for (i, peak, _), fall in zip(over, _rises([fall for *_, fall in over]), strict=True):
-        if fall.end_mm > 0.0:
-            left = -fall.left_N * math.exp(min(peak / fall.length_mm, FAR))
-            made[i] = Rise(peak + fall.end_mm, left, fall.length_mm)
+    falls = _rises([fall for *_, fall in over])
+    over = [(*one, fall) for one, fall in zip(over, falls, strict=True) if _by_damping(starts[one[0]], one[1], fall)]
+    left = _left_over([start for _, _, start, _ in over], [fall.length_mm for *_, fall in over])
+    for (i, peak, _, fall), (left_N, length) in zip(over, left, strict=True):
+        if left_N < 0.0:  # it follows the law
+            unsettled = -left_N * math.exp(min(peak / length, FAR)) if fall.left_N else 0.0
+            made[i] = Rise(peak + fall.end_mm, unsettled, length)
     return made
+
+
+def _by_damping(start: Start, peak_mm: float, fall: Rise) -> bool:
+    """Return whether a peak may be the bristles' damping: reached while the speed rises, and over within a share of the
+    stroke. The peak of a break-away falls over a longer distance."""
+    soon = 0.0 < fall.length_mm < SOON * float(start.distance_mm[-1])
+    return soon and peak_mm <= start.plateau_mm + fall.length_mm
 
 
 def _overshoot(start: Start) -> tuple[float, Start] | None:

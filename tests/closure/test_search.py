@@ -113,6 +113,7 @@ def test_sliding_power_is_a_channel_where_loads_differ():
 
 
 def test_three_speeds_show_no_effect_of_speed_beside_the_stribeck_curve_they_cannot_hold():
-    rows = rows_of(speeds=(1.0, 8.0, 64.0), bins=6)
+    bins = make_bins(speeds=(1.0, 8.0, 64.0), bins=6)
+    rows = make_rows(bins.assign(load_N=np.where(bins["aging_days"] > 4, 25.0, 50.0)), has_aging=True)
     found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
-    assert not any(c.channels == ("speed_mm_s",) for c in found)
+    assert not any({"speed_mm_s", "power"} & set(c.channels) for c in found)

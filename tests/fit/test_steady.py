@@ -273,7 +273,8 @@ def one_file_each_way(forces):
     rows = [
         {
             "condition": f"c{k}", "series": "", "rubber": "", "run_id": f"c{k}{way:+}", "repeat": 1,
-            "file": f"c{k}.csv", "direction": way, "speed_mm_s": way * speed, "load_N": np.nan, "force_N": way * force,
+            "specimen_id": f"c{k}", "file": f"c{k}.csv", "stroke": 1 + (way < 0), "direction": way,
+            "speed_mm_s": way * speed, "load_N": np.nan, "force_N": way * force,
             "used": True,
         }
         for k, pair in enumerate(forces)
