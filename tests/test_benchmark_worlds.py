@@ -264,4 +264,9 @@ def test_intervals_of_the_law_are_held_to_the_series_truth(tmp_path):
     place = {name: own[name] for name in ("temperature_C", "compression_ratio_pct")}
     table = table.assign(lo95=table["value"] - table["half"], hi95=table["value"] + table["half"], **place)
     table.to_parquet(tmp_path / "aging_fit.parquet")
+    steady = pd.DataFrame({"parameter": ["mu_s", "mu_c"], "identified": [True, True]})
+    steady.to_parquet(tmp_path / "steady_fit.parquet")
     assert laws_inside(world, tmp_path) == {"mu_0": [1, 1], "a": [1, 1], "b": [0, 1]}
+    # Without a Stribeck curve mu_c is the coefficient over the tested speeds.
+    steady.assign(identified=[False, True]).to_parquet(tmp_path / "steady_fit.parquet")
+    assert laws_inside(world, tmp_path) == {"mu_0": [1, 1], "a": [0, 0], "b": [0, 0]}
