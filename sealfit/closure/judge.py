@@ -31,7 +31,7 @@ from scipy.special import betainc, chdtrc, fdtrc
 
 from sealfit.closure.channels import FINER, MANY_UNITS
 from sealfit.closure.few import FewTest, FewUnits
-from sealfit.closure.slopes import SlopeTest, slope_test, specimens_agree
+from sealfit.closure.slopes import SlopeTest, slope_test
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import LEVELS
 from sealfit.fit.tangent import OwnColumns, Tangent
@@ -56,7 +56,6 @@ class Judgement(NamedTuple):
     scores: np.ndarray | None = None  # (units, k)
     few: FewTest | None = None  # against the scatter of few specimens; None where that was not tried
     slopes: tuple[SlopeTest, ...] = ()  # against the slopes of few units, in every variant; empty where not tried
-    agree: bool = True  # whether two to four specimens show the same, where many runs are the units
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class Candidate:
     def sure(self) -> bool:
         """Whether it may be claimed: too few specimens do not show their own scatter, or show that they differ."""
         agree = all(test.agree[np.argmax(np.abs(test.slope))] for test in self.judgement.slopes)
-        return agree and self.judgement.agree and (self.judgement.few is None or self.judgement.few.sure)
+        return agree and (self.judgement.few is None or self.judgement.few.sure)
 
     @property
     def chi2(self) -> float:
@@ -180,7 +179,7 @@ class Judge:
         weakest = max(found, key=lambda j: max(j.log_p, j.log_p_jackknife))
         weakest = weakest._replace(units=starts[level].size)
         if not few:
-            return weakest._replace(agree=all(map(self._specimens_agree, variants)))
+            return weakest
         if level == "specimen":
             test = self.few[level].test(variants[0], target)
             return weakest if test is None else weakest._replace(chi2=test.chi2, df=test.basis.shape[1], few=test)
@@ -188,15 +187,6 @@ class Judge:
         if any(test is None for test in tests):
             return None
         return weakest._replace(slopes=tests, few=self._of_few_runs(variants, between, level, target))
-
-    def _specimens_agree(self, left: np.ndarray) -> bool:
-        """Return whether a few specimens show the same effect, along what columns explain together."""
-        fitted = self.fitted
-        along = left @ (np.linalg.pinv(left.T @ left, hermitian=True) @ (left.T @ fitted.white_residual))
-        along /= max(np.linalg.norm(along), 1e-300)
-        sums = fitted.rows.groups.sums
-        both = (sums(values[:, None], "specimen") for values in (along**2, along * fitted.white_residual))
-        return bool(specimens_agree(*both)[0])
 
     def _of_few_runs(
         self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]

@@ -44,7 +44,7 @@ LARGEST_LEVERAGE = 0.98
 SHOWN = 0.05
 """Leverage from which a specimen says something of a contrast."""
 
-AGREE = 0.05
+AGREE = 0.1
 """P-value of Student's t over two to four specimens, above which their own slopes do not agree."""
 
 
@@ -95,9 +95,7 @@ def slope_test(fitted: Fitted, left: np.ndarray, level: str) -> SlopeTest | None
     known = df >= LEAST_DF
     if not known.any():
         return None
-    agree = specimens_agree(
-        groups.sums(left**2, "specimen"), groups.sums(left * fitted.white_residual[:, None], "specimen")
-    )
+    agree = _agree(groups.sums(left**2, "specimen"), groups.sums(left * fitted.white_residual[:, None], "specimen"))
     parts = (slope, (deviations**2).sum(axis=0), df, inside.sum(axis=0) < 0.5)
     return SlopeTest(level, *(part[known] for part in parts), deviations[:, known], agree[known])
 
@@ -111,7 +109,7 @@ def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
     return 1 / ((leverage**2).sum(axis=0) + shared.sum(axis=0) ** 2 - (shared**2).sum(axis=0))
 
 
-def specimens_agree(leverage: np.ndarray, scores: np.ndarray) -> np.ndarray:
+def _agree(leverage: np.ndarray, scores: np.ndarray) -> np.ndarray:
     """Return whether specimens have the same slope, shape (m,), from their leverages and scores, shape (specimens, m).
 
     Of one specimen nothing can be said, and from `LEAST_UNITS` on they are the units themselves.
