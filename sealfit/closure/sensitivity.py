@@ -156,10 +156,10 @@ class _Search:
 
     def __init__(self, grown: Grown, alpha: float) -> None:
         self.fitted, self.channels, self.candidates = grown.after, grown.channels, grown.last
-        self.level = alpha / SEARCHES
+        self.level, self.units = alpha / SEARCHES, {}
         judgements = [c.judgement for c in grown.last]
         slopes = [j.slopes for j in judgements if j.slopes]
-        few = [j.few for j in judgements if j.few is not None]
+        few = [test for c in grown.last if (test := self._few_again(c)) is not None]
         many = [j for j in judgements if j.few is None and not j.slopes]
         self.contrasts = WAYS * sum(own[0].slope.size for own in slopes)
         tests = [test for own in slopes for test in own]
@@ -173,6 +173,16 @@ class _Search:
         for name in {test.level for test in few}:
             level = self.level / (1 if name == SPECIMENS else WAYS)  # runs are tested in two ways, by slopes as well
             self.critical_few[name] = critical_few(self.fitted, [t for t in few if t.level == name], level)
+
+    def _few_again(self, candidate: Candidate) -> FewTest | None:
+        """Return a candidate's test on few units at the last model, which may hold fewer effects than were searched."""
+        known, target = candidate.judgement.few, (candidate.acts_on, candidate.operation)
+        if known is None:
+            return None
+        if known.level not in self.units:
+            self.units[known.level] = FewUnits(self.fitted, known.level)
+        columns = candidate.columns * self.fitted.slope(*target)[:, None]
+        return self.units[known.level].test(project(self.fitted, columns), target)
 
     def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
         """Return by how much an effect, shape (n,), must be multiplied to be found with `POWER`; infinite for never."""
@@ -235,6 +245,8 @@ class _Search:
         return float(np.nanmax(margins))
 
     def _by_few(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: FewTest) -> float:
+        if known.level not in self.critical_few:
+            return 0.0
         units = (FewUnits(one, known.level) for one in (noise, effect))
         return _by_numbers(*units, left, known.target, np.exp(self.critical_few[known.level]))
 
