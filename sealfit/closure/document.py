@@ -120,13 +120,13 @@ def closure_document(
     }
 
 
-def fit_quality(squaresafter: Mapping, floor_N: float | None) -> dict:
+def fit_quality(errors_after: Mapping, floor_N: float | None) -> dict:
     """Return closure.json's `fit_quality`: whether the error is what repeats scatter by, or how many times that."""
-    p_value = squaresafter["lack_of_fit_p"]
+    p_value = errors_after["lack_of_fit_p"]
     if floor_N is None or p_value is None:
         return {"state": "unknown", "ratio": None, "p_value": None}
     state = "above_scatter" if p_value < LACK_OF_FIT else "within_scatter"
-    return {"state": state, "ratio": squaresafter["rmse_N"] / max(floor_N, 1e-300), "p_value": p_value}
+    return {"state": state, "ratio": errors_after["rmse_N"] / max(floor_N, 1e-300), "p_value": p_value}
 
 
 def _refused(item: Refused, rows: Rows) -> dict:
