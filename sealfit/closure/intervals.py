@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -56,16 +58,18 @@ def sandwiches(fitted: Fitted) -> list[Sandwich]:
 
     Specimens and runs may differ in numbers that no variance component holds, such as v_s.
     """
-    found, rows = [], fitted.rows
+    found, rows, white = [], fitted.rows, fitted.white_jacobian
     for level in reversed(LEVELS[1:]):
         starts = rows.groups.starts[level]
         if starts.size < 2:
             continue
         information = []
         if starts.size < FEW_UNITS:
-            for own in np.split(fitted.white_jacobian.toarray(), starts[1:]):
-                numbers = np.flatnonzero(own.any(axis=0))
-                information.append((numbers, own[:, numbers].T @ own[:, numbers]))
+            for first, last in itertools.pairwise([*starts, white.shape[0]]):
+                layout = replace(white.layout, block=white.layout.block[first:last])
+                gram = Tangent(layout, white.values[first:last]).gram()
+                numbers = np.flatnonzero(np.diag(gram))
+                information.append((numbers, gram[np.ix_(numbers, numbers)]))
         found.append(Sandwich(robust_covariance(fitted, level), information))
         if starts.size >= FEW_UNITS:
             break
