@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
+from numpy.polynomial import Legendre
 from scipy.special import fdtrc
 
 from sealfit.closure.judge import Candidate
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import LEVELS, Rows
 from sealfit.fit.tangent import OwnColumns, Tangent
+
+SHAPES = 3
+"""Shapes along strokes that repeats are asked for: a slope, a bend and a wave."""
 
 RANK = 1e-9  # of the largest singular value of a tangent, below which it holds nothing
 
@@ -71,6 +75,45 @@ def noise_floor(fitted: Fitted) -> float | None:
 
 
 def lack_of_fit(fitted: Fitted) -> float | None:
+    """Return the p-value of the residual's means and shapes in runs against repeats (F tests); None without repeats.
+
+    The smallest p-value is multiplied by the number of tests (Bonferroni).
+    """
+    means = _lack_of_means(fitted)
+    tests = [p for p in (means, *_lack_of_shapes(fitted)) if p is not None]
+    return None if means is None else min(1.0, len(tests) * min(tests))
+
+
+def _lack_of_shapes(fitted: Fitted) -> list[float]:
+    """Return the p-values of a slope, a bend and a wave along strokes, which repeats of a run have in common.
+
+    Each is one number per stroke, the coefficient of a Legendre polynomial, so that noise may be correlated within
+    strokes.
+    """
+    rows = fitted.rows
+    stroke, start = rows.codes("stroke"), rows.groups.starts["stroke"]
+    count = np.bincount(stroke)
+    place = (np.arange(stroke.size) - start[stroke] + 0.5) * 2 / count[stroke] - 1
+    scale = fitted.scatter.noise_sd(fitted.force)[start]
+    run, number = rows.table["run_id"].to_numpy()[start], rows.table["stroke"].to_numpy()[start]
+    chosen = count > SHAPES
+    found = []
+    for degree in range(1, SHAPES + 1):
+        shape = Legendre.basis(degree)(place)
+        strokes = pd.DataFrame(
+            {"run": run, "stroke": number, "z": np.bincount(stroke, shape * fitted.residual) / count}
+        )
+        strokes["z"] /= scale
+        cells = strokes[chosen].groupby(["run", "stroke"])["z"]
+        mean, files = cells.mean().to_numpy(), cells.size().to_numpy()
+        df = float((files - 1).sum())
+        if df > 0:
+            pure = float((cells.var(ddof=0).to_numpy() * files).sum()) / df
+            found.append(float(fdtrc(mean.size, df, (files @ mean**2 / mean.size) / max(pure, 1e-300))))
+    return found
+
+
+def _lack_of_means(fitted: Fitted) -> float | None:
     """Return the p-value of run means against the scatter of files within runs (F test); None without repeats.
 
     What a piece of rubber moves as a whole is scatter, not lack of fit, and is taken out with the model.

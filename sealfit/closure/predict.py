@@ -19,7 +19,7 @@ from sealfit.conditions import add_keys
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.errors import RequestError
-from sealfit.fit.declared import Declared
+from sealfit.fit.declared import SPEEDS_BETWEEN, Declared
 from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.whitening import Component, Scatter
@@ -214,12 +214,12 @@ def _outside(
             own = days[:tested_count][series[:tested_count] == series[code[k]]]
             outside[k] |= bool(days[code[k]] > own.max())
     speed = np.abs(pd.to_numeric(table["speed_mm_s"], errors="coerce").to_numpy(dtype=float))
-    for k in np.flatnonzero((code >= 0) & (after.declared.index["v_s"][code] < 0)):
+    for k in np.flatnonzero(code >= 0):
         tested = np.array(model["speeds_mm_s"][series[code[k]]])
-        if not (np.abs(speed[k] / tested - 1) < SAME_SPEED).any():
+        if tested.size < SPEEDS_BETWEEN and not (np.abs(speed[k] / tested - 1) < SAME_SPEED).any():
             outside[k] = True
             notes[k].append(
-                f"too few speeds for a Stribeck curve: only {', '.join(f'{v:g}' for v in tested)} are known"
+                f"too few speeds to know the friction between them: tested were {', '.join(f'{v:g}' for v in tested)}"
             )
     read = {"speed_mm_s"} | {name for term in after.terms for name in term.channels}
     if model["has_load"]:

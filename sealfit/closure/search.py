@@ -85,8 +85,8 @@ def _of_shapes(
     for acts_on, operation in targets:
         if not (_allowed(channel, acts_on, operation, both_ways) and _declared(fitted, acts_on)):
             continue
-        if channel.name in ("speed_mm_s", POWER) and not _declared(fitted, "v_s"):
-            continue  # too few speeds for a Stribeck curve: what depends on speed may be just that
+        if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
+            continue  # too few speeds to know the Stribeck curve: what depends on speed may be just that
         slope = fitted.slope(acts_on, operation)
         if np.abs(slope).max() <= 0:
             continue

@@ -13,8 +13,16 @@ from sealfit.fit.both_ways import SAME_SPEED
 from sealfit.fit.rows import Rows
 
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
-SPEEDS_FOR_STRIBECK = 4  # mu_s, mu_c, v_s and sigma_2 are four numbers
+SPEEDS_FOR_STRIBECK = 3
+"""Tested speeds from which a series has a Stribeck curve: three fix it there, with sigma_2 not below 0."""
+
+SPEEDS_BETWEEN = 4
+"""Tested speeds from which the curve is known between them too: mu_s, mu_c, v_s and sigma_2 are four numbers."""
+
+CURVED = ("full", "interpolated")  # forms with mu_s and v_s
+
 SPEEDS_FOR_VISCOUS = 2
+ROUNDING = 1e-24  # of a sum of squares, below which it is none
 DAYS_FOR_LAW = 3  # mu_0, a and b are three numbers
 
 
@@ -34,7 +42,7 @@ class Declared:
     index: Mapping[str, np.ndarray]  # quantity -> (conditions,) number of the parameter
     conditions: tuple[str, ...]
     has_load: bool
-    stribeck: Mapping[str, str]  # series -> "full" | "viscous" | "constant"
+    stribeck: Mapping[str, str]  # series -> "full" | "interpolated" | "viscous" | "constant"
     law: Mapping[str, bool]  # series -> whether Eq. 15 is fitted across its days
 
     @property
@@ -46,9 +54,10 @@ class Declared:
 def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
     """Return the declared model that these conditions and speeds can carry.
 
-    A series needs four speeds in one direction for Eq. 14, two for the viscous term; Eq. 15 needs three days, the
-    unaged day included. What cannot be fitted is left out, not guessed. Speeds are counted within one direction, as an
-    offset between directions would otherwise pass for a Stribeck curve. Made once for the same rows. Rows that are a
+    A series needs four speeds in one direction for Eq. 14, or three between which friction is not a straight line
+    ("interpolated"), and two for the viscous term; Eq. 15 needs three days, the unaged day included. What cannot be
+    fitted is left out, not guessed. Speeds are counted within one direction, as an offset between directions would
+    otherwise pass for a Stribeck curve. Made once for the same rows. Rows that are a
     part of a campaign, with its conditions, may carry its model: `as_in` is the campaign.
     """
     if ("declared",) not in rows.cache:
@@ -78,14 +87,14 @@ def _declare(rows: Rows) -> Declared:
     for c, (name, series, rubber) in enumerate(zip(names, series_of, rubbers, strict=True)):
         unaged = aging and days[c] == 0 and rubber in law_rubbers
         for end in "sc":
-            if end == "s" and stribeck[series] != "full":
+            if end == "s" and stribeck[series] not in CURVED:
                 continue
             if law[series]:
                 for quantity, owner in ((f"mu_0{end}", rubber), (f"a_{end}", series), (f"b_{end}", series)):
                     use(c, quantity, owner)
             else:
                 use(c, f"mu_0{end}", rubber if unaged else name)
-        if stribeck[series] == "full":
+        if stribeck[series] in CURVED:
             use(c, "v_s", series)
         if stribeck[series] != "constant":
             use(c, "sigma_2", series)
@@ -120,10 +129,43 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
     ends = np.searchsorted(key[order], np.arange(2 * names.size + 1))
     levels = [tested_speeds(rows, order[first:last]).size for first, last in itertools.pairwise(ends)]
     most = np.reshape(levels, (names.size, 2)).max(axis=1)  # of the two directions
-    return {
-        name: "full" if m >= SPEEDS_FOR_STRIBECK else "viscous" if m >= SPEEDS_FOR_VISCOUS else "constant"
-        for name, m in zip(names, most, strict=True)
-    }
+    forms = {}
+    for k, (name, m) in enumerate(zip(names, most, strict=True)):
+        if m >= SPEEDS_BETWEEN:
+            forms[name] = "full"
+        elif m >= SPEEDS_FOR_STRIBECK and _curved(rows, np.flatnonzero(number[rows.condition] == k)):
+            forms[name] = "interpolated"
+        else:
+            forms[name] = "viscous" if m >= SPEEDS_FOR_VISCOUS else "constant"
+    return forms
+
+
+def _curved(rows: Rows, chosen: np.ndarray) -> bool:
+    """Return whether friction at three speeds is not a straight line, by Akaike's criterion on means of files.
+
+    A curve through three speeds leaves little to judge other effects by, so a line is kept where it will do. Conditions
+    have a level each and share the slope and the bend; the two directions count as repeats.
+    """
+    speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
+    tested = tested_speeds(rows, chosen)
+    table = pd.DataFrame(
+        {
+            "file": rows.codes("file")[chosen],
+            "direction": np.sign(rows.speed[chosen]),
+            "condition": rows.condition[chosen],
+            "middle": np.abs(speed[:, None] - tested).argmin(axis=1) == 1,
+            "slope": speed / load,
+            "mu": np.abs(rows.force[chosen]) / load,
+        }
+    )
+    files = table.groupby(["file", "direction", "condition"], as_index=False).mean()
+    line = np.column_stack([pd.get_dummies(files["condition"], dtype=float), files["slope"]])
+    costs = []
+    for columns in (line, np.column_stack([line, files["middle"]])):
+        found, _, rank, _ = np.linalg.lstsq(columns, files["mu"], rcond=1e-9)
+        left = files["mu"] - columns @ found
+        costs.append(len(files) * np.log(max(left @ left, ROUNDING * (files["mu"] @ files["mu"]))) + 2 * rank)
+    return bool(costs[1] < costs[0])
 
 
 def tested_speeds(rows: Rows, chosen: np.ndarray) -> np.ndarray:

@@ -219,6 +219,9 @@ def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     days = rows.days[rows.days > 0]
     first, last = (days.min(), days.max()) if days.size else (1.0, 1.0)
     limits = {
+        "mu_0s": (0.0, np.inf),
+        "mu_0c": (0.0, np.inf),
+        "sigma_2": (0.0, np.inf),
         "v_s": (np.log(slowest), np.log(fastest)),
         "b_s": (np.log(first / 1000), np.log(last * 30)),
         "b_c": (np.log(first / 1000), np.log(last * 30)),

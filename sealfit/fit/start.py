@@ -9,6 +9,9 @@ from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows
 
 GRID = 80  # values of v_s
+EQUAL = (
+    1e-10  # of the sum of squares, by which v_s differ no more: of three speeds many fit, and the middle one is taken
+)
 RANK = 1e-10  # of the largest singular value, below which columns are as good as dependent
 
 
@@ -72,17 +75,17 @@ def _per_condition(speed, load, size, condition, full: bool):
     """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of one series by a grid over v_s, the rest exact."""
     own, code = np.unique(condition, return_inverse=True)
     grid = np.geomspace(*stribeck_range(speed), GRID) if full else np.array([1.0])
-    best, answer = np.inf, None
+    solved, costs = [], []
     for v_s in grid:
         decay = np.exp(-((speed / v_s) ** 2)) if full else np.zeros_like(speed)
         columns = (load * decay, load * (1 - decay))
         pairs, sigma_2 = pairs_and_shared(columns, code, speed, size)
         first, second = pairs.T
         left = size - first[code] * columns[0] - second[code] * columns[1] - sigma_2 * speed
-        cost = float(left @ left)
-        if cost < best:
-            best, answer = cost, (pairs, sigma_2, v_s)
-    pairs, sigma_2, v_s = answer
+        costs.append(float(left @ left))
+        solved.append((pairs, sigma_2, v_s))
+    alike = np.flatnonzero(np.array(costs) <= min(costs) + EQUAL * float(size @ size))
+    pairs, sigma_2, v_s = solved[alike[alike.size // 2]]
     mu_s, mu_c = pairs.T if full else (pairs[:, 1], pairs[:, 1])
     return {int(c): (s, k) for c, s, k in zip(own, mu_s, mu_c, strict=True)}, float(sigma_2), float(v_s)
 
@@ -90,7 +93,7 @@ def _per_condition(speed, load, size, condition, full: bool):
 def pairs_and_shared(
     columns: tuple[np.ndarray, np.ndarray], code: np.ndarray, shared: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the least squares of two numbers per group and one that all share, the smallest where many fit.
+    """Return the least squares of two numbers per group and one, not below 0, that all share; the smallest of many.
 
     Each group's two columns are made orthogonal and taken out, which leaves one equation for the shared number.
 
@@ -131,6 +134,7 @@ def pairs_and_shared(
         number = float(shared_left @ values_left) / square
     else:
         number = float((of_values * of_shared).sum()) / (1.0 + float((of_shared**2).sum()))
+    number = max(number, 0.0)
     return of_values - number * of_shared, number
 
 

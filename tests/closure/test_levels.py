@@ -1,0 +1,21 @@
+import numpy as np
+from bins_helpers import make_bins
+
+from sealfit.closure.levels import lack_of_fit
+from sealfit.fit.estimate import fit_declared
+from sealfit.fit.rows import make_rows
+
+
+def p_value(seed: int, slope_N: float = 0.0) -> float:
+    bins = make_bins(seed=seed, temperatures=(60.0,), gain=0.005, noise_N=0.05, bins=8)
+    place = bins["bin"] / bins["bin"].max() - 0.5
+    bins["force_N"] += np.sign(bins["speed_mm_s"]) * slope_N * place
+    return lack_of_fit(fit_declared(make_rows(bins, has_aging=True)))
+
+
+def test_repeats_show_a_slope_along_strokes_that_the_model_lacks():
+    assert p_value(0, slope_N=0.3) < 1e-6
+
+
+def test_without_a_misfit_p_values_are_not_small_more_often_than_by_chance():
+    assert sum(p_value(seed) < 0.1 for seed in range(40)) <= 8
