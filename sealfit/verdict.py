@@ -39,7 +39,11 @@ def power_clause(closure: Mapping, units: Units) -> str:
 
 def untold_clause(closure: Mapping, units: Units) -> str:
     """Return which variables the campaign could not tell of, and what would do, in a clause; empty for none."""
-    texts = []
+    texts = [
+        f"{effect['label']} (shown by too few specimens, or differently: test more)"
+        for effect in closure["effects"]
+        if effect["candidate"]
+    ]
     for entry in [s for s in closure.get("sensitivity") or () if s["cannot_tell"]][:NAMED]:
         name, smallest, files = entry["variable"], entry["smallest_pct"], entry["files_needed"]
         size = "no effect" if smallest is None else f"no effect below {smallest:.2g} % of the force"

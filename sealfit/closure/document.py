@@ -96,10 +96,13 @@ def closure_document(
     quality = fit_quality(numbers["after"], floor)
     seen = sensitivity(grown, config.loop.family_error)
     untold = set(cannot_tell(grown, seen, scatter))
-    if grown.left is not None or grown.worse:
+    only_doubted = grown.unsure is not None and not grown.added
+    if grown.worse or (grown.left is not None and not only_doubted):
         verdict = "unexplained"
     elif grown.added:
         verdict = "closed"
+    elif only_doubted:
+        verdict = "cannot_tell"
     else:
         verdict = "cannot_tell" if untold and quality["state"] != "within_scatter" else "nothing_missing"
     return {

@@ -121,27 +121,31 @@ def grow(
         if fitted is not judge.fitted:
             judge = Judge(fitted)
             last = tuple(search(judge, list(channels.values()), rng))
-        significant = [c for c in last if c.p_value <= alpha and c.sure]
+        doubted = _doubted(last, alpha)
+        claimable = _claimable(last, doubted)
+        significant = [c for c in claimable if c.p_value <= alpha]
         say(f"round {number}: {len(last)} candidates on {len(channels)} channels, {len(significant)} significant")
         aged = not significant or any(c.channels == (AGING,) for c in significant)
         laws = richer_laws(fitted, channels, effects) if aged else []
         pairs = []
         if not significant or significant[0].p_value > DOUBTFUL:
-            pairs = search_pairs(judge, list(channels.values()), last, rng)
+            pairs = _claimable(search_pairs(judge, list(channels.values()), last, rng), doubted)
             together = [c for c in pairs if c.p_value <= alpha * min((s.p_value for s in significant), default=1.0)]
             say(f"round {number}: {len(pairs)} pairs, {len(together)} significant")
             significant = sorted([*significant, *together], key=lambda c: c.p_value)
             if not hidden:
                 level = alpha * min((c.p_value for c in significant), default=1.0)
-                hidden = search_joint(judge, channels, [*last, *pairs], level)
+                hidden = search_joint(judge, channels, [*claimable, *pairs], level)
                 say(f"round {number}: {len(hidden)} pairs that hide each other")
                 two = next((pair for pair in hidden if {key[0] for key in pair.keys} == {("direction",)}), None)
-                if two is not None and (both := _both(fitted, _awaited([two], last), channels, effects, ask, number)):
+                if two is not None and (
+                    both := _both(fitted, _awaited([two], claimable), channels, effects, ask, number)
+                ):
                     added, hidden = [*added, *both], []
                     fitted = fit(added[-1].proposal.fitted.model, rows, fitted.scatter, turns=2)
                     continue
                 hidden = [] if significant else [pair for pair in hidden if refused.isdisjoint(pair.keys)]
-        significant = _awaited(hidden, (*last, *pairs)) or significant
+        significant = _awaited(hidden, (*claimable, *pairs)) or significant
         significant += [c for c, _ in laws if c.p_value <= alpha and c.sure]
         left = significant[0] if significant else ripples.found
         significant += pairs_in_disguise(judge, significant, channels)
@@ -154,7 +158,7 @@ def grow(
             if added is before_that:
                 break
             continue
-        open_ += [c for c in _standing_for(open_, last) if c.key not in refused]
+        open_ += [c for c in _standing_for(open_, claimable) if c.key not in refused]
         proposals = propose(fitted, open_, channels, effects, [p for _, p in laws])
         accepted = ask(fitted, proposals, number, not_confirmed)
         if accepted is None:
@@ -206,6 +210,16 @@ def _both(
     base = fit(alone, fitted.rows, fitted.scatter, turns=1)
     earlier = ask(base, propose(base, [first], channels, effects), number, [])
     return [] if earlier is None else [later, earlier]
+
+
+def _doubted(candidates: Sequence[Candidate], alpha: float) -> set[str]:
+    """Return the channels along which a few specimens differ in something significant: it may be their scatter."""
+    return {c.channels[-1] for c in candidates if c.p_value <= alpha and not c.agrees} - {"direction"}
+
+
+def _claimable(candidates: Sequence[Candidate], doubted: set[str]) -> list[Candidate]:
+    """Return the candidates that are sure and of no doubted channel, whatever they act on."""
+    return [c for c in candidates if c.sure and doubted.isdisjoint(c.channels)]
 
 
 def _awaited(hidden: Sequence[Hidden], candidates: Sequence[Candidate]) -> list[Candidate]:

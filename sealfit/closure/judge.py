@@ -31,7 +31,7 @@ from scipy.special import betainc, chdtrc, fdtrc
 
 from sealfit.closure.channels import FINER, MANY_UNITS
 from sealfit.closure.few import FewTest, FewUnits
-from sealfit.closure.slopes import SlopeTest, slope_test
+from sealfit.closure.slopes import SlopeTest, along_strokes, slope_test, specimens_agree
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import LEVELS
 from sealfit.fit.tangent import OwnColumns, Tangent
@@ -56,6 +56,7 @@ class Judgement(NamedTuple):
     scores: np.ndarray | None = None  # (units, k)
     few: FewTest | None = None  # against the scatter of few specimens; None where that was not tried
     slopes: tuple[SlopeTest, ...] = ()  # against the slopes of few units, in every variant; empty where not tried
+    agree: bool = True  # whether two to four specimens show the same along strokes, where many runs are the units
 
 
 @dataclass(frozen=True)
@@ -77,10 +78,15 @@ class Candidate:
         return (self.channels, self.acts_on, self.operation)
 
     @property
+    def agrees(self) -> bool:
+        """Whether two to four specimens show the same of it."""
+        few = (test.agree[np.argmax(np.abs(test.slope))] for test in self.judgement.slopes)
+        return self.judgement.agree and all(few)
+
+    @property
     def sure(self) -> bool:
         """Whether it may be claimed: too few specimens do not show their own scatter, or show that they differ."""
-        agree = all(test.agree[np.argmax(np.abs(test.slope))] for test in self.judgement.slopes)
-        return agree and (self.judgement.few is None or self.judgement.few.sure)
+        return self.agrees and (self.judgement.few is None or self.judgement.few.sure)
 
     @property
     def chi2(self) -> float:
@@ -179,7 +185,7 @@ class Judge:
         weakest = max(found, key=lambda j: max(j.log_p, j.log_p_jackknife))
         weakest = weakest._replace(units=starts[level].size)
         if not few:
-            return weakest
+            return weakest._replace(agree=all(map(self._specimens_agree, variants)))
         if level == "specimen":
             test = self.few[level].test(variants[0], target)
             return weakest if test is None else weakest._replace(chi2=test.chi2, df=test.basis.shape[1], few=test)
@@ -187,6 +193,13 @@ class Judge:
         if any(test is None for test in tests):
             return None
         return weakest._replace(slopes=tests, few=self._of_few_runs(variants, between, level, target))
+
+    def _specimens_agree(self, left: np.ndarray) -> bool:
+        """Return whether a few specimens show the same of what columns along strokes explain together."""
+        fitted = self.fitted
+        explained = left @ (np.linalg.pinv(left.T @ left, hermitian=True) @ (left.T @ fitted.white_residual))
+        explained = explained[:, None]
+        return not along_strokes(fitted, explained)[0] or bool(specimens_agree(fitted, explained)[0])
 
     def _of_few_runs(
         self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import log_ndtr, polygamma, psi, stdtr
+from scipy.special import chdtrc, log_ndtr, polygamma, psi, stdtr
 
 from sealfit.fit.estimate import Fitted
 
@@ -46,6 +46,12 @@ SHOWN = 0.05
 
 AGREE = 0.1
 """P-value of Student's t over two to four specimens, above which their own slopes do not agree."""
+
+LEAST_SPECIMENS = 2.5
+"""Specimens, counted by their leverages, from which they may agree: two that differ do so too often by chance."""
+
+DIFFER = 0.05
+"""P-value of chi-squared below which their slopes differ by more than noise, and agree by chance if they do."""
 
 
 class SlopeTest(NamedTuple):
@@ -91,13 +97,11 @@ def slope_test(fitted: Fitted, left: np.ndarray, level: str) -> SlopeTest | None
     scores = groups.sums(left * fitted.unit_residual(level)[:, None], level)
     deviations = (scores - leverage * slope) / np.sqrt(1 - np.minimum(leverage, LARGEST_LEVERAGE))
     df = satterthwaite_df(leverage)
-    inside = groups.sums(left, "stroke") ** 2 / groups.sums(np.ones(len(left)), "stroke")[:, None]
     known = df >= LEAST_DF
     if not known.any():
         return None
-    agree = _agree(groups.sums(left**2, "specimen"), groups.sums(left * fitted.white_residual[:, None], "specimen"))
-    parts = (slope, (deviations**2).sum(axis=0), df, inside.sum(axis=0) < 0.5)
-    return SlopeTest(level, *(part[known] for part in parts), deviations[:, known], agree[known])
+    parts = (slope, (deviations**2).sum(axis=0), df, along_strokes(fitted, left))
+    return SlopeTest(level, *(p[known] for p in parts), deviations[:, known], specimens_agree(fitted, left)[known])
 
 
 def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
@@ -109,18 +113,33 @@ def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
     return 1 / ((leverage**2).sum(axis=0) + shared.sum(axis=0) ** 2 - (shared**2).sum(axis=0))
 
 
-def _agree(leverage: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return whether specimens have the same slope, shape (m,), from their leverages and scores, shape (specimens, m).
+def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
+    """Return whether two to four specimens show the same slope along each whitened column, shape (n, m) -> (m,).
 
-    Of one specimen nothing can be said, and from `LEAST_UNITS` on they are the units themselves.
+    Of one specimen nothing can be said, and from `LEAST_UNITS` on they are the units themselves. Along strokes each has
+    a slope of its own, so there they must not differ by more than noise.
     """
-    found = np.ones(scores.shape[1], dtype=bool)
+    sums = fitted.rows.groups.sums
+    leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
+    found = np.ones(left.shape[1], dtype=bool)
+    if not 2 <= leverage.shape[0] < LEAST_UNITS:
+        return found
+    inside = along_strokes(fitted, left)
     for k, (own, score) in enumerate(zip(leverage.T, scores.T, strict=True)):
-        slopes = score[own > SHOWN] / own[own > SHOWN]
-        if 2 <= slopes.size < LEAST_UNITS:
-            error = np.std(slopes, ddof=1) / np.sqrt(slopes.size)
-            found[k] = log_p_of_t(slopes.mean() / max(error, 1e-300), np.array(slopes.size - 1.0)) < np.log(AGREE)
+        shown = own > SHOWN * own.sum()
+        own, slopes = own[shown], score[shown] / own[shown]
+        enough = not inside[k] or own.sum() ** 2 > LEAST_SPECIMENS * (own @ own)
+        t = slopes.mean() / max(np.std(slopes) / np.sqrt(max(slopes.size - 1, 1)), 1e-300)
+        alike = not inside[k] or chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFER
+        found[k] = enough and alike and log_p_of_t(t, np.array(slopes.size - 1.0)) < np.log(AGREE)
     return found
+
+
+def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:
+    """Return whether most of each whitened column varies inside strokes, shape (n, m) -> (m,)."""
+    sums = fitted.rows.groups.sums
+    between = sums(left, "stroke") ** 2 / sums(np.ones(len(left)), "stroke")[:, None]
+    return between.sum(axis=0) < 0.5 * (left**2).sum(axis=0)
 
 
 def slope_log_p(tests: Sequence[SlopeTest]) -> list[np.ndarray]:

@@ -142,7 +142,7 @@ def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
     # Three degrees of freedom are left: however strong, F says no more than 0.004 to 0.009 after all that is searched.
     made = close_loop(bins, make_traces(bins), Config(loop={"family_error": 0.02}))
     document = made.document
-    assert document["verdict"] == "unexplained"
+    assert document["verdict"] == "cannot_tell"
     (effect,) = document["effects"]
     assert effect["candidate"]
     assert (effect["channels"], effect["acts_on"], effect["level"]) == (["hardness_ShA"], "v_s", "condition")

@@ -3,14 +3,16 @@ from dataclasses import replace
 import numpy as np
 import numpy.testing as npt
 import pytest
-from bins_helpers import make_bins
+from bins_helpers import make_bins, make_traces
 from scipy import stats
 
 from sealfit.closure.channels import find_channels, level_values, scatter_level, settings, unit_of
 from sealfit.closure.judge import Judge
+from sealfit.closure.loop import close_loop
 from sealfit.closure.pairs import search_pairs
 from sealfit.closure.search import search
 from sealfit.closure.slopes import SlopeTest, log_p_of_t, slope_log_p, slope_test
+from sealfit.config import Config
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
 
@@ -133,3 +135,27 @@ def test_what_specimens_differ_in_is_judged_between_specimens():
     jittered = channels["oil_ppm"].values * (1 + 1e-5 * np.random.default_rng(0).normal(size=rows.force.size))
     assert unit_of(jittered, rows) == "run"
     assert np.unique(level_values(jittered, rows)).size == rows.groups.starts["run"].size
+
+
+def test_two_specimens_with_the_same_slope_are_too_few_to_claim_it():
+    def slope(table, force):
+        return force * (1 + 0.03 * (table["displacement_mm"].to_numpy() - 20) / 40)
+
+    bins = make_bins(3, days=(1.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, repeats=5, bins=8, effect=slope)
+    rows = make_rows(bins, has_aging=True)
+    found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    along = [c for c in found if c.channels == ("displacement_mm",) and c.p_value < 0.005]
+    assert along
+    assert not any(c.sure for c in along)
+
+
+def test_what_two_specimens_show_is_a_candidate_and_the_verdict_cannot_tell():
+    def slope(table, force):
+        return force * (1 + 0.03 * (table["displacement_mm"].to_numpy() - 20) / 40)
+
+    bins = make_bins(3, days=(1.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, repeats=5, bins=8, effect=slope)
+    document = close_loop(bins, make_traces(bins), Config()).document
+    assert document["verdict"] == "cannot_tell"
+    (candidate,) = document["effects"]
+    assert candidate["candidate"]
+    assert candidate["channels"][0] in ("displacement_mm", "distance_mm")
