@@ -223,6 +223,7 @@ def predicted(task: Task, world: World, rows: Rows, home: Path) -> dict:
     own_only = answer["note"].astype(str).str.contains("those of the tested ones").to_numpy()
     meant = np.where(own_only, force_at(world, points, tested=True), exact)  # what each interval says it is of
     inside = (low <= meant) & (meant <= high) & good
+    given = np.isfinite(low) & np.isfinite(high) & good
 
     def rms(error: np.ndarray) -> float | None:
         return float(np.sqrt(np.mean(error[good] ** 2))) if good.any() else None
@@ -234,7 +235,7 @@ def predicted(task: Task, world: World, rows: Rows, home: Path) -> dict:
         "extrapolated": int(outside.sum()),
         "errors": {"before": rms(before - exact), "after": rms(after - exact), "true_form": rms(oracle)},
         "inside": int(inside.sum()),
-        "of_tested_specimens": {"points": int((good & own_only).sum()), "inside": int((inside & own_only).sum())},
-        "with_interval": int((np.isfinite(low) & np.isfinite(high) & good).sum()),
-        "half_width_N": float(np.median((high - low)[good] / 2)) if good.any() else None,
+        "of_tested_specimens": {"points": int((given & own_only).sum()), "inside": int((inside & own_only).sum())},
+        "with_interval": int(given.sum()),
+        "half_width_N": float(np.median((high - low)[given] / 2)) if given.any() else None,
     }

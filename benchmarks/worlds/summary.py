@@ -78,7 +78,7 @@ def line(record: dict) -> str:
         f"{c['id']}({','.join(c['channels'])})->{c['acts_on']}/{c['operation']}" for c in record["claims"]
     )
     errors = " ".join(f"{k} {v:.3g}" for k, v in (record.get("errors") or {}).items() if v is not None)
-    inside = f"{record.get('inside', 0)}/{record.get('points', 0)}"
+    inside = f"{record.get('inside', 0)}/{record.get('with_interval', 0)}"
     return (
         f"{head} {record['verdict']:15s} {hidden or 'null'} | {claims or '-'} | extra {record['extra']} | {errors} | "
         f"inside {inside} | {record['seconds']:.0f} s {record['peak_MB']:.0f} MB{' | ' + why if why else ''}"
@@ -96,7 +96,7 @@ def figures(records: list[dict], fine: list[dict]) -> str:
     """Return the table of figures over all worlds."""
     nulls, clear = [r for r in fine if is_null(r)], clear_effects(fine)
     before, true_form = ratios(fine, "before"), ratios(fine, "true_form")
-    pooled = sum(r.get("inside", 0) for r in fine), sum(r.get("points", 0) for r in fine)
+    pooled = sum(r.get("inside", 0) for r in fine), sum(r.get("with_interval", 0) for r in fine)
     noted = [r["of_tested_specimens"] for r in fine if r.get("of_tested_specimens")]
     own = sum(n["inside"] for n in noted), sum(n["points"] for n in noted)
     stated = [(e["own_rms_N"] / e["smallest_N"], e["grade"] > 0) for r in fine for e in r["effects"] if e["smallest_N"]]
@@ -166,7 +166,7 @@ def by_feature(fine: list[dict]) -> str:
                 _count(here, lambda r: r["extra"] > 0),
                 f"{sum(e['grade'] > 0 for e in clear)}/{len(clear)}",
                 f"{int((ratios(here, 'before') > WORSE).sum())}/{ratios(here, 'before').size}",
-                _percent(sum(r.get("inside", 0) for r in here), sum(r.get("points", 0) for r in here)),
+                _percent(sum(r.get("inside", 0) for r in here), sum(r.get("with_interval", 0) for r in here)),
             )
         )
     head = ("feature", "worlds", "null: alarmed", "extra", "clear found", "made worse", "inside 95 %")

@@ -25,6 +25,10 @@ FEW_UNITS = 30
 """Groups of a level below which a sandwich covariance is itself uncertain, and has degrees of freedom of its own."""
 
 
+LEAST_LEFT = 0.5
+"""Runs that the model must leave over for their scatter to be known at all."""
+
+
 class Sandwich(NamedTuple):
     """Covariance of the fitted numbers that whole groups of a level show, whatever it is that these differ in."""
 
@@ -34,7 +38,16 @@ class Sandwich(NamedTuple):
 
 
 def degrees_of_freedom(fitted: Fitted) -> float:
-    """Return the degrees of freedom of the coarsest level that scatters: units there less the levels they estimate."""
+    """Return the degrees of freedom of the coarsest level that scatters: units there less the levels they estimate.
+
+    0 where the model has as many numbers as there are runs: nothing then shows how runs scatter.
+    """
+    groups = fitted.rows.groups
+    white = fitted.whitening(fitted.friction[:, None])[:, 0]
+    white = white / np.sqrt(groups.sums(white**2, "run"))[groups.codes["run"]]
+    taken = float((fitted.basis.sums(groups, "run", white).values ** 2).sum())
+    if groups.starts["run"].size - taken < LEAST_LEFT:
+        return 0.0
     active = [c.level for c in fitted.scatter.components if c.variance > 0]
     level = active[-1] if active else "file"
     units = fitted.rows.groups.starts[LEVELS[max(LEVELS.index(level), 1)]].size
@@ -43,7 +56,7 @@ def degrees_of_freedom(fitted: Fitted) -> float:
 
 
 def t_quantile(df: float) -> float:
-    """Return the two-sided 95 % quantile of Student's t."""
+    """Return the two-sided 95 % quantile of Student's t; NaN for no degrees of freedom."""
     return float(stdtrit(df, 0.975))
 
 

@@ -62,6 +62,9 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     if not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
         for k in np.flatnonzero(good):
             notes[k].append("how specimens scatter is not known: the intervals are those of the tested ones")
+    if model["df"] == 0:
+        for k in np.flatnonzero(good):
+            notes[k].append("no interval: the model has as many numbers as there are runs; test repeats or more speeds")
     extrapolated = _outside(table, conditions, code, model, notes, after)
     if good.any():
         at = point_rows(
