@@ -194,7 +194,9 @@ def _rubber_rows(values, curves, fitted, used, own, unit, unaged) -> Iterator[di
             continue
         q = fitted.index(curve.quantity)
         found = Estimate.of(joint, curve, q, shift)
-        yield from law_rows(curve, found, t[q], intervals[curve.place], unit, curve.quantity in unaged)
+        yield from law_rows(
+            curve, found, t[q], intervals[curve.place], unit, unaged=curve.quantity in unaged, df=dfs[q]
+        )
         share = len({c.series for c in curves if c.place >= 0 and c.quantity == curve.quantity})
         yield from statistics_rows(curve, joint, plain[curve.quantity], values, q, taus[q], dfs[q], share, unit)
         yield from covariance_rows(curve, found.covariance, unit)

@@ -58,11 +58,17 @@ class Estimate:
             return float(np.sqrt(gradient @ self.covariance @ gradient))
 
 
-def law_rows(curve: Curve, found: Estimate, t: float, ends: CurveInterval, unit: str, unaged: bool) -> Iterator[dict]:
+NO_SCATTER = "as many parameters as days: the interval leaves out how specimens scatter, which nothing shows."
+
+
+def law_rows(
+    curve: Curve, found: Estimate, t: float, ends: CurveInterval, unit: str, *, unaged: bool, df: int
+) -> Iterator[dict]:
     """Return the rows of mu_0, a, b and c."""
     mu_0, a, u = found.x
     se = np.sqrt(np.diag(found.covariance))
     b, se_c = np.exp(u), found.error_of_c()
+    beside = "" if df > 0 else NO_SCATTER
     move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # less is rounding
     judged = _judge(curve, a, b, ends, unaged)
     limits = {"mu_0": (mu_0 - t * se[0], mu_0 + t * se[0]), "a": ends.a, "b": ends.b, "c": ends.c}
@@ -85,7 +91,7 @@ def law_rows(curve: Curve, found: Estimate, t: float, ends: CurveInterval, unit:
             u_sys=abs(systematic),
             unit=its_unit,
             identified=judged[name][0],
-            reason=judged[name][1],
+            reason=" ".join(filter(None, (judged[name][1], beside))),
         ) | {"series": curve.series}
 
 
