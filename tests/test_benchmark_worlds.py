@@ -263,6 +263,7 @@ def test_intervals_of_the_law_are_held_to_the_series_truth(tmp_path):
     table = pd.DataFrame(rows, columns=["quantity", "parameter", "value", "half", "identified"])
     place = {name: own[name] for name in ("temperature_C", "compression_ratio_pct")}
     table = table.assign(lo95=table["value"] - table["half"], hi95=table["value"] + table["half"], **place)
+    table["reason"] = ""
     table.to_parquet(tmp_path / "aging_fit.parquet")
     steady = pd.DataFrame({"parameter": ["mu_s", "mu_c"], "identified": [True, True]})
     steady.to_parquet(tmp_path / "steady_fit.parquet")

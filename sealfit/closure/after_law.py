@@ -106,8 +106,10 @@ class _Law:
             yield from without_law(self.curve_of, self.unit, self.unaged)
             return
         found = self._estimate()
-        words = "; ".join(self._kept_words())
-        for row in law_rows(self.curve_of, found, t_quantile(self.df), self._interval(found), self.unit, self.unaged):
+        words, interval = "; ".join(self._kept_words()), self._interval(found)
+        for row in law_rows(
+            self.curve_of, found, t_quantile(self.df), interval, self.unit, unaged=self.unaged, df=self.df
+        ):
             yield {**row, "reason": " ".join(part for part in (row["reason"], words) if part)}
         yield from self._statistics(steady_fit)
         yield from covariance_rows(self.curve_of, found.covariance, self.unit)

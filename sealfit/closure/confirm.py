@@ -40,15 +40,14 @@ LEAST_SETTINGS, MOST_SETTINGS = 3, 15
 """Settings of a channel between which a shape interpolates: with fewer none is inside, with more they lie densely."""
 
 WEAK = 1e-5
-"""P-value above which an effect must also lower the held-out error by a least share: see `LEAST_FALLS`."""
+"""P-value above which an effect must also lower the held-out error by `LEAST_FALL`.
 
-LEAST_FALLS = ((1e-3, 0.1), (WEAK, 0.05))
-"""P-values, and the share of the held-out RMSE by which an effect with a larger one must lower it.
-
-P-values of a few specimens or runs rest on what their scatter is assumed to be; held-out data do not. Of 28 claims with
-p > 1e-5 in worlds drawn at random, 9 of the 11 true ones lower the error by 5 % or more, 13 of the 17 false ones by
-less. With p > 1e-3 the false ones come up to 7 %, and 8 of 10 true ones lie above 12 %.
+P-values of a few specimens or runs rest on what their scatter is assumed to be; held-out data do not. Of 28 claims
+with such p-values in worlds drawn at random, 9 of the 11 true ones lower it by more, 13 of the 17 false ones by less.
 """
+
+LEAST_FALL = 0.05
+"""Share of the held-out RMSE by which an effect of weak evidence must lower it."""
 
 LEAST_SIZE = 2e-4
 """Of the RMS force: the smallest effect that counts. What is smaller may as well be the sensor's nonlinearity."""
@@ -428,11 +427,8 @@ def _why_not(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFra
     """Return why a proposal is not confirmed; None where it is."""
     if not gain.real:
         return "it does not predict the data that were held out better than the model without it"
-    p_value, least_fall = next(((p, share) for p, share in LEAST_FALLS if proposal.p_value > p), (0.0, 0.0))
-    if gain.share < least_fall:
-        return (
-            f"its p-value is no less than {p_value:g}, and it lowers the held-out error by less than {least_fall:.0%}"
-        )
+    if proposal.p_value > WEAK and gain.share < LEAST_FALL:
+        return f"its p-value is no less than {WEAK:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
     least = max(unseen_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
     if np.sqrt(np.mean(_added_force(proposal) ** 2)) <= least:
         return "it is smaller than the recorded force can show"

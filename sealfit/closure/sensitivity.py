@@ -20,7 +20,7 @@ from sealfit.closure.confirm import LEAST_SIZE
 from sealfit.closure.few import FewTest, FewUnits
 from sealfit.closure.grow import Grown
 from sealfit.closure.judge import CONSTANT, JACKKNIFE_UNITS, Candidate, Judge, project
-from sealfit.closure.slopes import LEAST_UNITS, WAYS, SlopeTest, moderated, slope_test
+from sealfit.closure.slopes import LEAST_UNITS, WAYS, SlopeTest, enough_specimens, moderated, slope_test
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.reml import orthonormal
 from sealfit.fit.rows import LEVELS
@@ -86,7 +86,7 @@ def sensitivity(grown: Grown, alpha: float) -> list[dict]:
     """
     fitted = grown.after
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))
-    files = rows.groups.starts["file"].size
+    files, specimens = (rows.groups.starts[level].size for level in ("file", "specimen"))
     search = _Search(grown, alpha)
     entries = []
     for name, channel in grown.channels.items():
@@ -102,6 +102,8 @@ def sensitivity(grown: Grown, alpha: float) -> list[dict]:
                 smallest = force * float(max(times, SHOWN * LEAST_SIZE)) if times < 1 else None
             if smallest is None:
                 units = rows.groups.starts[scatter_level([channel], rows)].size
+                if channel.unit == "sample" and specimens > 1:
+                    units = min(units, specimens)
                 needed = int(np.ceil(files * LEAST_UNITS / units)) if units < LEAST_UNITS else None
             else:
                 needed = int(np.ceil(files * (100 * smallest / force / WANTED_PCT) ** 2))
@@ -115,7 +117,6 @@ def sensitivity(grown: Grown, alpha: float) -> list[dict]:
                     "files_needed": needed,
                 }
             )
-    specimens = rows.groups.starts["specimen"].size
     if len(rows.conditions) < specimens < LEAST_UNITS:  # they may differ, and no variable says how
         needed = int(np.ceil(files * LEAST_UNITS / specimens))
         unknown = {"variable": SPECIMEN, "level": "condition", "acts_on": "mu", "smallest_N": None}
@@ -210,6 +211,8 @@ class _Search:
         channel, judgement = self.channels[candidate.channels[-1]], candidate.judgement
         columns = candidate.columns * noise.slope(candidate.acts_on, candidate.operation)[:, None]
         variants = judge.variants(columns, channel.unit)
+        if not all(enough_specimens(noise, left).all() for left in variants):
+            return 0.0
         few = judgement.few
         by_few = 0.0 if few is None else min(self._by_few(noise, effect, left, few) for left in variants)
         if judgement.slopes:

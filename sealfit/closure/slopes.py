@@ -50,8 +50,11 @@ AGREE = 0.1
 LEAST_SPECIMENS = 2.5
 """Specimens, counted by their leverages, from which they may agree: two that differ do so too often by chance."""
 
+CLOSELY = 0.005
+"""The same where they differ by more than noise: rarely enough by chance alone."""
+
 DIFFER = 0.05
-"""P-value of chi-squared below which their slopes differ by more than noise, and agree by chance if they do."""
+"""P-value of chi-squared below which their slopes differ by more than noise."""
 
 
 class SlopeTest(NamedTuple):
@@ -117,22 +120,34 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     """Return whether two to four specimens show the same slope along each whitened column, shape (n, m) -> (m,).
 
     Of one specimen nothing can be said, and from `LEAST_UNITS` on they are the units themselves. Along strokes each has
-    a slope of its own, so there they must not differ by more than noise.
+    a slope of its own, so there they must be enough, and agree closely where they differ by more than noise.
     """
-    sums = fitted.rows.groups.sums
+    found = enough_specimens(fitted, left)
+    sums, inside = fitted.rows.groups.sums, along_strokes(fitted, left)
     leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
-    found = np.ones(left.shape[1], dtype=bool)
     if not 2 <= leverage.shape[0] < LEAST_UNITS:
         return found
-    inside = along_strokes(fitted, left)
-    for k, (own, score) in enumerate(zip(leverage.T, scores.T, strict=True)):
-        shown = own > SHOWN * own.sum()
-        own, slopes = own[shown], score[shown] / own[shown]
-        enough = not inside[k] or own.sum() ** 2 > LEAST_SPECIMENS * (own @ own)
+    for k in np.flatnonzero(found):
+        shown = leverage[:, k] > SHOWN * leverage[:, k].sum()
+        own = leverage[shown, k]
+        slopes = scores[shown, k] / own
         t = slopes.mean() / max(np.std(slopes) / np.sqrt(max(slopes.size - 1, 1)), 1e-300)
-        alike = not inside[k] or chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFER
-        found[k] = enough and alike and log_p_of_t(t, np.array(slopes.size - 1.0)) < np.log(AGREE)
+        log_p = log_p_of_t(t, np.array(slopes.size - 1.0))
+        alike = chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFER
+        found[k] = log_p < np.log(AGREE if alike or not inside[k] else CLOSELY)
     return found
+
+
+def enough_specimens(fitted: Fitted, left: np.ndarray) -> np.ndarray:
+    """Return whether two to four specimens could agree on each whitened column at all, shape (n, m) -> (m,).
+
+    They are counted by their leverages. Of columns that do not lie along strokes they always could.
+    """
+    leverage = fitted.rows.groups.sums(left**2, "specimen")
+    if not 2 <= leverage.shape[0] < LEAST_UNITS:
+        return np.ones(left.shape[1], dtype=bool)
+    many = leverage.sum(axis=0) ** 2 > LEAST_SPECIMENS * (leverage**2).sum(axis=0)
+    return many | ~along_strokes(fitted, left)
 
 
 def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:

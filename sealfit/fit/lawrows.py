@@ -18,6 +18,9 @@ SIGNIFICANT = 0.05
 LAW = ("mu_0", "a", "b", "c")
 
 
+NO_SCATTER = "as many parameters as days: the interval leaves out how specimens scatter, which nothing shows."
+
+
 @dataclass(frozen=True)
 class Curve:
     """One quantity of one series: its place in the joint fit (-1 without a law) and the days tested."""
@@ -58,11 +61,8 @@ class Estimate:
             return float(np.sqrt(gradient @ self.covariance @ gradient))
 
 
-NO_SCATTER = "as many parameters as days: the interval leaves out how specimens scatter, which nothing shows."
-
-
 def law_rows(
-    curve: Curve, found: Estimate, t: float, ends: CurveInterval, unit: str, *, unaged: bool, df: int
+    curve: Curve, found: Estimate, t: float, ends: CurveInterval, unit: str, *, unaged: bool, df: float
 ) -> Iterator[dict]:
     """Return the rows of mu_0, a, b and c."""
     mu_0, a, u = found.x
