@@ -57,6 +57,16 @@ class Grown:
     worse: tuple[Refused, ...] = ()  # of these, what was in the model and lowered no error
 
 
+class _Shown(NamedTuple):
+    """What the searches show on one model."""
+
+    claimable: list[Candidate]  # single channels, sure and not doubted
+    laws: list[tuple[Candidate, Proposal]]  # richer laws of aging
+    pairs: list[Candidate]  # pairs of channels; none where a single one is sure enough
+    significant: list[Candidate]  # single channels and pairs, strongest evidence first
+    hidden: list[Hidden]  # effects that hide each other
+
+
 def grow(
     rows: Rows,
     samples: pd.DataFrame,
@@ -113,39 +123,30 @@ def grow(
     left: Candidate | Peak | None = None
     hidden: list[Hidden] = []  # effects that hide each other, until both are in the model
     again = False  # whether earlier effects have been asked again
+    shown: _Shown | None = None
 
     def ask(base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[Refused]) -> Added | None:
         return confirmed(base, proposals, ripples.samples, config, number, say, compare=compare, refused=failed)
 
     for number in range(len(added) + 1, config.loop.max_rounds + 3):
         if fitted is not judge.fitted:
-            judge = Judge(fitted)
+            judge, shown = Judge(fitted), None
             last = tuple(search(judge, list(channels.values()), rng))
-        doubted = _doubted(last, alpha)
-        claimable = _claimable(last, doubted)
-        significant = [c for c in claimable if c.p_value <= alpha]
-        say(f"round {number}: {len(last)} candidates on {len(channels)} channels, {len(significant)} significant")
-        aged = not significant or any(c.channels == (AGING,) for c in significant)
-        laws = richer_laws(fitted, channels, effects) if aged else []
-        pairs = []
-        if not significant or significant[0].p_value > DOUBTFUL:
-            pairs = _claimable(search_pairs(judge, list(channels.values()), last, rng), doubted)
-            together = [c for c in pairs if c.p_value <= alpha * min((s.p_value for s in significant), default=1.0)]
-            say(f"round {number}: {len(pairs)} pairs, {len(together)} significant")
-            significant = sorted([*significant, *together], key=lambda c: c.p_value)
-            if not hidden:
-                level = alpha * min((c.p_value for c in significant), default=1.0)
-                hidden = search_joint(judge, channels, [*claimable, *pairs], level)
-                say(f"round {number}: {len(hidden)} pairs that hide each other")
-                two = next((pair for pair in hidden if {key[0] for key in pair.keys} == {("direction",)}), None)
-                if two is not None and (
-                    both := _both(fitted, _awaited([two], claimable), channels, effects, ask, number)
-                ):
-                    added, hidden = [*added, *both], []
+        if shown is None:  # else the last round refused what it was shown, and the model is as it was
+            shown = _shown(judge, last, channels, effects, alpha, rng)
+            tried = f"{len(last)} candidates on {len(channels)} channels, {len(shown.pairs)} on pairs of them"
+            say(f"round {number}: {tried}; {len(shown.significant)} significant, {len(shown.hidden)} hide each other")
+            two = next((pair for pair in shown.hidden if {key[0] for key in pair.keys} == {("direction",)}), None)
+            if not hidden and two is not None:
+                both = _both(fitted, _awaited([two], shown.claimable), channels, effects, ask, number)
+                if both:
+                    added = [*added, *both]
                     fitted = fit(added[-1].proposal.fitted.model, rows, fitted.scatter, turns=2)
                     continue
-                hidden = [] if significant else [pair for pair in hidden if refused.isdisjoint(pair.keys)]
-        significant = _awaited(hidden, (*claimable, *pairs)) or significant
+        if not (hidden or shown.significant):
+            hidden = [pair for pair in shown.hidden if refused.isdisjoint(pair.keys)]
+        claimable, laws = shown.claimable, shown.laws
+        significant = _awaited(hidden, (*claimable, *shown.pairs)) or list(shown.significant)
         significant += [c for c, _ in laws if c.p_value <= alpha and c.sure]
         left = significant[0] if significant else ripples.found
         significant += pairs_in_disguise(judge, significant, channels)
@@ -188,6 +189,30 @@ def grow(
     return Grown(
         before, fitted if added else before, tuple(added), first, last, left, unsure, channels, tuple(not_confirmed)
     )
+
+
+def _shown(
+    judge: Judge,
+    last: Sequence[Candidate],
+    channels: Mapping[str, Channel],
+    effects: Mapping[str, Effect],
+    alpha: float,
+    rng: np.random.Generator,
+) -> _Shown:
+    """Return what a model lacks by the search of single channels, `last`, and by those that come after it."""
+    doubted = _doubted(last, alpha)
+    claimable = _claimable(last, doubted)
+    significant = [c for c in claimable if c.p_value <= alpha]
+    aged = not significant or any(c.channels == (AGING,) for c in significant)
+    laws = richer_laws(judge.fitted, channels, effects) if aged else []
+    if significant and significant[0].p_value <= DOUBTFUL:
+        return _Shown(claimable, laws, [], significant, [])
+    pairs = _claimable(search_pairs(judge, list(channels.values()), last, rng), doubted)
+    level = alpha * min((c.p_value for c in significant), default=1.0)
+    significant = sorted([*significant, *(c for c in pairs if c.p_value <= level)], key=lambda c: c.p_value)
+    level = alpha * min((c.p_value for c in significant), default=1.0)
+    hidden = search_joint(judge, channels, [*claimable, *pairs], level)
+    return _Shown(claimable, laws, pairs, significant, hidden)
 
 
 def _both(
