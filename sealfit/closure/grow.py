@@ -75,9 +75,8 @@ def grow(
     *,
     fine: Rows | None = None,
     start: Start | None = None,
-    compare: bool = True,
+    rounds: int | None = None,
     workers: int = 1,
-    on_found: Callable[[Fitted], None] | None = None,
     on_progress: Callable[[str], None] | None = None,
 ) -> Grown:
     """Return the model grown until no channel orders its residual.
@@ -96,25 +95,22 @@ def grow(
         The bins as they are, to fit ripples to, which merged bins would blur; they are held as found there.
     start : Start, optional
         Where the fit of the declared model begins, so that it need not search again.
-    compare : bool
-        Whether rivals of what is accepted are asked for the held-out data too.
+    rounds : int, optional
+        Rounds after which a fold's search ends: nothing is asked then but what effects it adds, not for their rivals on
+        held-out data, nor for what is left.
     workers : int
         Processes for what is independent in the search.
-    on_found : callable, optional
-        Given the declared fit as soon as the first search has found something.
     on_progress : callable, optional
         Told in words what is being done.
     """
     say = on_progress or (lambda text: None)
     rng = np.random.default_rng(config.loop.seed)
-    alpha = config.loop.family_error
+    alpha, compare = config.loop.family_error, rounds is None
     ripples = Ripples(samples, config, effects, say, compare=compare, workers=workers)
     before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
     channels = {c.name: c for c in channels_of(rows, config)}
     judge = Judge(before)
     last = first = tuple(search(judge, list(channels.values()), rng))
-    if on_found is not None and (ripples.found or any(c.p_value <= alpha for c in first)):
-        on_found(before)
     fitted = ripples.added_to(before, fine)
     added = list(ripples.added)
     revisit = Revisit(channels, effects, ripples.samples, config, say, compare=compare)
@@ -128,7 +124,7 @@ def grow(
     def ask(base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[Refused]) -> Added | None:
         return confirmed(base, proposals, ripples.samples, config, number, say, compare=compare, refused=failed)
 
-    for number in range(len(added) + 1, config.loop.max_rounds + 3):
+    for number in range(len(added) + 1, (config.loop.max_rounds + 2 if rounds is None else rounds) + 1):
         if fitted is not judge.fitted:
             judge, shown = Judge(fitted), None
             last = tuple(search(judge, list(channels.values()), rng))
@@ -176,6 +172,8 @@ def grow(
         # What came and went does not come again.
         refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}
         added = kept
+    if rounds is not None:
+        return Grown(before, fitted if added else before, tuple(added), first, last, None, None, channels)
     failed = {item.p_value for item in not_confirmed}
     if left is not None and left.p_value in failed and left.p_value > WEAK:
         left = None  # it is listed as refused
