@@ -147,11 +147,6 @@ def spare(workers: int) -> int:
     return max(workers - 1, 1) if _leads.get() else workers
 
 
-def many_workers(workers: int) -> bool:
-    """Whether a map would be done by several workers at once."""
-    return not _here(workers)
-
-
 def _here(workers: int) -> bool:
     """Whether the work is to be done in this process."""
     if multiprocessing.parent_process() is not None and not _leads.get():  # a worker itself

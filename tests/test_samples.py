@@ -58,7 +58,7 @@ def test_a_fold_holds_all_bins_and_samples_only_where_it_searches():
     part = Searched(rows, coarse, coarse)
     campaign = SimpleNamespace(masks=[out], rows=rows, part=part, samples=samples, config=None, effects={})
     before = SimpleNamespace(model=None, scatter=None)
-    searching, refitting = (_Folds(campaign, before, search=search)[0] for search in (True, False))
+    searching, refitting = (_Folds(campaign, before, rounds)[0] for rounds in (2, 0))
     kept = set(rows.table["stroke_id"][~out])
     assert set(searching.seen["stroke_id"]) == kept
     assert not len(refitting.seen)

@@ -57,6 +57,16 @@ class Grown:
     worse: tuple[Refused, ...] = ()  # of these, what was in the model and lowered no error
 
 
+class _Shown(NamedTuple):
+    """What the searches show on one model."""
+
+    claimable: list[Candidate]  # single channels, sure and not doubted
+    laws: list[tuple[Candidate, Proposal]]  # richer laws of aging
+    pairs: list[Candidate]  # pairs of channels; none where a single one is sure enough
+    significant: list[Candidate]  # single channels and pairs, strongest evidence first
+    hidden: list[Hidden]  # effects that hide each other
+
+
 def grow(
     rows: Rows,
     samples: pd.DataFrame,
@@ -65,9 +75,8 @@ def grow(
     *,
     fine: Rows | None = None,
     start: Start | None = None,
-    compare: bool = True,
+    rounds: int | None = None,
     workers: int = 1,
-    on_found: Callable[[Fitted], None] | None = None,
     on_progress: Callable[[str], None] | None = None,
 ) -> Grown:
     """Return the model grown until no channel orders its residual.
@@ -86,25 +95,22 @@ def grow(
         The bins as they are, to fit ripples to, which merged bins would blur; they are held as found there.
     start : Start, optional
         Where the fit of the declared model begins, so that it need not search again.
-    compare : bool
-        Whether rivals of what is accepted are asked for the held-out data too.
+    rounds : int, optional
+        Rounds after which a fold's search ends: nothing is asked then but what effects it adds, not for their rivals on
+        held-out data, nor for what is left.
     workers : int
         Processes for what is independent in the search.
-    on_found : callable, optional
-        Given the declared fit as soon as the first search has found something.
     on_progress : callable, optional
         Told in words what is being done.
     """
     say = on_progress or (lambda text: None)
     rng = np.random.default_rng(config.loop.seed)
-    alpha = config.loop.family_error
+    alpha, compare = config.loop.family_error, rounds is None
     ripples = Ripples(samples, config, effects, say, compare=compare, workers=workers)
     before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
     channels = {c.name: c for c in channels_of(rows, config)}
     judge = Judge(before)
     last = first = tuple(search(judge, list(channels.values()), rng))
-    if on_found is not None and (ripples.found or any(c.p_value <= alpha for c in first)):
-        on_found(before)
     fitted = ripples.added_to(before, fine)
     added = list(ripples.added)
     revisit = Revisit(channels, effects, ripples.samples, config, say, compare=compare)
@@ -113,39 +119,30 @@ def grow(
     left: Candidate | Peak | None = None
     hidden: list[Hidden] = []  # effects that hide each other, until both are in the model
     again = False  # whether earlier effects have been asked again
+    shown: _Shown | None = None
 
     def ask(base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[Refused]) -> Added | None:
         return confirmed(base, proposals, ripples.samples, config, number, say, compare=compare, refused=failed)
 
-    for number in range(len(added) + 1, config.loop.max_rounds + 3):
+    for number in range(len(added) + 1, (config.loop.max_rounds + 2 if rounds is None else rounds) + 1):
         if fitted is not judge.fitted:
-            judge = Judge(fitted)
+            judge, shown = Judge(fitted), None
             last = tuple(search(judge, list(channels.values()), rng))
-        doubted = _doubted(last, alpha)
-        claimable = _claimable(last, doubted)
-        significant = [c for c in claimable if c.p_value <= alpha]
-        say(f"round {number}: {len(last)} candidates on {len(channels)} channels, {len(significant)} significant")
-        aged = not significant or any(c.channels == (AGING,) for c in significant)
-        laws = richer_laws(fitted, channels, effects) if aged else []
-        pairs = []
-        if not significant or significant[0].p_value > DOUBTFUL:
-            pairs = _claimable(search_pairs(judge, list(channels.values()), last, rng), doubted)
-            together = [c for c in pairs if c.p_value <= alpha * min((s.p_value for s in significant), default=1.0)]
-            say(f"round {number}: {len(pairs)} pairs, {len(together)} significant")
-            significant = sorted([*significant, *together], key=lambda c: c.p_value)
-            if not hidden:
-                level = alpha * min((c.p_value for c in significant), default=1.0)
-                hidden = search_joint(judge, channels, [*claimable, *pairs], level)
-                say(f"round {number}: {len(hidden)} pairs that hide each other")
-                two = next((pair for pair in hidden if {key[0] for key in pair.keys} == {("direction",)}), None)
-                if two is not None and (
-                    both := _both(fitted, _awaited([two], claimable), channels, effects, ask, number)
-                ):
-                    added, hidden = [*added, *both], []
+        if shown is None:  # else the last round refused what it was shown, and the model is as it was
+            shown = _shown(judge, last, channels, effects, alpha, rng)
+            tried = f"{len(last)} candidates on {len(channels)} channels, {len(shown.pairs)} on pairs of them"
+            say(f"round {number}: {tried}; {len(shown.significant)} significant, {len(shown.hidden)} hide each other")
+            two = next((pair for pair in shown.hidden if {key[0] for key in pair.keys} == {("direction",)}), None)
+            if not hidden and two is not None:
+                both = _both(fitted, _awaited([two], shown.claimable), channels, effects, ask, number)
+                if both:
+                    added = [*added, *both]
                     fitted = fit(added[-1].proposal.fitted.model, rows, fitted.scatter, turns=2)
                     continue
-                hidden = [] if significant else [pair for pair in hidden if refused.isdisjoint(pair.keys)]
-        significant = _awaited(hidden, (*claimable, *pairs)) or significant
+        if not (hidden or shown.significant):
+            hidden = [pair for pair in shown.hidden if refused.isdisjoint(pair.keys)]
+        claimable, laws = shown.claimable, shown.laws
+        significant = _awaited(hidden, (*claimable, *shown.pairs)) or list(shown.significant)
         significant += [c for c, _ in laws if c.p_value <= alpha and c.sure]
         left = significant[0] if significant else ripples.found
         significant += pairs_in_disguise(judge, significant, channels)
@@ -175,6 +172,8 @@ def grow(
         # What came and went does not come again.
         refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}
         added = kept
+    if rounds is not None:
+        return Grown(before, fitted if added else before, tuple(added), first, last, None, None, channels)
     failed = {item.p_value for item in not_confirmed}
     if left is not None and left.p_value in failed and left.p_value > WEAK:
         left = None  # it is listed as refused
@@ -188,6 +187,30 @@ def grow(
     return Grown(
         before, fitted if added else before, tuple(added), first, last, left, unsure, channels, tuple(not_confirmed)
     )
+
+
+def _shown(
+    judge: Judge,
+    last: Sequence[Candidate],
+    channels: Mapping[str, Channel],
+    effects: Mapping[str, Effect],
+    alpha: float,
+    rng: np.random.Generator,
+) -> _Shown:
+    """Return what a model lacks by the search of single channels, `last`, and by those that come after it."""
+    doubted = _doubted(last, alpha)
+    claimable = _claimable(last, doubted)
+    significant = [c for c in claimable if c.p_value <= alpha]
+    aged = not significant or any(c.channels == (AGING,) for c in significant)
+    laws = richer_laws(judge.fitted, channels, effects) if aged else []
+    if significant and significant[0].p_value <= DOUBTFUL:
+        return _Shown(claimable, laws, [], significant, [])
+    pairs = _claimable(search_pairs(judge, list(channels.values()), last, rng), doubted)
+    level = alpha * min((c.p_value for c in significant), default=1.0)
+    significant = sorted([*significant, *(c for c in pairs if c.p_value <= level)], key=lambda c: c.p_value)
+    level = alpha * min((c.p_value for c in significant), default=1.0)
+    hidden = search_joint(judge, channels, [*claimable, *pairs], level)
+    return _Shown(claimable, laws, pairs, significant, hidden)
 
 
 def _both(

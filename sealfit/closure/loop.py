@@ -24,7 +24,7 @@ from sealfit.closure.told_by_all import told_by_all
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
-from sealfit.engine import begin_map, many_workers
+from sealfit.engine import begin_map
 from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows, make_rows
@@ -94,7 +94,6 @@ def close_loop(
                     fine=fine,
                     start=None if part.whole else start,
                     workers=workers,
-                    on_found=heldout.begin,
                     on_progress=say,
                 )
             if not part.whole:
@@ -148,10 +147,7 @@ def _on_all(rows: Rows, grown: Grown) -> tuple[Fitted, Fitted]:
 
 
 class _HeldOut:
-    """The folds: everything fitted and searched again without some groups, and asked for them.
-
-    With several workers the folds begin as soon as something is found in the whole campaign.
-    """
+    """The folds: everything fitted and searched again without some groups, and asked for them."""
 
     def __init__(
         self,
@@ -176,11 +172,6 @@ class _HeldOut:
         """
         return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
 
-    def begin(self, before: Fitted) -> None:
-        """Set processes to work, on the assumption that something will be added."""
-        if self.repeats and many_workers(self.workers):
-            self._begun = begin_map(_held_out, _Folds(self, before, search=True), workers=self.workers)
-
     def close(self) -> None:
         """End what is still being computed."""
         if self._begun is not None:
@@ -188,12 +179,16 @@ class _HeldOut:
             self._begun = None
 
     def settle(self, grown: Grown) -> None:
-        """Set processes to work on the folds, or end what they do where nothing needs a search."""
-        if not (grown.added and self.repeats):
-            self.close()
+        """Set processes to work on the folds where they repeat the search; where they do not, let the samples go.
+
+        They search for as many rounds as the whole campaign took to find its last effect. A fold has less to see by:
+        it would go on for many rounds after small effects that it refuses, one form after the other.
+        """
+        if grown.added and self.repeats:
+            rounds = max(a.round for a in grown.added)
+            self._begun = begin_map(_held_out, _Folds(self, grown.before, rounds), workers=self.workers)
+        else:
             self.samples = self.samples.iloc[[]]  # much of the memory, and nothing is searched again
-        elif self._begun is None:
-            self._begun = begin_map(_held_out, _Folds(self, grown.before, search=True), workers=self.workers)
 
     def forces(self, grown: Grown, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
         """Return each row's force, before and after, by fits that did not see its group; NaN if never held out."""
@@ -209,7 +204,7 @@ class _HeldOut:
     def refitted(self, fitted: Fitted) -> np.ndarray:
         """Return each row's force by a model's fits to the other folds, shape (n,); NaN if never held out."""
         force = np.full(self.rows.force.size, np.nan)
-        folds = _Folds(self, fitted, search=False)
+        folds = _Folds(self, fitted, rounds=0)
         for out, (own, _) in zip(self.masks, map(_held_out, folds), strict=True):
             force[out] = own
         return force
@@ -235,14 +230,14 @@ class _Fold:
     config: Config
     effects: dict[str, Effect]
     start: Start
-    search: bool
+    rounds: int  # of the search; without any, `start` is refitted
 
 
 class _Folds(Sequence):
     """The folds of a campaign, each made when it is asked for: it holds most of the campaign."""
 
-    def __init__(self, campaign: _HeldOut, before: Fitted, *, search: bool) -> None:
-        self.campaign, self.start, self.search = campaign, Start(before.model, before.scatter), search
+    def __init__(self, campaign: _HeldOut, before: Fitted, rounds: int) -> None:
+        self.campaign, self.start, self.rounds = campaign, Start(before.model, before.scatter), rounds
 
     def __len__(self) -> int:
         return len(self.campaign.masks)
@@ -257,18 +252,20 @@ class _Folds(Sequence):
             return rows.subset(~rows.table["stroke_id"].isin(gone).to_numpy())
 
         fine, seen = None, own.samples.head(0)
-        if self.search:  # without one, neither is looked at
+        if self.rounds:  # without a search, neither is looked at
             fine = kept(part.rows) if part.coarse is not part.rows else None
             seen = own.samples[~own.samples["stroke_id"].isin(gone)]
         every = None if part.whole else kept(part.every)
         test = own.rows.subset(out)
-        return _Fold(kept(part.coarse), fine, every, seen, test, own.config, own.effects, self.start, self.search)
+        return _Fold(kept(part.coarse), fine, every, seen, test, own.config, own.effects, self.start, self.rounds)
 
 
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
     """Return the forces before and after at a fold's rows; before twice where the whole campaign lacks nothing."""
-    if fold.search:
-        part = grow(fold.train, fold.seen, fold.config, fold.effects, fine=fold.fine, start=fold.start, compare=False)
+    if fold.rounds:
+        part = grow(
+            fold.train, fold.seen, fold.config, fold.effects, fine=fold.fine, start=fold.start, rounds=fold.rounds
+        )
         before, after = part.before, part.after
     else:
         before = after = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
