@@ -21,7 +21,7 @@ from sealfit.closure.pairs import pairs_in_disguise, search_pairs
 from sealfit.closure.periodic import Ripples
 from sealfit.closure.revisit import Revisit
 from sealfit.closure.ripple import Peak
-from sealfit.closure.search import search
+from sealfit.closure.search import MAIN_TARGETS, search
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit, fit_declared
@@ -236,8 +236,15 @@ def _both(
 
 
 def _doubted(candidates: Sequence[Candidate], alpha: float) -> set[str]:
-    """Return the channels along which a few specimens differ in something significant: it may be their scatter."""
-    return {c.channels[-1] for c in candidates if c.p_value <= alpha and not c.agrees} - {"direction"}
+    """Return the channels along which a few specimens differ: it may be their scatter, whatever quantity it acts on.
+
+    The strongest evidence on mu or the force counts, as on a wrong quantity the same effect looks different in each.
+    """
+    strongest: dict[str, Candidate] = {}
+    for c in candidates:  # strongest evidence first
+        if c.p_value <= alpha and (c.acts_on, c.operation) in MAIN_TARGETS:
+            strongest.setdefault(c.channels[-1], c)
+    return {name for name, c in strongest.items() if not c.agrees} - {"direction"}
 
 
 def _claimable(candidates: Sequence[Candidate], doubted: set[str]) -> list[Candidate]:
