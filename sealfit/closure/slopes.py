@@ -123,10 +123,10 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     a slope of its own, so there they must be enough, and agree closely where they differ by more than noise.
     """
     found = enough_specimens(fitted, left)
+    if not _few_specimens(fitted):
+        return found
     sums, inside = fitted.rows.groups.sums, along_strokes(fitted, left)
     leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
-    if not 2 <= leverage.shape[0] < LEAST_UNITS:
-        return found
     for k in np.flatnonzero(found):
         shown = leverage[:, k] > SHOWN * leverage[:, k].sum()
         own = leverage[shown, k]
@@ -143,11 +143,16 @@ def enough_specimens(fitted: Fitted, left: np.ndarray) -> np.ndarray:
 
     They are counted by their leverages. Of columns that do not lie along strokes they always could.
     """
-    leverage = fitted.rows.groups.sums(left**2, "specimen")
-    if not 2 <= leverage.shape[0] < LEAST_UNITS:
+    if not _few_specimens(fitted):
         return np.ones(left.shape[1], dtype=bool)
+    leverage = fitted.rows.groups.sums(left**2, "specimen")
     many = leverage.sum(axis=0) ** 2 > LEAST_SPECIMENS * (leverage**2).sum(axis=0)
     return many | ~along_strokes(fitted, left)
+
+
+def _few_specimens(fitted: Fitted) -> bool:
+    """Return whether two to four specimens were tested: too few to be the units of a slope."""
+    return 2 <= fitted.rows.groups.starts["specimen"].size < LEAST_UNITS
 
 
 def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:
