@@ -25,7 +25,11 @@ COMPARED = 4  # rivals, best first, that are put to held-out data too
 TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
 
 MOSTLY = 0.5
-"""Share of an effect's variance that must lie within groups for its gain to be taken about their means."""
+"""Share of an effect's variance that must lie within groups for its gain to be taken about their means, and of the
+rows that blocks of the calendar must hold out."""
+
+BLOCKS_OF_A_FOLD = (1, 2, 4)
+"""Blocks of the calendar that a fold holds: as few as leave most rows held out once."""
 
 BEYOND = 0.02
 """Of the range of what the fit saw, by which a held-out row may lie outside before it counts as extrapolated."""
@@ -92,17 +96,23 @@ def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]
     yield from _masks(rows, level, number)
 
 
-def blocks(rows: Rows, level: str, count: int, channel: str) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,): groups that follow one another in the campaign's calendar.
+def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]:
+    """Return masks of the rows held out, shape (n,): groups that follow one another in the campaign's calendar.
 
     Neighbours in time resemble each other, and so do the conditions that were tested one after the other: with groups
-    left out here and there any wavy line through the calendar seems to be confirmed.
+    left out here and there any wavy line through the calendar seems to be confirmed. Where a block would hold all of a
+    condition that cannot be predicted without, blocks are made shorter, and a fold holds several that lie apart.
     """
     start = rows.groups.starts[level]
     count = min(count, start.size)
-    number = np.empty(start.size, dtype=int)
-    number[np.argsort(rows.values(channel)[start], kind="stable")] = np.arange(start.size) * count // start.size
-    yield from _masks(rows, level, number)
+    place = np.empty(start.size, dtype=int)
+    place[np.argsort(rows.values(channel)[start], kind="stable")] = np.arange(start.size)
+    masks: list[np.ndarray] = []
+    for parts in BLOCKS_OF_A_FOLD:
+        masks = list(_masks(rows, level, place * min(count * parts, start.size) // start.size % count))
+        if np.any(masks, axis=0).mean() > MOSTLY:
+            break
+    return masks
 
 
 def _masks(rows: Rows, level: str, number: np.ndarray) -> Iterator[np.ndarray]:

@@ -200,9 +200,10 @@ def _root_of(gram: np.ndarray) -> np.ndarray:
         try:
             return np.linalg.cholesky(gram + ridge * np.eye(gram.shape[0]))
         except np.linalg.LinAlgError:
-            if not np.isfinite(gram).all() or ridge > 1:
+            largest = float(np.diag(gram).max())
+            if not np.isfinite(gram).all() or ridge > max(largest, 1.0):
                 raise
-            ridge = max(100 * ridge, 1e-12 * float(np.diag(gram).max()))
+            ridge = max(100 * ridge, 1e-12 * largest)
 
 
 Symmetric = tuple[np.ndarray, np.ndarray, np.ndarray]
