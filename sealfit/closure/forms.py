@@ -27,12 +27,10 @@ UNITS_PER_KNOT = 3
 APART = 1e-3  # of a channel scaled to -1..1: knots that are nearer are one value measured twice
 MOST_PLACES = 60  # between neighbouring values that are tried
 REACH = 4.0  # spans of a channel that a width or a time constant may have
-NUMBERS_ALONG_SPEED = {
-    "full": 4,
-    "interpolated": 3,
-    "viscous": 2,
-    "constant": 1,
-}  # mu_s, mu_c, v_s and sigma_2, or fewer
+
+NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1}
+"""Of mu_s, mu_c, v_s and sigma_2, those that the speeds of a series determine, by the form of its curve."""
+
 PHASES = tuple(np.arange(4) * np.pi / 4)
 PERIODIC = ("ripple", "sinusoid", "sinusoid_harmonics")  # sought in the spectrum, not along a grid of wavelengths
 

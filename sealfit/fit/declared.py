@@ -57,8 +57,8 @@ def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
     A series needs four speeds in one direction for Eq. 14, or three between which friction is not a straight line
     ("interpolated"), and two for the viscous term; Eq. 15 needs three days, the unaged day included. What cannot be
     fitted is left out, not guessed. Speeds are counted within one direction, as an offset between directions would
-    otherwise pass for a Stribeck curve. Made once for the same rows. Rows that are a
-    part of a campaign, with its conditions, may carry its model: `as_in` is the campaign.
+    otherwise pass for a Stribeck curve. Made once for the same rows. Rows that are a part of a campaign, with its
+    conditions, may carry its model: `as_in` is the campaign.
     """
     if ("declared",) not in rows.cache:
         rows.cache["declared",] = _declare(rows) if as_in is None else declare(as_in)

@@ -16,8 +16,6 @@ DAYS_FOR_LAW = 3  # mu_0, a and b are three numbers
 WIDE_B = 100.0  # a 95 % interval of b over more than this ratio does not determine it
 SIGNIFICANT = 0.05
 LAW = ("mu_0", "a", "b", "c")
-
-
 NO_SCATTER = "as many parameters as days: the interval leaves out how specimens scatter, which nothing shows."
 
 

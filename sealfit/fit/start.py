@@ -9,9 +9,10 @@ from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows
 
 GRID = 80  # values of v_s
-EQUAL = (
-    1e-10  # of the sum of squares, by which v_s differ no more: of three speeds many fit, and the middle one is taken
-)
+
+EQUAL = 1e-10
+"""Of the sum of squares of the forces, within which values of v_s fit equally well; the middle one of them is taken."""
+
 RANK = 1e-10  # of the largest singular value, below which columns are as good as dependent
 
 

@@ -199,9 +199,7 @@ def left_over(closure: Mapping, config: Config) -> Markup:
         said[0] += "."
     if closure["verdict"] == "unexplained":
         said.append(f"It is not only noise: {_where(left, config)}.")
-    elif (
-        closure["verdict"] == "cannot_tell" and left.get("channels") and any(e["candidate"] for e in closure["effects"])
-    ):
+    elif left.get("channels") and any(effect["candidate"] for effect in closure["effects"]):
         said.append(f"What may order it is shown by too few specimens to be claimed: {_where(left, config)}.")
     elif left.get("channels"):
         said.append(f"No channel orders it more surely than chance would; where to look first: {_where(left, config)}.")
