@@ -31,7 +31,7 @@ from scipy.special import betainc, chdtrc, fdtrc
 
 from sealfit.closure.channels import FINER, MANY_UNITS
 from sealfit.closure.few import FewTest, FewUnits
-from sealfit.closure.slopes import SlopeTest, along_strokes, slope_test, specimens_agree
+from sealfit.closure.slopes import SlopeTest, along_strokes, few_specimens, slope_test, specimens_agree
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import LEVELS
 from sealfit.fit.tangent import OwnColumns, Tangent
@@ -197,6 +197,8 @@ class Judge:
     def _specimens_agree(self, left: np.ndarray) -> bool:
         """Return whether a few specimens show the same of what columns along strokes explain together."""
         fitted = self.fitted
+        if not few_specimens(fitted):
+            return True
         explained = left @ (np.linalg.pinv(left.T @ left, hermitian=True) @ (left.T @ fitted.white_residual))
         explained = explained[:, None]
         return not along_strokes(fitted, explained)[0] or bool(specimens_agree(fitted, explained)[0])

@@ -194,7 +194,7 @@ class _Search:
             power = 1.0 if before is None else np.log(margin / before[1]) / np.log(size / before[0])
             before = size, margin
             size *= margin ** (-1 / min(max(power, LEAST_POWER), 1.0))
-            if not size <= 1:  # NaN where the margin does not grow with the size in any way
+            if size > 1:
                 return np.inf
             margin = self.margin(candidate, size * effect, _under(self.fitted, size * effect))
             if margin > 0 and abs(np.log(margin)) < CLOSE:

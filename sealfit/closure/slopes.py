@@ -47,14 +47,14 @@ SHOWN = 0.05
 AGREE = 0.1
 """P-value of Student's t over two to four specimens, above which their own slopes do not agree."""
 
-LEAST_SPECIMENS = 2.5
-"""Specimens, counted by their leverages, from which they may agree: two that differ do so too often by chance."""
-
 CLOSELY = 0.005
-"""The same where they differ by more than noise: rarely enough by chance alone."""
+"""The same p-value where the slopes differ by more than noise, so that they may agree by chance."""
 
 DIFFER = 0.05
-"""P-value of chi-squared below which their slopes differ by more than noise."""
+"""P-value of chi-squared below which the slopes of specimens differ by more than noise."""
+
+LEAST_SPECIMENS = 2.5
+"""Specimens, counted by their leverages, from which slopes along strokes may agree: two do too often by chance."""
 
 
 class SlopeTest(NamedTuple):
@@ -123,7 +123,7 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     a slope of its own, so there they must be enough, and agree closely where they differ by more than noise.
     """
     found = enough_specimens(fitted, left)
-    if not _few_specimens(fitted):
+    if not few_specimens(fitted):
         return found
     sums, inside = fitted.rows.groups.sums, along_strokes(fitted, left)
     leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
@@ -131,7 +131,9 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
         shown = leverage[:, k] > SHOWN * leverage[:, k].sum()
         own = leverage[shown, k]
         slopes = scores[shown, k] / own
-        t = slopes.mean() / max(np.std(slopes) / np.sqrt(max(slopes.size - 1, 1)), 1e-300)
+        if slopes.size < 2:
+            continue
+        t = slopes.mean() / max(np.std(slopes) / np.sqrt(slopes.size - 1), 1e-300)
         log_p = log_p_of_t(t, np.array(slopes.size - 1.0))
         alike = chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFER
         found[k] = log_p < np.log(AGREE if alike or not inside[k] else CLOSELY)
@@ -143,14 +145,14 @@ def enough_specimens(fitted: Fitted, left: np.ndarray) -> np.ndarray:
 
     They are counted by their leverages. Of columns that do not lie along strokes they always could.
     """
-    if not _few_specimens(fitted):
+    if not few_specimens(fitted):
         return np.ones(left.shape[1], dtype=bool)
     leverage = fitted.rows.groups.sums(left**2, "specimen")
     many = leverage.sum(axis=0) ** 2 > LEAST_SPECIMENS * (leverage**2).sum(axis=0)
     return many | ~along_strokes(fitted, left)
 
 
-def _few_specimens(fitted: Fitted) -> bool:
+def few_specimens(fitted: Fitted) -> bool:
     """Return whether two to four specimens were tested: too few to be the units of a slope."""
     return 2 <= fitted.rows.groups.starts["specimen"].size < LEAST_UNITS
 

@@ -11,7 +11,7 @@ from sealfit.closure.judge import Judge
 from sealfit.closure.loop import close_loop
 from sealfit.closure.pairs import search_pairs
 from sealfit.closure.search import search
-from sealfit.closure.slopes import SlopeTest, log_p_of_t, slope_log_p, slope_test
+from sealfit.closure.slopes import SlopeTest, log_p_of_t, slope_log_p, slope_test, specimens_agree
 from sealfit.config import Config
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
@@ -159,3 +159,11 @@ def test_what_two_specimens_show_is_a_candidate_and_the_verdict_cannot_tell():
     (candidate,) = document["effects"]
     assert candidate["candidate"]
     assert candidate["channels"][0] in ("displacement_mm", "distance_mm")
+
+
+def test_what_one_specimen_of_two_holds_alone_is_not_said_to_differ_between_them():
+    rows = make_rows(make_bins(2, days=(4.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, bins=8), has_aging=True)
+    fitted = fit_declared(rows)
+    column = np.where(rows.codes("specimen") == 0, 1.0, 0.0)
+    column *= np.where(rows.codes("stroke") % 2, 1.0, -1.0)  # constant in strokes
+    assert specimens_agree(fitted, column[:, None]).tolist() == [True]
