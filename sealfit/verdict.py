@@ -44,6 +44,11 @@ def untold_clause(closure: Mapping, units: Units) -> str:
         for effect in closure["effects"]
         if effect["candidate"]
     ]
+    texts += [
+        f"{item['label']} (p = {item['p_value']:.1g}, too weak to claim it: test more)"
+        for item in closure.get("refused") or ()
+        if item["weak"]
+    ][:NAMED]
     for entry in [s for s in closure.get("sensitivity") or () if s["cannot_tell"]][:NAMED]:
         name, smallest, files = entry["variable"], entry["smallest_pct"], entry["files_needed"]
         size = "no effect" if smallest is None else f"no effect below {smallest:.2g} % of the force"

@@ -33,6 +33,9 @@ OFFSET = "zero_offset"
 SAME_ERROR = 1.005
 """Ratio of errors up to which they are equal: effects are fitted by whitened, not by plain, squares."""
 
+HARMLESS = 1.05
+"""Ratio of errors up to which an effect inside runs may move what runs differ by, where that is most of the error."""
+
 LACK_OF_FIT = 0.05
 """P-value of the lack of fit from which the error is called larger than the scatter of repeats."""
 
@@ -62,8 +65,12 @@ class Ends:
     def gains(self, around: str | None) -> bool:
         """Whether after has no higher errors than before, in sample and held out.
 
-        Errors are about the means of a level's groups where one is named.
+        Where a level is named, the errors about the means of its groups are no higher, and the whole ones not by much.
         """
+        return self._largest_ratio(around) <= SAME_ERROR and (around is None or self._largest_ratio(None) <= HARMLESS)
+
+    def _largest_ratio(self, around: str | None) -> float:
+        """Return after's error over before's, in sample or held out, whichever is larger."""
         rows, weight = self.before.rows, self.before.rows.weight
         inside = [weight @ about_means(f.residual, rows, around) ** 2 for f in (self.before, self.after)]
         squares = [inside]
@@ -72,7 +79,7 @@ class Ends:
             test = rows.subset(known)
             left = [about_means(test.force - h[known], test, around) for h in (self.held_before, self.held_after)]
             squares.append([test.weight @ own**2 for own in left])
-        return all(after <= SAME_ERROR**2 * before for before, after in squares)
+        return float(np.sqrt(max(after / max(before, 1e-300) for before, after in squares)))
 
 
 def closure_document(
@@ -104,7 +111,8 @@ def closure_document(
     elif only_doubted:
         verdict = "cannot_tell"
     else:
-        verdict = "cannot_tell" if untold and quality["state"] != "within_scatter" else "nothing_missing"
+        open_ = any(item.weak for item in grown.refused) or (untold and quality["state"] != "within_scatter")
+        verdict = "cannot_tell" if open_ else "nothing_missing"
     return {
         "schema": 1,
         "verdict": verdict,
@@ -137,8 +145,10 @@ def _refused(item: Refused, rows: Rows) -> dict:
         "id": item.term.effect.id,
         "channels": channels_of(item.term, rows),
         "acts_on": item.term.acts_on,
+        "label": describe(item.term),
         "p_value": item.p_value,
         "reason": item.reason,
+        "weak": item.weak,
     }
 
 

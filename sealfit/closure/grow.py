@@ -174,8 +174,7 @@ def grow(
         added = kept
     if rounds is not None:
         return Grown(before, fitted if added else before, tuple(added), first, last, None, None, channels)
-    failed = {item.p_value for item in not_confirmed}
-    if left is not None and left.p_value in failed and left.p_value > WEAK:
+    if isinstance(left, Candidate) and left.key in refused and left.p_value > WEAK:
         left = None  # it is listed as refused
     unsure = None
     doubtful = [c for c in (*last, *(c for c, _ in laws)) if c.p_value <= alpha and not c.sure]

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import Added, Refused, covered, folds, heldout_level
+from sealfit.closure.confirm import Added, Refused, covered, folds, heldout_level, varies_within
 from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import Ends, closure_document, effect_table
-from sealfit.closure.forms import PERIODIC, describe
+from sealfit.closure.forms import describe
 from sealfit.closure.grow import Grown, Start, grow, numbered, predict_rows, steady_samples
 from sealfit.closure.judge import JACKKNIFE_UNITS
 from sealfit.closure.levels import level_table
@@ -27,7 +27,7 @@ from sealfit.effects.contract import Effect
 from sealfit.engine import begin_map
 from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import Model
-from sealfit.fit.rows import Rows, make_rows
+from sealfit.fit.rows import LEVELS, Rows, make_rows
 from sealfit.profiling import timed
 from sealfit.samples import StoredTraces
 
@@ -281,13 +281,15 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
 def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], None]) -> tuple[Grown, Ends]:
     """Return the end of the loop with the first effects alone, as many as lower the error in sample and held out.
 
-    What is left out was significant: it is put on record as refused, and the verdict says that something is left.
+    What is left out was significant: it is put on record as refused, and the verdict says that something is left or,
+    where its evidence is weak, that these files cannot tell.
     """
     refused = []
     while grown.added and not ends.gains(_around(grown.added)):
         last = grown.added[-1].proposal
         say(f"left out, as the error is no lower with it: {describe(last.term)}")
-        refused.append(Refused(last.term, last.p_value, "with it the error is no lower, in sample or held out"))
+        reason = "with it the error is no lower, in sample or held out"
+        refused.append(Refused(last.term, last.p_value, reason))
         model = grown.after.model.without_term(len(grown.added) - 1)
         own = fit(model, grown.after.rows, grown.after.scatter, turns=2) if model.terms else grown.before
         grown = replace(grown, after=own, added=grown.added[:-1])
@@ -296,15 +298,16 @@ def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], 
             ends = replace(ends, after=ends.before, held_after=ends.held_before)
         else:
             ends = replace(ends, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model))
-    return replace(grown, refused=(*grown.refused, *refused), worse=tuple(refused)), ends
+    return replace(grown, refused=(*grown.refused, *refused), worse=tuple(r for r in refused if not r.weak)), ends
 
 
 def _around(added: Sequence[Added]) -> str | None:
-    """Return the level about whose means the error is taken: that of the strokes where there are ripples alone.
+    """Return the coarsest level within whose groups the effects vary; None where one differs between specimens.
 
-    Ripples change nothing that runs differ by, and that may be most of the error.
+    What varies inside a run changes nothing that runs differ by, and that may be most of the error.
     """
-    return "stroke" if all(a.proposal.term.effect.id in PERIODIC for a in added) else None
+    levels = [varies_within(a.proposal) for a in added]
+    return None if None in levels else max(levels, key=LEVELS.index)
 
 
 def _residual_table(bins: pd.DataFrame, fitted: Fitted, held: np.ndarray) -> pd.DataFrame:

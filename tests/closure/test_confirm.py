@@ -1,9 +1,12 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
+import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.confirm import blocks, gain_between_settings
+from sealfit.closure.confirm import Gain, blocks, confirmed, gain_between_settings
+from sealfit.config import Config
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
 
@@ -22,3 +25,32 @@ def test_blocks_of_the_calendar_are_shorter_than_conditions_that_follow_one_anot
     masks = blocks(rows, "run", 3, "elapsed_h")
     assert np.any(masks, axis=0).mean() > 0.5
     assert all(np.unique(rows.condition[~out]).size == len(rows.conditions) for out in masks)
+
+
+@pytest.mark.parametrize(
+    ("effect", "channels", "acts_on", "p_value", "claimed"),
+    [
+        ("smooth", ("run_order",), "mu", 1e-4, True),
+        ("smooth", ("run_order",), "v_s", 1e-4, False),
+        ("smooth", ("run_order",), "v_s", 1e-6, True),
+        ("surface", ("speed_mm_s", "repeat"), "mu", 1e-4, False),
+        ("surface", ("oil_ppm", "dust_mg"), "mu", 1e-4, True),
+        ("asymmetry", ("direction",), "sigma_2", 1e-4, True),
+    ],
+)
+def test_a_free_shape_that_bends_the_curve_wants_more_evidence(
+    monkeypatch, effect, channels, acts_on, p_value, claimed
+):
+    monkeypatch.setattr("sealfit.closure.confirm.heldout_gain", lambda *args: Gain(0.5, 0.5, 10.0))
+    monkeypatch.setattr("sealfit.closure.confirm.gain_between_settings", lambda *args: [])
+    monkeypatch.setattr("sealfit.closure.confirm._added_force", lambda proposal: np.ones(3))
+    monkeypatch.setattr("sealfit.closure.confirm.describe", lambda term: term.acts_on)
+    own = SimpleNamespace(id=effect, physical=effect == "asymmetry")
+    term = SimpleNamespace(effect=own, channels=channels, acts_on=acts_on)
+    proposal = SimpleNamespace(term=term, p_value=p_value, unit="run")
+    fitted = SimpleNamespace(rows=SimpleNamespace(force=np.full(3, 10.0)))
+    samples = pd.DataFrame({"force_N": np.random.default_rng(0).normal(size=50), "stroke_id": 0})
+    refused = []
+    found = confirmed(fitted, [proposal], samples, Config(), 1, lambda text: None, compare=False, refused=refused)
+    assert (found is not None) == claimed
+    assert [item.weak for item in refused] == ([] if claimed else [True])

@@ -183,6 +183,10 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     fitted = fit_declared(rows)
     run = np.random.default_rng(0).normal(0, 3, rows.groups.starts["run"].size)[rows.codes("run")]
     wave = np.sin(rows.values("displacement_mm"))
-    ends = Ends(fitted, fitted, rows.force - run - wave, rows.force - 1.1 * run, np.ones(run.size, dtype=bool))
-    assert not ends.gains(None)
-    assert ends.gains("stroke")
+
+    def ends(rise):
+        return Ends(fitted, fitted, rows.force - run - wave, rows.force - rise * run, np.ones(run.size, dtype=bool))
+
+    assert ends(1.04).gains("stroke")
+    assert not ends(1.04).gains(None)
+    assert not ends(1.2).gains("stroke")
