@@ -56,6 +56,10 @@ DIFFER = 0.05
 LEAST_SPECIMENS = 2.5
 """Specimens, counted by their leverages, from which slopes along strokes may agree: two do too often by chance."""
 
+LARGE = 0.01
+"""Share of the force, root mean square: what changes along the strokes of every specimen by more, and the same way, is
+no scatter of specimens. A straight line of that size changes by 3.5 % from end to end."""
+
 
 class SlopeTest(NamedTuple):
     """Contrasts of one candidate: estimates, their variances from the units, and what the prior needs."""
@@ -120,18 +124,27 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     """Return whether two to four specimens show the same slope along each whitened column, shape (n, m) -> (m,).
 
     Of one specimen nothing can be said, and from `LEAST_UNITS` on they are the units themselves. Along strokes each has
-    a slope of its own, so there they must be enough, and agree closely where they differ by more than noise.
+    a slope of its own, so there they must be enough, and agree closely where they differ by more than noise; or all
+    their slopes must be larger than specimens have them.
     """
     found = enough_specimens(fitted, left)
     if not few_specimens(fitted):
         return found
     sums, inside = fitted.rows.groups.sums, along_strokes(fitted, left)
     leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
-    for k in np.flatnonzero(found):
+    size_N = np.sqrt(sums((left / fitted.whitening.unit[:, None]) ** 2, "specimen"))
+    force_N = np.sqrt(sums(fitted.rows.force[:, None] ** 2, "specimen"))
+    for k in range(left.shape[1]):
         shown = leverage[:, k] > SHOWN * leverage[:, k].sum()
         own = leverage[shown, k]
         slopes = scores[shown, k] / own
         if slopes.size < 2:
+            continue
+        share = slopes * (size_N[shown, k] / force_N[shown, 0])
+        if inside[k] and (share.min() > LARGE or share.max() < -LARGE):
+            found[k] = True
+            continue
+        if not found[k]:
             continue
         t = slopes.mean() / max(np.std(slopes) / np.sqrt(slopes.size - 1), 1e-300)
         log_p = log_p_of_t(t, np.array(slopes.size - 1.0))

@@ -60,6 +60,15 @@ def test_the_same_slope_in_a_few_specimens_is_an_effect():
     assert strongest(bins) < 1e-4
 
 
+@pytest.mark.parametrize(("share", "claimed"), [(0.1, True), (0.01, False)])
+def test_two_specimens_show_an_effect_only_if_it_is_larger_than_their_own_slopes(share, claimed):
+    def warmer(table, force):
+        return force * (1 - share * (1 - np.exp(-table["distance_mm"].to_numpy() / 10)))
+
+    bins = make_bins(3, days=(4.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, repeats=2, bins=8, effect=warmer)
+    assert (strongest(bins) < 1e-4) == claimed
+
+
 def test_an_offset_that_stands_in_the_scatter_of_eight_runs_is_found():
     bins = make_bins(
         1, days=(4.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, directions=(1, -1), repeats=1, bins=8,
