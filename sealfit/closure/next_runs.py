@@ -96,8 +96,9 @@ def _replicates(item: Added, config: Config) -> dict:
     without = evaluate(fitted.model.without_term(len(fitted.model.terms) - 1), fitted.rows, jacobian=False)[0]
     k = int(np.argmax(np.abs(fitted.force - without)))
     count = fitted.rows.groups.starts["specimen"].size
+    few = "one specimen is" if count == 1 else f"{count} specimens are"
     return {
-        "why": f"{count} specimens are too few to tell {describe(item.proposal.term)} from how specimens scatter: "
+        "why": f"{few} too few to tell {describe(item.proposal.term)} from how specimens scatter: "
         "test a second specimen of the same conditions, here first",
         "conditions": {name: _plain(fitted.rows.table[name].iloc[k]) for name in (*config.condition, "speed_mm_s")},
     }

@@ -20,7 +20,16 @@ from sealfit.closure.confirm import LEAST_SIZE
 from sealfit.closure.few import FewTest, FewUnits
 from sealfit.closure.grow import Grown
 from sealfit.closure.judge import CONSTANT, JACKKNIFE_UNITS, Candidate, Judge, project
-from sealfit.closure.slopes import LEAST_UNITS, WAYS, SlopeTest, enough_specimens, moderated, slope_test
+from sealfit.closure.slopes import (
+    LARGE,
+    LEAST_UNITS,
+    WAYS,
+    SlopeTest,
+    enough_specimens,
+    least_share,
+    moderated,
+    slope_test,
+)
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.reml import orthonormal
 from sealfit.fit.rows import LEVELS
@@ -208,11 +217,17 @@ class _Search:
         noise, effect = (replace(fitted, white_residual=column) for column in white.T)
         for one in (noise, effect):
             one.__dict__["basis"] = fitted.basis
-        channel, judgement = self.channels[candidate.channels[-1]], candidate.judgement
+        channel = self.channels[candidate.channels[-1]]
         columns = candidate.columns * noise.slope(candidate.acts_on, candidate.operation)[:, None]
         variants = judge.variants(columns, channel.unit)
-        if not all(enough_specimens(noise, left).all() for left in variants):
-            return 0.0
+        if all(enough_specimens(noise, left).all() for left in variants):
+            return self._by_units(candidate, noise, effect, variants)
+        large = min(float(least_share(effect, left).max()) for left in variants) / LARGE
+        return min(large, self._by_units(candidate, noise, effect, variants))
+
+    def _by_units(self, candidate: Candidate, noise: Fitted, effect: Fitted, variants: Sequence[np.ndarray]) -> float:
+        """Return the margin by the units' own scatter."""
+        channel, judgement = self.channels[candidate.channels[-1]], candidate.judgement
         few = judgement.few
         by_few = 0.0 if few is None else min(self._by_few(noise, effect, left, few) for left in variants)
         if judgement.slopes:

@@ -121,30 +121,24 @@ def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
 
 
 def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return whether two to four specimens show the same slope along each whitened column, shape (n, m) -> (m,).
+    """Return whether up to four specimens show the same slope along each whitened column, shape (n, m) -> (m,).
 
-    Of one specimen nothing can be said, and from `LEAST_UNITS` on they are the units themselves. Along strokes each has
-    a slope of its own, so there they must be enough, and agree closely where they differ by more than noise; or all
-    their slopes must be larger than specimens have them.
+    From `LEAST_UNITS` on they are the units themselves. Along strokes each has a slope of its own, so there they must
+    be enough, and agree closely where they differ by more than noise; or all their slopes must be larger than specimens
+    have them.
     """
     found = enough_specimens(fitted, left)
     if not few_specimens(fitted):
         return found
     sums, inside = fitted.rows.groups.sums, along_strokes(fitted, left)
     leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
-    size_N = np.sqrt(sums((left / fitted.whitening.unit[:, None]) ** 2, "specimen"))
-    force_N = np.sqrt(sums(fitted.rows.force[:, None] ** 2, "specimen"))
-    for k in range(left.shape[1]):
+    large = least_share(fitted, left) > LARGE
+    found |= large
+    for k in np.flatnonzero(found & ~(inside & large)):
         shown = leverage[:, k] > SHOWN * leverage[:, k].sum()
         own = leverage[shown, k]
         slopes = scores[shown, k] / own
         if slopes.size < 2:
-            continue
-        share = slopes * (size_N[shown, k] / force_N[shown, 0])
-        if inside[k] and (share.min() > LARGE or share.max() < -LARGE):
-            found[k] = True
-            continue
-        if not found[k]:
             continue
         t = slopes.mean() / max(np.std(slopes) / np.sqrt(slopes.size - 1), 1e-300)
         log_p = log_p_of_t(t, np.array(slopes.size - 1.0))
@@ -153,8 +147,23 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     return found
 
 
+def least_share(fitted: Fitted, left: np.ndarray) -> np.ndarray:
+    """Return what whitened columns, shape (n, m), hold of the residual in the specimen that shows least of it, (m,).
+
+    It is a share of the force, root mean square, and 0 where specimens differ in sign.
+    """
+    sums = fitted.rows.groups.sums
+    leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
+    shown = leverage > SHOWN * leverage.sum(axis=0)
+    size_N = np.sqrt(sums((left / fitted.whitening.unit[:, None]) ** 2, "specimen"))
+    force_N = np.sqrt(sums(fitted.rows.force[:, None] ** 2, "specimen"))
+    share = scores / np.where(shown, leverage, np.inf) * size_N / force_N
+    least, most = (np.where(shown, share, outside) for outside in (np.inf, -np.inf))
+    return np.maximum(np.maximum(least.min(axis=0), -most.max(axis=0)), 0.0)
+
+
 def enough_specimens(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return whether two to four specimens could agree on each whitened column at all, shape (n, m) -> (m,).
+    """Return whether up to four specimens could agree on each whitened column at all, shape (n, m) -> (m,).
 
     They are counted by their leverages. Of columns that do not lie along strokes they always could.
     """
@@ -166,8 +175,8 @@ def enough_specimens(fitted: Fitted, left: np.ndarray) -> np.ndarray:
 
 
 def few_specimens(fitted: Fitted) -> bool:
-    """Return whether two to four specimens were tested: too few to be the units of a slope."""
-    return 2 <= fitted.rows.groups.starts["specimen"].size < LEAST_UNITS
+    """Return whether up to four specimens were tested: too few to be the units of a slope."""
+    return fitted.rows.groups.starts["specimen"].size < LEAST_UNITS
 
 
 def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:

@@ -61,11 +61,12 @@ def test_the_same_slope_in_a_few_specimens_is_an_effect():
 
 
 @pytest.mark.parametrize(("share", "claimed"), [(0.1, True), (0.01, False)])
-def test_two_specimens_show_an_effect_only_if_it_is_larger_than_their_own_slopes(share, claimed):
+@pytest.mark.parametrize("temperatures", [(), (60.0,)], ids=["one specimen", "two specimens"])
+def test_one_or_two_specimens_show_an_effect_only_if_it_is_larger_than_their_own_slopes(share, claimed, temperatures):
     def warmer(table, force):
         return force * (1 - share * (1 - np.exp(-table["distance_mm"].to_numpy() / 10)))
 
-    bins = make_bins(3, days=(4.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, repeats=2, bins=8, effect=warmer)
+    bins = make_bins(3, days=(4.0,), temperatures=temperatures, speeds=FEW_SPEEDS, repeats=3, bins=8, effect=warmer)
     assert (strongest(bins) < 1e-4) == claimed
 
 
