@@ -33,7 +33,7 @@ OFFSET = "zero_offset"
 SAME_ERROR = 1.005
 """Ratio of errors up to which they are equal: effects are fitted by whitened, not by plain, squares."""
 
-HARMLESS = 1.05
+HARMLESS = 1.1
 """Ratio of errors up to which an effect inside runs may move what runs differ by, where that is most of the error."""
 
 LACK_OF_FIT = 0.05
