@@ -66,6 +66,7 @@ def reml(
     total = max(float(np.var(residual)), float(np.mean(variance)), 1e-20)
     unit = np.array([total / (scale_force**2 if kind == "gain" else 1.0) for _, kind in kinds])
     basis = jacobian.orthonormal(1e-9)
+    variance = np.maximum(variance, LEAST * total)  # less is nothing beside the scatter, and rounding would be more
     likelihood = RestrictedLikelihood(residual, basis, variance, force, groups, kinds)
 
     def objective(sd: np.ndarray) -> tuple[float, np.ndarray]:

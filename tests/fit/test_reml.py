@@ -96,3 +96,15 @@ def test_rounding_moves_no_variance_and_scatter_that_is_not_there_is_nothing():
         none += one[4] == 0
     assert max(moved) < 1e-5
     assert none >= 4  # a variance whose best value is at or below zero: half of all, and more beside others
+
+
+def test_next_to_no_noise_beside_the_scatter_of_files_with_one_stroke_is_no_error():
+    """One unit of two levels: what the upper one leaves is a difference of numbers 1e8 times as large."""
+    codes = {"stroke": np.arange(96), **nested(3, 1, 32)}
+    rng = np.random.default_rng(0)
+    force, tangent = rng.uniform(4, 8, 96), orthonormal(rng.normal(size=(96, 22)))
+    kinds = [("file", "offset"), ("file", "gain"), ("specimen", "gain")]
+    for _ in range(20):
+        residual = force * rng.normal(0, 0.05, 96)
+        parts = reml(residual, Tangent.dense(tangent), np.full(96, 2e-8), force, Groups.of(codes), kinds)
+        assert all(np.isfinite(part.variance) for part in parts)
