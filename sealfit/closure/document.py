@@ -111,8 +111,9 @@ def closure_document(
     elif only_doubted:
         verdict = "cannot_tell"
     else:
-        open_ = any(item.weak for item in grown.refused) or (untold and quality["state"] != "within_scatter")
-        verdict = "cannot_tell" if open_ else "nothing_missing"
+        weak = any(item.weak for item in grown.refused)
+        unseen = untold and quality["state"] != "within_scatter"
+        verdict = "cannot_tell" if weak or unseen else "nothing_missing"
     return {
         "schema": 1,
         "verdict": verdict,

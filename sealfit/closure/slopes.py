@@ -130,21 +130,26 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     found = enough_specimens(fitted, left)
     if not few_specimens(fitted):
         return found
-    sums, inside = fitted.rows.groups.sums, along_strokes(fitted, left)
-    leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
-    large = least_share(fitted, left) > LARGE
-    found |= large
-    for k in np.flatnonzero(found & ~(inside & large)):
-        shown = leverage[:, k] > SHOWN * leverage[:, k].sum()
-        own = leverage[shown, k]
-        slopes = scores[shown, k] / own
+    inside = along_strokes(fitted, left)
+    leverage, every = _slopes_of_specimens(fitted, left)
+    for k in np.flatnonzero(found):
+        shown = leverage[:, k] > 0
+        own, slopes = leverage[shown, k], every[shown, k]
         if slopes.size < 2:
             continue
         t = slopes.mean() / max(np.std(slopes) / np.sqrt(slopes.size - 1), 1e-300)
         log_p = log_p_of_t(t, np.array(slopes.size - 1.0))
         alike = chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFER
         found[k] = log_p < np.log(AGREE if alike or not inside[k] else CLOSELY)
-    return found
+    return found | (inside & (least_share(fitted, left) > LARGE))
+
+
+def _slopes_of_specimens(fitted: Fitted, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return leverage and slope of each specimen along whitened columns, shape (specimens, m); 0 where not `SHOWN`."""
+    sums = fitted.rows.groups.sums
+    leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
+    shown = leverage > SHOWN * leverage.sum(axis=0)
+    return np.where(shown, leverage, 0.0), np.where(shown, scores / np.where(shown, leverage, 1.0), 0.0)
 
 
 def least_share(fitted: Fitted, left: np.ndarray) -> np.ndarray:
@@ -153,12 +158,11 @@ def least_share(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     It is a share of the force, root mean square, and 0 where specimens differ in sign.
     """
     sums = fitted.rows.groups.sums
-    leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
-    shown = leverage > SHOWN * leverage.sum(axis=0)
+    leverage, slopes = _slopes_of_specimens(fitted, left)
     size_N = np.sqrt(sums((left / fitted.whitening.unit[:, None]) ** 2, "specimen"))
     force_N = np.sqrt(sums(fitted.rows.force[:, None] ** 2, "specimen"))
-    share = scores / np.where(shown, leverage, np.inf) * size_N / force_N
-    least, most = (np.where(shown, share, outside) for outside in (np.inf, -np.inf))
+    share = slopes * size_N / force_N
+    least, most = (np.where(leverage > 0, share, outside) for outside in (np.inf, -np.inf))
     return np.maximum(np.maximum(least.min(axis=0), -most.max(axis=0)), 0.0)
 
 

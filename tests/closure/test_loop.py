@@ -187,6 +187,6 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     def ends(rise):
         return Ends(fitted, fitted, rows.force - run - wave, rows.force - rise * run, np.ones(run.size, dtype=bool))
 
-    assert ends(1.04).gains("stroke")
-    assert not ends(1.04).gains(None)
+    assert not ends(1.1).gains(None)
+    assert ends(1.1).gains("stroke")
     assert not ends(1.2).gains("stroke")
