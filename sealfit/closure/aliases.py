@@ -78,8 +78,8 @@ def _at_grid(
     for point in itertools.product(*searched.values()):
         at = {**effect.start(), **dict(zip(searched, point, strict=True))}
         for name, shape in zip(effect.linear, mean_derivatives(term, at, rows, only_linear=True), strict=True):
-            if np.isfinite(shape).all() and np.sqrt((shape**2).mean()) > NEGLIGIBLE:
-                column = slope * shape
+            column = slope * shape
+            if np.isfinite(shape).all() and (column**2).mean() > NEGLIGIBLE**2 * (slope**2).mean():
                 white = fitted.whitening(column[:, None])[:, 0]
                 left = fitted.basis.freed(white)
                 amplitudes = {n: float(n == name) for n in effect.linear}

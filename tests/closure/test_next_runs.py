@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bins_helpers import make_bins
@@ -7,6 +9,7 @@ from sealfit.closure.linearised import Proposal
 from sealfit.closure.next_runs import where_apart
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
+from sealfit.effects.contract import AMPLITUDE, Parameter
 from sealfit.fit.estimate import fit_declared, fitted_at
 from sealfit.fit.rows import make_rows
 from sealfit.fit.terms import Term
@@ -62,3 +65,16 @@ def test_an_offset_is_no_alias_where_runs_go_both_ways():
     fitted = fit_declared(make_rows(make_bins(bins=4, repeats=1, directions=(1, -1)), has_aging=True))
     found = {a.term.effect.id for a in find_aliases(fitted, EFFECTS, ("temperature_C", "compression_ratio_pct"))}
     assert not found & {"zero_offset", "asymmetry", "drift", "warming_time"}
+
+
+def test_an_effect_on_what_does_not_act_where_it_is_there_is_no_alias():
+    """mu_s is no part of friction far above v_s, so a change of it there adds nothing that could be scaled."""
+    fitted = fit_declared(
+        make_rows(make_bins(speeds=(1.0, 4.0, 8.0, 16.0, 32.0, 1000.0), bins=4, repeats=1), has_aging=True)
+    )
+    fast = replace(
+        EFFECTS["drift"], id="fast", reads=("speed_mm_s",), acts_on=(("mu_s", "multiply"),),
+        shape=lambda inputs, **values: values["A"] * (np.abs(inputs["speed_mm_s"]) > 500.0),
+        parameters=(Parameter("A", "", 0.1, AMPLITUDE, "size", linear=True),),
+    )  # fmt: skip
+    assert find_aliases(fitted, {"fast": fast}, ()) == []
