@@ -17,7 +17,7 @@ from sealfit.config import Config
 from sealfit.fit.estimate import Fitted, as_smooth_as_wanted, fit
 from sealfit.fit.joint import Model, evaluate
 from sealfit.fit.rows import LEVELS, Rows
-from sealfit.fit.terms import Term
+from sealfit.fit.terms import Term, shape_of
 from sealfit.fit.whitening import Whitening
 
 SURE = 0.005  # p-value, over files (Wilcoxon), at which a ripple of free phase helps the half it was not fitted to
@@ -308,13 +308,17 @@ def _left_in(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.nd
 
 
 def varies_within(proposal: Proposal) -> str | None:
-    """Return the finest level within whose groups most of what the effect adds to the force varies; None for none."""
-    rows = proposal.fitted.rows
-    if proposal.term.channels == ("direction",):
+    """Return the finest level within whose groups most of the effect's shape varies; None for none.
+
+    The shape, not the force that it adds: a share of the friction that is lost along each stroke is a force that differs
+    from run to run as friction does, and the declared quantities take that up.
+    """
+    rows, term, model = proposal.fitted.rows, proposal.term, proposal.fitted.model
+    if term.channels == ("direction",):
         return None
-    added = _added_force(proposal)
-    least = MOSTLY * float(np.var(added))
-    return next((level for level in LEVELS if np.mean(about_means(added, rows, level) ** 2) >= least), None)
+    shape = shape_of(term, model.values[-1], rows)
+    least = MOSTLY * float(np.var(shape))
+    return next((level for level in LEVELS if np.mean(about_means(shape, rows, level) ** 2) >= least), None)
 
 
 def about_means(values: np.ndarray, rows: Rows, level: str | None) -> np.ndarray:

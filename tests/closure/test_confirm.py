@@ -5,10 +5,12 @@ import pandas as pd
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.confirm import Gain, blocks, confirmed, gain_between_settings
+from sealfit.closure.confirm import Gain, blocks, confirmed, gain_between_settings, varies_within
 from sealfit.config import Config
+from sealfit.effects import EFFECTS
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
+from sealfit.fit.terms import Term
 
 
 def test_a_form_of_one_number_is_not_asked_between_settings():
@@ -16,6 +18,14 @@ def test_a_form_of_one_number_is_not_asked_between_settings():
     before = fit_declared(make_rows(make_bins(0, temperatures=(60.0,), days=(4.0,), bins=4), has_aging=True))
     line = SimpleNamespace(channels=("repeat",), effect=SimpleNamespace(parameters=("A",)))
     assert list(gain_between_settings(before, SimpleNamespace(term=line), {})) == []
+
+
+def test_a_share_lost_along_strokes_is_held_out_about_their_means_however_much_friction_differs_between_runs():
+    bins = make_bins(0, temperatures=(60.0,), days=(4.0,), bins=6, speeds=(0.1, 1.0, 100.0))
+    rows = make_rows(bins, has_aging=True)
+    lost = Term(EFFECTS["exponential_approach"], ("distance_mm",), "mu", "multiply")
+    model = fit_declared(rows).model.with_term(lost, {"A": -0.004, "tau": 3.0})
+    assert varies_within(SimpleNamespace(term=lost, fitted=SimpleNamespace(rows=rows, model=model))) == "stroke"
 
 
 def test_blocks_of_the_calendar_are_shorter_than_conditions_that_follow_one_another():
