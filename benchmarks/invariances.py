@@ -70,6 +70,11 @@ DESIGNS = {
     "column": MANY_RUNS,
     "batch": MANY_RUNS,
     "stribeck_exponent": MANY_RUNS,
+    "log_rate": MANY_RUNS,
+    "lab_temperature": MANY_RUNS,
+    "column_step": MANY_RUNS,
+    "product": MANY_RUNS,
+    "asymmetry": BOTH_WAYS,
     "zero_offset": BOTH_WAYS,
     "there_and_back": {**BOTH_WAYS, "strokes_per_file": 2, "max_rows": 2 * ROWS},
     "run_in": {**BOTH_WAYS, "strokes_per_file": 5, "max_rows": 5 * ROWS},
@@ -77,6 +82,10 @@ DESIGNS = {
     "aging_induction": {**AGED, "speeds_mm_s": (0.5, 5.0, 50.0)},
 }
 STRENGTH = 10.0  # strong, as campaigns.py has it
+OWN_NAME = (
+    "asymmetry", "bump", "log_rate", "warming_power", "lab_temperature", "column_of_the_trace", "column_step",
+    "product", "two_at_once",
+)  # fmt: skip
 KINDS = {
     "ripple": "ripple",
     "warming": "warming_distance",
@@ -89,6 +98,7 @@ KINDS = {
     "column": "column_linear_mu",
     "batch": "column_category_mu",
     "aging_induction": "aging_induction",
+    **{name: name for name in OWN_NAME},
 }
 EXPONENT = {
     "id": "stribeck_exponent",

@@ -28,6 +28,12 @@ MOSTLY = 0.5
 """Share of an effect's variance that must lie within groups for its gain to be taken about their means, and of the
 rows that blocks of the calendar must hold out."""
 
+PARTLY = 0.1
+"""Share of an effect's variance within groups from which the end of the loop compares errors about their means.
+
+What warms a stroke by the power lost in it has a quarter of its variance inside strokes, where the evidence is.
+"""
+
 BLOCKS_OF_A_FOLD = (1, 2, 4)
 """Blocks of the calendar that a fold holds: as few as leave most rows held out once."""
 
@@ -274,8 +280,12 @@ def _gain(
     key: tuple,
     known: dict[tuple, np.ndarray],
 ) -> Gain:
-    """Return the gain on rows held out by `masks`; about the means of groups where a level is named."""
-    rows, after, scatter = before.rows, proposal.fitted, before.scatter
+    """Return the gain on rows held out by `masks`; about the means of groups where a level is named.
+
+    Both models are whitened by the scatter that is left with the proposal in: without it the effect itself is in the
+    scatter, and a specimen counts for next to nothing.
+    """
+    rows, after = before.rows, proposal.fitted
     squares, total, falls = np.zeros(2), 0.0, []
     for number, out in enumerate(masks):
         inside = covered(rows, out, proposal.term.channels)[out]
@@ -283,7 +293,10 @@ def _gain(
             continue
         held = rows.subset(out)
         test = held.subset(inside)
-        weight, whitening = rows.weight[out][inside], Whitening(scatter, before.friction[out][inside], test.groups)
+        weight, whitening = (
+            rows.weight[out][inside],
+            Whitening(after.scatter, before.friction[out][inside], test.groups),
+        )
         total += float(weight.sum())
         if (*key, number) not in known:
             known[*key, number] = _left_in(before, before.model, out, held)
@@ -307,17 +320,17 @@ def _left_in(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.nd
     return test.force - evaluate(kept.model, test, jacobian=False)[0]
 
 
-def varies_within(proposal: Proposal) -> str | None:
-    """Return the finest level within whose groups most of the effect's shape varies; None for none.
+def varies_within(proposal: Proposal, share: float = MOSTLY) -> str | None:
+    """Return the finest level within whose groups a share of the variance of the effect's shape lies; None for none.
 
-    The shape, not the force that it adds: a share of the friction that is lost along each stroke is a force that differs
-    from run to run as friction does, and the declared quantities take that up.
+    The shape is used, not the force that it adds. A share of the friction that is lost along each stroke is a force
+    that differs from run to run as friction does, and the declared quantities take that up.
     """
     rows, term, model = proposal.fitted.rows, proposal.term, proposal.fitted.model
     if term.channels == ("direction",):
         return None
     shape = shape_of(term, model.values[-1], rows)
-    least = MOSTLY * float(np.var(shape))
+    least = share * float(np.var(shape))
     return next((level for level in LEVELS if np.mean(about_means(shape, rows, level) ** 2) >= least), None)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import Added, Refused, covered, folds, heldout_level, varies_within
+from sealfit.closure.confirm import PARTLY, Added, Refused, covered, folds, heldout_level, varies_within
 from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import Ends, closure_document, effect_table
 from sealfit.closure.forms import describe
@@ -306,7 +306,7 @@ def _around(added: Sequence[Added]) -> str | None:
 
     What varies inside a run changes nothing that runs differ by, and that may be most of the error.
     """
-    levels = [varies_within(a.proposal) for a in added]
+    levels = [varies_within(a.proposal, PARTLY) for a in added]
     return None if None in levels else max(levels, key=LEVELS.index)
 
 

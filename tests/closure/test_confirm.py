@@ -5,10 +5,10 @@ import pandas as pd
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.confirm import Gain, blocks, confirmed, gain_between_settings, varies_within
+from sealfit.closure.confirm import Gain, blocks, confirmed, gain_between_settings, heldout_gain, varies_within
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.estimate import fit_declared
+from sealfit.fit.estimate import fit, fit_declared
 from sealfit.fit.rows import make_rows
 from sealfit.fit.terms import Term
 
@@ -26,6 +26,23 @@ def test_a_share_lost_along_strokes_is_held_out_about_their_means_however_much_f
     lost = Term(EFFECTS["exponential_approach"], ("distance_mm",), "mu", "multiply")
     model = fit_declared(rows).model.with_term(lost, {"A": -0.004, "tau": 3.0})
     assert varies_within(SimpleNamespace(term=lost, fitted=SimpleNamespace(rows=rows, model=model))) == "stroke"
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_gain_is_weighed_by_the_scatter_that_is_left_with_the_effect_in(seed):
+    """Aging with a floor stands in the scatter of specimens without it, and each would count for next to nothing."""
+
+    def floor(table, force):
+        return force * (1 + 0.05 * np.log(np.maximum(table["aging_days"].to_numpy() / 4, 1)))
+
+    days = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+    tested = {"temperatures": (60.0,), "days": days, "speeds": (1.0, 8.0, 64.0), "repeats": 2, "bins": 3}
+    rows = make_rows(make_bins(seed, **tested, specimen=0.005, effect=floor), has_aging=True)
+    before = fit_declared(rows)
+    term = Term(EFFECTS["aging_floor"], ("aging_days",), "mu", "multiply")
+    after = fit(before.model.with_term(term, {"A": 0.05, "t_f": 4.0}), rows, before.scatter, turns=2)
+    gain = heldout_gain(before, SimpleNamespace(term=term, fitted=after, unit="specimen"), 5, 0, None, {})
+    assert gain.real
 
 
 def test_blocks_of_the_calendar_are_shorter_than_conditions_that_follow_one_another():
