@@ -6,7 +6,7 @@ NO_NETWORK = echo "make: the packages that sealfit needs could not be installed;
 CODE := $(wildcard sealfit tests benchmarks)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-solver bench-start bench-speed bench-worlds paper clean
+.PHONY: help demo test golden lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-solver bench-start bench-speed bench-worlds paper clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -16,6 +16,9 @@ demo: .venv/.installed ## analyse the simulated campaign in sample_data, and say
 
 test: lint ## lint and run every test
 	$(BIN)/python -m pytest -rs -n auto --dist loadfile
+
+golden: .venv/.installed-test ## compare ten campaigns with what is on record; after every step that is to move no number (three minutes)
+	$(BIN)/python -m pytest -rs -n auto -m golden tests/golden
 
 lint: .venv/.installed-test ## check style and formatting
 	$(BIN)/ruff check $(CODE)
