@@ -17,12 +17,12 @@ from rivals import rival_forces
 from scoring import Target, correlations, match, misplaced, named_right
 from truths import NO_INTERVAL, TrueEffect, test_true_forms, true_effects, truth_in_claim
 
-from sealfit.closure.grow import numbered
-from sealfit.closure.judge import project
 from sealfit.closure.loop import Closure, close_loop
-from sealfit.closure.merged import merged_bins
+from sealfit.closure.model_record import from_record
 from sealfit.closure.predict import predict
-from sealfit.closure.record import from_record
+from sealfit.closure.score_test import project
+from sealfit.closure.selection import numbered
+from sealfit.closure.subsampling import merged_bins
 from sealfit.config import load_config
 from sealfit.fit.estimate import fitted_at
 from sealfit.fit.joint import Model, evaluate

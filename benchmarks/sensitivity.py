@@ -26,10 +26,10 @@ import pandas as pd
 from counts import bounds
 
 from sealfit.closure.channels import scaled
-from sealfit.closure.grow import Grown, grow, numbered, steady_samples
-from sealfit.closure.judge import project
-from sealfit.closure.merged import merged_bins
+from sealfit.closure.score_test import project
+from sealfit.closure.selection import Selection, grow, numbered, steady_samples
 from sealfit.closure.sensitivity import sensitivity
+from sealfit.closure.subsampling import merged_bins
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.rows import make_rows
@@ -164,14 +164,14 @@ def at_level(table: pd.DataFrame, shape: np.ndarray, level: str) -> np.ndarray:
     return np.asarray(means[k] - (means[k + 1] if k + 1 < len(levels) else 0.0))
 
 
-def close(bins: pd.DataFrame) -> Grown:
+def close(bins: pd.DataFrame) -> Selection:
     """Return the end of the loop."""
     rows = make_rows(merged_bins(numbered(bins), CONFIG.loop.seed), has_aging=True)
     traces = bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(presliding_N=0.0, steady=True)
     return grow(rows, steady_samples(traces, rows), CONFIG, EFFECTS, compare=False)
 
 
-def outcome(grown: Grown, entry: dict, effect: np.ndarray) -> str:
+def outcome(grown: Selection, entry: dict, effect: np.ndarray) -> str:
     """Return how an effect came out: found, same, shown (significant, in no model), other or none."""
     name = entry["variable"]
     for item in grown.added:

@@ -16,8 +16,8 @@ import numpy as np
 from effect_kinds import FORMULA_OF
 
 from sealfit.closure.channels import flip_level, unit_of
-from sealfit.closure.document import channels_of, effect_level
 from sealfit.closure.intervals import robust_covariance
+from sealfit.closure.result import channels_of, effect_level
 from sealfit.effects import EFFECTS
 from sealfit.effects.categories import LEVELS, levels_effect
 from sealfit.effects.contract import AMPLITUDE, Effect, Parameter
@@ -170,8 +170,8 @@ def _wider(fitted: Fitted, unit: str) -> np.ndarray:
 def _z(amplitude: np.ndarray, covariance: np.ndarray) -> float:
     if amplitude.size == 1:
         return float(amplitude[0] / np.sqrt(max(covariance[0, 0], 1e-300)))
-    wald = float(amplitude @ np.linalg.pinv(covariance) @ amplitude)
-    return float(np.sqrt(max(wald - (amplitude.size - 1), 0.0)))
+    score_statistic = float(amplitude @ np.linalg.pinv(covariance) @ amplitude)
+    return float(np.sqrt(max(score_statistic - (amplitude.size - 1), 0.0)))
 
 
 def truth_in_claim(effect: TrueEffect, claimed: Term, found: Mapping[str, float], rows: Rows) -> dict[str, float]:

@@ -164,7 +164,7 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
     """Return the catalogue as plain values; parameters have their units for the likeliest way to act."""
     from types import SimpleNamespace
 
-    from sealfit.closure.document import parameter_unit
+    from sealfit.closure.result import parameter_unit
     from sealfit.effects.contract import CHANNEL
 
     units = replace(units, channels={**units.channels, CHANNEL: "unit of x"})

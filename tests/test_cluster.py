@@ -209,7 +209,7 @@ def test_the_search_on_a_cluster_gives_the_same_although_a_worker_is_killed(camp
             killed.append(rows)
         return fit_declared(rows)
 
-    monkeypatch.setattr("sealfit.closure.grow.fit_declared", fit_while_spectra_are_made)
+    monkeypatch.setattr("sealfit.closure.selection.fit_declared", fit_while_spectra_are_made)
     run(folder, tmp_path / "there", steps=STEPS[:-1], scheduler=str(dask.file))
     assert killed
     assert_same_results(tmp_path / "there", here, closure)

@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 from bins_helpers import make_bins, make_traces
 
-from sealfit.closure.grow import numbered, steady_samples
 from sealfit.closure.loop import _Folds
-from sealfit.closure.merged import Searched
+from sealfit.closure.selection import numbered, steady_samples
+from sealfit.closure.subsampling import Subsample
 from sealfit.fit.rows import make_rows, thin
 from sealfit.samples import StoredTraces, a_part_at_a_time
 
@@ -55,7 +55,7 @@ def test_a_fold_holds_all_bins_and_samples_only_where_it_searches():
     rows, coarse = make_rows(bins, has_aging=True), make_rows(thin(bins, len(bins) // 3), has_aging=True)
     out = rows.codes("run") % 5 == 0
     samples = steady_samples(make_traces(bins), rows)
-    part = Searched(rows, coarse, coarse)
+    part = Subsample(rows, coarse, coarse)
     campaign = SimpleNamespace(masks=[out], rows=rows, part=part, samples=samples, config=None, effects={})
     before = SimpleNamespace(model=None, scatter=None)
     searching, refitting = (_Folds(campaign, before, rounds)[0] for rounds in (2, 0))

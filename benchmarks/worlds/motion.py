@@ -120,8 +120,8 @@ def integrate(
         half = distance_mm(middle[None, :], speed, world)
         g = _deflection(world, shared | repeated, begin, half, middle, v, own, sigma_0, without, nudge)[0]
         if z is None:
-            settled = g[:, -1:] * direction
-            z = np.zeros_like(settled) if rig["start"] == "rest" else REVERSED * settled
+            reestimated = g[:, -1:] * direction
+            z = np.zeros_like(reestimated) if rig["start"] == "rest" else REVERSED * reestimated
         bent = _followed(z[:, 0], direction * g, v * (dt / sub) / g)[:, ::sub]
         z = bent[:, -1:]
         first = 0 if stroke == 0 else 1  # a stroke's first sample is the last one's last

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sealfit.closure.forms import grid_of, reference
-from sealfit.closure.judge import LEAST_LEFT
+from sealfit.closure.score_test import LEAST_LEFT
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.descent import bounds_of
 from sealfit.fit.estimate import Fitted

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import BSpline
 
-from sealfit.closure.slopes import LEAST_UNITS as LEAST_SLOPES
+from sealfit.closure.contrasts import LEAST_UNITS as LEAST_SLOPES
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.declared import SAME_SPEED

@@ -12,7 +12,7 @@ from sealfit.closure.channels import CALENDAR, LEAST_UNITS, level_values, settin
 from sealfit.closure.forms import describe
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
-from sealfit.closure.waves import agreement, pass_shifts
+from sealfit.closure.stroke_phases import agreement, pass_shifts
 from sealfit.config import Config
 from sealfit.fit.estimate import Fitted, as_smooth_as_wanted, fit
 from sealfit.fit.joint import Model, evaluate
@@ -386,7 +386,7 @@ def _inside(rows: Rows, force: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Added:
+class AcceptedEffect:
     """An accepted effect: the proposal, its gain on held-out data and the rivals these data cannot tell from it.
 
     `left_N` is the RMSE on the held-out data with it, and `rivals_rmse_N` with each rival in its place; NaN where that
@@ -402,7 +402,7 @@ class Added:
 
 
 @dataclass(frozen=True)
-class Refused:
+class RefusedEffect:
     """What the search found significant and no model holds, with the reason."""
 
     term: Term
@@ -424,8 +424,8 @@ def confirmed(
     say: Callable[[str], None],
     *,
     compare: bool,
-    refused: list[Refused],
-) -> Added | None:
+    refused: list[RefusedEffect],
+) -> AcceptedEffect | None:
     """Return the first of a round's best proposals that gains on held-out data; None where none does.
 
     What is refused is added to `refused`, with the reason.
@@ -449,7 +449,7 @@ def confirmed(
     refused : list of Refused
         Grows by the best proposal where none is confirmed.
     """
-    failed: list[Refused] = []
+    failed: list[RefusedEffect] = []
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
     for proposal in proposals[:TRIES]:
         gain = heldout_gain(fitted, proposal, *folds_of)
@@ -460,9 +460,9 @@ def confirmed(
             others = rivals(proposal, proposals)
             rmse = [heldout_gain(fitted, o, *folds_of).left_N for o in others[:COMPARED]] if compare else []
             rmse += [np.nan] * (len(others) - len(rmse))
-            return Added(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
+            return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
         if proposal.p_value <= config.loop.family_error:
-            failed.append(Refused(proposal.term, proposal.p_value, reason))
+            failed.append(RefusedEffect(proposal.term, proposal.p_value, reason))
     refused += failed[:1]
     return None
 

@@ -10,10 +10,10 @@ import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, FINER, FREE_DF, Channel, even_knots, scaled
 from sealfit.closure.intervals import t_quantile
-from sealfit.closure.judge import Candidate, Judgement
 from sealfit.closure.linearised import middles
 from sealfit.closure.ripple import Peak
-from sealfit.closure.waves import common_wavelength, pass_shifts
+from sealfit.closure.score_test import Candidate, ScoreTestResult
+from sealfit.closure.stroke_phases import common_wavelength, pass_shifts
 from sealfit.effects.categories import LEVELS, SLOPES
 from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect
 from sealfit.effects.free import SMOOTH, SURFACE, WIDE, free_effect, natural
@@ -59,7 +59,7 @@ def terms_of(
         return
     name = candidate.channels[-1]
     channel = channels[name]
-    knots = min(MOST_KNOTS, candidate.judgement.units // UNITS_PER_KNOT)
+    knots = min(MOST_KNOTS, candidate.test_result.units // UNITS_PER_KNOT)
     for term, grid in _terms_of_single(channel, target, channels, fitted, effects, knots):
         fits = len(term.effect.parameters) <= room_along(channel, fitted)
         if fits or len(term.channels) > 1 or term.smoothness is not None:  # a smoothing spline has fewer than its knots
@@ -240,8 +240,8 @@ def periodic_terms(
     units = rows.groups.starts["file"].size
     for way in ways:
         if way in effect.acts_on:
-            judgement = Judgement(0.0, 2, units, 0.0)
-            candidate = Candidate((peak.axis,), *way, "file", np.empty((0, 0)), judgement, p_value=peak.p_value)
+            test_result = ScoreTestResult(0.0, 2, units, 0.0)
+            candidate = Candidate((peak.axis,), *way, "file", np.empty((0, 0)), test_result, p_value=peak.p_value)
             yield Term(effect, (peak.axis,), *way, fixed=fixed), names, candidate
 
 

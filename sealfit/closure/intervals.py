@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from sealfit.closure.slopes import LARGEST_LEVERAGE, satterthwaite_df
+from sealfit.closure.contrasts import LARGEST_LEVERAGE, satterthwaite_df
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import LEVELS
 from sealfit.fit.tangent import Tangent

@@ -9,10 +9,10 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.closure.judge import LEAST_LEFT, Candidate, project
+from sealfit.closure.score_test import LEAST_LEFT, Candidate, project
 from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
-from sealfit.fit.estimate import Fitted, worth
+from sealfit.fit.estimate import Fitted, effective_df
 from sealfit.fit.prior import likely_smoothness, penalised, roughness_of
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term, mean_derivatives
@@ -44,18 +44,18 @@ class Proposal:
         """How many numbers it is worth: its parameters, fewer where a free shape is held smooth."""
         if self.linear_size is None:
             return float(len(self.term.effect.parameters))
-        return self.linear_size if self.fitted is None else worth(self.fitted, len(self.fitted.model.terms) - 1)
+        return self.linear_size if self.fitted is None else effective_df(self.fitted, len(self.fitted.model.terms) - 1)
 
     @property
-    def price(self) -> float:
+    def bic_penalty(self) -> float:
         """Schwarz's price of its parameters, and of being one of the many pairs of channels."""
         pair = PAIR if SECOND in self.term.effect.reads else 0.0
         return self.size * np.log(max(self.units, 2)) + pair
 
     @property
-    def criterion(self) -> float:
+    def bic(self) -> float:
         """Twice the negative log likelihood plus the price; smaller is better."""
-        return (self.fitted.deviance if self.fitted is not None else -self.chi2) + self.price
+        return (self.fitted.deviance if self.fitted is not None else -self.chi2) + self.bic_penalty
 
     @property
     def named(self) -> bool:
@@ -109,7 +109,7 @@ class Linearised:
         chosen = {**effect.start(), **point, **dict(zip(effect.linear, amplitude.tolist(), strict=True))}
         values = {p.name: chosen[p.name] for p in effect.parameters}
         found = float(2 * column @ fitted.white_residual - column @ column)
-        units = candidate.judgement.units
+        units = candidate.test_result.units
         return [Proposal(term, values, candidate.unit, units, found, candidate.p_value, column, candidate.key, size)]
 
     def _best(

@@ -10,17 +10,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import PARTLY, Added, Refused, covered, folds, heldout_level, varies_within
-from sealfit.closure.curves import channel_table, curve_table, shape_table
-from sealfit.closure.document import Ends, closure_document, effect_table
+from sealfit.closure.confirm import PARTLY, AcceptedEffect, RefusedEffect, covered, folds, heldout_level, varies_within
+from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
-from sealfit.closure.grow import Grown, Start, grow, numbered, predict_rows, steady_samples
-from sealfit.closure.judge import JACKKNIFE_UNITS
-from sealfit.closure.levels import level_table
-from sealfit.closure.merged import Searched, searched
-from sealfit.closure.overlooked import overlooked
-from sealfit.closure.record import to_record
-from sealfit.closure.told_by_all import told_by_all
+from sealfit.closure.model_record import to_record
+from sealfit.closure.plot_tables import channel_table, curve_table, shape_table
+from sealfit.closure.result import BeforeAfter, closure_document, effect_table
+from sealfit.closure.score_test import JACKKNIFE_UNITS
+from sealfit.closure.selection import Selection, Start, grow, numbered, predict_rows, steady_samples
+from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
@@ -76,7 +74,7 @@ def close_loop(
     rows = make_rows(counted, has_aging=config.aging)
     del counted  # much of the memory: `rows` holds all of it
     start = None
-    for part in searched(rows, config.loop.seed):
+    for part in subsamples(rows, config.loop.seed):
         if not part.whole and start is None:  # all strokes tell where to begin better than those that are searched
             say("the declared model on all strokes")
             with timed("declared model", rows=part.every.force.size, of="bins, merged"):
@@ -97,18 +95,18 @@ def close_loop(
                     on_progress=say,
                 )
             if not part.whole:
-                grown, on_all_strokes = told_by_all(grown, part.every, heldout.samples, config, say)
+                grown, on_all_strokes = reselect_on_all(grown, part.every, heldout.samples, config, say)
             heldout.settle(grown)
             say("before and after on all rows")
             with timed("before and after", rows=rows.force.size, of="bins"):
                 before, after = _on_all(rows, grown)
-            if not part.whole and (more := overlooked(on_all_strokes, grown, config)):
+            if not part.whole and (more := missed_by_subsample(on_all_strokes, grown, config)):
                 say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
                 continue
             say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
             with timed("held out", rows=len(heldout.masks), of="folds"):
                 held_before, held_after = heldout.forces(grown, say)
-                ends = Ends(before, after, held_before, held_after, heldout.covered(after.model))
+                ends = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
                 grown, ends = _no_worse(grown, ends, heldout, say)
             break
     before, after, held_before, held_after = ends.before, ends.after, ends.held_before, ends.held_after
@@ -124,7 +122,7 @@ def close_loop(
     return Closure(document, to_record(before, after, config), tables, after)
 
 
-def _drawn_tables(grown: Grown, before: Fitted, after: Fitted, config: Config) -> dict[str, pd.DataFrame]:
+def _drawn_tables(grown: Selection, before: Fitted, after: Fitted, config: Config) -> dict[str, pd.DataFrame]:
     """Return the tables that need no held-out folds, which workers may be at meanwhile."""
     levels = [level_table("before", before, list(grown.first)), level_table("after", after, list(grown.last))]
     return {
@@ -135,7 +133,7 @@ def _drawn_tables(grown: Grown, before: Fitted, after: Fitted, config: Config) -
     }
 
 
-def _on_all(rows: Rows, grown: Grown) -> tuple[Fitted, Fitted]:
+def _on_all(rows: Rows, grown: Selection) -> tuple[Fitted, Fitted]:
     """Return before and after, refitted to rows as they are, held ripples included; once where nothing was added."""
     if grown.before.rows is rows:
         return grown.before, grown.after
@@ -152,7 +150,7 @@ class _HeldOut:
     def __init__(
         self,
         rows: Rows,
-        part: Searched,
+        part: Subsample,
         samples: pd.DataFrame,
         config: Config,
         effects: dict[str, Effect],
@@ -178,7 +176,7 @@ class _HeldOut:
             self._begun.close()
             self._begun = None
 
-    def settle(self, grown: Grown) -> None:
+    def settle(self, grown: Selection) -> None:
         """Set processes to work on the folds where they repeat the search; where they do not, let the samples go.
 
         They search for as many rounds as the whole campaign took to find its last effect. A fold has less to see by:
@@ -190,7 +188,7 @@ class _HeldOut:
         else:
             self.samples = self.samples.iloc[[]]  # much of the memory, and nothing is searched again
 
-    def forces(self, grown: Grown, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
+    def forces(self, grown: Selection, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
         """Return each row's force, before and after, by fits that did not see its group; NaN if never held out."""
         if self._begun is None:
             before = self.refitted(grown.before)
@@ -278,7 +276,9 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
     return first, first if after is before else force(after)
 
 
-def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], None]) -> tuple[Grown, Ends]:
+def _no_worse(
+    grown: Selection, ends: BeforeAfter, heldout: _HeldOut, say: Callable[[str], None]
+) -> tuple[Selection, BeforeAfter]:
     """Return the end of the loop with the first effects alone, as many as lower the error in sample and held out.
 
     What is left out was significant: it is put on record as refused, and the verdict says that something is left or,
@@ -289,7 +289,7 @@ def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], 
         last = grown.added[-1].proposal
         say(f"left out, as the error is no lower with it: {describe(last.term)}")
         reason = "with it the error is no lower, in sample or held out"
-        refused.append(Refused(last.term, last.p_value, reason))
+        refused.append(RefusedEffect(last.term, last.p_value, reason))
         model = grown.after.model.without_term(len(grown.added) - 1)
         own = fit(model, grown.after.rows, grown.after.scatter, turns=2) if model.terms else grown.before
         grown = replace(grown, after=own, added=grown.added[:-1])
@@ -301,7 +301,7 @@ def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], 
     return replace(grown, refused=(*grown.refused, *refused), worse=tuple(r for r in refused if not r.weak)), ends
 
 
-def _around(added: Sequence[Added]) -> str | None:
+def _around(added: Sequence[AcceptedEffect]) -> str | None:
     """Return the coarsest level within whose groups the effects vary; None where one differs between specimens.
 
     What varies inside a run changes nothing that runs differ by, and that may be most of the error.

@@ -17,12 +17,12 @@ import pandas as pd
 from sealfit.closure.channels import CALENDAR, Channel
 from sealfit.closure.forms import periodic_terms, terms_of
 from sealfit.closure.intervals import robust_covariance
-from sealfit.closure.judge import Candidate
 from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripple import Peak
+from sealfit.closure.score_test import Candidate
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.descent import linear_solved, search_bent
-from sealfit.fit.estimate import Fitted, fit, settled
+from sealfit.fit.descent import linear_solved, search_nonlinear
+from sealfit.fit.estimate import Fitted, fit, reestimated
 from sealfit.fit.whitening import Scatter, Whitening
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
@@ -74,7 +74,7 @@ def propose(
         return named_among(fitted, _spread(found))
     # Conditions are tested one after the other and the calendar follows them: what was set or measured comes first.
     others, calendar = (_refitted(fitted, part) for part in (_spread(others), _spread(calendar)[:CALENDAR_RIVALS]))
-    return _ordered(fitted, others) + sorted(calendar, key=lambda p: p.criterion)
+    return _ordered(fitted, others) + sorted(calendar, key=lambda p: p.bic)
 
 
 def propose_ripples(fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]) -> list[Proposal]:
@@ -126,7 +126,7 @@ def _spread(found: list[Proposal]) -> list[Proposal]:
     quantity that explains nearly as much: what is missing bends the model it is looked for in.
     """
     kept: list[Proposal] = []
-    ranked = sorted(found, key=lambda p: p.criterion - TIED * p.term.effect.physical)
+    ranked = sorted(found, key=lambda p: p.bic - TIED * p.term.effect.physical)
     for proposal in ranked:
         kind = _kind(proposal)
         same = [p for p in kept if _kind(p) == kind]
@@ -154,9 +154,9 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
     """Return proposals best first; in front of its equals the one that leaves earlier effects alone, then by rank."""
     if not found:
         return []
-    found = sorted(found, key=lambda p: p.criterion)
+    found = sorted(found, key=lambda p: p.bic)
     best = found[0]
-    equals = [p for p in found if p.criterion - best.criterion < TIED or _simpler(p, best)]
+    equals = [p for p in found if p.bic - best.bic < TIED or _simpler(p, best)]
     held = [p for p in equals if determined(p)]
     fewest = min((p.size for p in held), default=0)
     held += [p for p in equals if p.term.effect.physical and p not in held and p.size <= fewest]
@@ -166,9 +166,9 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
         least = min((p.fitted.deviance for p in own), default=0.0)
         held += [p for p in own if p.fitted.deviance - least < 2 * TIED and p not in held]
     if held:
-        first = min(held, key=lambda p: (_overturns(fitted, p), p.rank, p.criterion))
+        first = min(held, key=lambda p: (_overturns(fitted, p), p.rank, p.bic))
     else:
-        first = next((p for p in found if p.criterion - best.criterion < RIVAL and determined(p)), best)
+        first = next((p for p in found if p.bic - best.bic < RIVAL and determined(p)), best)
     return [first, *(p for p in found if p is not first)]
 
 
@@ -215,7 +215,7 @@ def _simpler(proposal: Proposal, best: Proposal) -> bool:
     """
     gain = (best.term.acts_on, best.term.operation) == ("force", "multiply") and proposal.term.acts_on != "force"
     plain = proposal.rank[:2] < best.rank[:2] or proposal.source == ZERO_OFFSET or gain
-    return plain and correlation(proposal, best) > SAME and proposal.criterion - best.criterion < 2 * TIED
+    return plain and correlation(proposal, best) > SAME and proposal.bic - best.bic < 2 * TIED
 
 
 def correlation(one: Proposal, other: Proposal) -> float:
@@ -231,12 +231,12 @@ def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
 
 def _rival(proposal: Proposal, chosen: Proposal) -> bool:
     alike = correlation(proposal, chosen)
-    return alike > SAME or (alike > ALIKE and proposal.criterion - chosen.criterion < RIVAL)
+    return alike > SAME or (alike > ALIKE and proposal.bic - chosen.bic < RIVAL)
 
 
 def _identical(one: Proposal, other: Proposal) -> bool:
     """Whether two proposals are one equation under two names, on the same channels and quantity."""
-    return one.term.key()[1:] == other.term.key()[1:] and abs(one.criterion - other.criterion) < 1e-3
+    return one.term.key()[1:] == other.term.key()[1:] and abs(one.bic - other.bic) < 1e-3
 
 
 def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
@@ -247,19 +247,19 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
     """
     if not found:
         return []
-    likeliest = sorted(found, key=lambda p: p.criterion)
-    refitted = sorted((_joint(fitted, p) for p in likeliest[:LIKELIEST]), key=lambda p: p.criterion)
-    best, alone = _settled(refitted[0]), _settled(refitted[0], noise=True)
+    likeliest = sorted(found, key=lambda p: p.bic)
+    refitted = sorted((_joint(fitted, p) for p in likeliest[:LIKELIEST]), key=lambda p: p.bic)
+    best, alone = _reestimated(refitted[0]), _reestimated(refitted[0], noise=True)
     if refitted[0].fitted.deviance - alone.fitted.deviance > DOMINANT:
-        refitted = sorted(_from_anew(fitted, likeliest, alone.fitted.scatter), key=lambda p: p.criterion)
-        best = _settled(refitted[0])
+        refitted = sorted(_from_anew(fitted, likeliest, alone.fitted.scatter), key=lambda p: p.bic)
+        best = _reestimated(refitted[0])
     elif len(found) > LIKELIEST:
-        refitted = sorted([*refitted, *(_joint(fitted, p) for p in likeliest[LIKELIEST:])], key=lambda p: p.criterion)
-        best = best if refitted[0].term is best.term else _settled(refitted[0])
-    least = min(best.criterion, refitted[0].criterion)
+        refitted = sorted([*refitted, *(_joint(fitted, p) for p in likeliest[LIKELIEST:])], key=lambda p: p.bic)
+        best = best if refitted[0].term is best.term else _reestimated(refitted[0])
+    least = min(best.bic, refitted[0].bic)
     scatter = best.fitted.scatter
-    near = [_deviance_under(p.fitted, scatter) + p.price < least + BEHIND for p in refitted[1:]]
-    own = [_settled(p) for p, n in zip(refitted[1:], near, strict=True) if n]
+    near = [_deviance_under(p.fitted, scatter) + p.bic_penalty < least + BEHIND for p in refitted[1:]]
+    own = [_reestimated(p) for p, n in zip(refitted[1:], near, strict=True) if n]
     far = [p for p, n in zip(refitted[1:], near, strict=True) if not n]
     return [best, *own, *far[:LIKELIEST]]
 
@@ -271,8 +271,8 @@ def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:
     return replace(proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction))
 
 
-def _settled(proposal: Proposal, *, noise: bool = False) -> Proposal:
-    return replace(proposal, fitted=settled(proposal.fitted, noise=noise))
+def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
+    return replace(proposal, fitted=reestimated(proposal.fitted, noise=noise))
 
 
 def _from_anew(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
@@ -288,7 +288,7 @@ def _from_anew(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> I
         if target in begun:
             model = linear_solved(replace(model, theta=begun[target]), rows, scatter, friction)
         else:
-            model = search_bent(model, rows, scatter)
+            model = search_nonlinear(model, rows, scatter)
         anew = fit(model, rows, scatter, turns=0, friction=friction)
         begun.setdefault(target, anew.model.theta)
         yield replace(proposal, fitted=anew)

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from sealfit.closure.aliases import Alias, find_aliases
-from sealfit.closure.confirm import Added
+from sealfit.closure.confirm import AcceptedEffect
 from sealfit.closure.forms import describe
-from sealfit.closure.grow import Grown
+from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted
@@ -24,7 +24,7 @@ TIE = 1e-9  # relative: closer than that, only rounding tells runs apart
 ROWS = 4  # of each stroke at which forces are compared
 
 
-def next_runs(grown: Grown, config: Config, effects: Mapping[str, Effect]) -> list[dict]:
+def next_runs(grown: Selection, config: Config, effects: Mapping[str, Effect]) -> list[dict]:
     """Return for each effect with rivals the run that would tell it from the nearest one, and for what cannot be seen
     here the run that would show it.
 
@@ -90,7 +90,7 @@ def _unseen(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> It
             }
 
 
-def _replicates(item: Added, config: Config) -> dict:
+def _replicates(item: AcceptedEffect, config: Config) -> dict:
     """Return the condition to repeat on a new specimen: where an effect that too few specimens show is largest."""
     fitted = item.proposal.fitted
     without = evaluate(fitted.model.without_term(len(fitted.model.terms) - 1), fitted.rows, jacobian=False)[0]

@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealfit.closure.adjusted import judged
 from sealfit.closure.channels import FINER, Channel, even_knots, flip_level, off_zero, scatter_level
-from sealfit.closure.judge import Candidate, Judge
+from sealfit.closure.multiplicity import judged
+from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import MAIN_TARGETS
 from sealfit.effects.free import BENDS, evenly
 
@@ -26,7 +26,7 @@ MOST_CATEGORIES = 12  # a slope for each of more would find what single units do
 
 
 def search_pairs(
-    judge: Judge, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
+    judge: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
 ) -> list[Candidate]:
     """Return candidates of two channels, adjusted over these and the single ones, strongest evidence first.
 
@@ -49,7 +49,7 @@ def search_pairs(
 
 
 def pairs_in_disguise(
-    judge: Judge, significant: Sequence[Candidate], channels: Mapping[str, Channel]
+    judge: ScoreTests, significant: Sequence[Candidate], channels: Mapping[str, Channel]
 ) -> list[Candidate]:
     """Return the pairs that a channel's change of a or of v_s may stand for.
 
@@ -74,7 +74,7 @@ def pairs_in_disguise(
         found = _of_pair(judge, *members) if len(members) == 2 else []
         strongest = [max(own, key=lambda c: c.chi2) for t in MAIN_TARGETS if (own := [c for c in found if _on(c, t)])]
         best[pair] = [
-            replace(c, judgement=c.judgement._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value)
+            replace(c, test_result=c.test_result._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value)
             for c in strongest
         ]
     return list(itertools.chain.from_iterable(best.values()))
@@ -92,7 +92,7 @@ def _usable(channels: Sequence[Channel]) -> list[Channel]:
     ]
 
 
-def _of_pair(judge: Judge, one: Channel, other: Channel) -> list[Candidate]:
+def _of_pair(judge: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
     blocks = mixed_columns(one, other)
     if not blocks:
         return []
@@ -107,10 +107,10 @@ def _of_pair(judge: Judge, one: Channel, other: Channel) -> list[Candidate]:
             continue
         variants = judge.variants(shapes * fitted.slope(*target)[:, None], finer)
         for block, first, last in zip(blocks, ends[:-1], ends[1:], strict=True):
-            judgement = judge([v[:, first:last] for v in variants], between, level, target)
-            if judgement is not None:
+            test_result = judge([v[:, first:last] for v in variants], between, level, target)
+            if test_result is not None:
                 names = (one.name, other.name)
-                found.append(Candidate(names, *target, level, block, judgement, pair=True))
+                found.append(Candidate(names, *target, level, block, test_result, pair=True))
     return found
 
 

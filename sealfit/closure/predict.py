@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.intervals import Sandwich, mean_half_width, t_quantile
-from sealfit.closure.record import from_record
+from sealfit.closure.model_record import from_record
 from sealfit.conditions import add_keys
 from sealfit.config import Config
 from sealfit.effects.contract import Effect

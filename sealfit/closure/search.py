@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sealfit.closure.adjusted import judged
 from sealfit.closure.channels import (
     CALENDAR,
     FEW_DF,
@@ -21,7 +20,8 @@ from sealfit.closure.channels import (
     scatter_level,
     unit_of,
 )
-from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge
+from sealfit.closure.multiplicity import judged
+from sealfit.closure.score_test import JACKKNIFE_UNITS, Candidate, ScoreTests
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import POWER, Rows
 
@@ -40,7 +40,7 @@ MOST_NUMBERS = 1 << 22  # of columns on all rows that are projected at once: 34 
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 
 
-def search(judge: Judge, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
+def search(judge: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
     """Return every candidate with its adjusted p-value, strongest evidence first.
 
     Parameters
@@ -56,7 +56,7 @@ def search(judge: Judge, channels: Sequence[Channel], rng: np.random.Generator) 
     return judged(judge, candidates, rng) if candidates else []
 
 
-def of_channel(judge: Judge, channel: Channel) -> Iterator[Candidate]:
+def of_channel(judge: ScoreTests, channel: Channel) -> Iterator[Candidate]:
     """Yield the candidates of one channel, not adjusted for any search."""
     rows = judge.fitted.rows
     if channel.name == "direction":
@@ -76,7 +76,11 @@ def of_channel(judge: Judge, channel: Channel) -> Iterator[Candidate]:
 
 
 def _of_shapes(
-    judge: Judge, channel: Channel, shapes: np.ndarray, targets: Sequence[tuple[str, str]], widths: Sequence[int] = ()
+    judge: ScoreTests,
+    channel: Channel,
+    shapes: np.ndarray,
+    targets: Sequence[tuple[str, str]],
+    widths: Sequence[int] = (),
 ) -> Iterator[Candidate]:
     """Yield the candidates of a channel's columns, by the first so many of them, on every target that may take them."""
     fitted, rows = judge.fitted, judge.fitted.rows
@@ -112,9 +116,9 @@ def _of_shapes(
         level = flip_level(unit, rows)
         between = level if channel.grouping else scatter_level([channel], rows)
         for width in dict.fromkeys(widths or (own.shape[1],)):
-            judgement = judge([v[:, first : first + width] for v in variants], between, level, (acts_on, operation))
-            if judgement is not None:
-                yield Candidate(names, acts_on, operation, level, own[:, :width], judgement)
+            test_result = judge([v[:, first : first + width] for v in variants], between, level, (acts_on, operation))
+            if test_result is not None:
+                yield Candidate(names, acts_on, operation, level, own[:, :width], test_result)
 
 
 def _direction_unit(rows: Rows) -> str:

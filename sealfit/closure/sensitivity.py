@@ -14,22 +14,22 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri
 
-from sealfit.closure.adjusted import SEARCHES, critical_few, critical_many
 from sealfit.closure.channels import Channel, scatter_level
 from sealfit.closure.confirm import LEAST_SIZE
-from sealfit.closure.few import FewTest, FewUnits
-from sealfit.closure.grow import Grown
-from sealfit.closure.judge import CONSTANT, JACKKNIFE_UNITS, Candidate, Judge, project
-from sealfit.closure.slopes import (
+from sealfit.closure.contrasts import (
     LARGE,
     LEAST_UNITS,
     WAYS,
-    SlopeTest,
+    ContrastTest,
+    contrast_test,
     enough_specimens,
     least_share,
     moderated,
-    slope_test,
 )
+from sealfit.closure.multiplicity import SEARCHES, critical_few, critical_many
+from sealfit.closure.score_test import CONSTANT, JACKKNIFE_UNITS, Candidate, ScoreTests, project
+from sealfit.closure.selection import Selection
+from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.reml import orthonormal
 from sealfit.fit.rows import LEVELS
@@ -74,7 +74,7 @@ MATERIAL = 0.02
 LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
 
 
-def sensitivity(grown: Grown, alpha: float) -> list[dict]:
+def sensitivity(grown: Selection, alpha: float) -> list[dict]:
     """Return per variable and level: variable, level, acts_on, smallest_N, smallest_pct and files_needed.
 
     A variable that varies at several levels has an entry for each, of an effect that follows it at that level only.
@@ -133,7 +133,7 @@ def sensitivity(grown: Grown, alpha: float) -> list[dict]:
     return entries
 
 
-def _parts(grown: Grown, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
+def _parts(grown: Selection, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
     """Yield each level at which a channel has a real share of its variance, and its first column's part there."""
     groups, weight = grown.after.rows.groups, grown.after.rows.weight
     if not own or not channel.numeric or channel.name == "direction":
@@ -164,17 +164,17 @@ class _Search:
     the variance of a contrast in few units is moderated, and that of scores of many is 1 or more.
     """
 
-    def __init__(self, grown: Grown, alpha: float) -> None:
+    def __init__(self, grown: Selection, alpha: float) -> None:
         self.fitted, self.channels, self.candidates = grown.after, grown.channels, grown.last
         self.level, self.units = alpha / SEARCHES, {}
-        judgements = [c.judgement for c in grown.last]
+        judgements = [c.test_result for c in grown.last]
         slopes = [j.slopes for j in judgements if j.slopes]
         few = [test for c in grown.last if (test := self._few_again(c)) is not None]
         many = [j for j in judgements if j.few is None and not j.slopes]
         self.contrasts = WAYS * sum(own[0].slope.size for own in slopes)
         tests = [test for own in slopes for test in own]
         self.moderated = {id(t): m for t, m in zip(tests, moderated(tests), strict=True)}
-        lines = [c for c in grown.last if c.judgement.slopes and not c.pair and (c.acts_on, c.operation) == FRICTION]
+        lines = [c for c in grown.last if c.test_result.slopes and not c.pair and (c.acts_on, c.operation) == FRICTION]
         self.lines = np.column_stack([c.columns[:, 0] for c in lines] or [np.ones(grown.after.force.size)])
         self.lines = self.lines * grown.after.slope(*FRICTION)[:, None]
         self.many = len(many)
@@ -184,13 +184,13 @@ class _Search:
             level = self.level / (1 if name == SPECIMENS else WAYS)  # runs are tested in two ways, by slopes as well
             self.critical_few[name] = critical_few(self.fitted, [t for t in few if t.level == name], level)
 
-    def _few_again(self, candidate: Candidate) -> FewTest | None:
+    def _few_again(self, candidate: Candidate) -> SmallSampleTest | None:
         """Return a candidate's test on few units at the last model, which may hold fewer effects than were searched."""
-        known, target = candidate.judgement.few, (candidate.acts_on, candidate.operation)
+        known, target = candidate.test_result.few, (candidate.acts_on, candidate.operation)
         if known is None:
             return None
         if known.level not in self.units:
-            self.units[known.level] = FewUnits(self.fitted, known.level)
+            self.units[known.level] = ClusterTests(self.fitted, known.level)
         columns = candidate.columns * self.fitted.slope(*target)[:, None]
         return self.units[known.level].test(project(self.fitted, columns), target)
 
@@ -212,7 +212,7 @@ class _Search:
 
     def margin(self, candidate: Candidate, effect: np.ndarray, fitted: Fitted) -> float:
         """Return how many times as long as needed an effect is."""
-        judge = Judge(fitted)
+        judge = ScoreTests(fitted)
         white = fitted.basis.freed(fitted.whitening(np.column_stack([self.fitted.residual, effect])))
         noise, effect = (replace(fitted, white_residual=column) for column in white.T)
         for one in (noise, effect):
@@ -227,26 +227,26 @@ class _Search:
 
     def _by_units(self, candidate: Candidate, noise: Fitted, effect: Fitted, variants: Sequence[np.ndarray]) -> float:
         """Return the margin by the units' own scatter."""
-        channel, judgement = self.channels[candidate.channels[-1]], candidate.judgement
-        few = judgement.few
+        channel, test_result = self.channels[candidate.channels[-1]], candidate.test_result
+        few = test_result.few
         by_few = 0.0 if few is None else min(self._by_few(noise, effect, left, few) for left in variants)
-        if judgement.slopes:
+        if test_result.slopes:
             tail = self.level / self.contrasts / (1 if few is None else WAYS)
-            pairs = zip(variants, judgement.slopes, strict=True)
+            pairs = zip(variants, test_result.slopes, strict=True)
             return max(by_few, min(self._by_slopes(noise, effect, left, test, tail) for left, test in pairs))
         if few is not None:
             return by_few
         level = candidate.unit if channel.grouping else scatter_level([channel], noise.rows)
         return min(self._by_many(noise, effect, left, level, candidate) for left in variants)
 
-    def _by_slopes(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: SlopeTest, tail: float) -> float:
-        test, added = (slope_test(one, left, known.level) for one in (noise, effect))
+    def _by_slopes(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: ContrastTest, tail: float) -> float:
+        test, added = (contrast_test(one, left, known.level) for one in (noise, effect))
         if test is None or test.slope.size != known.slope.size:
             return 0.0
         variance, df = self.moderated[id(known)]
         prior_df = df - known.df
         prior = (df * variance - known.df * known.variance) / np.maximum(prior_df, 1e-9)
-        others = slope_test(effect, project(effect, self.lines), known.level)
+        others = contrast_test(effect, project(effect, self.lines), known.level)
         for along in (False, True) if others is not None else ():
             alike = others.variance[others.along == along]  # the effect stands in the scatter of other contrasts
             prior[known.along == along] *= np.exp(np.mean(np.log1p(alike))) if alike.size else 1.0
@@ -262,10 +262,10 @@ class _Search:
         ]
         return float(np.nanmax(margins))
 
-    def _by_few(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: FewTest) -> float:
+    def _by_few(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: SmallSampleTest) -> float:
         if known.level not in self.critical_few:
             return 0.0
-        units = (FewUnits(one, known.level) for one in (noise, effect))
+        units = (ClusterTests(one, known.level) for one in (noise, effect))
         return _by_numbers(*units, left, known.target, np.exp(self.critical_few[known.level]))
 
     def _by_many(self, noise: Fitted, effect: Fitted, left: np.ndarray, level: str, candidate: Candidate) -> float:
@@ -274,7 +274,7 @@ class _Search:
         length = float(np.linalg.norm(seen))
         if length == 0:
             return 0.0
-        scores = candidate.judgement.scores
+        scores = candidate.test_result.scores
         units, k = scores.shape
         sums = noise.rows.groups.sums
         own, added = (float((sums(seen / length * f.unit_residual(level), level) ** 2).sum()) for f in (noise, effect))
@@ -289,13 +289,18 @@ class _Search:
         explained = length / (np.sqrt(chdtri(k, tail)) + beyond)
         if level == "run":
             target = (candidate.acts_on, candidate.operation)
-            runs = FewUnits(noise, "run"), FewUnits(effect, "run")
+            runs = ClusterTests(noise, "run"), ClusterTests(effect, "run")
             explained = max(explained, _by_numbers(*runs, left, target, tail, least=CONSTANT))
         return max(margin, min(spread, explained))
 
 
 def _by_numbers(
-    noise: FewUnits, effect: FewUnits, left: np.ndarray, target: tuple[str, str], tail: float, least: float = 0.0
+    noise: ClusterTests,
+    effect: ClusterTests,
+    left: np.ndarray,
+    target: tuple[str, str],
+    tail: float,
+    least: float = 0.0,
 ) -> float:
     """Return the margin by the F test of one number a unit, at a p-value; 0 where columns are not one number a unit."""
     test, added = (units.test(left, target) for units in (noise, effect))
@@ -326,7 +331,7 @@ def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
     return replace(fitted, scatter=scatter, whitening=whitening, white_jacobian=whitening.of(fitted.jacobian))
 
 
-def cannot_tell(grown: Grown, entries: Sequence[dict], scatter: Sequence[dict]) -> list[str]:
+def cannot_tell(grown: Selection, entries: Sequence[dict], scatter: Sequence[dict]) -> list[str]:
     """Return the variables of which this campaign could not have told; empty where it could.
 
     A variable cannot be told if no effect of it can reach the required p-value, and it varies along strokes, is the

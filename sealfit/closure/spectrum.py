@@ -17,7 +17,7 @@ from scipy.fft import next_fast_len
 from scipy.sparse import csr_array
 
 from sealfit.closure.background import LOBE
-from sealfit.closure.strokes import Strokes
+from sealfit.closure.stroke_signals import Strokes
 from sealfit.engine import begin_map, spare
 
 MOST_NUMBERS = 1 << 19  # of the grids of a block: 4 MB

@@ -116,7 +116,7 @@ def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
             "form": law.loss.form,
             "rank": number + 1,
             "rival": law in rivals,
-            "criterion": law.criterion - best.criterion,
+            "criterion": law.bic - best.bic,
             "scatter_rel": law.scatter,
             "heldout_series": held.get("series", np.nan),
             "heldout_last_day": held.get("last_day", np.nan),
@@ -132,7 +132,7 @@ def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
     if apart is not None:
         yield {
             "law": SEPARATE, "way": "", "form": "mu_0 - a ln(1 + t/b), a and b of each series", "rank": len(laws) + 1,
-            "rival": False, "criterion": apart[0] - best.criterion, "heldout_last_day": apart[1], "identified": True,
+            "rival": False, "criterion": apart[0] - best.bic, "heldout_last_day": apart[1], "identified": True,
         }  # fmt: skip
 
 
@@ -147,12 +147,12 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
         return None
     origin = np.zeros(aged.value.size, int)
     fitted = fit_law(Values(aged.days, aged.value, origin, series, aged.covariance(law.scatter)))
-    criterion = fitted.chi2 + aged.spread.log_determinant(law.scatter) + fitted.x.size * np.log(aged.value.size)
+    bic = fitted.chi2 + aged.spread.log_determinant(law.scatter) + fitted.x.size * np.log(aged.value.size)
     squares = []
     for out in aged.last_days() if min(days) > 3 else []:
         part = fit_law(fitted.values.part(~out))
         squares += list((law_model(fitted.values, part.x)[0][out] - aged.value[out]) ** 2)
-    return criterion, float(np.sqrt(np.mean(squares))) if squares else np.nan
+    return bic, float(np.sqrt(np.mean(squares))) if squares else np.nan
 
 
 def _master_curve(law: JointLaw) -> pd.DataFrame:

@@ -82,7 +82,7 @@ def descend(
     return model
 
 
-def search_bent(model: Model, rows: Rows, scatter: Scatter) -> Model:
+def search_nonlinear(model: Model, rows: Rows, scatter: Scatter) -> Model:
     """Return the model with each v_s, and all b together, at the best point of a grid, what is linear solved anew.
 
     What an effect explains may have stood in them before, and the way out of there can lead over a hill. Series share

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.fit.descent import descend, search_bent
+from sealfit.fit.descent import descend, search_nonlinear
 from sealfit.fit.joint import Model, evaluate, friction_of, term_slope
 from sealfit.fit.prior import centre_of, covariance_of, free_of_others, penalised, precision_of, smoothed
 from sealfit.fit.rows import Rows
@@ -139,7 +139,7 @@ def fit(
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
         model = descend(model, rows, scatter, centre, near=ROUGH)
     if turns and model.terms:
-        model = search_bent(model, rows, scatter)
+        model = search_nonlinear(model, rows, scatter)
     for turn in range(turns):
         force, jacobian = evaluate(model, rows)
         scatter = estimate_scatter(
@@ -162,7 +162,7 @@ def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray |
     return Fitted(model, scatter, rows, force, friction, jacobian, residual, white, deviance, whitening)
 
 
-def settled(fitted: Fitted, *, noise: bool = False) -> Fitted:
+def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
     """Return a fit with the variance components that its own residual shows, and the row noise if asked for.
 
     What a model leaves unexplained between units stands in their variance. Two models are told apart by their deviances
@@ -182,7 +182,7 @@ def settled(fitted: Fitted, *, noise: bool = False) -> Fitted:
     return fitted_at(model, rows, scatter, fitted.friction)
 
 
-def worth(fitted: Fitted, number: int) -> float:
+def effective_df(fitted: Fitted, number: int) -> float:
     """Return how many numbers a term's free shape is worth, held as smooth as it is."""
     model, white = fitted.model, fitted.white_jacobian
     place = model.place(number)

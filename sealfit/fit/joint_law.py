@@ -61,7 +61,7 @@ class JointLaw:
     x: np.ndarray
     covariance: np.ndarray
     scatter: float
-    criterion: float
+    bic: float
 
     @property
     def df(self) -> int:
@@ -162,11 +162,11 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
         before, scatter = scatter, _scatter(aged, aged.value - empty.at(aged, x), aged.value.size - len(names))
         if abs(scatter - before) <= SETTLED * before:
             break
-    criterion = aged.spread.chi2(aged.value - empty.at(aged, x), scatter) + aged.spread.log_determinant(scatter)
-    criterion += len(names) * float(np.log(aged.value.size))
+    bic = aged.spread.chi2(aged.value - empty.at(aged, x), scatter) + aged.spread.log_determinant(scatter)
+    bic += len(names) * float(np.log(aged.value.size))
     white = aged.spread.whitening(scatter) @ empty.slope(aged, x).T
     covariance = covariance_of(white.T @ white, np.zeros((len(names),) * 2))
-    return replace(empty, x=x, covariance=covariance, scatter=scatter, criterion=criterion)
+    return replace(empty, x=x, covariance=covariance, scatter=scatter, bic=bic)
 
 
 def _scatter(aged: Aged, residual: np.ndarray, df: int) -> float:
@@ -206,12 +206,12 @@ def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw
                 first = first or error  # of the law with the fewest numbers
     if not found:
         raise first
-    return sorted(found, key=lambda law: law.criterion)
+    return sorted(found, key=lambda law: law.bic)
 
 
 def rivals_of(laws: Sequence[JointLaw]) -> list[JointLaw]:
     """Return the laws that these values cannot tell from the first."""
-    return [law for law in laws[1:] if law.criterion - laws[0].criterion < RIVAL]
+    return [law for law in laws[1:] if law.bic - laws[0].bic < RIVAL]
 
 
 def left_out(law: JointLaw) -> dict[str, float]:

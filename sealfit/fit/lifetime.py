@@ -115,7 +115,7 @@ def over_laws(
     goal, temperature_C, compression_pct
         As `lifetime`.
     """
-    weights = np.exp(-0.5 * np.array([law.criterion - min(one.criterion for one in laws) for law in laws]))
+    weights = np.exp(-0.5 * np.array([law.bic - min(one.bic for one in laws) for law in laws]))
     lives = [lifetime(law, goal, temperature_C, compression_pct) for law in laws]
     found = list(zip(weights / weights.sum(), laws, lives, strict=True))
 

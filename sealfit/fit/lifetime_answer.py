@@ -67,7 +67,7 @@ def answer(
             "no unaged rubber was tested: there is no start of which a share could be lost.",
             mend="Give --threshold VALUE, or test unaged rubber.",
         )
-    found = {"law": law.loss.name, "way": law.way, "form": law.loss.form, "criterion": law.criterion}
+    found = {"law": law.loss.name, "way": law.way, "form": law.loss.form, "criterion": law.bic}
     found |= {"parameters": {name: value for name, value, *_ in law.parameters()}}
     if years is not None:
         celsius, *ends = temperature_for(law, goal, years, compression_pct)

@@ -110,7 +110,7 @@ def polish(
             gtol=None if not free else 1e-15,
             max_nfev=budget,
         )
-        x, steps, settled = _finish(residual, derivative, found.x, low, high)
+        x, steps, reestimated = _finish(residual, derivative, found.x, low, high)
     at_bound = (x <= low) | (x >= high)
     rest, tangent = residual(x), derivative(x)
     covariance, rank = covariance_of(tangent, ~at_bound)
@@ -122,7 +122,7 @@ def polish(
         covariance=covariance,
         rank=rank,
         at_bound=at_bound,
-        converged=bool(found.success or settled),
+        converged=bool(found.success or reestimated),
         evaluations=int(found.nfev) + steps,
     )
 

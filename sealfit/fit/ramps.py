@@ -148,11 +148,11 @@ def _descended(rows: _Rows, shape: Shape, at: np.ndarray, unit: np.ndarray) -> n
         move = -_solve(damped, pull)
         gain = np.einsum("ki,kij,kj->k", move, normal, move)
         # Where one direction is hardly seen (a ramp within a step), the other is what tells.
-        settled = (gain <= SETTLED * squares) | (np.abs(move).max(axis=1) <= TOO_SHORT)
-        settled |= damping[alive] > DAMPED[2]
-        if settled.any():
-            alive, own = alive[~settled], own.some(~settled)
-            squares, pull, normal, move, gain = (values[~settled] for values in (squares, pull, normal, move, gain))
+        reestimated = (gain <= SETTLED * squares) | (np.abs(move).max(axis=1) <= TOO_SHORT)
+        reestimated |= damping[alive] > DAMPED[2]
+        if reestimated.any():
+            alive, own = alive[~reestimated], own.some(~reestimated)
+            squares, pull, normal, move, gain = (values[~reestimated] for values in (squares, pull, normal, move, gain))
             if not len(alive):
                 break
         trial = at[alive] + move * unit[alive]

@@ -128,7 +128,7 @@ def ingest_campaign(
     faults += found
     faults += incomplete_columns(steady)
     strokes = strokes.assign(used=_still_used(strokes, steady))
-    parts = make.settled(parts, _ruled_out(plan, strokes, files))
+    parts = make.reestimated(parts, _ruled_out(plan, strokes, files))
     used = np.zeros(len(listing), bool)
     used[files[strokes["used"].to_numpy(bool)]] = True
     inputs, marks = inputs_table(campaign, make.marks, plan, parts, used, faults)
@@ -196,7 +196,7 @@ class _Maker:
         """Return the strokes of a part, from the disk if they lie there."""
         return stored_strokes(part, self._place.folder) if part.strokes is None else part.strokes
 
-    def settled(self, parts: Sequence[Made], unused: Sequence[frozenset]) -> list[Made]:
+    def reestimated(self, parts: Sequence[Made], unused: Sequence[frozenset]) -> list[Made]:
         """Return the parts, made again where the whole campaign leaves out other strokes or has other columns."""
         columns = common_columns(parts)
         again = {

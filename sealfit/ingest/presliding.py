@@ -224,9 +224,9 @@ def _settled_mm(start: Start, level_N: float, fitted_mm: float) -> float:
     length = float(distance[-1])
     if float(start.force_N[0]) > HALF_WAY * level_N and fitted_mm > SHORT * length:
         return 0.0
-    settled = min(SETTLED * fitted_mm, max(length / 3.0, ENOUGH * fitted_mm))
+    reestimated = min(SETTLED * fitted_mm, max(length / 3.0, ENOUGH * fitted_mm))
     ramp = start.plateau_mm
-    return float(max(settled, ramp + AFTER_RAMP * fitted_mm if ramp > 0.0 else 0.0))
+    return float(max(reestimated, ramp + AFTER_RAMP * fitted_mm if ramp > 0.0 else 0.0))
 
 
 def _below(plateau_N: np.ndarray, begin_N: float) -> bool:

@@ -72,10 +72,10 @@ def quality_findings(quality: pd.DataFrame, config: Config) -> tuple[list[dict],
     """Return the findings worth listing (all but what is only said), the worst first, and how many there are in all."""
     if quality.empty:
         return [], 0
-    worth = quality[(quality["severity"] != "info") | (quality["action"].fillna("kept") != "kept")]
-    rank = worth["severity"].map({name: k for k, name in enumerate(SEVERITIES)}).fillna(9)
-    worth = worth.assign(rank=rank).sort_values("rank", kind="stable").drop(columns="rank")
-    shown = worth.head(MOST_FINDINGS).astype(object)
+    effective_df = quality[(quality["severity"] != "info") | (quality["action"].fillna("kept") != "kept")]
+    rank = effective_df["severity"].map({name: k for k, name in enumerate(SEVERITIES)}).fillna(9)
+    effective_df = effective_df.assign(rank=rank).sort_values("rank", kind="stable").drop(columns="rank")
+    shown = effective_df.head(MOST_FINDINGS).astype(object)
     rows = []
     for row in shown.where(shown.notna(), None).to_dict("records"):
         place = f"line {int(row['line'])}" if row["line"] is not None else ""
@@ -84,7 +84,7 @@ def quality_findings(quality: pd.DataFrame, config: Config) -> tuple[list[dict],
         texts = {name: true_units(row[name] or "", config.units) for name in ("reason", "mend")}
         column = channel_label(row["column"], config.units) if row["column"] else ""
         rows.append({**row, **texts, "place": place, "column": column, "check": (row["check"] or "").replace("_", " ")})
-    return rows, len(worth)
+    return rows, len(effective_df)
 
 
 def provenance_facts(provenance: Mapping) -> dict:

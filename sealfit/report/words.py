@@ -148,9 +148,9 @@ def _change(effect: Mapping, shape: pd.DataFrame, config: Config) -> Markup:
     sign = 1.0 if value[k] > 0 else -1.0
     ends = sorted((scale * sign * lo[k], scale * sign * hi[k]))
     way = "rises" if sign > 0 else "falls"
-    settled = k == len(value) - 1 and abs(value[0]) <= STARTS * span
+    reestimated = k == len(value) - 1 and abs(value[0]) <= STARTS * span
     size = _measured(scale * abs(value[k]), ends, unit)
-    return Markup("{} {} by {}{}").format(what, way, "" if settled else "up to ", size)
+    return Markup("{} {} by {}{}").format(what, way, "" if reestimated else "up to ", size)
 
 
 def target_html(target: str, config: Config) -> Markup:

@@ -57,7 +57,7 @@ def move_at(design: Design, speed_mm_s: float, direction: int, start_mm: float, 
     since = time - number * period - rest  # since the stroke began to move
     along, speed = _trapezoid(since, ramp, cruise, speed_mm_s, length)
     cruising = (since > ramp) & (since < ramp + cruise)
-    settled = 0.5 * speed_mm_s * ramp + STEADY_LENGTHS * design.stiffness_mm
+    reestimated = 0.5 * speed_mm_s * ramp + STEADY_LENGTHS * design.stiffness_mm
     sign = direction * np.where(number % 2, -1, 1)
     both = design.strokes_per_file > 1
     return Motion(
@@ -69,7 +69,7 @@ def move_at(design: Design, speed_mm_s: float, direction: int, start_mm: float, 
         direction=sign,
         stroke=number + 1,
         cruising=cruising,
-        steady=cruising & (along > settled),
+        steady=cruising & (along > reestimated),
     )
 
 

@@ -5,9 +5,9 @@ import numpy.testing as npt
 import pytest
 from bins_helpers import make_bins, make_traces, warm
 
-from sealfit.closure.document import Ends
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
+from sealfit.closure.result import BeforeAfter
 from sealfit.config import Config
 from sealfit.errors import RequestError
 from sealfit.fit.estimate import fit_declared
@@ -185,7 +185,9 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     wave = np.sin(rows.values("displacement_mm"))
 
     def ends(rise):
-        return Ends(fitted, fitted, rows.force - run - wave, rows.force - rise * run, np.ones(run.size, dtype=bool))
+        return BeforeAfter(
+            fitted, fitted, rows.force - run - wave, rows.force - rise * run, np.ones(run.size, dtype=bool)
+        )
 
     assert not ends(1.1).gains(None)
     assert ends(1.1).gains("stroke")

@@ -7,8 +7,8 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure import naming
-from sealfit.closure.grow import numbered
 from sealfit.closure.ripple import Peak
+from sealfit.closure.selection import numbered
 from sealfit.effects import EFFECTS
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
@@ -21,10 +21,8 @@ def proposal(effect, acts_on, deviance, size):
     term = SimpleNamespace(effect=effect, acts_on=acts_on, operation="multiply")
     rank = (0 if effect.physical else 1, size, ("mu", "force").index(acts_on), 0)
     fitted = SimpleNamespace(deviance=deviance)
-    criterion = deviance + PRICE * size
-    return SimpleNamespace(
-        term=term, fitted=fitted, size=size, rank=rank, criterion=criterion, source=(), column=np.ones(3)
-    )
+    bic = deviance + PRICE * size
+    return SimpleNamespace(term=term, fitted=fitted, size=size, rank=rank, bic=bic, source=(), column=np.ones(3))
 
 
 @pytest.mark.parametrize(("behind", "first"), [(1.0, "mu"), (10.0, "force")])
@@ -54,4 +52,4 @@ def test_rivals_are_told_apart_under_the_noise_that_the_effect_leaves():
     fitted = fit_declared(make_rows(bins, has_aging=True))
     first, second = naming.propose_ripples(fitted, peak, bins.iloc[:0], EFFECTS)[:2]
     assert (first.term.acts_on, first.term.operation) == ("force", "add")
-    assert second.criterion - first.criterion > 100
+    assert second.bic - first.bic > 100

@@ -3,7 +3,7 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.channels import find_channels, flip_level, free_columns, unit_of
-from sealfit.closure.judge import Judge, log_p_of
+from sealfit.closure.score_test import ScoreTests, log_p_of
 from sealfit.closure.search import search
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
@@ -70,7 +70,7 @@ def test_p_values_of_nulls_are_not_too_small():
     smallest = []
     for seed in range(24):
         rows = rows_of(seed + 100, bins=8, autocorrelation=0.5 * (seed % 2))
-        found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(seed))
+        found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(seed))
         smallest.append(min(c.p_value for c in found))
     # Each campaign's smallest adjusted p is uniform: of 24, two below 0.1 on average, and more than seven with p 0.003.
     assert sum(p < 0.1 for p in smallest) <= 7
@@ -79,7 +79,7 @@ def test_p_values_of_nulls_are_not_too_small():
 
 def test_a_channel_that_orders_the_residual_is_found_at_its_unit():
     rows = rows_of(bins=6, effect=lambda t, f: f * (1 + 0.02 * (t["lab_temperature_C"].to_numpy() - 22)))
-    best = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))[0]
+    best = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))[0]
     assert best.channels == ("lab_temperature_C",)
     assert best.unit == "run"
     assert best.p_value <= 0.001
@@ -96,7 +96,7 @@ def test_a_channel_may_change_how_soon_a_rubber_ages():
         return force - 49.03 * 0.04 * (np.log1p(days / (0.1 * 2 ** (-warmer / 4))) - np.log1p(days / 0.1))
 
     rows = rows_of(bins=6, effect=sooner)
-    found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     keys = {c.key for c in found if c.p_value < 0.005}
     assert (("lab_temperature_C",), "b", "multiply") in keys
 
@@ -115,5 +115,5 @@ def test_sliding_power_is_a_channel_where_loads_differ():
 def test_three_speeds_show_no_effect_of_speed_beside_the_stribeck_curve_they_cannot_hold():
     bins = make_bins(speeds=(1.0, 8.0, 64.0), bins=6)
     rows = make_rows(bins.assign(load_N=np.where(bins["aging_days"] > 4, 25.0, 50.0)), has_aging=True)
-    found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     assert not any({"speed_mm_s", "power"} & set(c.channels) for c in found)

@@ -4,10 +4,10 @@ import pytest
 from bins_helpers import make_bins, make_traces
 
 from sealfit.closure.channels import channels_of
-from sealfit.closure.grow import Grown
-from sealfit.closure.judge import Judge
 from sealfit.closure.loop import close_loop
+from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
+from sealfit.closure.selection import Selection
 from sealfit.closure.sensitivity import cannot_tell, sensitivity
 from sealfit.config import Config
 from sealfit.fit.estimate import fit_declared
@@ -21,8 +21,8 @@ def searched(bins):
     """The end of a loop that finds nothing: one search."""
     fitted = fit_declared(make_rows(bins, has_aging=True))
     channels = {c.name: c for c in channels_of(fitted.rows, Config())}
-    found = tuple(search(Judge(fitted), list(channels.values()), np.random.default_rng(0)))
-    return Grown(fitted, fitted, (), found, found, None, None, channels)
+    found = tuple(search(ScoreTests(fitted), list(channels.values()), np.random.default_rng(0)))
+    return Selection(fitted, fitted, (), found, found, None, None, channels)
 
 
 def entries(grown):

@@ -7,7 +7,7 @@ import pytest
 
 from sealfit.effects import EFFECTS
 from sealfit.fit import descent
-from sealfit.fit.descent import search_bent
+from sealfit.fit.descent import search_nonlinear
 from sealfit.fit.rows import make_rows
 from sealfit.fit.start import start_model
 from sealfit.fit.terms import Term
@@ -37,9 +37,9 @@ def astray(one_specimen: bool, aging: bool):
 @pytest.mark.parametrize("aging", [True, False])
 def test_series_by_themselves_are_found_as_on_all_rows(monkeypatch, one_specimen, aging):
     model, rows, curved = astray(one_specimen, aging)
-    found = search_bent(model, rows, SCATTER)
+    found = search_nonlinear(model, rows, SCATTER)
     monkeypatch.setattr(descent, "ALONE", 0.0)
-    whole = search_bent(model, rows, SCATTER)
+    whole = search_nonlinear(model, rows, SCATTER)
     npt.assert_allclose(found.vector(), whole.vector(), rtol=1e-6, atol=1e-9)
     assert np.abs(found.vector()[curved] - model.vector()[curved]).max() > 0.3
     npt.assert_allclose(np.exp(found.vector()[curved]), bins_helpers.TRUE["v_s"], rtol=0.4)  # a grid of twelve
@@ -50,12 +50,12 @@ def test_few_rows_are_looked_at_for_one_series(monkeypatch):
     seen = []
     sums = descent._sums
     monkeypatch.setattr(descent, "_sums", lambda m, r, *more: seen.append(r.force.size) or sums(m, r, *more))
-    search_bent(model, rows, SCATTER)
+    search_nonlinear(model, rows, SCATTER)
     # Three passes over all rows for each series, 13 each for all series together and for b; the rest on its own rows.
     assert sum(size == rows.sparse(descent.ROWS_FOR_START).force.size for size in seen) <= 3 * curved.size + 2 * 13
 
 
 def test_series_are_searched_though_every_row_of_one_is_held_out():
     model, rows, curved = astray(one_specimen=False, aging=True)
-    found = search_bent(model, rows.subset(rows.values("temperature_C") != 80.0), SCATTER)
+    found = search_nonlinear(model, rows.subset(rows.values("temperature_C") != 80.0), SCATTER)
     npt.assert_allclose(np.exp(found.vector()[curved]), bins_helpers.TRUE["v_s"], rtol=0.4)

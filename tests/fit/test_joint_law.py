@@ -56,7 +56,7 @@ def test_exact_values_give_the_law_back(loss, own):
 def test_evidence_chooses_the_shape_that_is_true(loss, own, a):
     laws = fit_laws(campaign(loss, own, a=a, scatter=0.003))
     assert (laws[0].loss.name, laws[0].way) == (loss, "rate")
-    assert all(law.criterion > laws[0].criterion for law in laws[1:])
+    assert all(law.bic > laws[0].bic for law in laws[1:])
     assert left_out(laws[0])["series"] < 0.02
 
 

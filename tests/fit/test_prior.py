@@ -10,7 +10,7 @@ import pytest
 from sealfit.closure.channels import Channel
 from sealfit.closure.forms import free_term
 from sealfit.effects.free import natural, roughness
-from sealfit.fit.estimate import fit, fit_declared, worth
+from sealfit.fit.estimate import effective_df, fit, fit_declared
 from sealfit.fit.prior import likely_smoothness, penalised
 from sealfit.fit.rows import make_rows
 from sealfit.fit.terms import shape_of
@@ -76,7 +76,7 @@ def test_the_joint_fit_holds_a_free_shape_as_smooth_as_the_data_want_it():
         wanted = humps(rows.values("oil_ppm"))
         off = (found - found.mean()) - (wanted - wanted.mean())
         errors[held] = np.sqrt(np.mean(off**2))
-        sizes[held] = worth(fitted, 0)
+        sizes[held] = effective_df(fitted, 0)
     assert errors[True] < 0.006
     assert errors[True] < errors[False]
     assert 6 < sizes[True] < 20

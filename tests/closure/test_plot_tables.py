@@ -3,7 +3,7 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.closure.curves import POINTS, curve_table
+from sealfit.closure.plot_tables import POINTS, curve_table
 from sealfit.fit.estimate import fit
 from sealfit.fit.rows import make_rows
 from sealfit.fit.start import start_model

@@ -9,20 +9,20 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import FINER, Channel, incomplete_channels, unit_of
-from sealfit.closure.confirm import Added, Refused, about_means
+from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, about_means
+from sealfit.closure.error_sizes import errors, lack_of_fit, noise_floor, scatter_list
 from sealfit.closure.forms import describe, free_term
-from sealfit.closure.grow import Grown
 from sealfit.closure.intervals import effect_intervals
-from sealfit.closure.judge import Candidate, Judge
-from sealfit.closure.levels import errors, lack_of_fit, noise_floor, scatter_list
 from sealfit.closure.next_runs import next_runs
 from sealfit.closure.reference import reference_of
 from sealfit.closure.ripple import Peak
+from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import search
+from sealfit.closure.selection import Selection
 from sealfit.closure.sensitivity import LEVEL_NAMES, cannot_tell, sensitivity
 from sealfit.config import Config
 from sealfit.effects.contract import Effect, fill_unit
-from sealfit.fit.estimate import Fitted, fit, worth
+from sealfit.fit.estimate import Fitted, effective_df, fit
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term
 from sealfit.units import Units
@@ -44,7 +44,7 @@ UNSTEADY = 0.2  # share of an offset by which it may differ from run to run and 
 
 
 @dataclass(frozen=True)
-class Ends:
+class BeforeAfter:
     """The model before and after on all rows, and the forces by fits that did not see a row's unit."""
 
     before: Fitted
@@ -83,7 +83,7 @@ class Ends:
 
 
 def closure_document(
-    grown: Grown, ends: Ends, heldout_unit: str, config: Config, effects: Mapping[str, Effect]
+    grown: Selection, ends: BeforeAfter, heldout_unit: str, config: Config, effects: Mapping[str, Effect]
 ) -> dict:
     """Return closure.json."""
     after, units = ends.after, config.units
@@ -141,7 +141,7 @@ def fit_quality(errors_after: Mapping, floor_N: float | None) -> dict:
     return {"state": state, "ratio": errors_after["rmse_N"] / max(floor_N, 1e-300), "p_value": p_value}
 
 
-def _refused(item: Refused, rows: Rows) -> dict:
+def _refused(item: RefusedEffect, rows: Rows) -> dict:
     return {
         "id": item.term.effect.id,
         "channels": channels_of(item.term, rows),
@@ -153,7 +153,7 @@ def _refused(item: Refused, rows: Rows) -> dict:
     }
 
 
-def effect_entries(after: Fitted, grown: Grown, config: Config) -> list[dict]:
+def effect_entries(after: Fitted, grown: Selection, config: Config) -> list[dict]:
     """Return closure.json's `effects`: one per term of the after-model, then what is a candidate only."""
     entries = [_entry(after, number, item, config) for number, item in enumerate(grown.added)]
     if grown.unsure is not None:
@@ -162,7 +162,7 @@ def effect_entries(after: Fitted, grown: Grown, config: Config) -> list[dict]:
     return entries
 
 
-def _entry(after: Fitted, number: int, item: Added, config: Config) -> dict:
+def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> dict:
     """Return the entry of one effect of a fit's model."""
     term, proposal = after.model.terms[number], item.proposal
     own_phase = "shift" in term.fixed  # each pass has a phase of its own: there is not one to print
@@ -184,8 +184,7 @@ def _entry(after: Fitted, number: int, item: Added, config: Config) -> dict:
         "acts_on": term.acts_on,
         "operation": term.operation,
         "reference": reference_of(term, after.model.values[number], config),
-        "form": form_of(term)
-        + ("" if term.smoothness is None else f"; held smooth, worth {worth(after, number):.1f} numbers"),
+        "form": form_of(term) + _smoothness(after, number),
         "named": proposal.named,
         "candidate": False,
         "parameters": parameters,
@@ -224,6 +223,13 @@ def effect_level(term: Term, rows: Rows) -> str:
     return LEVEL_NAMES[min(units, key=FINER.get)]
 
 
+def _smoothness(after: Fitted, number: int) -> str:
+    """Return how smooth a free shape is, to follow its equation; "" for other effects."""
+    if after.model.terms[number].smoothness is None:
+        return ""
+    return f"; smooth, {effective_df(after, number):.1f} effective degrees of freedom"
+
+
 def form_of(term: Term) -> str:
     """Return the effect's equation in plain text with its fixed reference value."""
     text = term.effect.form.replace("{x}", term.channels[0]).replace("{z}", term.channels[-1])
@@ -249,7 +255,7 @@ def parameter_unit(unit: str, term: Term, units: Units) -> str:
     return fill_unit(unit, channel, given, second)
 
 
-def effect_table(entries: Sequence[dict], added: Sequence[Added]) -> pd.DataFrame:
+def effect_table(entries: Sequence[dict], added: Sequence[AcceptedEffect]) -> pd.DataFrame:
     """Return the `effects` table: a row per parameter."""
     names = [
         "round", "id", "label", "channels", "acts_on", "operation", "form", "named",
@@ -272,7 +278,7 @@ def effect_table(entries: Sequence[dict], added: Sequence[Added]) -> pd.DataFram
     return pd.DataFrame(records, columns=names)
 
 
-def left_entry(grown: Grown, rmse_N: float, floor_N: float | None) -> dict:
+def left_entry(grown: Selection, rmse_N: float, floor_N: float | None) -> dict:
     """Return closure.json's `left`: the error above the floor, and the strongest structure that is still there.
 
     Where nothing is significant any more but effects were added, the channel that orders most of what is left is named
@@ -286,7 +292,7 @@ def left_entry(grown: Grown, rmse_N: float, floor_N: float | None) -> dict:
         return {"rmse_N": above, "level": effect_level(item.term, rows), "channel": names, "p_value": item.p_value}
     if left is None and grown.added:
         left = _unsteady_offset(grown) or _largest(
-            grown.after, [c for c in grown.last if c.judgement.log_p <= np.log(WORTH_A_LOOK) and c.p_value < EVEN]
+            grown.after, [c for c in grown.last if c.test_result.log_p <= np.log(WORTH_A_LOOK) and c.p_value < EVEN]
         )
     if isinstance(left, Peak):
         return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
@@ -300,7 +306,7 @@ def left_entry(grown: Grown, rmse_N: float, floor_N: float | None) -> dict:
     return {"rmse_N": above, "level": None, "channel": None, "p_value": smallest}
 
 
-def _unsteady_offset(grown: Grown) -> Candidate | None:
+def _unsteady_offset(grown: Selection) -> Candidate | None:
     """Return the category that orders most of an offset between directions which differs from run to run; else None.
 
     Each condition is given an offset of its own first, as that would hide what a set-up does to it. The p-value is
@@ -320,7 +326,7 @@ def _unsteady_offset(grown: Grown) -> Candidate | None:
         term = free_term(Channel("condition", rows.values("condition"), "run"), "force", "add")
         model = fitted.model.with_term(term, {p.name: 0.0 for p in term.effect.parameters})
         fitted = fit(model, rows, fitted.scatter, turns=2)
-    found = search(Judge(fitted), categories, np.random.default_rng(0))
+    found = search(ScoreTests(fitted), categories, np.random.default_rng(0))
     return _largest(fitted, [c for c in found if c.channels[0] == "direction"])
 
 

@@ -18,13 +18,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.special import fdtrc
 
-from sealfit.closure.adjusted import SEARCHES
 from sealfit.closure.channels import Channel
-from sealfit.closure.few import FewTest
-from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judgement, project
 from sealfit.closure.linearised import Proposal
+from sealfit.closure.multiplicity import SEARCHES
+from sealfit.closure.score_test import JACKKNIFE_UNITS, Candidate, ScoreTestResult, project
+from sealfit.closure.small_sample_test import SmallSampleTest
 from sealfit.effects.contract import Effect
-from sealfit.fit.estimate import Fitted, fit, settled
+from sealfit.fit.estimate import Fitted, fit, reestimated
 from sealfit.fit.terms import Term, mean_derivatives, shape_of
 
 AGING = "aging_days"
@@ -58,7 +58,7 @@ def richer_laws(
     if specimens - fitted.model.declared.numbers_of_mu <= FEWEST:
         return []
     rows = fitted.rows.sparse(ROWS)
-    before = settled(fit(fitted.model, rows, fitted.scatter, turns=1))
+    before = reestimated(fit(fitted.model, rows, fitted.scatter, turns=1))
     found = [_judged(fitted, before, effect, len(laws)) for effect in laws]
     return [f for f in found if f is not None]
 
@@ -70,7 +70,7 @@ def _judged(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[
     if after is None:
         return None
     place = len(after.model.terms) - 1
-    without = settled(
+    without = reestimated(
         fit(after.model.without_term(place), before.rows, before.scatter, turns=0, friction=before.friction)
     )
     gain = min(before.deviance, without.deviance) - after.deviance
@@ -89,9 +89,9 @@ def _judged(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[
     shape = shape_of(term, values, fitted.rows)
     column = project(fitted, (fitted.slope(*TARGET) * shape)[:, None])[:, 0]
     adjusted = float(min(1.0, (SEARCHES + 1) * laws * p_value))
-    test = FewTest(TARGET, np.empty((0, q)), 0.0, gain, float(np.log(max(p_value, 1e-300))), 1.0, error)
-    judgement = Judgement(gain, q, units, test.log_p, few=test)
-    candidate = Candidate((AGING,), *TARGET, "specimen", shape[:, None], judgement, adjusted)
+    test = SmallSampleTest(TARGET, np.empty((0, q)), 0.0, gain, float(np.log(max(p_value, 1e-300))), 1.0, error)
+    test_result = ScoreTestResult(gain, q, units, test.log_p, few=test)
+    candidate = Candidate((AGING,), *TARGET, "specimen", shape[:, None], test_result, adjusted)
     return candidate, Proposal(term, values, "specimen", units, gain, adjusted, column, candidate.key)
 
 
@@ -111,7 +111,7 @@ def _best(before: Fitted, term: Term) -> Fitted | None:
             number: day,
         }
         model = before.model.with_term(term, {p.name: start[p.name] for p in effect.parameters})
-        found.append(settled(fit(model, rows, before.scatter, turns=0, friction=before.friction)))
+        found.append(reestimated(fit(model, rows, before.scatter, turns=0, friction=before.friction)))
     return min(found, key=lambda f: f.deviance, default=None)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.strokes import Strokes
+from sealfit.closure.stroke_signals import Strokes
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import passes
 

@@ -5,10 +5,10 @@ import pytest
 from bins_helpers import make_bins, make_traces
 
 from sealfit.closure.channels import find_channels
-from sealfit.closure.joint import search_joint
-from sealfit.closure.judge import Judge
 from sealfit.closure.loop import close_loop
+from sealfit.closure.masked_pairs import search_masked_pairs
 from sealfit.closure.pairs import search_pairs
+from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.fit.estimate import fit_declared
@@ -21,10 +21,10 @@ ONE = {"temperatures": (), "days": (), "directions": (1, -1), "setup": 0.003, "b
 
 def hidden(bins, alpha=0.005):
     rows = make_rows(bins, has_aging=True)
-    judge, channels, rng = Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
+    judge, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
     singles = search(judge, channels, rng)
     pairs = search_pairs(judge, channels, singles, rng)
-    return search_joint(judge, {c.name: c for c in channels}, [*singles, *pairs], alpha)
+    return search_masked_pairs(judge, {c.name: c for c in channels}, [*singles, *pairs], alpha)
 
 
 def one_way(table, force):

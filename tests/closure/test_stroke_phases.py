@@ -4,7 +4,7 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.spectrum import _on_grid
-from sealfit.closure.waves import agreement, common_wavelength, pass_shifts
+from sealfit.closure.stroke_phases import agreement, common_wavelength, pass_shifts
 from sealfit.fit.rows import make_rows
 
 

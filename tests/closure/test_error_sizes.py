@@ -1,7 +1,7 @@
 import numpy as np
 from bins_helpers import make_bins
 
-from sealfit.closure.levels import lack_of_fit
+from sealfit.closure.error_sizes import lack_of_fit
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
 

@@ -15,10 +15,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealfit.closure import few
-from sealfit.closure.few import FewTest, FewUnits
-from sealfit.closure.judge import JACKKNIFE_UNITS, Candidate, Judge, Judgement, log_p_of, wald
-from sealfit.closure.slopes import slope_log_p
+from sealfit.closure import small_sample_test
+from sealfit.closure.contrasts import slope_log_p
+from sealfit.closure.score_test import (
+    JACKKNIFE_UNITS,
+    Candidate,
+    ScoreTestResult,
+    ScoreTests,
+    log_p_of,
+    score_statistic,
+)
+from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest
 from sealfit.fit.estimate import Fitted
 
 FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
@@ -26,9 +33,9 @@ MOST_SIGNS = 1 << 22  # drawn at once: 34 MB
 SEARCHES = 2  # single channels and pairs of them: each search has half of the error
 
 
-def judged(judge: Judge, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
+def judged(judge: ScoreTests, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
     """Return candidates with p-values adjusted over all of them, strongest evidence first."""
-    judgements = [c.judgement for c in candidates]
+    judgements = [c.test_result for c in candidates]
     p_values = np.ones(len(candidates))
     many = [k for k, j in enumerate(judgements) if j.few is None and not j.slopes]
     if many:
@@ -43,7 +50,7 @@ def judged(judge: Judge, candidates: Sequence[Candidate], rng: np.random.Generat
     return sorted(found, key=lambda c: -c.evidence)
 
 
-def adjust(judgements: Sequence[Judgement], rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:
+def adjust(judgements: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:
     """Return each p-value adjusted over all judgements, by the maximum over sign flips, shape (m,).
 
     Those of as many units are flipped with the same signs, so that what they share counts once.
@@ -51,25 +58,25 @@ def adjust(judgements: Sequence[Judgement], rng: np.random.Generator, flips: int
     return _adjusted([j.log_p for j in judgements], _least(judgements, rng, flips))
 
 
-def critical_many(judgements: Sequence[Judgement], level: float, rng: np.random.Generator) -> float:
+def critical_many(judgements: Sequence[ScoreTestResult], level: float, rng: np.random.Generator) -> float:
     """Return the log p-value, not adjusted, that the smallest of all judgements falls below by chance at a level."""
     return float(np.quantile(_least(judgements, rng, FLIPS), level))
 
 
-def critical_few(fitted: Fitted, tests: Sequence[FewTest], level: float) -> float:
+def critical_few(fitted: Fitted, tests: Sequence[SmallSampleTest], level: float) -> float:
     """Return the same for the tests on few units of one level."""
-    units = FewUnits(fitted, tests[0].level)
+    units = ClusterTests(fitted, tests[0].level)
     for test in tests:
         units.numbers(test.target)
     return float(np.quantile(_least_few(units, tests, np.random.default_rng(0), FLIPS), level))
 
 
-def _least(judgements: Sequence[Judgement], rng: np.random.Generator, flips: int) -> np.ndarray:
+def _least(judgements: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int) -> np.ndarray:
     """Return the smallest log p-value of all judgements under each of many random flips."""
     alike = defaultdict(lambda: defaultdict(list))
-    for judgement in judgements:
-        units, df = judgement.scores.shape
-        alike[units][df].append(judgement.scores)
+    for test_result in judgements:
+        units, df = test_result.scores.shape
+        alike[units][df].append(test_result.scores)
     least = np.zeros(flips)
     for units, by_df in alike.items():
         scores = np.column_stack([own for scores in by_df.values() for own in scores])
@@ -78,7 +85,7 @@ def _least(judgements: Sequence[Judgement], rng: np.random.Generator, flips: int
         for df, scores in by_df.items():
             most = np.zeros(flips)  # the largest T has the smallest p-value where units and df are the same
             for own in scores:
-                most = np.maximum(most, wald(totals[:, first : first + df], own))
+                most = np.maximum(most, score_statistic(totals[:, first : first + df], own))
                 first += df
             least = np.minimum(least, log_p_of(most, df, units))
     return least
@@ -96,7 +103,7 @@ def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.nda
 
 
 def adjust_few(
-    units: FewUnits, judgements: Sequence[Judgement], rng: np.random.Generator, draws: int = FLIPS
+    units: ClusterTests, judgements: Sequence[ScoreTestResult], rng: np.random.Generator, draws: int = FLIPS
 ) -> np.ndarray:
     """Return the p-values of the tests on few units of a level, adjusted over all of them, shape (m,); 1 for none."""
     p_values = np.ones(len(judgements))
@@ -109,13 +116,15 @@ def adjust_few(
     return p_values
 
 
-def _least_few(units: FewUnits, tests: Sequence[FewTest], rng: np.random.Generator, draws: int) -> np.ndarray:
+def _least_few(
+    units: ClusterTests, tests: Sequence[SmallSampleTest], rng: np.random.Generator, draws: int
+) -> np.ndarray:
     """Return the smallest log p-value of all tests on few units of one level in each of many draws."""
     drawn = units.draws(draws, rng)
-    return np.min([few.log_p_of(drawn[test.target], test.basis, test.known) for test in tests], axis=0)
+    return np.min([small_sample_test.log_p_of(drawn[test.target], test.basis, test.known) for test in tests], axis=0)
 
 
-def adjust_slopes(judgements: Sequence[Judgement]) -> np.ndarray:
+def adjust_slopes(judgements: Sequence[ScoreTestResult]) -> np.ndarray:
     """Return the p-values of the contrasts in few units, times the number of all contrasts, shape (m,); 1 for none.
 
     A candidate has that of its strongest contrast, by the variant of it that says least.

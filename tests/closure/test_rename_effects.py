@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins, make_traces
 
-from sealfit.closure import revisit
+from sealfit.closure import rename_effects
 from sealfit.closure.channels import find_channels
-from sealfit.closure.confirm import Added
+from sealfit.closure.confirm import AcceptedEffect
 from sealfit.closure.forms import terms_of
-from sealfit.closure.grow import grow, numbered, steady_samples
-from sealfit.closure.judge import Candidate, Judge, Judgement
 from sealfit.closure.linearised import PAIR, Linearised, Proposal
+from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.search import search
+from sealfit.closure.selection import grow, numbered, steady_samples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.estimate import fit, fit_declared
@@ -44,7 +44,7 @@ def test_two_humps_that_hide_in_the_scatter_of_runs_are_found():
         return force * (1 + 0.03 * (np.exp(-(((oil - 40) / 4) ** 2)) + np.exp(-(((oil - 60) / 4) ** 2))))
 
     rows = fitted_of(effect=humps, run_channels=OIL).rows
-    found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     best = min(found, key=lambda c: c.p_value)
     assert best.channels == ("oil_ppm",)
     assert best.p_value < 0.005
@@ -54,11 +54,11 @@ def test_a_load_that_does_not_vary_may_be_read_where_that_is_another_equation():
     fitted = fitted_of()
     channels = {c.name: c for c in find_channels(fitted.rows)}
     assert "load_N" not in channels
-    judgement = Judgement(1.0, 4, 72, -1.0)
-    candidate = Candidate(("time_s",), "mu", "multiply", "run", np.empty((0, 4)), judgement)
+    test_result = ScoreTestResult(1.0, 4, 72, -1.0)
+    candidate = Candidate(("time_s",), "mu", "multiply", "run", np.empty((0, 4)), test_result)
     ids = {term.effect.id for term, _ in terms_of(candidate, channels, fitted, EFFECTS)}
     assert {"warming_time", "warming_power"} <= ids
-    candidate = Candidate(("distance_mm",), "mu", "multiply", "run", np.empty((0, 4)), judgement)
+    candidate = Candidate(("distance_mm",), "mu", "multiply", "run", np.empty((0, 4)), test_result)
     ids = {term.effect.id for term, _ in terms_of(candidate, channels, fitted, EFFECTS)}
     assert "warming_conduction" in ids
     assert "warming_conduction_load" not in ids  # the same equation at one load
@@ -67,14 +67,14 @@ def test_a_load_that_does_not_vary_may_be_read_where_that_is_another_equation():
 def test_two_channels_together_pay_for_being_one_of_many():
     fitted = fitted_of(run_channels=OIL)
     channels = {c.name: c for c in find_channels(fitted.rows)}
-    judgement, linearised = Judgement(1.0, 1, 72, -1.0), Linearised(fitted)
-    price = {}
+    test_result, linearised = ScoreTestResult(1.0, 1, 72, -1.0), Linearised(fitted)
+    bic_penalty = {}
     for names, pair in ((("oil_ppm",), False), (("oil_ppm", "time_s"), True)):
-        candidate = Candidate(names, "mu", "multiply", "run", np.empty((0, 1)), judgement, pair=pair)
+        candidate = Candidate(names, "mu", "multiply", "run", np.empty((0, 1)), test_result, pair=pair)
         for term, searched in terms_of(candidate, channels, fitted, EFFECTS):
             for proposal in linearised(term, searched, candidate):
-                price[term.effect.id] = proposal.price
-    assert price["product"] - price["linear"] == pytest.approx(PAIR)
+                bic_penalty[term.effect.id] = proposal.bic_penalty
+    assert bic_penalty["product"] - bic_penalty["linear"] == pytest.approx(PAIR)
 
 
 def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
@@ -90,7 +90,9 @@ def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
     model = model.with_term(warming, {"A": 0.1, "s_0": 10.0}).with_term(oil, {"A": 3e-4})
     fitted = fit(model, rows, turns=2)
     added = [
-        Added(Proposal(t, v, "run", 72, 1e3, 1e-3, np.empty(0), (t.channels, "force", "multiply")), 1.0, 1.0, (), (), 1)
+        AcceptedEffect(
+            Proposal(t, v, "run", 72, 1e3, 1e-3, np.empty(0), (t.channels, "force", "multiply")), 1.0, 1.0, (), (), 1
+        )
         for t, v in zip(fitted.model.terms, fitted.model.values, strict=True)
     ]
     refitted = []
@@ -101,10 +103,10 @@ def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
         )
         return refitted
 
-    propose = revisit.propose
-    monkeypatch.setattr(revisit, "propose", without_its_own_curve)
+    propose = rename_effects.propose
+    monkeypatch.setattr(rename_effects, "propose", without_its_own_curve)
     channels = {c.name: c for c in find_channels(rows)}
-    again = revisit.Revisit(channels, EFFECTS, rows.table.head(0), Config(), lambda text: None, compare=False)
+    again = rename_effects.Renaming(channels, EFFECTS, rows.table.head(0), Config(), lambda text: None, compare=False)
     after, kept = again.all_but_last(fitted, added)
     assert refitted
     assert kept is added

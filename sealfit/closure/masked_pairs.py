@@ -18,33 +18,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealfit.closure.adjusted import SEARCHES
 from sealfit.closure.channels import Channel, scatter_level
-from sealfit.closure.few import LEAST_ERROR_OF_RUNS, log_p_of
-from sealfit.closure.judge import CONSTANT, JACKKNIFE_UNITS, Candidate, Judge
+from sealfit.closure.contrasts import LEAST_UNITS
+from sealfit.closure.multiplicity import SEARCHES
+from sealfit.closure.score_test import CONSTANT, JACKKNIFE_UNITS, Candidate, ScoreTests
 from sealfit.closure.search import MAIN_TARGETS
-from sealfit.closure.slopes import LEAST_UNITS
+from sealfit.closure.small_sample_test import LEAST_ERROR_OF_RUNS, log_p_of
 from sealfit.fit.reml import orthonormal
 
 OF_DIRECTION = (("force", "add"), ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
 SEPARATE = 1e-3  # singular value of two columns of length 1 below which they are one
 
 
-class Hidden(NamedTuple):
+class MaskedPair(NamedTuple):
     """Two effects that hide each other: what the tests say of both together, and the keys of their candidates."""
 
     p_value: float  # adjusted
     chi2: float  # whitened sum of squares they explain
     keys: tuple[tuple, ...]  # of those not in the model yet
 
-    def without(self, key: tuple) -> Hidden:
+    def without(self, key: tuple) -> MaskedPair:
         """Return what is left once one of them is in the model."""
-        return Hidden(self.p_value, 0.0, tuple(k for k in self.keys if k != key))
+        return MaskedPair(self.p_value, 0.0, tuple(k for k in self.keys if k != key))
 
 
-def search_joint(
-    judge: Judge, channels: Mapping[str, Channel], candidates: Sequence[Candidate], alpha: float
-) -> list[Hidden]:
+def search_masked_pairs(
+    judge: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate], alpha: float
+) -> list[MaskedPair]:
     """Return the pairs that are significant jointly, most significant first.
 
     Parameters
@@ -61,7 +61,7 @@ def search_joint(
     tested = [(two, _tested(judge, two, level)) for two, level in _pairs(judge, channels, candidates)]
     tested = [(two, test) for two, test in tested if test is not None]
     found = [
-        Hidden(min(1.0, SEARCHES * len(tested) * float(np.exp(joint))), chi2, tuple(c.key for c in two))
+        MaskedPair(min(1.0, SEARCHES * len(tested) * float(np.exp(joint))), chi2, tuple(c.key for c in two))
         for two, (joint, given, chi2) in tested
         if given <= np.log(alpha)
     ]
@@ -69,7 +69,7 @@ def search_joint(
 
 
 def _pairs(
-    judge: Judge, channels: Mapping[str, Channel], candidates: Sequence[Candidate]
+    judge: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate]
 ) -> Iterator[tuple[tuple[Candidate, Candidate], str]]:
     """Yield the pairs to be tested and the level of their units."""
     rows = judge.fitted.rows
@@ -101,7 +101,7 @@ def _targets(candidate: Candidate) -> Sequence[tuple[str, str]]:
     return OF_DIRECTION if candidate.channels == ("direction",) else MAIN_TARGETS
 
 
-def _tested(judge: Judge, two: tuple[Candidate, Candidate], level: str) -> tuple[float, float, float] | None:
+def _tested(judge: ScoreTests, two: tuple[Candidate, Candidate], level: str) -> tuple[float, float, float] | None:
     """Return log p of two candidates jointly, the larger of each given the other, and what they explain; else None.
 
     None is where they are no pair. Of all variants in which they must hold, what says least.

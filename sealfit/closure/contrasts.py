@@ -61,7 +61,7 @@ LARGE = 0.01
 no scatter of specimens. A straight line of that size changes by 3.5 % from end to end."""
 
 
-class SlopeTest(NamedTuple):
+class ContrastTest(NamedTuple):
     """Contrasts of one candidate: estimates, their variances from the units, and what the prior needs."""
 
     level: str  # of the units
@@ -80,7 +80,7 @@ class Prior(NamedTuple):
     df: float
 
 
-def slope_test(fitted: Fitted, left: np.ndarray, level: str) -> SlopeTest | None:
+def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest | None:
     """Return the contrasts of projected columns, each by itself; None with too few units.
 
     Parameters
@@ -108,7 +108,7 @@ def slope_test(fitted: Fitted, left: np.ndarray, level: str) -> SlopeTest | None
     if not known.any():
         return None
     parts = (slope, (deviations**2).sum(axis=0), df, along_strokes(fitted, left))
-    return SlopeTest(level, *(p[known] for p in parts), deviations[:, known], specimens_agree(fitted, left)[known])
+    return ContrastTest(level, *(p[known] for p in parts), deviations[:, known], specimens_agree(fitted, left)[known])
 
 
 def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
@@ -190,7 +190,7 @@ def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     return between.sum(axis=0) < 0.5 * (left**2).sum(axis=0)
 
 
-def slope_log_p(tests: Sequence[SlopeTest]) -> list[np.ndarray]:
+def slope_log_p(tests: Sequence[ContrastTest]) -> list[np.ndarray]:
     """Return the log p-values of the contrasts of several candidates, two-sided, not adjusted for their number."""
     found = []
     for test, (variance, df) in zip(tests, moderated(tests), strict=True):
@@ -199,7 +199,7 @@ def slope_log_p(tests: Sequence[SlopeTest]) -> list[np.ndarray]:
     return found
 
 
-def moderated(tests: Sequence[SlopeTest]) -> list[tuple[np.ndarray, np.ndarray]]:
+def moderated(tests: Sequence[ContrastTest]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return for each test the variances of its contrasts, moderated by all of a kind, and their degrees of freedom."""
     priors = {kind: _prior(tests, *kind) for kind in {(t.level, bool(a)) for t in tests for a in t.along}}
     found = []
@@ -217,7 +217,7 @@ def log_p_of_t(t: np.ndarray, df: np.ndarray) -> np.ndarray:
     return np.log(2) + np.where(df >= MOST_DF, log_ndtr(-np.abs(t)), tail)
 
 
-def _prior(tests: Sequence[SlopeTest], level: str, along: bool) -> Prior:
+def _prior(tests: Sequence[ContrastTest], level: str, along: bool) -> Prior:
     """Return the prior of the variances of one kind of contrast, by moments of their logarithms (Smyth 2004, 6.2)."""
     chosen = [(t, t.along == along) for t in tests if t.level == level]
     variance, df = (np.concatenate([getattr(t, name)[own] for t, own in chosen]) for name in ("variance", "df"))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import Added, Refused, confirmed
+from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, confirmed
 from sealfit.closure.naming import propose_ripples
 from sealfit.closure.ripple import AXES, Peak, strongest
 from sealfit.closure.spectrum import Spectrum, begin_spectra
@@ -59,8 +59,8 @@ class Ripples:
         workers: int = 1,
     ) -> None:
         self.config, self.effects, self.say, self.compare, self.workers = config, effects, say, compare, workers
-        self.added: list[Added] = []
-        self.refused: list[Refused] = []
+        self.added: list[AcceptedEffect] = []
+        self.refused: list[RefusedEffect] = []
         self.samples = samples.assign(residual_N=samples["force_N"])
         self._found: Peak | None = None
         self._begun: Iterator[Spectrum] | None = self._begin()

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import pandas as pd
 
 from sealfit.closure.channels import Channel
-from sealfit.closure.confirm import Added, confirmed
+from sealfit.closure.confirm import AcceptedEffect, confirmed
 from sealfit.closure.forms import PERIODIC
-from sealfit.closure.judge import Candidate, Judge
 from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.naming import RIVAL, TIED, propose
+from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import of_channel
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
@@ -25,7 +25,7 @@ from sealfit.fit.estimate import Fitted, fit
 
 
 @dataclass(frozen=True)
-class Revisit:
+class Renaming:
     """What naming an effect anew needs besides the model.
 
     Parameters
@@ -43,7 +43,7 @@ class Revisit:
     say: Callable[[str], None]
     compare: bool
 
-    def all_but_last(self, fitted: Fitted, added: list[Added]) -> tuple[Fitted, list[Added]]:
+    def all_but_last(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
         """Return a fit and its effects with each but the last named anew beside all the others."""
         for item in added[:-1]:
             number = next(k for k, a in enumerate(added) if a is item)
@@ -51,7 +51,7 @@ class Revisit:
             if not proposals or proposals[0].term.key() == item.proposal.term.key():
                 continue
             # While it is missing, what stood for most of the residual may rank too low on a grid to be refitted.
-            if proposals[0].criterion > fitted.deviance + item.proposal.price + RIVAL:
+            if proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL:
                 continue
             better = self._confirmed(without, proposals, item.round)
             if better is not None and better.proposal.term.key() != item.proposal.term.key():
@@ -59,7 +59,9 @@ class Revisit:
                 added = [*added[:number], *added[number + 1 :], better]
         return fitted, added
 
-    def one_for_two(self, fitted: Fitted, added: list[Added], new: Added) -> tuple[list[Added], Added]:
+    def one_for_two(
+        self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect
+    ) -> tuple[list[AcceptedEffect], AcceptedEffect]:
         """Return earlier effects and a new one that is not in `fitted` yet.
 
         An earlier effect of the same channel goes where one alone, of another shape, does as well as the two. Two forms
@@ -71,24 +73,24 @@ class Revisit:
         if number is None or name == "direction":
             return added, new
         without, proposals = self._anew(fitted, number, new)
-        two = new.proposal.criterion + added[number].proposal.price
-        better = [p for p in proposals[:1] if p.criterion < two + TIED]
+        two = new.proposal.bic + added[number].proposal.bic_penalty
+        better = [p for p in proposals[:1] if p.bic < two + TIED]
         if not (better or any(a.proposal.term.effect.physical for a in (added[number], new))):
-            pieces = new.proposal.price + added[number].proposal.price
-            fitting = [p for p in proposals if p.criterion - p.price < two - pieces + RIVAL]
-            better = sorted(fitting, key=lambda p: p.criterion)[:1]
+            pieces = new.proposal.bic_penalty + added[number].proposal.bic_penalty
+            fitting = [p for p in proposals if p.bic - p.bic_penalty < two - pieces + RIVAL]
+            better = sorted(fitting, key=lambda p: p.bic)[:1]
         one = self._confirmed(without, better, new.round) if better else None
         return (added, new) if one is None else ([*added[:number], *added[number + 1 :]], one)
 
-    def _anew(self, fitted: Fitted, number: int, item: Added) -> tuple[Fitted, Sequence[Proposal]]:
+    def _anew(self, fitted: Fitted, number: int, item: AcceptedEffect) -> tuple[Fitted, Sequence[Proposal]]:
         """Return the fit without a term, and what may stand in its place on the channel of `item`."""
         name = self._channel(item)
         if name is None:
             return fitted, ()
         without = fit(fitted.model.without_term(number), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
         finest: dict[tuple, Candidate] = {}
-        for c in of_channel(Judge(without), self.channels[name]):
-            if c.key not in finest or c.judgement.df > finest[c.key].judgement.df:
+        for c in of_channel(ScoreTests(without), self.channels[name]):
+            if c.key not in finest or c.test_result.df > finest[c.key].test_result.df:
                 finest[c.key] = replace(c, p_value=item.proposal.p_value)
         found = sorted(finest.values(), key=lambda c: -c.chi2)
         own, values = fitted.model.terms[number], fitted.model.values[number]
@@ -97,13 +99,13 @@ class Revisit:
         as_it_is = Linearised(without)(own, there, alike) if alike is not None else ()
         return without, propose(without, found, self.channels, self.effects, as_it_is)
 
-    def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> Added | None:
+    def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> AcceptedEffect | None:
         self.say(f"  round {number} again:")
         return confirmed(
             without, proposals, self.samples, self.config, number, self.say, compare=self.compare, refused=[]
         )
 
-    def _channel(self, item: Added) -> str | None:
+    def _channel(self, item: AcceptedEffect) -> str | None:
         """Return the channel along which an effect was found; None for a pair and for a ripple."""
         names = item.proposal.source[0]
         single = len(set(names) - {"direction"}) <= 1 and names[-1] in self.channels

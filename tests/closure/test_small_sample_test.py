@@ -4,9 +4,9 @@ from bins_helpers import make_bins
 from scipy import stats
 
 from sealfit.closure.channels import find_channels
-from sealfit.closure.few import FewUnits, Root, log_p_of, small_root
-from sealfit.closure.judge import Judge
+from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
+from sealfit.closure.small_sample_test import ClusterTests, Root, log_p_of, small_root
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
 from sealfit.fit.tangent import Tangent
@@ -29,7 +29,7 @@ def test_one_column_is_students_t_of_a_slope():
 
 
 def test_draws_have_the_covariance_of_the_numbers():
-    units = FewUnits(fit_declared(rows_of(specimen=0.05)))
+    units = ClusterTests(fit_declared(rows_of(specimen=0.05)))
     mu, force = ("mu", "multiply"), ("force", "multiply")
     d = units.numbers(mu).values.size
     units.numbers(force)
@@ -56,7 +56,7 @@ def test_p_values_along_a_dozen_specimens_are_not_too_small():
     for seed in range(24):
         rows = rows_of(seed + 500, specimen=0.02)
         days = [c for c in find_channels(rows) if c.name == "aging_days"]
-        found = search(Judge(fit_declared(rows)), days, np.random.default_rng(seed))
+        found = search(ScoreTests(fit_declared(rows)), days, np.random.default_rng(seed))
         smallest.append(min(c.p_value for c in found))
     # The smallest adjusted p is doubled for the two searches: a tenth below 0.2; more than 7 of 24 with p 0.003.
     assert sum(p < 0.2 for p in smallest) <= 7
@@ -69,7 +69,7 @@ def test_an_aging_that_stops_is_found_on_nineteen_specimens():
 
     rows = rows_of(1, specimen=0.003, temperatures=(40.0, 60.0, 80.0), effect=floor)
     days = [c for c in find_channels(rows) if c.name == "aging_days"]
-    best = min(search(Judge(fit_declared(rows)), days, np.random.default_rng(0)), key=lambda c: c.p_value)
+    best = min(search(ScoreTests(fit_declared(rows)), days, np.random.default_rng(0)), key=lambda c: c.p_value)
     assert best.unit == "specimen"
     assert best.p_value < 0.005
 
@@ -86,12 +86,12 @@ def test_an_asymmetry_of_viscous_friction_is_found_in_sixteen_runs_without_repea
             seed, temperatures=(), days=(), directions=(1, -1), repeats=1, bins=4, setup=0.003, effect=softer_forward
         )
         rows = make_rows(bins, has_aging=True)
-        candidates = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+        candidates = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
         best = min(candidates, key=lambda c: c.p_value)
         found.append(best.key == (("direction",), "sigma_2", "add") and best.p_value < 0.005 and best.sure)
     assert sum(found) >= 5
 
 
 def test_the_scatter_of_runs_is_its_own_where_each_run_is_a_file():
-    units = FewUnits(fit_declared(rows_of(setup=0.02)), "run")
+    units = ClusterTests(fit_declared(rows_of(setup=0.02)), "run")
     assert units.numbers(("mu", "multiply")).known < 1

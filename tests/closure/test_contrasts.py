@@ -7,11 +7,11 @@ from bins_helpers import make_bins, make_traces
 from scipy import stats
 
 from sealfit.closure.channels import find_channels, level_values, scatter_level, settings, unit_of
-from sealfit.closure.judge import Judge
+from sealfit.closure.contrasts import ContrastTest, contrast_test, log_p_of_t, slope_log_p, specimens_agree
 from sealfit.closure.loop import close_loop
 from sealfit.closure.pairs import search_pairs
+from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
-from sealfit.closure.slopes import SlopeTest, log_p_of_t, slope_log_p, slope_test, specimens_agree
 from sealfit.config import Config
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows
@@ -22,7 +22,7 @@ FEW_SPEEDS = (1.0, 4.0, 16.0, 64.0)
 def strongest(bins):
     """The smallest p-value of a claim in one search of single channels and pairs."""
     rows = make_rows(bins, has_aging=True)
-    judge, channels, rng = Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
+    judge, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
     singles = search(judge, channels, rng)
     return min((c.p_value for c in (*singles, *search_pairs(judge, channels, singles, rng)) if c.sure), default=1.0)
 
@@ -87,7 +87,7 @@ def test_one_contrast_of_equal_units_is_students_t():
     noise = rng.normal(size=rows.force.size)
     bare = replace(fitted, white_residual=noise)
     bare.__dict__["_widened"] = {"run": noise}  # nothing was taken out of the units
-    test = slope_test(bare, left, "run")
+    test = contrast_test(bare, left, "run")
     scores = rows.groups.sums(left[:, 0] * noise, "run") / np.sqrt((left**2).sum())
     wanted = stats.ttest_1samp(scores, 0.0)
     npt.assert_allclose(test.slope / np.sqrt(test.variance), wanted.statistic, rtol=1e-9)
@@ -102,7 +102,7 @@ def test_moderated_p_values_are_uniform_where_every_unit_has_its_own_slope():
         scores = (own + rng.normal(size=(units, contrasts))) / np.sqrt(units)
         slope = scores.sum(axis=0)
         deviations = (scores - slope / units) / np.sqrt(1 - 1 / units)
-        test = SlopeTest(
+        test = ContrastTest(
             "run", slope, (deviations**2).sum(axis=0), np.full(contrasts, units - 1.0), np.ones(contrasts, bool),
             deviations, np.ones(contrasts, bool),
         )  # fmt: skip
@@ -153,7 +153,7 @@ def test_two_specimens_with_the_same_slope_are_too_few_to_claim_it():
 
     bins = make_bins(3, days=(1.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, repeats=5, bins=8, effect=slope)
     rows = make_rows(bins, has_aging=True)
-    found = search(Judge(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     along = [c for c in found if c.channels == ("displacement_mm",) and c.p_value < 0.005]
     assert along
     assert not any(c.sure for c in along)

@@ -6,9 +6,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import Channel, unit_of
-from sealfit.closure.document import parameter_unit
 from sealfit.closure.forms import free_term
-from sealfit.closure.grow import Grown
 from sealfit.closure.intervals import (
     degrees_of_freedom,
     mean_half_width,
@@ -17,6 +15,8 @@ from sealfit.closure.intervals import (
     sandwiches,
     t_quantile,
 )
+from sealfit.closure.result import parameter_unit
+from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects.contract import SECOND
 from sealfit.fit.estimate import Fitted, fit
@@ -30,7 +30,7 @@ GROUPS = 12  # groups of a numeric channel in the residual plot
 POINTS = 60  # points of a drawn curve
 
 
-def channel_table(grown: Grown, before: Fitted, after: Fitted) -> pd.DataFrame:
+def channel_table(grown: Selection, before: Fitted, after: Fitted) -> pd.DataFrame:
     """Return the mean residual by channel, before and after, with standard errors from whole files."""
     rows = before.rows
     files = rows.codes("file")

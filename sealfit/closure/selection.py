@@ -10,17 +10,17 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel, channels_of
-from sealfit.closure.confirm import TRIES, WEAK, Added, Refused, confirmed
+from sealfit.closure.confirm import TRIES, WEAK, AcceptedEffect, RefusedEffect, confirmed
 from sealfit.closure.forms import PERIODIC
-from sealfit.closure.joint import Hidden, search_joint
-from sealfit.closure.judge import Candidate, Judge
-from sealfit.closure.laws import AGING, richer_laws
 from sealfit.closure.linearised import Proposal
+from sealfit.closure.masked_pairs import MaskedPair, search_masked_pairs
 from sealfit.closure.naming import HALF, propose, rivals
 from sealfit.closure.pairs import pairs_in_disguise, search_pairs
-from sealfit.closure.periodic import Ripples
-from sealfit.closure.revisit import Revisit
+from sealfit.closure.rename_effects import Renaming
+from sealfit.closure.richer_laws import AGING, richer_laws
 from sealfit.closure.ripple import Peak
+from sealfit.closure.ripple_selection import Ripples
+from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import MAIN_TARGETS, search
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
@@ -42,19 +42,19 @@ class Start(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Grown:
+class Selection:
     """The end of the loop on some rows: both fits, what was added, and what the last searches found."""
 
     before: Fitted
     after: Fitted
-    added: tuple[Added, ...]
+    added: tuple[AcceptedEffect, ...]
     first: tuple[Candidate, ...]  # candidates on the declared model
     last: tuple[Candidate, ...]  # candidates on the final one
     left: Candidate | Peak | None  # what is still significant
-    unsure: Added | None  # the best form of what too few specimens show; not in any model
+    unsure: AcceptedEffect | None  # the best form of what too few specimens show; not in any model
     channels: Mapping[str, Channel] = field(default_factory=dict)
-    refused: tuple[Refused, ...] = ()  # significant, and in no model
-    worse: tuple[Refused, ...] = ()  # of these, what was in the model and lowered no error
+    refused: tuple[RefusedEffect, ...] = ()  # significant, and in no model
+    worse: tuple[RefusedEffect, ...] = ()  # of these, what was in the model and lowered no error
 
 
 class _Shown(NamedTuple):
@@ -64,7 +64,7 @@ class _Shown(NamedTuple):
     laws: list[tuple[Candidate, Proposal]]  # richer laws of aging
     pairs: list[Candidate]  # pairs of channels; none where a single one is sure enough
     significant: list[Candidate]  # single channels and pairs, strongest evidence first
-    hidden: list[Hidden]  # effects that hide each other
+    hidden: list[MaskedPair]  # effects that hide each other
 
 
 def grow(
@@ -78,7 +78,7 @@ def grow(
     rounds: int | None = None,
     workers: int = 1,
     on_progress: Callable[[str], None] | None = None,
-) -> Grown:
+) -> Selection:
     """Return the model grown until no channel orders its residual.
 
     Parameters
@@ -109,24 +109,26 @@ def grow(
     ripples = Ripples(samples, config, effects, say, compare=compare, workers=workers)
     before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
     channels = {c.name: c for c in channels_of(rows, config)}
-    judge = Judge(before)
+    judge = ScoreTests(before)
     last = first = tuple(search(judge, list(channels.values()), rng))
     fitted = ripples.added_to(before, fine)
     added = list(ripples.added)
-    revisit = Revisit(channels, effects, ripples.samples, config, say, compare=compare)
+    revisit = Renaming(channels, effects, ripples.samples, config, say, compare=compare)
     refused: set[tuple] = set()
     not_confirmed = ripples.refused
     left: Candidate | Peak | None = None
-    hidden: list[Hidden] = []  # effects that hide each other, until both are in the model
+    hidden: list[MaskedPair] = []  # effects that hide each other, until both are in the model
     again = False  # whether earlier effects have been asked again
     shown: _Shown | None = None
 
-    def ask(base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[Refused]) -> Added | None:
+    def ask(
+        base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
+    ) -> AcceptedEffect | None:
         return confirmed(base, proposals, ripples.samples, config, number, say, compare=compare, refused=failed)
 
     for number in range(len(added) + 1, (config.loop.max_rounds + 2 if rounds is None else rounds) + 1):
         if fitted is not judge.fitted:
-            judge, shown = Judge(fitted), None
+            judge, shown = ScoreTests(fitted), None
             last = tuple(search(judge, list(channels.values()), rng))
         if shown is None:  # else the last round refused what it was shown, and the model is as it was
             shown = _shown(judge, last, channels, effects, alpha, rng)
@@ -173,7 +175,7 @@ def grow(
         refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}
         added = kept
     if rounds is not None:
-        return Grown(before, fitted if added else before, tuple(added), first, last, None, None, channels)
+        return Selection(before, fitted if added else before, tuple(added), first, last, None, None, channels)
     if isinstance(left, Candidate) and left.key in refused and left.p_value > WEAK:
         left = None  # it is listed as refused
     unsure = None
@@ -182,14 +184,14 @@ def grow(
         proposals = propose(fitted, doubtful, channels, effects, [p for _, p in laws])
         others = tuple(rivals(proposals[0], proposals))
         left = doubtful[0]
-        unsure = Added(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
-    return Grown(
+        unsure = AcceptedEffect(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
+    return Selection(
         before, fitted if added else before, tuple(added), first, last, left, unsure, channels, tuple(not_confirmed)
     )
 
 
 def _shown(
-    judge: Judge,
+    judge: ScoreTests,
     last: Sequence[Candidate],
     channels: Mapping[str, Channel],
     effects: Mapping[str, Effect],
@@ -208,7 +210,7 @@ def _shown(
     level = alpha * min((c.p_value for c in significant), default=1.0)
     significant = sorted([*significant, *(c for c in pairs if c.p_value <= level)], key=lambda c: c.p_value)
     level = alpha * min((c.p_value for c in significant), default=1.0)
-    hidden = search_joint(judge, channels, [*claimable, *pairs], level)
+    hidden = search_masked_pairs(judge, channels, [*claimable, *pairs], level)
     return _Shown(claimable, laws, pairs, significant, hidden)
 
 
@@ -217,9 +219,9 @@ def _both(
     two: Sequence[Candidate],
     channels: Mapping[str, Channel],
     effects: Mapping[str, Effect],
-    ask: Callable[..., Added | None],
+    ask: Callable[..., AcceptedEffect | None],
     number: int,
-) -> list[Added]:
+) -> list[AcceptedEffect]:
     """Return two effects, each confirmed beside the other, as neither predicts held-out data alone; nothing if not."""
     if len(two) < 2:
         return []
@@ -251,7 +253,7 @@ def _claimable(candidates: Sequence[Candidate], doubted: set[str]) -> list[Candi
     return [c for c in candidates if c.sure and doubted.isdisjoint(c.channels)]
 
 
-def _awaited(hidden: Sequence[Hidden], candidates: Sequence[Candidate]) -> list[Candidate]:
+def _awaited(hidden: Sequence[MaskedPair], candidates: Sequence[Candidate]) -> list[Candidate]:
     """Return the straight candidates of hidden pairs that are not in the model yet, with the p-value of the pair."""
     pairs = {key: pair for pair in reversed(hidden) for key in pair.keys}
     found = []
@@ -259,7 +261,7 @@ def _awaited(hidden: Sequence[Hidden], candidates: Sequence[Candidate]) -> list[
         if c.key in pairs and c.columns.shape[1] == 1:
             chi2 = max(c.chi2, *(pair.chi2 for pair in hidden if c.key in pair.keys))
             p_value = min(c.p_value, pairs[c.key].p_value)
-            found.append(replace(c, judgement=c.judgement._replace(chi2=chi2), p_value=p_value))
+            found.append(replace(c, test_result=c.test_result._replace(chi2=chi2), p_value=p_value))
     found = [c for c in found if c.evidence > 0]  # else the effects in the model hold it
     return sorted(found, key=lambda c: c.p_value)
 
@@ -286,20 +288,22 @@ def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> 
     return found
 
 
-def _drop_needless(fitted: Fitted, added: list[Added]) -> tuple[Fitted, list[Added]]:
+def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
     """Return the fit without effects that a later one has made needless, by Schwarz's price.
 
     A ripple was judged on the raw samples, which bins cannot overrule.
     """
     k = 0
     while k < len(added) - 1:
-        price = added[k].proposal.price
+        bic_penalty = added[k].proposal.bic_penalty
         periodic = added[k].proposal.term.effect.id in PERIODIC
-        if periodic or _wald(fitted, k) > 2 * price:  # far from needless: no refit is wanted to see that
+        if (
+            periodic or _wald_statistic(fitted, k) > 2 * bic_penalty
+        ):  # far from needless: no refit is wanted to see that
             k += 1
             continue
         without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
-        if without.deviance - fitted.deviance < price:
+        if without.deviance - fitted.deviance < bic_penalty:
             fitted = fit(without.model, fitted.rows, fitted.scatter, turns=1)
             added = [a for j, a in enumerate(added) if j != k]
         else:
@@ -307,7 +311,7 @@ def _drop_needless(fitted: Fitted, added: list[Added]) -> tuple[Fitted, list[Add
     return fitted, added
 
 
-def _wald(fitted: Fitted, number: int) -> float:
+def _wald_statistic(fitted: Fitted, number: int) -> float:
     """Return the squared standardised size of an effect's amplitudes, all together."""
     at = fitted.model.place(number).start
     effect, values = fitted.model.terms[number].effect, fitted.model.values[number]

@@ -3,7 +3,7 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.channels import find_channels
-from sealfit.closure.laws import richer_laws
+from sealfit.closure.richer_laws import richer_laws
 from sealfit.effects import EFFECTS
 from sealfit.fit.estimate import fit_declared
 from sealfit.fit.rows import make_rows

@@ -36,7 +36,7 @@ LEAST_ERROR = 4  # degrees of freedom left for the specimens' scatter, with fewe
 LEAST_ERROR_OF_RUNS = 3  # the same for runs: three speeds both ways leave three
 
 
-class FewTest(NamedTuple):
+class SmallSampleTest(NamedTuple):
     """Columns seen as one number per specimen: the quantity, their span there, and how surely it is followed."""
 
     target: tuple[str, str]
@@ -100,7 +100,7 @@ def small_root(taken: Tangent, moved: np.ndarray) -> np.ndarray:
     return axes[:, kept].T / np.sqrt(share[kept])[:, None]
 
 
-class FewUnits:
+class ClusterTests:
     """The specimens of a fit as single numbers.
 
     Parameters
@@ -149,7 +149,7 @@ class FewUnits:
         values = root @ groups.sums(direction * self._residual, self.level)
         return Numbers(direction, taken, root, values, root.df if isinstance(root, Root) else values.size, 0.0)
 
-    def test(self, left: np.ndarray, target: tuple[str, str]) -> FewTest | None:
+    def test(self, left: np.ndarray, target: tuple[str, str]) -> SmallSampleTest | None:
         """Return the F test of projected columns, shape (n, k), on a quantity; None with too few units for one."""
         numbers = self.numbers(target)
         columns = self.fitted.rows.groups.sums(numbers.direction[:, None] * left, self.level)
@@ -160,7 +160,7 @@ class FewUnits:
         chi2 = float(((numbers.values @ basis) ** 2).sum())
         log_p = float(log_p_of(numbers.values[None, :], basis, numbers.known, d)[0])
         share = float((columns**2).sum() / max((left**2).sum(), 1e-300))
-        return FewTest(target, basis, numbers.known, chi2, log_p, share, d - k, self.level)
+        return SmallSampleTest(target, basis, numbers.known, chi2, log_p, share, d - k, self.level)
 
     def draws(self, count: int, rng: np.random.Generator) -> dict[tuple[str, str], np.ndarray]:
         """Return numbers as chance alone would give them, for each quantity of shape (count, d), correlated as here."""

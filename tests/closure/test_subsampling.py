@@ -6,10 +6,9 @@ import numpy.testing as npt
 import pytest
 from bins_helpers import TRUE, make_bins, make_traces, warm
 
-from sealfit.closure.grow import grow, numbered, steady_samples
 from sealfit.closure.loop import close_loop
-from sealfit.closure.merged import FURTHER, MOST_ROWS, PER_STROKE, ROWS, merged_bins, searched
-from sealfit.closure.told_by_all import told_by_all
+from sealfit.closure.selection import grow, numbered, steady_samples
+from sealfit.closure.subsampling import FURTHER, MOST_ROWS, PER_STROKE, ROWS, merged_bins, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.declared import declare
@@ -33,7 +32,7 @@ def test_the_search_works_on_few_rows_but_not_on_too_few_of_a_stroke(bins, repea
 
 
 def test_of_very_many_strokes_a_few_files_all_over_the_campaign_keep_several_bins(monkeypatch):
-    monkeypatch.setattr("sealfit.closure.merged.MOST_ROWS", 160)
+    monkeypatch.setattr("sealfit.closure.subsampling.MOST_ROWS", 160)
     table = numbered(make_bins(1, bins=20, repeats=3))
     left = merged_bins(table, 1)
     rows = left.groupby(["file", "stroke"]).size()
@@ -54,14 +53,14 @@ MANY_SPEEDS = (1.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 60.
 @pytest.fixture
 def few(monkeypatch):
     """A search that begins with 40 strokes, whatever the model."""
-    monkeypatch.setattr("sealfit.closure.merged.STROKES", 40)
-    monkeypatch.setattr("sealfit.closure.merged.RUNS", 1)
-    monkeypatch.setattr("sealfit.closure.merged.LEAST_RUNS", 1)
+    monkeypatch.setattr("sealfit.closure.subsampling.STROKES", 40)
+    monkeypatch.setattr("sealfit.closure.subsampling.RUNS", 1)
+    monkeypatch.setattr("sealfit.closure.subsampling.LEAST_RUNS", 1)
 
 
 def test_more_and_more_whole_runs_all_over_the_campaign_are_searched_and_in_the_end_all(few):
     rows = make_rows(numbered(make_bins(1, bins=4)), has_aging=True)
-    parts = list(searched(rows, 1))
+    parts = list(subsamples(rows, 1))
     sizes = [part.rows.groups.starts["stroke"].size for part in parts]
     assert sizes == pytest.approx([40, 40 * FURTHER, 216], abs=5)
     assert [part.whole for part in parts] == [False] * (len(parts) - 1) + [True]
@@ -71,15 +70,15 @@ def test_more_and_more_whole_runs_all_over_the_campaign_are_searched_and_in_the_
         for run in set(part.rows.table["run_id"]):  # with all their repeats
             assert (part.rows.table["run_id"] == run).sum() == (rows.table["run_id"] == run).sum()
         assert set(part.rows.condition) == set(rows.condition)
-    drawn = [set(next(searched(rows, seed)).rows.table["run_id"]) for seed in (1, 1, 2)]
+    drawn = [set(next(subsamples(rows, seed)).rows.table["run_id"]) for seed in (1, 1, 2)]
     assert drawn[0] == drawn[1] != drawn[2]
 
 
 def test_a_part_has_the_campaigns_model_and_some_run_of_each_condition(few, monkeypatch):
-    monkeypatch.setattr("sealfit.closure.merged.STROKES", 12)
-    monkeypatch.setattr("sealfit.closure.merged.MOST_ROWS", 40)
+    monkeypatch.setattr("sealfit.closure.subsampling.STROKES", 12)
+    monkeypatch.setattr("sealfit.closure.subsampling.MOST_ROWS", 40)
     rows = make_rows(numbered(make_bins(1, bins=20, noise_N=0.0, gain=0.0)), has_aging=True)
-    part = next(searched(rows, 1))
+    part = next(subsamples(rows, 1))
     assert part.coarse.force.size < part.rows.force.size
     assert set(part.coarse.condition) == set(rows.condition)
     assert part.rows.groups.starts["run"].size == len(rows.conditions)
@@ -90,17 +89,17 @@ def test_a_part_has_the_campaigns_model_and_some_run_of_each_condition(few, monk
 
 def test_few_runs_of_very_many_strokes_are_all_searched(few, monkeypatch):
     rows = make_rows(numbered(make_bins(1, bins=4)), has_aging=True)
-    monkeypatch.setattr("sealfit.closure.merged.RUNS", rows.groups.starts["run"].size)
-    (part,) = searched(rows, 1)
+    monkeypatch.setattr("sealfit.closure.subsampling.RUNS", rows.groups.starts["run"].size)
+    (part,) = subsamples(rows, 1)
     assert part.whole
 
 
 def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(monkeypatch):
     bins = make_bins(3, effect=warm, setup=0.005, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4)
-    monkeypatch.setattr("sealfit.closure.merged.RUNS", 1)
+    monkeypatch.setattr("sealfit.closure.subsampling.RUNS", 1)
     found, said = [], []
     for strokes in (120, 10_000):
-        monkeypatch.setattr("sealfit.closure.merged.STROKES", strokes)
+        monkeypatch.setattr("sealfit.closure.subsampling.STROKES", strokes)
         found.append(close_loop(bins, make_traces(bins), Config(), on_progress=said.append))
     assert not any("show more" in text for text in said)
     part, whole = (closed.document for closed in found)
@@ -118,15 +117,15 @@ def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(monkeypatch
 @pytest.mark.parametrize(("acts_on", "other", "seed"), [("mu", "force", 2), ("force", "mu", 6)])
 def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatch):
     """Of the whole force sigma_2 |v| is a part, which a factor on mu leaves as it is."""
-    monkeypatch.setattr("sealfit.closure.merged.STROKES", 60)
-    monkeypatch.setattr("sealfit.closure.merged.RUNS", 1)
+    monkeypatch.setattr("sealfit.closure.subsampling.STROKES", 60)
+    monkeypatch.setattr("sealfit.closure.subsampling.RUNS", 1)
 
     def stiffer(table, force):
         viscous = TRUE["sigma_2"] * table["speed_mm_s"] if acts_on == "mu" else 0.0
         return force + 0.1 * -np.expm1(-table["distance_mm"] / 10.0) * (force - viscous)
 
     bins = numbered(make_bins(seed, effect=stiffer, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, noise_N=0.1))
-    part = next(searched(make_rows(bins, has_aging=True), 1))
+    part = next(subsamples(make_rows(bins, has_aging=True), 1))
     samples = steady_samples(make_traces(bins), part.rows)
     grown = grow(part.coarse, samples, Config(), EFFECTS)
     (found,) = grown.added
@@ -140,7 +139,7 @@ def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatc
         chosen, rival = on(first), on(second)
         item = replace(found, proposal=chosen, rivals=(rival,), rivals_rmse_N=(0.1,))
         doubted = replace(grown, after=chosen.fitted, added=(item,))
-        told, whole = told_by_all(doubted, part.every, samples, Config(), lambda text: None)
+        told, whole = reselect_on_all(doubted, part.every, samples, Config(), lambda text: None)
         (effect,) = told.added
         terms = (effect.proposal.term, *told.after.model.terms, *whole.model.terms)
         assert [term.acts_on for term in terms] == [acts_on] * 3
@@ -151,8 +150,8 @@ def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatc
 
 
 def test_what_only_all_strokes_show_has_all_of_them_searched(monkeypatch):
-    monkeypatch.setattr("sealfit.closure.merged.STROKES", 60)
-    monkeypatch.setattr("sealfit.closure.merged.RUNS", 1)
+    monkeypatch.setattr("sealfit.closure.subsampling.STROKES", 60)
+    monkeypatch.setattr("sealfit.closure.subsampling.RUNS", 1)
     rng = np.random.default_rng(5)
     bins = make_bins(3, setup=0.003, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, noise_N=0.1)
     humidity = bins["run_id"].map({run: rng.normal() for run in bins["run_id"].unique()})

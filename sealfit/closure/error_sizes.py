@@ -7,7 +7,7 @@ import pandas as pd
 from numpy.polynomial import Legendre
 from scipy.special import fdtrc
 
-from sealfit.closure.judge import Candidate
+from sealfit.closure.score_test import Candidate
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import LEVELS, Rows
 from sealfit.fit.tangent import OwnColumns, Tangent
@@ -201,7 +201,7 @@ def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.D
     best: dict[tuple, Candidate] = {}
     for candidate in candidates:
         name = " ".join(candidate.channels)
-        if name not in best or candidate.judgement.log_p < best[name].judgement.log_p:
+        if name not in best or candidate.test_result.log_p < best[name].test_result.log_p:
             best[name] = candidate
     sd = float(np.sqrt(rows.weight @ fitted.residual**2))
     white = float(fitted.white_residual @ fitted.white_residual)
@@ -214,7 +214,7 @@ def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.D
                 "channel": name,
                 "sd_N": sd * np.sqrt(share),
                 "share": share,
-                "df": float(candidate.judgement.df),
+                "df": float(candidate.test_result.df),
                 "p_value": candidate.p_value,
             }
         )

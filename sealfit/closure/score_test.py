@@ -30,8 +30,8 @@ import numpy as np
 from scipy.special import betainc, chdtrc, fdtrc
 
 from sealfit.closure.channels import FINER, MANY_UNITS
-from sealfit.closure.few import FewTest, FewUnits
-from sealfit.closure.slopes import SlopeTest, along_strokes, few_specimens, slope_test, specimens_agree
+from sealfit.closure.contrasts import ContrastTest, along_strokes, contrast_test, few_specimens, specimens_agree
+from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import LEVELS
 from sealfit.fit.tangent import OwnColumns, Tangent
@@ -45,7 +45,7 @@ RANK = 1e-9  # singular value of what specimens do not hold of the tangent space
 LEAST_LEFT = 0.01  # share of a column's variance that must survive projection to be identifiable here
 
 
-class Judgement(NamedTuple):
+class ScoreTestResult(NamedTuple):
     """What the residual says of some columns."""
 
     chi2: float  # whitened sum of squares they explain
@@ -54,8 +54,8 @@ class Judgement(NamedTuple):
     log_p: float  # of T by its F distribution, not adjusted
     log_p_jackknife: float = 0.0  # of the estimate against its jackknife over units; 0 where that was not tried
     scores: np.ndarray | None = None  # (units, k)
-    few: FewTest | None = None  # against the scatter of few specimens; None where that was not tried
-    slopes: tuple[SlopeTest, ...] = ()  # against the slopes of few units, in every variant; empty where not tried
+    few: SmallSampleTest | None = None  # against the scatter of few specimens; None where that was not tried
+    slopes: tuple[ContrastTest, ...] = ()  # against the slopes of few units, in every variant; empty where not tried
     agree: bool = True  # whether two to four specimens show the same along strokes, where many runs are the units
 
 
@@ -68,7 +68,7 @@ class Candidate:
     operation: str
     unit: str  # level of the groups moved by sign flips
     columns: np.ndarray  # (n, k) shape values, before the slope of the quantity
-    judgement: Judgement
+    test_result: ScoreTestResult
     p_value: float = 1.0  # adjusted over the search
     pair: bool = False  # whether it acts by two channels together
 
@@ -80,23 +80,23 @@ class Candidate:
     @property
     def agrees(self) -> bool:
         """Whether two to four specimens show the same of it."""
-        few = (test.agree[np.argmax(np.abs(test.slope))] for test in self.judgement.slopes)
-        return self.judgement.agree and all(few)
+        few = (test.agree[np.argmax(np.abs(test.slope))] for test in self.test_result.slopes)
+        return self.test_result.agree and all(few)
 
     @property
     def sure(self) -> bool:
         """Whether it may be claimed: too few specimens do not show their own scatter, or show that they differ."""
-        return self.agrees and (self.judgement.few is None or self.judgement.few.sure)
+        return self.agrees and (self.test_result.few is None or self.test_result.few.sure)
 
     @property
     def chi2(self) -> float:
         """Whitened sum of squares it explains."""
-        return self.judgement.chi2
+        return self.test_result.chi2
 
     @property
     def evidence(self) -> float:
         """Explained sum of squares less what as many idle columns would be given (Schwarz)."""
-        return self.chi2 - self.judgement.df * np.log(max(self.judgement.units, 2))
+        return self.chi2 - self.test_result.df * np.log(max(self.test_result.units, 2))
 
 
 def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
@@ -115,7 +115,7 @@ def _squares(columns: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->j", columns, columns)
 
 
-class Judge:
+class ScoreTests:
     """Holds columns of the force against the residual of a fit.
 
     Parameters
@@ -126,7 +126,7 @@ class Judge:
 
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
-        self.few = {level: FewUnits(fitted, level) for level in LEVELS}
+        self.few = {level: ClusterTests(fitted, level) for level in LEVELS}
         self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
@@ -160,7 +160,7 @@ class Judge:
 
     def __call__(
         self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]
-    ) -> Judgement | None:
+    ) -> ScoreTestResult | None:
         """Return the judgement that says least of all variants of some columns; None where one cannot be judged.
 
         Parameters
@@ -178,10 +178,10 @@ class Judge:
         few = starts[between].size < JACKKNIFE_UNITS
         found = []
         for left in variants:
-            judgement = self._judge(left, level if few else between, target)
-            if judgement is None:
+            test_result = self._judge(left, level if few else between, target)
+            if test_result is None:
                 return None
-            found.append(judgement)
+            found.append(test_result)
         weakest = max(found, key=lambda j: max(j.log_p, j.log_p_jackknife))
         weakest = weakest._replace(units=starts[level].size)
         if not few:
@@ -189,7 +189,7 @@ class Judge:
         if level == "specimen":
             test = self.few[level].test(variants[0], target)
             return weakest if test is None else weakest._replace(chi2=test.chi2, df=test.basis.shape[1], few=test)
-        tests = tuple(slope_test(self.fitted, left, between) for left in variants)
+        tests = tuple(contrast_test(self.fitted, left, between) for left in variants)
         if any(test is None for test in tests):
             return None
         return weakest._replace(slopes=tests, few=self._of_few_runs(variants, between, level, target))
@@ -205,7 +205,7 @@ class Judge:
 
     def _of_few_runs(
         self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]
-    ) -> FewTest | None:
+    ) -> SmallSampleTest | None:
         """Return the F test, of all variants that which says least, of columns constant in each of a few runs.
 
         It is exact there, while the variance of a slope from half a dozen runs has two or three degrees of freedom.
@@ -217,7 +217,7 @@ class Judge:
             return None
         return max(tests, key=lambda test: test.log_p)
 
-    def _judge(self, left: np.ndarray, level: str, target: tuple[str, str]) -> Judgement | None:
+    def _judge(self, left: np.ndarray, level: str, target: tuple[str, str]) -> ScoreTestResult | None:
         fitted = self.fitted
         units = fitted.rows.groups.starts[level].size
         size = np.sqrt(_squares(left))
@@ -229,7 +229,7 @@ class Judge:
         left = (left @ u[:, keep] / np.sqrt(s[keep]))[:, : max(1, units // 5)]
         scores = fitted.rows.groups.sums(left * fitted.unit_residual(level)[:, None], level)
         total = left.T @ fitted.white_residual
-        log_p = float(log_p_of(wald(total[None, :], scores)[0], left.shape[1], units))
+        log_p = float(log_p_of(score_statistic(total[None, :], scores)[0], left.shape[1], units))
         jackknife = 0.0
         if units >= JACKKNIFE_UNITS:
             explained = _log(chdtrc(left.shape[1], total @ total))
@@ -239,7 +239,7 @@ class Judge:
                     explained = min(explained, test.log_p)
             if explained < np.log(PROMISING):
                 jackknife = max(self._jackknife(left, level), explained)
-        return Judgement(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
+        return ScoreTestResult(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
 
     def _jackknife(self, left: np.ndarray, level: str) -> float:
         """Return the log p-value of orthonormal columns' coefficients against their jackknife over whole units.
@@ -283,7 +283,7 @@ def _inverse_of(size: np.ndarray, axes: np.ndarray) -> np.ndarray:
     return (axes * shrink[:, None, :]) @ axes.transpose(0, 2, 1)
 
 
-def wald(totals: np.ndarray, scores: np.ndarray) -> np.ndarray:
+def score_statistic(totals: np.ndarray, scores: np.ndarray) -> np.ndarray:
     """Return T for each row of `totals`, shape (m, k) -> (m,)."""
     inverse = np.linalg.pinv(scores.T @ scores, rcond=1e-10, hermitian=True)
     return np.einsum("ij,jk,ik->i", totals, inverse, totals)

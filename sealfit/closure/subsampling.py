@@ -1,0 +1,273 @@
+"""Subsampling of large campaigns: which runs and rows are searched, and what the full campaign says of the result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.channels import channels_of
+from sealfit.closure.confirm import COMPARED, AcceptedEffect, heldout_gain
+from sealfit.closure.forms import PERIODIC, describe
+from sealfit.closure.linearised import Proposal
+from sealfit.closure.naming import RIVAL, named_among
+from sealfit.closure.score_test import ScoreTests
+from sealfit.closure.search import search
+from sealfit.closure.selection import Selection
+from sealfit.config import Config
+from sealfit.fit.declared import declare
+from sealfit.fit.estimate import Fitted, fit, fitted_at
+from sealfit.fit.rows import POWER, Rows, make_rows, merge, thin
+
+STROKES = 4_000  # that are searched; of more, whole runs are dealt,
+RUNS = 1_000  # at least so many, as they are the evidence of most channels,
+LEAST_RUNS = 20  # and at least so many for each number of the declared model,
+FURTHER = 4  # and so many times as many strokes where the campaign shows more than they do
+ROWS = 4_000  # that the search works on; more are merged along their strokes,
+PER_STROKE = 8  # to about so many of each stroke,
+MOST_ROWS = 8_000  # unless there are more than so many then.
+LEAST_PER_STROKE = 4  # where even so many of each are more, some files keep `PER_STROKE`, the others one a stroke
+
+
+@dataclass(frozen=True)
+class Subsample:
+    """What of a campaign is searched: some runs, or all, and their rows merged along the strokes.
+
+    The same objects stand where there is nothing to leave out or to merge.
+    """
+
+    rows: Rows
+    coarse: Rows
+    every: Rows  # the whole campaign, merged
+
+    @property
+    def whole(self) -> bool:
+        """Whether all runs are searched."""
+        return self.coarse is self.every
+
+
+def subsamples(rows: Rows, seed: int) -> Iterator[Subsample]:
+    """Yield more and more of a campaign's runs, dealt evenly over its conditions, the last time all of them.
+
+    The first part bounds what a search costs by the model, not by the number of files.
+
+    Parameters
+    ----------
+    rows : Rows
+        The campaign, made of bins as `numbered` gives them.
+    seed : int
+        Of the deal.
+    """
+    every, most, searched_before = _merged(rows, rows, seed), STROKES, 0
+    strokes, runs = (rows.groups.starts[level].size for level in ("stroke", "run"))
+    while most < strokes:
+        drawn = _dealt(rows, min(max(most / strokes, RUNS / runs), 1.0), seed)
+        if searched_before < np.count_nonzero(drawn) < drawn.size:
+            part = rows.subset(drawn)
+            yield Subsample(part, _merged(part, rows, seed), every)
+            searched_before = part.force.size
+        most *= FURTHER
+    yield Subsample(rows, every, every)
+
+
+def _merged(part: Rows, campaign: Rows, seed: int) -> Rows:
+    """Return rows merged along their strokes, their conditions and declared model those of the whole campaign."""
+    few = merged_bins(part.table.drop(columns=POWER, errors="ignore"), seed)
+    if len(few) == part.force.size:
+        return part
+    made = make_rows(few, has_aging=campaign.has_aging, conditions=campaign.conditions)
+    declare(made, as_in=campaign)
+    return made
+
+
+def _dealt(rows: Rows, share: float, seed: int) -> np.ndarray:
+    """Return which rows are of the runs drawn, shape (n,): one at random of every 1 / `share` beside each other.
+
+    At least one of each condition, and `LEAST_RUNS` of those that tell a number of the declared model.
+    """
+    first = rows.groups.starts["run"]
+    condition = rows.condition[first]
+    drawn = _one_of_each(np.lexsort([np.abs(rows.speed[first]), condition]), share, seed)
+    rng = np.random.default_rng(seed)
+    _fill(drawn, condition, 1, rng)
+    for numbers in declare(rows).index.values():
+        _fill(drawn, numbers[condition], LEAST_RUNS, rng)
+    return drawn[rows.codes("run")]
+
+
+def _fill(drawn: np.ndarray, number: np.ndarray, least: int, rng: np.random.Generator) -> None:
+    """Draw more at random until there are so many of each number, or all; none of numbers below 0."""
+    wanted = least - np.bincount(number[drawn & (number >= 0)], minlength=number.max(initial=0) + 1)
+    left = rng.permutation(np.flatnonzero(~drawn & (number >= 0)))
+    left = left[np.argsort(number[left], kind="stable")]
+    own = number[left]
+    place = np.arange(left.size) - np.searchsorted(own, own)
+    drawn[left[place < wanted[own]]] = True
+
+
+def merged_bins(bins: pd.DataFrame, seed: int) -> pd.DataFrame:
+    """Return the bins that the search works on: neighbours of a stroke merged where there are many.
+
+    Of very many strokes some files, dealt evenly over the campaign, show what happens along a stroke, in `MOST_ROWS`
+    rows; of the others the means are enough.
+
+    Parameters
+    ----------
+    bins : DataFrame
+        As `numbered` gives them.
+    seed : int
+        Of the deal.
+    """
+    strokes = bins["stroke_id"].nunique()
+    if LEAST_PER_STROKE * strokes <= MOST_ROWS:
+        return thin(bins, int(np.clip(PER_STROKE * strokes, ROWS, MOST_ROWS)))
+    finely = _files_dealt(bins, MOST_ROWS / (PER_STROKE * strokes), seed)
+    together = int(np.ceil(len(bins) / strokes / PER_STROKE))
+    return merge(bins, np.where(finely, together, len(bins)))
+
+
+def _files_dealt(bins: pd.DataFrame, share: float, seed: int) -> np.ndarray:
+    """Return whether each row's file is of those drawn, shape (n,): one of every 1 / `share` beside each other."""
+    file = pd.factorize(bins["file"])[0]
+    first = np.flatnonzero(np.diff(np.maximum.accumulate(file), prepend=-1))
+    beside = np.lexsort([pd.factorize(bins[name])[0][first] for name in ("run_id", "condition")])
+    return _one_of_each(beside, share, seed)[file]
+
+
+def _one_of_each(beside: np.ndarray, share: float, seed: int) -> np.ndarray:
+    """Return what is drawn, one at random of every 1 / `share` in the order `beside`, shape (n,)."""
+    group = np.floor(np.arange(beside.size) * share)
+    shuffled = np.lexsort((np.random.default_rng(seed).random(beside.size), group))
+    drawn = np.zeros(beside.size, dtype=bool)
+    drawn[beside[shuffled[np.flatnonzero(np.diff(group, prepend=-1))]]] = True
+    return drawn
+
+
+Way = tuple[str, str]  # what an effect acts on, and how
+
+
+def reselect_on_all(
+    grown: Selection, every: Rows, samples: pd.DataFrame, config: Config, say: Callable[[str], None]
+) -> tuple[Selection, Fitted]:
+    """Return what the search of a part came to, and its final model fitted to all strokes.
+
+    An effect is held against its first rivals, and what comes out against itself on the quantities that its rivals act
+    on, each time on all strokes; rivals on quantities that these rule out are none any more. A ripple was judged on
+    samples, and stays.
+
+    Parameters
+    ----------
+    grown : Grown
+        What the search of a part came to.
+    every : Rows
+        The campaign, merged along the strokes.
+    samples : DataFrame
+        The part's raw samples, with `residual_N`.
+    config : Config
+        Folds and seed.
+    say : callable
+        Told in words what is being done.
+    """
+    added, after = list(grown.added), grown.after
+    whole = fit(after.model, every, after.scatter, turns=1)
+    for first in (a for a in grown.added if a.rivals and not _periodic(a.proposal)):
+        item = first
+        for others_of in (_first_rivals, _on_other_quantities):
+            number = next(k for k, a in enumerate(added) if a is item)
+            asked = [item.proposal, *others_of(item)]
+            if len(asked) == 1:
+                continue
+            base = fitted_at(whole.model.without_term(number), every, whole.scatter, whole.friction)
+            found = named_among(base, [_of_all(p, every) for p in asked])
+            chosen = next(p for p in asked if p.term is found[0].term)
+            if chosen is not item.proposal:
+                say(f"all strokes say {describe(chosen.term)} rather than {describe(item.proposal.term)}")
+                item, after = _instead(item, chosen, after, number, samples, config)
+                added, whole = [*added[:number], *added[number + 1 :], item], found[0].fitted
+            if others_of is _on_other_quantities:
+                left = [_way(p) for p in found if p.bic - found[0].bic < RIVAL]
+                number = next(k for k, a in enumerate(added) if a is item)
+                added[number] = item = _with_rivals(item, [r for r in _rivals(item) if _way(r[0]) in left])
+    return replace(grown, added=tuple(added), after=after), whole
+
+
+def _first_rivals(item: AcceptedEffect) -> list[Proposal]:
+    """Return the first rivals of an effect."""
+    return [rival for rival in item.rivals[:COMPARED] if not _periodic(rival)]
+
+
+def _on_other_quantities(item: AcceptedEffect) -> list[Proposal]:
+    """Return an effect on the quantities that its rivals act on, to begin where it stands."""
+    term = item.proposal.term
+    ways = (way for way in dict.fromkeys(map(_way, item.rivals)) if way != _way(item.proposal))
+    return [
+        replace(item.proposal, term=replace(term, acts_on=way[0], operation=way[1]))
+        for way in ways
+        if way in term.effect.acts_on
+    ]
+
+
+def _instead(
+    item: AcceptedEffect, chosen: Proposal, after: Fitted, number: int, samples: pd.DataFrame, config: Config
+) -> tuple[AcceptedEffect, Fitted]:
+    """Return an effect with another proposal in its place and its own among the rivals, and the part's fit with it."""
+    rows, scatter, friction = after.rows, after.scatter, after.friction
+    without = fit(after.model.without_term(number), rows, scatter, turns=0, friction=friction)
+    model = without.model.with_term(chosen.term, _values(chosen))
+    chosen = replace(chosen, fitted=fit(model, rows, scatter, turns=0, friction=friction))
+    gain = heldout_gain(without, chosen, config.loop.folds, config.loop.seed, samples, {})
+    rest = [r for r in _rivals(item) if r[0].term is not chosen.term]
+    item = _with_rivals(item, [(item.proposal, item.left_N), *rest])
+    after = fit(chosen.fitted.model, rows, scatter, turns=2)
+    return replace(item, proposal=chosen, gain_N=gain.rmse_N, left_N=gain.left_N), after
+
+
+def _periodic(proposal: Proposal) -> bool:
+    return proposal.term.effect.id in PERIODIC
+
+
+def _rivals(item: AcceptedEffect) -> list[tuple[Proposal, float]]:
+    """Return the rivals of an effect that are not itself, and their RMSE."""
+    pairs = zip(item.rivals, item.rivals_rmse_N, strict=True)
+    return [(rival, rmse) for rival, rmse in pairs if rival.term.key() != item.proposal.term.key()]
+
+
+def _with_rivals(item: AcceptedEffect, rivals: list[tuple[Proposal, float]]) -> AcceptedEffect:
+    return replace(item, rivals=tuple(r for r, _ in rivals), rivals_rmse_N=tuple(rmse for _, rmse in rivals))
+
+
+def _of_all(proposal: Proposal, every: Rows) -> Proposal:
+    """Return a proposal of a part as one of all strokes, to be fitted."""
+    return replace(proposal, units=every.groups.starts[proposal.unit].size, values=_values(proposal), fitted=None)
+
+
+def _way(proposal: Proposal) -> Way:
+    return proposal.term.acts_on, proposal.term.operation
+
+
+def _values(proposal: Proposal) -> Mapping[str, float]:
+    """Return the numbers of a fitted proposal."""
+    return proposal.fitted.model.values[-1]
+
+
+def missed_by_subsample(fitted: Fitted, grown: Selection, config: Config) -> str:
+    """Return the channel that still orders the residual of all strokes, though those searched do not show it; or "".
+
+    What they show and what could not be explained there is known already.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The final model, fitted to all strokes.
+    grown : Grown
+        What the search of a part came to.
+    config : Config
+        Levels of error, channels.
+    """
+    alpha = config.loop.family_error
+    found = search(ScoreTests(fitted), channels_of(fitted.rows, config), np.random.default_rng(config.loop.seed))
+    known = {c.channels for c in grown.last if c.p_value <= alpha}
+    new = (c for c in found if c.p_value <= alpha and c.sure and c.channels not in known)
+    return ", ".join(next((c.channels for c in new), ()))
