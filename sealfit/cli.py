@@ -247,7 +247,7 @@ def _run(
     as_json: bool,
     **options: Path | None,
 ) -> None:
-    count = _workers(workers, scheduler, "sealfit.ingest.stored")
+    count = _workers(workers, scheduler)
     options |= {"workers": count, "scheduler": scheduler, "force": force, "strict": strict}
     command = "ingest" if len(names) == 1 else "run"
     _do(
@@ -268,8 +268,7 @@ def _single(
     scheduler: str | None = None,
     **options: Path | None,
 ) -> None:
-    needed = {"fit-dynamic": ("sealfit.fit.dynamic",), "close-loop": ("sealfit.closure.loop",)}.get(step, ())
-    options |= {"workers": _workers(workers, scheduler, *needed), "scheduler": scheduler, "force": force}
+    options |= {"workers": _workers(workers, scheduler), "scheduler": scheduler, "force": force}
     _do(step, profile, as_json, lambda steps, progress: steps.single(step, out, progress=progress, **options))
 
 
@@ -284,16 +283,13 @@ def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
     end(command, made, lambda made: summary_lines.lines(made) + profiling.lines(made.get("profile", ())), as_json)
 
 
-def _workers(workers: int | None, scheduler: str | None, *needed: str) -> int:
-    """Return how many processes of this computer to use; they begin to load the modules `needed` at once."""
+def _workers(workers: int | None, scheduler: str | None) -> int:
+    """Return how many processes of this computer to use."""
     from sealfit import engine
 
     if workers is not None and scheduler is not None:
         raise typer.BadParameter("use either --workers (this computer) or --scheduler (a Dask cluster), not both.")
-    workers = workers or engine.cores()
-    if needed and scheduler is None:
-        engine.prepare(*needed, workers=workers)
-    return workers
+    return workers or engine.cores()
 
 
 def main() -> None:

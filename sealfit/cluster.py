@@ -91,7 +91,7 @@ class Cluster:
         self._client.close()
 
     def apply(self, function: Callable[[bytes], list], chunks: Iterator[bytes]) -> Iterator[list]:
-        """Yield once when the first chunks are sent, then the list that `function` makes of each chunk.
+        """Yield the list that `function` makes of each chunk.
 
         Raises
         ------
@@ -112,7 +112,6 @@ class Cluster:
 
         try:
             send()
-            yield []
             while sent:
                 made = self._result(sent[0])
                 sent.popleft().release()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
-import gc
 import json
 import os
 import sys
@@ -37,10 +35,6 @@ def print_json(document: dict) -> None:
 def exit_code(app: typer.Typer) -> int:
     """Run the command line and say how it ended: 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
     one_thread()
-    gc.set_threshold(100_000, 20, 20)  # a campaign is many objects and no cycles: looking for them takes a fifth
-    atexit.register(gc.freeze)  # nor when the process ends, where that takes a tenth of a second
-    # Arrow's own allocator takes pages of 2 MB, and the kernel clears each: a tenth of an ingest, and 30 MB.
-    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     try:
         code = app(standalone_mode=False, prog_name="sealfit") or 0
         return _interrupted() if code == INTERRUPTED else code

@@ -6,14 +6,13 @@ import contextlib
 import multiprocessing
 import os
 import pickle
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from sealfit.cluster import Cluster
-    from sealfit.processes import Beside, Say
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
@@ -22,7 +21,6 @@ CHUNKS_PER_WORKER = 4  # enough to even out items of different cost, few enough 
 MAX_CHUNK = 32  # so that progress is shown often
 
 _cluster: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
-_leads: ContextVar[bool] = ContextVar("leads", default=False)  # a process that may use others, although one itself
 
 
 def cores() -> int:
@@ -63,14 +61,6 @@ def on_cluster(scheduler: str | None, *folders: Path) -> Iterator[None]:
         cluster.close()
 
 
-def prepare(*modules: str, workers: int) -> None:
-    """Begin to load `modules`, in the background, if processes of this computer will want them soon."""
-    if workers > 1 and _cluster.get() is None:
-        from sealfit.processes import prepare
-
-        prepare(*modules)
-
-
 def run_map(
     function: Callable[[Given], Made], items: Iterable[Given], *, workers: int = 1, together: int | None = None
 ) -> Iterator[Made]:
@@ -96,92 +86,32 @@ def run_map(
     WorkerError
         If a process dies before it has answered (killed, or out of memory), or the cluster gives up.
     """
-    yield from begin_map(function, list(items), workers=workers, together=together)
-
-
-def begin_map(
-    function: Callable[[Given], Made], items: Sequence[Given], *, workers: int = 1, together: int | None = None
-) -> Generator[Made, None, None]:
-    """Return `run_map`, its processes already at work while the caller does something else.
-
-    Close it (`contextlib.closing`) where its results may not be wanted after all.
-
-    Parameters
-    ----------
-    function, items, workers, together
-        As for `run_map`; with one worker nothing is done before the first result is asked for.
-    """
+    items = items if isinstance(items, Sequence) else list(items)
     cluster = _cluster.get()
-    if _here(workers) or (len(items) <= 1 and cluster is None):
-        return (function(item) for item in items)
+    inside_worker = multiprocessing.parent_process() is not None
+    if inside_worker or (cluster is None and (workers <= 1 or len(items) <= 1)):
+        yield from map(function, items)
+        return
     workers = min(workers, len(items)) if cluster is None else max(cluster.threads(), 1)
     size = together or max(1, min(MAX_CHUNK, len(items) // (workers * CHUNKS_PER_WORKER)))
-    made = _elsewhere(function, items, size, workers)
-    next(made)
-    return made
-
-
-def begin_beside(function: Callable[[Given, Say], Made], item: Given, *, workers: int) -> Beside | None:
-    """Let another process of this computer do `function(item, say)`; None where work is done one after the other.
-
-    It may map over `workers` processes in its turn. Close what is returned (`contextlib.closing`).
-
-    Parameters
-    ----------
-    function : callable
-        At the top level of a module; given the item and a function to call with what there is to say.
-    item
-        Sent to the process.
-    workers : int
-        Processes that may be used in all. With one, on a cluster and in a worker there is none to spare.
-    """
-    if _cluster.get() is not None or _here(workers):
-        return None
-    from sealfit.processes import Beside
-
-    return Beside(_lead, pickle.dumps((function, item)))
-
-
-def spare(workers: int) -> int:
-    """Return how many processes are idle: in one begun with `begin_beside`, the process that began it is at work."""
-    return max(workers - 1, 1) if _leads.get() else workers
-
-
-def _here(workers: int) -> bool:
-    """Whether the work is to be done in this process."""
-    if multiprocessing.parent_process() is not None and not _leads.get():  # a worker itself
-        return True
-    return workers <= 1 and _cluster.get() is None
-
-
-def _elsewhere(
-    function: Callable[[Given], Made], items: Sequence[Given], size: int, workers: int
-) -> Generator[Made, None, None]:
-    """Yield once when the first items are sent, `size` at a time, then the results."""
     # Pickled here, not by another thread later, while the caller goes on to use and change the items.
     chunks = (pickle.dumps((function, items[start : start + size])) for start in range(0, len(items), size))
-    cluster = _cluster.get()
     if cluster is None:
         from sealfit.processes import in_processes
 
-        if _leads.get():  # its workers come from a server of its own, which then loads once what each would load
-            prepare(function.__module__, workers=workers)
-        made = in_processes(_apply, chunks, workers)
+        made = in_processes(_apply, chunks, workers, load=function_module(function))
     else:
         made = cluster.apply(_apply, chunks)
     with contextlib.closing(made):
-        next(made)
-        yield None
         for results in made:
             yield from results
+
+
+def function_module(function: Callable) -> str:
+    """Return the name of the module that a function, or a partial one, is found in."""
+    return getattr(function, "func", function).__module__
 
 
 def _apply(pickled: bytes) -> list:
     function, chunk = pickle.loads(pickled)
     return [function(item) for item in chunk]
-
-
-def _lead(pickled: bytes, say: Say) -> object:
-    _leads.set(True)
-    function, item = pickle.loads(pickled)
-    return function(item, say)

@@ -9,17 +9,17 @@ from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def undisturbed(by: signal.Signals = signal.SIGINT) -> Iterator[None]:
-    """Let a Ctrl-C, or another signal that Python hears, wait until the block has ended."""
-    before = signal.getsignal(by)
+def undisturbed() -> Iterator[None]:
+    """Let a Ctrl-C wait until the block has ended."""
+    before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield  # signals reach the main thread only, and this one is not heard
         return
     waiting: list[object] = []
-    signal.signal(by, lambda *caught: waiting.append(caught))
+    signal.signal(signal.SIGINT, lambda *caught: waiting.append(caught))
     try:
         yield
     finally:
-        signal.signal(by, before)
+        signal.signal(signal.SIGINT, before)
         if waiting:
-            signal.raise_signal(by)
+            signal.raise_signal(signal.SIGINT)

@@ -8,47 +8,44 @@ import os
 import signal
 import sys
 import threading
-import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
-from multiprocessing.connection import Connection
-from typing import Any
 
-from sealfit.errors import SealfitError, WorkerError
-from sealfit.interrupts import undisturbed
+from sealfit.errors import WorkerError
 from sealfit.threads import one_thread
 
-Say = Callable[[str], None]
-
 WAITING_PER_WORKER = 2  # chunks sent ahead of the one awaited: bounds the memory of results not yet taken
-UNHEARD_S = 5.0  # a process that is told to end may be at a long product of matrices
 # Not fork: it copies the locks of pyarrow's and BLAS's threads without the threads that free them. A fork server has
 # no threads, and has loaded what the workers need before the first of them is wanted.
 START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 
 
-def prepare(*modules: str) -> None:
-    """Begin to load `modules`, in the background, for processes that will be wanted soon."""
-    if START == "forkserver":
-        from multiprocessing import forkserver
+def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], workers: int, *, load: str) -> Iterator[list]:
+    """Yield the list that `apply` makes of each chunk.
 
-        multiprocessing.set_forkserver_preload(list(modules))
-        with _no_interrupt_for_children():
-            forkserver.ensure_running()
-
-
-def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], workers: int) -> Iterator[list]:
-    """Yield once when the first chunks are sent, then the list that `apply` makes of each chunk.
+    Parameters
+    ----------
+    apply : callable
+        At the top level of a module.
+    chunks : iterator of bytes
+        What it is given, one after the other.
+    workers : int
+        Processes to use.
+    load : str
+        Module that the server of processes imports once, so that no process imports it again.
 
     Raises
     ------
     WorkerError
         If a process dies before it has answered (killed, or out of memory).
     """
-    executor = ProcessPoolExecutor(workers, multiprocessing.get_context(START), _start_worker)
+    context = multiprocessing.get_context(START)
+    if START == "forkserver":
+        context.set_forkserver_preload([load])
+    executor = ProcessPoolExecutor(workers, context, _start_worker)
     sent: deque[Future[list]] = deque()
 
     def send(count: int) -> None:
@@ -58,7 +55,6 @@ def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], worker
     finished = False
     try:
         send(workers * WAITING_PER_WORKER)
-        yield []
         while sent:
             made = sent.popleft().result()
             send(1)
@@ -76,74 +72,6 @@ def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], worker
                 process.join()
 
 
-class Beside:
-    """One piece of work in a process of its own, which may use others.
-
-    Parameters
-    ----------
-    work : callable
-        A function at the top level of a module: given `asked`, and a function to call with what there is to say.
-    asked : bytes
-        What it is to do.
-    """
-
-    def __init__(self, work: Callable[[bytes, Say], Any], asked: bytes) -> None:
-        context = multiprocessing.get_context(START)
-        self._told, tell = context.Pipe(duplex=False)
-        self._process = context.Process(target=_telling, args=(work, asked, tell))
-        try:
-            with _no_interrupt_for_children():
-                self._process.start()
-        except EOFError as error:
-            raise _died() from error
-        tell.close()
-        self._answered = False
-
-    def result(self, say: Say) -> Any:
-        """Return what the work returns, or raise what it raises; pass on what it said so far, and says until then.
-
-        Raises
-        ------
-        WorkerError
-            If the process dies before.
-        """
-        while True:
-            try:
-                kind, told = self._told.recv()
-            except EOFError as error:
-                raise _died() from error
-            if kind == "said":
-                say(told)
-                continue
-            self._answered = True
-            if kind == "raised":
-                raise told
-            return told
-
-    def close(self) -> None:
-        """End the process, whatever it is at."""
-        if not self._answered:
-            self._process.terminate()
-            self._process.join(UNHEARD_S)
-            self._process.kill()
-        self._process.join()
-        self._told.close()
-
-
-def _telling(work: Callable[[bytes, Say], Any], asked: bytes, tell: Connection) -> None:
-    _start_worker()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends its own processes, and leaves nothing of theirs
-    try:
-        told = "made", work(asked, lambda text: tell.send(("said", text)))
-    except SystemExit:
-        return  # and lets go of what was begun, before anybody waits for it
-    except Exception as error:
-        if not isinstance(error, SealfitError):  # a bug: its traceback is here
-            error.add_note(traceback.format_exc())
-        told = "raised", error
-    tell.send(told)
-
-
 def _died() -> WorkerError:
     return WorkerError(
         "a worker process died before it had answered.", mend="If memory ran out, use fewer workers (--workers 1)."
@@ -154,8 +82,7 @@ def _died() -> WorkerError:
 def _no_interrupt_for_children() -> Iterator[None]:
     """Start processes that do not see Ctrl-C: the parent stops them, so none prints a traceback of its own.
 
-    A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not lost; nor
-    is the end that a process beside is told: what it is about to start would look for it in vain.
+    A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not lost.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -163,12 +90,11 @@ def _no_interrupt_for_children() -> Iterator[None]:
     from multiprocessing import resource_tracker
 
     resource_tracker.ensure_running()  # here, as it lets Ctrl-C through again when it starts
-    with undisturbed(by=signal.SIGTERM):
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            yield
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start_worker() -> None:

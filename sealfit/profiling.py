@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 
 @dataclass
@@ -18,7 +18,6 @@ class Part:
     seconds: float = 0.0
     rows: int | None = None
     of: str = ""
-    beside: str = ""  # what went on at the same time, if it was begun before its turn
 
 
 _parts: ContextVar[list[Part] | None] = ContextVar("parts", default=None)
@@ -38,7 +37,7 @@ def profiled() -> Iterator[list[Part]]:
 
 @contextlib.contextmanager
 def timed(name: str, rows: int | None = None, of: str = "") -> Iterator[Part]:
-    """Take the time of the block, where somebody asked for it; rows may be told while it runs, and other seconds.
+    """Take the time of the block, where somebody asked for it; rows may be told while it runs.
 
     Examples
     --------
@@ -58,29 +57,18 @@ def timed(name: str, rows: int | None = None, of: str = "") -> Iterator[Part]:
     try:
         yield part
     finally:
-        part.seconds = part.seconds or time.perf_counter() - began
+        part.seconds = time.perf_counter() - began
         _depth.reset(token)
 
 
-def adopt(parts: Iterable[Part], beside: str) -> None:
-    """Write parts that were timed before, beside something else, where they are looked for: as if they began here."""
-    own = _parts.get()
-    if own is not None:
-        own.extend(replace(part, depth=part.depth + _depth.get(), beside=beside) for part in parts)
-
-
 def as_dicts(parts: Sequence[Part]) -> list[dict]:
-    """Return the parts as plain values: step, part (null for the step itself), seconds, rows and what these are.
-
-    `beside` names what went on at the same time; else it is empty.
-    """
+    """Return the parts as plain values: step, part (null for the step itself), seconds, rows and what these are."""
     found, step = [], ""
     for part in parts:
         step = part.name if part.depth == 0 else step
         name = None if part.depth == 0 else part.name
         seconds = round(part.seconds, 3)
-        counted = {"seconds": seconds, "rows": part.rows, "of": part.of}
-        found.append({"step": step, "part": name, **counted, "beside": part.beside})
+        found.append({"step": step, "part": name, "seconds": seconds, "rows": part.rows, "of": part.of})
     return found
 
 
@@ -95,7 +83,5 @@ def lines(profile: Sequence[Mapping]) -> list[str]:
         if part["rows"] is not None:
             rate = f"{part['rows'] / part['seconds']:11,.0f}" if part["seconds"] > 0 else f"{'':11s}"
             row += f"{part['rows']:13,d}{rate} {part['of']}"
-        if part["beside"]:
-            row += f" (beside {part['beside']})"
         text.append(row.rstrip())
     return text

@@ -71,17 +71,6 @@ class Lines(Silent):
         yield on_file
 
 
-class Relayed(Lines):
-    """Lines that `tell` passes on to who can show them."""
-
-    def __init__(self, tell: Callable[[str], None]):
-        self._tell = tell
-
-    def say(self, text: str) -> None:
-        """Say what is being done."""
-        self._tell(text)
-
-
 class Terminal(Lines):
     """Lines, and a bar for what is counted."""
 

@@ -32,7 +32,6 @@ class Staged:
     def __init__(self, out: Path, units: Units, step: str):
         self._out, self._units = out, units
         self._folder = out / f"{STAGING}{os.getpid()}-{step}"
-        self.seconds: float | None = None  # of its work, where that began before the step's turn
         self.files: dict[str, int] = {}
         self.inputs: Fingerprints | None = None  # set by ingest: what it read
 

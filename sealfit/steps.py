@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import closing
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sealfit.engine import on_cluster
 from sealfit.errors import CampaignError, Fault
 from sealfit.fingerprint import STEPS, fingerprint, glob_names
-from sealfit.order import Counted, Order, Work
 from sealfit.own_effects import own_effects_folder
 from sealfit.places import RUNS, campaign_folder, existing_out
 from sealfit.profiling import timed
@@ -23,8 +19,6 @@ from sealfit.store import Store
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from sealfit.report.drawn import Drawn
 
 INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
@@ -40,6 +34,11 @@ REPORTED = {  # of tables with a row per bin, what the report looks at
     for stage in ("before", "after")
 }
 FAULTY = ("warning", "error")  # severities that count as a fault
+
+Counted = tuple[int, str]
+"""How many rows a step worked on, and what they are."""
+
+Work = Callable[[Store, Staged, int, Silent], Counted]
 
 
 def run(
@@ -126,18 +125,18 @@ def _do_steps(
         progress.warn(warning)
     store.anew = force
     done = []
-    with closing(Order(store, steps, _WORK, _early_report, workers=workers, progress=progress)) as order:
-        for step in steps:
-            why = store.why_stale(step)
-            if why or force:
-                if why and step in store.state.steps:
-                    progress.say(why)
-                order.do(step)
-                done.append(step)
-            else:
-                progress.say(f"{step}: current, not redone")
-            if step == "ingest" and strict:
-                _refuse_faults(store.read("quality"))
+    for step in steps:
+        why = store.why_stale(step)
+        if why or force:
+            if why and step in store.state.steps:
+                progress.say(why)
+            with timed(step) as part, store.step(step) as staged:
+                part.rows, part.of = _WORK[step](store, staged, workers, progress)
+            done.append(step)
+        else:
+            progress.say(f"{step}: current, not redone")
+        if step == "ingest" and strict:
+            _refuse_faults(store.read("quality"))
     with timed("summary"):
         found = summary.of_steps(store, steps)
     return {"out": str(store.out), "done": done, **found}
@@ -238,32 +237,15 @@ def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) ->
     return len(closure.tables["residuals_before"]), "bins"
 
 
-@dataclass(frozen=True)
-class _Early:
-    """What of the report shows nothing of the closed loop: tables, and figures drawn."""
-
-    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    figures: Mapping[str, Drawn] = field(default_factory=dict)
-
-
-def _early_report(store: Store) -> Work:
-    """Do what of the report shows nothing of the closed loop, and return the work that is left."""
-    from sealfit.report.page import figures_of_fits
-
-    tables = _reported(store, (*INGESTED, *FITTED))
-    return partial(_report, early=_Early(tables, figures_of_fits(tables, store.seen_config("report"))))
-
-
-def _report(store: Store, staged: Staged, workers: int, progress: Silent, early: _Early = _Early()) -> Counted:
+def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     from sealfit.report.page import build_report
 
     progress.say("drawing the report")
     with timed("reading tables"):
-        closed = _reported(store, (*CLOSED, *AFTER))
-        tables = {**(early.tables or _reported(store, (*INGESTED, *FITTED))), **closed}
+        tables = _reported(store, (*INGESTED, *FITTED, *CLOSED, *AFTER))
     with timed("page"):
         about = store.read_json("closure"), store.provenance(), store.seen_config("report")
-        report = build_report(tables, *about, drawn=early.figures)
+        report = build_report(tables, *about)
     with timed("writing plots", rows=len(report.figures), of="plots"):
         for name, figure in report.figures.items():
             staged.figure(name, figure)

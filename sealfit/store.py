@@ -245,20 +245,14 @@ class Store:
         return provenance(self.state)
 
     # ------------------------------------------------------------ writing
-    def stage(self, step: str) -> Staged:
-        """Return a place for the files of a step whose work begins before its turn; clear it if that never comes."""
-        return Staged(self.out, self.config.units, step)
-
     @contextlib.contextmanager
-    def step(self, name: str, staged: Staged | None = None) -> Iterator[Staged]:
+    def step(self, name: str) -> Iterator[Staged]:
         """Give a place for the files of step `name`; they all take their places when the block ends without an error.
 
         Parameters
         ----------
         name : str
             One of `STEPS`.
-        staged : Staged, optional
-            A place that holds some of them already.
 
         Raises
         ------
@@ -266,10 +260,10 @@ class Store:
             If the disk is full or refuses; OUT then holds what it held before.
         """
         began = time.monotonic()
-        staged = staged or self.stage(name)
+        staged = Staged(self.out, self.config.units, name)
         try:
             yield staged
-            self._commit(name, staged, staged.seconds or time.monotonic() - began)
+            self._commit(name, staged, time.monotonic() - began)
         finally:
             staged.clear()
 

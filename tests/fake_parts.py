@@ -120,7 +120,7 @@ class Parts:
     def after_fits(self, after, steady, traces, config, *, workers=1):
         return {schema.name: small(schema.name) for schema in AFTER}
 
-    def build_report(self, tables, closure, provenance, config, *, drawn):
+    def build_report(self, tables, closure, provenance, config):
         self._called("report", config)
         assert set(tables) >= {"steady", "steady_fit", "aging_curves", "curves"}
         return SimpleNamespace(
@@ -146,7 +146,6 @@ class Parts:
 def put_in(monkeypatch):
     """Put the stand-ins in the place of the computing parts, in this process alone, and return them."""
     parts = Parts()
-    monkeypatch.setattr("sealfit.order.begin_beside", lambda *asked, workers: None)
     places = {
         "sealfit.ingest.campaign": ["ingest_campaign", "Place"],
         "sealfit.fit.steady": ["fit_conditions"],

@@ -4,16 +4,14 @@ import pickle
 import signal
 import subprocess
 import sys
-import threading
 import time
-from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from sealfit.engine import begin_beside, begin_map, cores, run_map, spare
+from sealfit.engine import cores, run_map
 from sealfit.errors import CampaignError, Fault, RequestError, WorkerError
-from sealfit.processes import START, _no_interrupt_for_children
+from sealfit.processes import START
 
 HERE = Path(__file__).resolve().parent
 
@@ -48,38 +46,6 @@ def die(number):
 
 def wait_long(number):
     time.sleep(60)
-
-
-def square_beside(number, say):
-    say(f"squaring {number}")
-    say("done")
-    return square(number)
-
-
-def map_beside(count, say):
-    return os.getpid(), set(run_map(process_id, range(count), workers=2)), spare(2)
-
-
-def fail_beside(number, say):
-    say("failing")
-    return fail_on_three(number)
-
-
-def bug_beside(number, say):
-    return number / 0
-
-
-def die_beside(number, say):
-    say("dying")
-    die(number)
-
-
-def wait_beside(number, say):
-    list(run_map(wait_long, range(number), workers=2))
-
-
-def nested_beside(number):
-    return begin_beside(square_beside, number, workers=2) is None
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -132,9 +98,9 @@ def test_cores_is_what_this_process_may_use():
 PROGRAM = """
 import sys
 sys.path.insert(0, {tests!r})
-from contextlib import closing
-from sealfit.engine import begin_beside, prepare, run_map
-from test_engine import wait_beside, wait_long
+from sealfit.engine import run_map
+from sealfit.processes import in_processes
+from test_engine import wait_long
 
 if __name__ == "__main__":
     print("begun", flush=True)
@@ -144,12 +110,9 @@ if __name__ == "__main__":
         print("interrupted", file=sys.stderr)
         sys.exit(130)
 """
-WORK = {
-    # two workers, the server that starts them, and the resource tracker
-    "a map": ("list(run_map(wait_long, range(4), workers=2))", 4),
-    # the one beside, its two workers, a server for each of the two, and the resource tracker
-    "beside": ("with closing(begin_beside(wait_beside, 4, workers=2)) as beside: beside.result(print)", 6),
-}
+WORK = "list(run_map(wait_long, range(4), workers=2))"
+PROCESSES = 4
+"""Two workers, the server that starts them, and the resource tracker."""
 
 
 def descendants_of(pid):
@@ -178,19 +141,18 @@ def alive(pid):
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc to see the processes")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill -9"])
-@pytest.mark.parametrize(("work", "processes"), WORK.values(), ids=WORK)
-def test_no_worker_outlives_its_parent(tmp_path, how, work, processes):
+def test_no_worker_outlives_its_parent(tmp_path, how):
     program = tmp_path / "program.py"
-    program.write_text(PROGRAM.format(tests=str(HERE), work=work))
+    program.write_text(PROGRAM.format(tests=str(HERE), work=WORK))
     with subprocess.Popen(
         [sys.executable, program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as run:
         assert run.stdout.readline() == "begun\n"
         until = time.monotonic() + 20
-        while len(descendants_of(run.pid)) < processes and time.monotonic() < until:
+        while len(descendants_of(run.pid)) < PROCESSES and time.monotonic() < until:
             time.sleep(0.05)
         children = descendants_of(run.pid)
-        assert len(children) == processes
+        assert len(children) == PROCESSES
         if how == signal.SIGINT:
             os.killpg(run.pid, how)  # as a terminal does: to the whole group
         else:
@@ -208,7 +170,7 @@ def test_no_worker_outlives_its_parent(tmp_path, how, work, processes):
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 def test_a_server_that_is_still_loading_does_not_see_ctrl_c(tmp_path):
     (tmp_path / "slow_to_load.py").write_text("import time\nopen('loading', 'w').close()\ntime.sleep(3)\n")
-    work = "prepare('slow_to_load', workers=2); wait_long(1)"
+    work = "list(in_processes(wait_long, iter([b'', b'']), 2, load='slow_to_load'))"
     program = tmp_path / "program.py"
     program.write_text(PROGRAM.format(tests=str(HERE), work=work))
     with subprocess.Popen(
@@ -218,7 +180,7 @@ def test_a_server_that_is_still_loading_does_not_see_ctrl_c(tmp_path):
         text=True,
         start_new_session=True,
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
     ) as run:
         until = time.monotonic() + 20
         while not (tmp_path / "loading").exists() and time.monotonic() < until:
@@ -229,29 +191,9 @@ def test_a_server_that_is_still_loading_does_not_see_ctrl_c(tmp_path):
     assert (run.returncode, stderr) == (130, "interrupted\n")
 
 
-def test_who_is_told_to_end_while_it_starts_others_ends_after():
-    def end(*_):
-        raise SystemExit(1)
-
-    before, begun = signal.signal(signal.SIGTERM, end), []
-
-    def start():
-        with _no_interrupt_for_children():
-            signal.raise_signal(signal.SIGTERM)
-            begun.append("others")
-
-    try:
-        with pytest.raises(SystemExit):
-            start()
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert begun == ["others"]
-
-
-def test_begun_work_gives_the_same_and_can_be_given_up():
-    items = list(range(6))
-    assert list(begin_map(square, items, workers=2)) == list(begin_map(square, items)) == [k * k for k in items]
-    given_up = begin_map(square, items, workers=2)
+def test_a_map_that_is_given_up_ends_its_processes():
+    given_up = run_map(square, range(6), workers=2)
+    assert next(given_up) == 0
     given_up.close()
     for _ in range(100):
         if not multiprocessing.active_children():
@@ -260,80 +202,16 @@ def test_begun_work_gives_the_same_and_can_be_given_up():
     assert not multiprocessing.active_children()
 
 
-class PickledBy:
-    """Remembers which thread pickled it."""
-
-    def __getstate__(self):
-        return {"thread": threading.current_thread() is threading.main_thread()}
-
-
-def pickled_by_main(item):
-    return item.thread
-
-
-def test_items_are_pickled_before_the_caller_goes_on_to_change_them():
-    with closing(begin_map(pickled_by_main, [PickledBy() for _ in range(6)], workers=2)) as made:
-        assert list(made) == [True] * 6
-
-
-def test_work_beside_says_what_it_does_and_answers():
-    said = []
-    with closing(begin_beside(square_beside, 3, workers=2)) as beside:
-        assert beside.result(said.append) == 9
-    assert said == ["squaring 3", "done"]
-
-
-def test_work_beside_may_use_processes_and_leaves_one_to_who_began_it():
-    with closing(begin_beside(map_beside, 5, workers=2)) as beside:
-        own, used, spared = beside.result(print)
-    assert not {own, os.getpid()} & used
-    assert 1 <= len(used) <= 2
-    assert (spared, spare(2)) == (1, 2)
-
-
-def test_nothing_is_begun_beside_with_one_worker_or_by_a_worker():
-    assert begin_beside(square_beside, 3, workers=1) is None
-    assert list(run_map(nested_beside, range(2), workers=2)) == [True, True]
-
-
-def test_an_error_beside_comes_back_whole_and_a_bug_with_its_traceback():
-    said = []
-    with (
-        closing(begin_beside(fail_beside, 3, workers=2)) as beside,
-        pytest.raises(RequestError, match="three is wrong") as caught,
-    ):
-        beside.result(said.append)
-    assert (said, caught.value.mend) == (["failing"], "Use another.")
-    with closing(begin_beside(bug_beside, 3, workers=2)) as beside, pytest.raises(ZeroDivisionError) as caught:
-        beside.result(print)
-    assert "in bug_beside" in caught.value.__notes__[0]
-
-
-def test_a_death_beside_is_a_clear_error():
-    with (
-        closing(begin_beside(die_beside, 2, workers=2)) as beside,
-        pytest.raises(WorkerError, match=r"worker process died.*--workers 1"),
-    ):
-        beside.result(lambda text: None)
-
-
 @pytest.mark.skipif(START != "forkserver", reason="no server starts processes here")
 def test_a_death_of_the_server_that_starts_workers_is_a_clear_error(tmp_path):
     (tmp_path / "deadly_to_load.py").write_text("import os\nos._exit(1)\n")
-    for work in ("list(run_map(wait_long, range(4), workers=2))", "begin_beside(wait_beside, 4, workers=2)"):
-        (tmp_path / "program.py").write_text(
-            PROGRAM.format(tests=str(HERE), work=f"prepare('deadly_to_load', workers=2); {work}")
-        )
-        run = subprocess.run(
-            [sys.executable, tmp_path / "program.py"],
-            capture_output=True,
-            text=True,
-            check=False,
-            env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        )
-        assert "WorkerError: a worker process died before it had answered" in run.stderr
-
-
-def test_work_beside_that_is_given_up_ends():
-    begin_beside(wait_beside, 4, workers=2).close()
-    assert not multiprocessing.active_children()
+    work = "list(in_processes(wait_long, iter([b'', b'']), 2, load='deadly_to_load'))"
+    (tmp_path / "program.py").write_text(PROGRAM.format(tests=str(HERE), work=work))
+    run = subprocess.run(
+        [sys.executable, tmp_path / "program.py"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
+    )
+    assert "WorkerError: a worker process died before it had answered" in run.stderr

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
-from sealfit.engine import begin_map
+from sealfit.engine import run_map
 from sealfit.fit.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint import Model
 from sealfit.fit.rows import LEVELS, Rows, make_rows
@@ -81,34 +80,32 @@ def close_loop(
                 declared = fit_declared(part.every)
             start = Start(declared.model, declared.scatter)
         heldout = _HeldOut(rows, part, steady_samples(traces, part.rows), config, effects, workers)
-        with closing(heldout):
-            fine = part.rows if part.coarse is not part.rows else None
-            with timed("search", rows=part.coarse.force.size, of="bins, merged"):
-                grown = grow(
-                    part.coarse,
-                    heldout.samples,
-                    config,
-                    effects,
-                    fine=fine,
-                    start=None if part.whole else start,
-                    workers=workers,
-                    on_progress=say,
-                )
-            if not part.whole:
-                grown, on_all_strokes = reselect_on_all(grown, part.every, heldout.samples, config, say)
-            heldout.settle(grown)
-            say("before and after on all rows")
-            with timed("before and after", rows=rows.force.size, of="bins"):
-                before, after = _on_all(rows, grown)
-            if not part.whole and (more := missed_by_subsample(on_all_strokes, grown, config)):
-                say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
-                continue
-            say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
-            with timed("held out", rows=len(heldout.masks), of="folds"):
-                held_before, held_after = heldout.forces(grown, say)
-                ends = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
-                grown, ends = _no_worse(grown, ends, heldout, say)
-            break
+        fine = part.rows if part.coarse is not part.rows else None
+        with timed("search", rows=part.coarse.force.size, of="bins, merged"):
+            grown = grow(
+                part.coarse,
+                heldout.samples,
+                config,
+                effects,
+                fine=fine,
+                start=None if part.whole else start,
+                workers=workers,
+                on_progress=say,
+            )
+        if not part.whole:
+            grown, on_all_strokes = reselect_on_all(grown, part.every, heldout.samples, config, say)
+        say("before and after on all rows")
+        with timed("before and after", rows=rows.force.size, of="bins"):
+            before, after = _on_all(rows, grown)
+        if not part.whole and (more := missed_by_subsample(on_all_strokes, grown, config)):
+            say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
+            continue
+        say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
+        with timed("held out", rows=len(heldout.masks), of="folds"):
+            held_before, held_after = heldout.forces(grown, say)
+            ends = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
+            grown, ends = _no_worse(grown, ends, heldout, say)
+        break
     before, after, held_before, held_after = ends.before, ends.after, ends.held_before, ends.held_after
     drawn = _drawn_tables(grown, before, after, config)
     document = closure_document(grown, ends, heldout.level, config, effects)
@@ -160,7 +157,6 @@ class _HeldOut:
         self.config, self.effects, self.workers = config, effects, workers
         self.level = heldout_level(rows)
         self.masks = list(folds(rows, self.level, config.loop.folds, config.loop.seed))
-        self._begun: Generator | None = None
 
     @property
     def repeats(self) -> bool:
@@ -170,33 +166,21 @@ class _HeldOut:
         """
         return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
 
-    def close(self) -> None:
-        """End what is still being computed."""
-        if self._begun is not None:
-            self._begun.close()
-            self._begun = None
-
-    def settle(self, grown: Selection) -> None:
-        """Set processes to work on the folds where they repeat the search; where they do not, let the samples go.
-
-        They search for as many rounds as the whole campaign took to find its last effect. A fold has less to see by:
-        it would go on for many rounds after small effects that it refuses, one form after the other.
-        """
-        if grown.added and self.repeats:
-            rounds = max(a.round for a in grown.added)
-            self._begun = begin_map(_held_out, _Folds(self, grown.before, rounds), workers=self.workers)
-        else:
-            self.samples = self.samples.iloc[[]]  # much of the memory, and nothing is searched again
-
     def forces(self, grown: Selection, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
-        """Return each row's force, before and after, by fits that did not see its group; NaN if never held out."""
-        if self._begun is None:
+        """Return each row's force, before and after, by fits that did not see its group; NaN if never held out.
+
+        Where the search is repeated, a fold searches for as many rounds as the whole campaign took to find its last
+        effect. It has less to see by: it would go on for many rounds after small effects that it refuses.
+        """
+        if not (grown.added and self.repeats):
             before = self.refitted(grown.before)
             return before, self.refitted(grown.after) if grown.added else before
+        rounds = max(a.round for a in grown.added)
+        parts = run_map(_held_out, _Folds(self, grown.before, rounds), workers=self.workers)
         before, after = np.full(self.rows.force.size, np.nan), np.full(self.rows.force.size, np.nan)
-        for k, (out, parts) in enumerate(zip(self.masks, self._begun, strict=True)):
+        for k, (out, forces) in enumerate(zip(self.masks, parts, strict=True)):
             say(f"  fold {k + 1} of {len(self.masks)}")
-            before[out], after[out] = parts
+            before[out], after[out] = forces
         return before, after
 
     def refitted(self, fitted: Fitted) -> np.ndarray:

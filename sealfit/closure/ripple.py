@@ -8,7 +8,7 @@ Where each file has an origin of its own only the power is shared: it is held ag
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ import pandas as pd
 from scipy.special import betaincc, gammaincc
 
 from sealfit.closure.background import LOBE, alike, background, smooth_background, tops
-from sealfit.closure.spectrum import Spectrum, begin_spectra
+from sealfit.closure.spectrum import Spectrum, spectra_of
 
 SHARED = 1e-3  # p-value below which the phase is taken to be common to all files
 ABOVE_BACKGROUND = 4.0  # a peak's power over the median of its neighbours: a smooth trend has no peak
@@ -55,13 +55,8 @@ def find_ripple(
     workers : int
         Processes to use where there are many samples.
     """
-    return strongest(begin_spectra(samples, AXES, known, workers=workers), common_phase=common_phase)
-
-
-def strongest(spectra: Iterable[Spectrum], *, common_phase: bool) -> Peak | None:
-    """Return the strongest periodic component of the spectra along `AXES`, or None; arguments as `find_ripple`."""
     peaks, locked = [], []
-    for spectrum in spectra:
+    for spectrum in spectra_of(samples, AXES, known, workers=workers):
         if common_phase and spectrum.axis == "displacement_mm":
             peaks += _coherent(spectrum)
         elif spectrum.axis == "time_s":  # which counts from the start of every stroke: a wave may be locked to that

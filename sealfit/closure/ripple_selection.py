@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +10,7 @@ import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, confirmed
 from sealfit.closure.naming import propose_ripples
-from sealfit.closure.ripple import AXES, Peak, strongest
-from sealfit.closure.spectrum import Spectrum, begin_spectra
+from sealfit.closure.ripple import Peak, find_ripple
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.estimate import Fitted, fit
@@ -36,16 +35,18 @@ class Ripples:
     compare : bool
         Whether rivals of an accepted ripple are asked for the held-out data too.
     workers : int
-        Processes for the spectra of many samples: already at work until somebody asks what is found.
+        Processes for the spectra of many samples.
 
     Attributes
     ----------
     samples : DataFrame
         The samples with `residual_N`: the force less the ripples added so far.
-    added : list of Added
+    added : list of AcceptedEffect
         Those confirmed.
-    refused : list of Refused
+    refused : list of RefusedEffect
         Those significant but not confirmed.
+    found : Peak or None
+        The significant one that is not in the model yet and may still be.
     """
 
     def __init__(
@@ -62,17 +63,7 @@ class Ripples:
         self.added: list[AcceptedEffect] = []
         self.refused: list[RefusedEffect] = []
         self.samples = samples.assign(residual_N=samples["force_N"])
-        self._found: Peak | None = None
-        self._begun: Iterator[Spectrum] | None = self._begin()
-
-    @property
-    def found(self) -> Peak | None:
-        """The significant one that is not in the model yet and may still be."""
-        if self._begun is not None:
-            peak = strongest(self._begun, common_phase=self.config.position_origin == "rig")
-            self._found = peak if peak is not None and peak.p_value <= self.config.loop.family_error else None
-            self._begun = None
-        return self._found
+        self.found = self._find()
 
     def added_to(self, fitted: Fitted, fine: Rows | None) -> Fitted:
         """Return a fit with every ripple that is significant and holds on data it was not fitted to.
@@ -94,22 +85,24 @@ class Ripples:
                 own, proposals, self.samples, self.config, number, self.say, compare=self.compare, refused=self.refused
             )
             if accepted is None:
-                self._found = None
+                self.found = None
                 break
             self.added.append(accepted)
             found = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
             own = fit(found.model, own.rows, found.scatter, turns=2)
             self.samples = without_ripples(self.samples, own)
-            self._begun = self._begin(own.model)
+            self.found = self._find(own.model)
         if fine is None:
             return own
         if not self.added:
             return fitted
         return fit(_held(own.model), fitted.rows, own.scatter, turns=2)
 
-    def _begin(self, model: Model | None = None) -> Iterator[Spectrum]:
+    def _find(self, model: Model | None = None) -> Peak | None:
         known = [(t.channels[0], v["lambda_"]) for t, v in zip(model.terms, model.values, strict=True)] if model else []
-        return begin_spectra(self.samples, AXES, known, workers=self.workers)
+        common_phase = self.config.position_origin == "rig"
+        peak = find_ripple(self.samples, common_phase=common_phase, known=known, workers=self.workers)
+        return peak if peak is not None and peak.p_value <= self.config.loop.family_error else None
 
 
 def _held(model: Model) -> Model:

@@ -7,7 +7,6 @@ with the campaign. Workers may share the blocks: they are the same whoever sums 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass, fields
 from functools import lru_cache
 
@@ -18,7 +17,7 @@ from scipy.sparse import csr_array
 
 from sealfit.closure.background import LOBE
 from sealfit.closure.stroke_signals import Strokes
-from sealfit.engine import begin_map, spare
+from sealfit.engine import run_map
 
 MOST_NUMBERS = 1 << 19  # of the grids of a block: 4 MB
 WORTHWHILE = 400_000  # samples from which it takes longer to transform them than to start processes and send them
@@ -52,7 +51,7 @@ class Spectrum:
     taken: np.ndarray  # (f,) within a main lobe of a component already in the model
 
 
-def begin_spectra(
+def spectra_of(
     samples: pd.DataFrame, axes: Sequence[str], known: Sequence[tuple[str, float]] = (), *, workers: int = 1
 ) -> Iterator[Spectrum]:
     """Return the spectra along some axes, in their order, without those of which the samples show too little.
@@ -69,11 +68,11 @@ def begin_spectra(
     known : sequence of (axis, wavelength)
         Components already in the model.
     workers : int
-        Processes that transform many samples, already at work while the caller does something else.
+        Processes that transform many samples.
     """
     surveys = [survey for axis in axes if (survey := _survey(samples, axis)) is not None]
-    workers = spare(workers) if len(samples) >= WORTHWHILE else 1
-    made = begin_map(_sums_of, _Blocks(surveys), workers=workers, together=1)
+    workers = workers if len(samples) >= WORTHWHILE else 1
+    made = run_map(_sums_of, _Blocks(surveys), workers=workers, together=1)
     return _summed(surveys, made, known)
 
 
@@ -244,19 +243,18 @@ def _medians(values: np.ndarray, count: np.ndarray) -> np.ndarray:
 def _summed(
     surveys: Sequence[_Survey], made: Iterator[_Sums], known: Sequence[tuple[str, float]]
 ) -> Iterator[Spectrum]:
-    with closing(made):
-        for survey in surveys:
-            numbers, longest = survey.whole.numbers, survey.whole.longest
-            sums = next(made)
-            for _ in survey.blocks[1:]:
-                sums = sums + next(made)
-            frequency, count = numbers / longest, np.maximum(sums.count, 1)
-            taken = np.zeros(frequency.size, dtype=bool)
-            for axis, wavelength in known:
-                taken |= (axis == survey.axis) & (np.abs(frequency - 1 / wavelength) <= LOBE / longest)
-            common = tuple(
-                Common(way == 0, sums.total[way], sums.scaled[way], int(units), sums.amplitude[way] / count)
-                for way, units in enumerate(sums.units)
-            )
-            amplitude = np.sqrt(sums.square / count)
-            yield Spectrum(survey.axis, frequency, sums.count, sums.power / count, amplitude, common, taken)
+    for survey in surveys:
+        numbers, longest = survey.whole.numbers, survey.whole.longest
+        sums = next(made)
+        for _ in survey.blocks[1:]:
+            sums = sums + next(made)
+        frequency, count = numbers / longest, np.maximum(sums.count, 1)
+        taken = np.zeros(frequency.size, dtype=bool)
+        for axis, wavelength in known:
+            taken |= (axis == survey.axis) & (np.abs(frequency - 1 / wavelength) <= LOBE / longest)
+        common = tuple(
+            Common(way == 0, sums.total[way], sums.scaled[way], int(units), sums.amplitude[way] / count)
+            for way, units in enumerate(sums.units)
+        )
+        amplitude = np.sqrt(sums.square / count)
+        yield Spectrum(survey.axis, frequency, sums.count, sums.power / count, amplitude, common, taken)

@@ -12,7 +12,6 @@ import numpy as np
 from sealfit.fit.batch import DEPENDENT
 from sealfit.fit.moving import Moving, chosen, dot
 from sealfit.fit.moving_grid import BLOCK, TABLE, Grid, common, polish_best
-from sealfit.memory import keep_freed_memory
 
 STEP = np.log(10) / 4  # of ln b: ln(1 + t/b) changes over a decade of b
 
@@ -37,7 +36,6 @@ def search_law(days, value, weight, low, high) -> LawFound:
         Limits of ln b.
     """
     parts = [common(x) for x in (days, value, np.sqrt(weight), low[:, None], high[:, None])]
-    keep_freed_memory()
     found = LawFound(np.empty(len(value)), np.empty((2, len(value))), np.empty(len(value)))
     for start in range(0, len(value), BLOCK):
         rows = slice(start, start + BLOCK)

@@ -16,7 +16,6 @@ from sealfit.fit.batch import DEPENDENT
 from sealfit.fit.moving import Moving, chosen
 from sealfit.fit.moving_grid import BLOCK, ROUNDING, Grid, common, polish_best, polish_peaks
 from sealfit.fit.stribeck_columns import STEP, TINY, Weighted, weighted
-from sealfit.memory import keep_freed_memory
 
 MISSED = 1e-10  # of |F|^2: that far above what a grid point reaches, an optimum was dropped by mistake
 
@@ -187,7 +186,6 @@ def search(speed, load, force, weight, low, high, held) -> Found:
     """
     parts = [common(x) for x in (speed, load, force, np.sqrt(weight), low[:, None], high[:, None])]
     problems = len(force)
-    keep_freed_memory()
     found = Found(np.empty(problems), np.empty((3, problems)), np.empty(problems))
 
     def fill(rows, solve):

@@ -125,7 +125,6 @@ def _read_runs(campaign: Path, config: Config) -> tuple[Entries, Columns, list[F
         mend = suggestion("file", _cells(head, delimiter) if head else [])
         raise _stop("missing_column", "there is no such column.", mend, file=RUNS_CSV, line=1, column="file")
     lines, columns = _plain_table(text, names, delimiter, first) or _line_by_line(text, names, delimiter, faults)
-    pa.default_memory_pool().release_unused()  # 50 MB of a hundred thousand lines, beside processes that read traces
     if delimiter != ",":  # decimal commas are plain here: no cell of a table of ; or tabs can be split by them
         columns = {name: column.map(_decimal_point) for name, column in columns.items()}
     files = _posix_paths(campaign, columns.pop("file").cells())

@@ -26,7 +26,6 @@ from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.fingerprint import Fingerprint
 from sealfit.ingest.part import SAMPLED, Asked, read_part
-from sealfit.memory import keep_freed_memory
 from sealfit.staging import PARQUET, disk, file_size, sync
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
@@ -68,7 +67,6 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     OutError
         If the disk is full or refuses.
     """
-    keep_freed_memory()
     part = read_part(asked, campaign, config)
     marks = {found.file: found.mark for found in part.files}
     rows, count = [found.rows for found in part.files], [found.strokes for found in part.files]

@@ -34,11 +34,6 @@ def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config
         variance_levels(tables, config),
         residual_channels(tables, config),
         force_speed(tables, config),
+        *(make(tables, config) for make in (aging, master_curve, starts, traces_mean)),
     )
-    return {**{plot.name: plot for plot in plots if plot is not None}, **draw_fits(tables, config)}
-
-
-def draw_fits(tables: Mapping[str, pd.DataFrame], config: Config) -> dict[str, Plot]:
-    """Return the plots among them that show nothing of the closed loop."""
-    plots = (make(tables, config) for make in (aging, master_curve, starts, traces_mean))
     return {plot.name: plot for plot in plots if plot is not None}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
-from types import MappingProxyType
 
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
@@ -15,7 +14,7 @@ from sealfit.config import Config
 from sealfit.profiling import timed
 from sealfit.report import facts
 from sealfit.report.drawn import Drawn, data_uri, draw_plots
-from sealfit.report.figures import draw_all, draw_fits
+from sealfit.report.figures import draw_all
 from sealfit.report.figures_residual import MOST_CHANNELS
 from sealfit.report.law_tables import law_rows
 from sealfit.report.loop_tables import (
@@ -41,8 +40,6 @@ TABLES = (
 )  # fmt: skip
 FITS = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
 BEFORE = "{}_before"  # name of such a table without the loop's effects, beside that of the after-model
-OF_FITS = ("aging", "master_curve", "starts")  # figures that show them
-EMPTY: Mapping[str, Drawn] = MappingProxyType({})
 VERDICTS = {
     "closed": "Closed",
     "nothing_missing": "Nothing missing",
@@ -60,17 +57,11 @@ class Report:
     figures: dict[str, Drawn]
 
 
-def figures_of_fits(tables: Mapping[str, pd.DataFrame], config: Config) -> dict[str, Drawn]:
-    """Return the figures that show nothing of the closed loop, drawn; arguments as `build_report`."""
-    return draw_plots(draw_fits(facts.complete(tables, TABLES), config))
-
-
 def build_report(
     tables: Mapping[str, pd.DataFrame],
     closure: Mapping | None,
     provenance: Mapping,
     config: Config,
-    drawn: Mapping[str, Drawn] = EMPTY,
 ) -> Report:
     """Return the report of one campaign.
 
@@ -84,8 +75,6 @@ def build_report(
         provenance.json.
     config : Config
         Names the conditions and gives every quantity its true unit.
-    drawn : mapping of str to Drawn, optional
-        Figures that were drawn before.
 
     Returns
     -------
@@ -96,11 +85,8 @@ def build_report(
     if closure is not None:
         closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
     plots = draw_all(tables, closure, config)
-    if BEFORE.format("steady_fit") in tables:  # drawn without effects
-        drawn = {name: figure for name, figure in drawn.items() if name not in OF_FITS}
-    left = {name: plot for name, plot in plots.items() if name not in drawn}
-    with timed("plots", rows=len(left), of="plots"):
-        figures = {**draw_plots(left), **drawn}
+    with timed("plots", rows=len(plots), of="plots"):
+        figures = draw_plots(plots)
     images = {name: _images(plot, figures[name]) for name, plot in plots.items()}
     html = _environment().from_string(_text("template.html")).render(
         style=Markup(_text("style.css")), plots=images, **_content(tables, closure, provenance, config)

@@ -5,7 +5,7 @@ import pytest
 
 from sealfit.closure import spectrum
 from sealfit.closure.ripple import AXES
-from sealfit.closure.spectrum import begin_spectra
+from sealfit.closure.spectrum import spectra_of
 
 LENGTH_MM, A_N, PHASE = 2.5, 0.3, 0.8
 
@@ -34,7 +34,7 @@ def samples_of(strokes):
 
 
 def spectrum_along(samples, axis, known=()):
-    return next(begin_spectra(samples, [axis], known), None)
+    return next(spectra_of(samples, [axis], known), None)
 
 
 def many_strokes():
@@ -104,7 +104,7 @@ def test_spectra_of_two_workers_are_those_of_one(monkeypatch):
     monkeypatch.setattr(spectrum, "WORTHWHILE", 0)
     monkeypatch.setattr(spectrum, "MOST_NUMBERS", 3000)
     samples = samples_of(many_strokes())
-    one, two = (list(begin_spectra(samples, AXES, workers=workers)) for workers in (1, 2))
+    one, two = (list(spectra_of(samples, AXES, workers=workers)) for workers in (1, 2))
     assert [found.axis for found in one] == list(AXES)
     for left, right in zip(one, two, strict=True):
         for name in ("frequency", "count", "power", "amplitude", "taken"):
