@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import PARTLY, Added, Refused, covered, folds, heldout_level, varies_within
+from sealfit.closure.confirm import PARTLY, WEAK, Added, Refused, covered, folds, heldout_level, varies_within
 from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import Ends, closure_document, effect_table
 from sealfit.closure.forms import describe
@@ -302,11 +302,12 @@ def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], 
 
 
 def _around(added: Sequence[Added]) -> str | None:
-    """Return the coarsest level within whose groups the effects vary; None where one differs between specimens.
+    """Return the coarsest level within whose groups the effects vary.
 
-    What varies inside a run changes nothing that runs differ by, and that may be most of the error.
+    What varies inside a run changes nothing that runs differ by, and that may be most of the error. None where an
+    effect does not vary within groups, or where its evidence is weak: it must not raise the whole error.
     """
-    levels = [varies_within(a.proposal, PARTLY) for a in added]
+    levels = [None if a.proposal.p_value > WEAK else varies_within(a.proposal, PARTLY) for a in added]
     return None if None in levels else max(levels, key=LEVELS.index)
 
 
