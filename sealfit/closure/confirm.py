@@ -400,6 +400,11 @@ class Added:
     rivals_rmse_N: tuple[float, ...]
     round: int
 
+    @property
+    def weak(self) -> bool:
+        """Whether its evidence is weak."""
+        return self.proposal.p_value > WEAK
+
 
 @dataclass(frozen=True)
 class Refused:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import PARTLY, WEAK, Added, Refused, covered, folds, heldout_level, varies_within
+from sealfit.closure.confirm import PARTLY, Added, Refused, covered, folds, heldout_level, varies_within
 from sealfit.closure.curves import channel_table, curve_table, shape_table
 from sealfit.closure.document import Ends, closure_document, effect_table
 from sealfit.closure.forms import describe
@@ -285,7 +285,7 @@ def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], 
     where its evidence is weak, that these files cannot tell.
     """
     refused = []
-    while grown.added and not ends.gains(_around(grown.added)):
+    while grown.added and not ends.gains(_around(grown.added), weak=any(a.weak for a in grown.added)):
         last = grown.added[-1].proposal
         say(f"left out, as the error is no lower with it: {describe(last.term)}")
         reason = "with it the error is no lower, in sample or held out"
@@ -302,12 +302,11 @@ def _no_worse(grown: Grown, ends: Ends, heldout: _HeldOut, say: Callable[[str], 
 
 
 def _around(added: Sequence[Added]) -> str | None:
-    """Return the coarsest level within whose groups the effects vary.
+    """Return the coarsest level within whose groups the effects vary; None where one differs between specimens.
 
-    What varies inside a run changes nothing that runs differ by, and that may be most of the error. None where an
-    effect does not vary within groups, or where its evidence is weak: it must not raise the whole error.
+    What varies inside a run changes nothing that runs differ by, and that may be most of the error.
     """
-    levels = [None if a.proposal.p_value > WEAK else varies_within(a.proposal, PARTLY) for a in added]
+    levels = [varies_within(a.proposal, PARTLY) for a in added]
     return None if None in levels else max(levels, key=LEVELS.index)
 
 
