@@ -168,7 +168,7 @@ def close(bins: pd.DataFrame) -> Selection:
     """Return the end of the loop."""
     rows = make_rows(merged_bins(numbered(bins), CONFIG.loop.seed), has_aging=True)
     traces = bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(presliding_N=0.0, steady=True)
-    return grow(rows, steady_samples(traces, rows), CONFIG, EFFECTS, compare=False)
+    return grow(rows, steady_samples(traces, rows), CONFIG, EFFECTS)
 
 
 def outcome(grown: Selection, entry: dict, effect: np.ndarray) -> str:

@@ -400,6 +400,11 @@ class AcceptedEffect:
     rivals_rmse_N: tuple[float, ...]
     round: int
 
+    @property
+    def weak(self) -> bool:
+        """Whether its evidence is weak."""
+        return self.proposal.p_value > WEAK
+
 
 @dataclass(frozen=True)
 class RefusedEffect:
@@ -446,7 +451,7 @@ def confirmed(
         Told in words what is being done.
     compare : bool
         Whether its rivals are asked for the held-out data too.
-    refused : list of Refused
+    refused : list of RefusedEffect
         Grows by the best proposal where none is confirmed.
     """
     failed: list[RefusedEffect] = []

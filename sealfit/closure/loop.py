@@ -269,7 +269,7 @@ def _no_worse(
     where its evidence is weak, that these files cannot tell.
     """
     refused = []
-    while grown.added and not ends.gains(_around(grown.added)):
+    while grown.added and not ends.gains(_around(grown.added), weak=any(a.weak for a in grown.added)):
         last = grown.added[-1].proposal
         say(f"left out, as the error is no lower with it: {describe(last.term)}")
         reason = "with it the error is no lower, in sample or held out"

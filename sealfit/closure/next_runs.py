@@ -30,7 +30,7 @@ def next_runs(grown: Selection, config: Config, effects: Mapping[str, Effect]) -
 
     Parameters
     ----------
-    grown : Grown
+    grown : Selection
         The end of the loop.
     config : Config
         The rig.

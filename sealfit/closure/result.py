@@ -36,6 +36,9 @@ SAME_ERROR = 1.005
 HARMLESS = 1.1
 """Ratio of errors up to which an effect inside runs may move what runs differ by, where that is most of the error."""
 
+HALVED = 0.5
+"""Ratio of held-out errors below which an effect of weak evidence is sure enough to move what runs differ by."""
+
 LACK_OF_FIT = 0.05
 """P-value of the lack of fit from which the error is called larger than the scatter of repeats."""
 
@@ -62,24 +65,31 @@ class BeforeAfter:
             return None
         return float(np.sqrt(weight @ (rows.force - held)[chosen] ** 2 / weight.sum()))
 
-    def gains(self, around: str | None) -> bool:
+    def gains(self, around: str | None, *, weak: bool) -> bool:
         """Whether after has no higher errors than before, in sample and held out.
 
-        Where a level is named, the errors about the means of its groups are no higher, and the whole ones not by much.
+        Where a level is named, the errors about the means of its groups are no higher, and the whole ones not by much:
+        `HARMLESS`. That needs evidence that is not weak, or a held-out error about these means that is halved.
         """
-        return self._largest_ratio(around) <= SAME_ERROR and (around is None or self._largest_ratio(None) <= HARMLESS)
+        whole = max(self._ratios(None))
+        if around is None:
+            return whole <= SAME_ERROR
+        inside = self._ratios(around)
+        sure = not weak or inside[1] < HALVED
+        return max(inside) <= SAME_ERROR and whole <= (HARMLESS if sure else SAME_ERROR)
 
-    def _largest_ratio(self, around: str | None) -> float:
-        """Return after's error over before's, in sample or held out, whichever is larger."""
+    def _ratios(self, around: str | None) -> tuple[float, float]:
+        """Return after's error over before's, in sample and held out; 1 for the second where nothing was held out."""
         rows, weight = self.before.rows, self.before.rows.weight
         inside = [weight @ about_means(f.residual, rows, around) ** 2 for f in (self.before, self.after)]
-        squares = [inside]
         known = np.isfinite(self.held_before) & np.isfinite(self.held_after) & self.covered
+        held = [1.0, 1.0]
         if known.any():
             test = rows.subset(known)
             left = [about_means(test.force - h[known], test, around) for h in (self.held_before, self.held_after)]
-            squares.append([test.weight @ own**2 for own in left])
-        return float(np.sqrt(max(after / max(before, 1e-300) for before, after in squares)))
+            held = [test.weight @ own**2 for own in left]
+        in_sample, held_out = (float(np.sqrt(after / max(before, 1e-300))) for before, after in (inside, held))
+        return in_sample, held_out
 
 
 def closure_document(

@@ -3,7 +3,8 @@
 The effect is a factor on mu, linear in the variable at one of the levels at which it varies, or an offset force for the
 direction. It is put into the residual, the scatter is estimated anew, as part of the effect is taken for scatter, and
 the search's own tests are asked: the size is sought that exceeds the critical value of the whole search with 80 %
-chance (noncentral F). What follows the search (naming, held-out data) is not asked, but for the least size that counts.
+chance (noncentral F). Of what follows the search the least size that counts is asked, and that weak evidence must lower
+the held-out error; naming is not.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri
 
 from sealfit.closure.channels import Channel, scatter_level
-from sealfit.closure.confirm import LEAST_SIZE
+from sealfit.closure.confirm import LEAST_FALL, LEAST_SIZE, WEAK, about_means
 from sealfit.closure.contrasts import (
     LARGE,
     LEAST_UNITS,
@@ -81,7 +82,7 @@ def sensitivity(grown: Selection, alpha: float) -> list[dict]:
 
     Parameters
     ----------
-    grown : Grown
+    grown : Selection
         The end of the loop, with the candidates of its last search.
     alpha : float
         Family-wise level of the search.
@@ -108,6 +109,7 @@ def sensitivity(grown: Selection, alpha: float) -> list[dict]:
                 effect = part * fitted.slope(*target)
                 effect *= force / np.sqrt(rows.weight @ effect**2)
                 times = search.smallest(own[0], effect)
+                times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
                 smallest = force * float(max(times, SHOWN * LEAST_SIZE)) if times < 1 else None
             if smallest is None:
                 units = rows.groups.starts[scatter_level([channel], rows)].size
@@ -131,6 +133,19 @@ def sensitivity(grown: Selection, alpha: float) -> list[dict]:
         unknown = {"variable": SPECIMEN, "level": "condition", "acts_on": "mu", "smallest_N": None}
         entries.append({**unknown, "smallest_pct": None, "files_needed": needed})
     return entries
+
+
+def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
+    """Return by how much an effect at a level, shape (n,), must be multiplied to lower the error as weak evidence must.
+
+    Only what the declared model does not take up of it lowers the error; both are taken about the means of the groups
+    inside which the effect varies.
+    """
+    rows = fitted.rows
+    around = dict(zip(LEVEL_NAMES, (*LEVELS, None), strict=True))[level]
+    own = project(fitted, effect[:, None])[:, 0] / fitted.whitening.unit
+    size, left = (float(np.sqrt(rows.weight @ about_means(x, rows, around) ** 2)) for x in (own, fitted.residual))
+    return SHOWN * left * float(np.sqrt(1 / (1 - LEAST_FALL) ** 2 - 1)) / size if size > 0 else np.inf
 
 
 def _parts(grown: Selection, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
@@ -193,6 +208,16 @@ class _Search:
             self.units[known.level] = ClusterTests(self.fitted, known.level)
         columns = candidate.columns * self.fitted.slope(*target)[:, None]
         return self.units[known.level].test(project(self.fitted, columns), target)
+
+    def surer(self, times: float, candidate: Candidate) -> float:
+        """Return by how much an effect found with `POWER` must be multiplied to be strong evidence; infinite for few.
+
+        The p-value of few units falls too slowly for that.
+        """
+        if candidate.test_result.units < JACKKNIFE_UNITS:
+            return np.inf
+        found, strong = (-ndtri(p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK))
+        return times * float((strong + ndtri(POWER)) / (found + ndtri(POWER)))
 
     def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
         """Return by how much an effect, shape (n,), must be multiplied to be found with `POWER`; infinite for never."""
@@ -340,7 +365,7 @@ def cannot_tell(grown: Selection, entries: Sequence[dict], scatter: Sequence[dic
 
     Parameters
     ----------
-    grown : Grown
+    grown : Selection
         The end of the loop.
     entries : sequence of dict
         As `sensitivity` gives them.

@@ -159,7 +159,7 @@ def reselect_on_all(
 
     Parameters
     ----------
-    grown : Grown
+    grown : Selection
         What the search of a part came to.
     every : Rows
         The campaign, merged along the strokes.
@@ -261,7 +261,7 @@ def missed_by_subsample(fitted: Fitted, grown: Selection, config: Config) -> str
     ----------
     fitted : Fitted
         The final model, fitted to all strokes.
-    grown : Grown
+    grown : Selection
         What the search of a part came to.
     config : Config
         Levels of error, channels.

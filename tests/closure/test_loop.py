@@ -184,11 +184,13 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     run = np.random.default_rng(0).normal(0, 3, rows.groups.starts["run"].size)[rows.codes("run")]
     wave = np.sin(rows.values("displacement_mm"))
 
-    def ends(rise):
-        return BeforeAfter(
-            fitted, fitted, rows.force - run - wave, rows.force - rise * run, np.ones(run.size, dtype=bool)
-        )
+    def ends(rise, left=0.0):
+        held = rows.force - run - wave, rows.force - rise * run - left * wave
+        return BeforeAfter(fitted, fitted, *held, np.ones(run.size, dtype=bool))
 
-    assert not ends(1.1).gains(None)
-    assert ends(1.1).gains("stroke")
-    assert not ends(1.2).gains("stroke")
+    assert not ends(1.1).gains(None, weak=False)
+    assert ends(1.1).gains("stroke", weak=False)
+    assert not ends(1.2).gains("stroke", weak=False)
+    assert ends(1.1).gains("stroke", weak=True)
+    assert ends(1.1, left=0.8).gains("stroke", weak=False)
+    assert not ends(1.1, left=0.8).gains("stroke", weak=True)
