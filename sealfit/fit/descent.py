@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from sealfit.fit.joint import Model, evaluate, friction_of
 from sealfit.fit.prior import centre_of, precision_of
@@ -14,7 +13,6 @@ from sealfit.fit.whitening import Scatter, Whitening
 
 MAX_STEPS = 60
 GRID = 12  # points of log v_s and log b tried when an effect has come in
-ALONE = 0.5  # share of the rows beyond which those of one series are not looked at by themselves
 ROWS_FOR_START = 4  # of each stroke: v_s acts on a stroke as a whole
 CREEPING = 1e-2  # several such steps in a row go along a valley in which the data hold nothing
 SETTLED = 1e-4  # of the whitened sum of squares: the estimates then lie within a hundredth of a standard error
@@ -95,7 +93,7 @@ def search_nonlinear(model: Model, rows: Rows, scatter: Scatter) -> Model:
     if stribeck:
         model = _best_on_grid(model, rows, whitening, stribeck)
     for number in stribeck if len(stribeck) > 1 else ():
-        model = _best_alone(model, rows, scatter, whitening, number)
+        model = _best_on_grid(model, rows, whitening, [number])
     laws = [k for k, name in enumerate(quantities) if name in ("b_s", "b_c")]
     return _best_on_grid(model, rows, whitening, laws) if laws else model
 
@@ -112,55 +110,6 @@ def _best_on_grid(model: Model, rows: Rows, whitening: Whitening, group: list[in
         if cost < best - 1e-9:
             best, chosen = cost, solved
     return model.at(np.clip(chosen.vector(), low, high))
-
-
-def _best_alone(model: Model, rows: Rows, scatter: Scatter, whitening: Whitening, number: int) -> Model:
-    """Return the model with one series' v_s at the best of a few values, by the rows of that series alone.
-
-    What the other rows say of the linear numbers is summed up once, and the numbers that this series does not have are
-    solved for in it: the cost of all series together is that of one pass over the rows.
-    """
-    part = _rows_of(model, rows, number)
-    if part.force.size == 0:  # held out, all of them
-        return model
-    if part.force.size > ALONE * rows.force.size:
-        return _best_on_grid(model, rows, whitening, [number])
-    low, high = bounds_of(model, rows)
-    linear, prior = ~model.bent, _linear_prior(model)
-    whole = _sums(model, rows, whitening, linear)
-    best, chosen = _solved(model, whole, *prior)
-    away = model.vector()[linear] - prior[1]
-    normal, pull = whole.normal + prior[0], whole.gradient - prior[0] @ away
-    used = np.concatenate([index[np.unique(part.condition)] for index in model.declared.index.values()])
-    own = np.arange(model.size) >= model.theta.size  # effects are everybody's
-    own[used[used >= 0]] = True
-    inner, white = own[linear], Whitening(scatter, part.force, part.groups)
-    cross = normal[inner][:, ~inner]
-    by_others, *_ = np.linalg.lstsq(normal[~inner][:, ~inner], np.c_[cross.T, pull[~inner]], rcond=1e-10)
-    here = _sums(model, part, white, own & linear)
-    normal = normal[inner][:, inner] - cross @ by_others[:, :-1] - here.normal
-    others, pull = pull[~inner] @ by_others[:, -1], pull[inner] - cross @ by_others[:, -1] - here.gradient
-    square = whole.square - here.square + away @ prior[0] @ away - others
-    vector, tried, costs = model.vector(), np.linspace(low[number], high[number], GRID), []
-    for vector[number] in tried:
-        now = _sums(model.at(vector), part, white, own & linear)
-        step, *_ = np.linalg.lstsq(normal + now.normal, pull + now.gradient, rcond=1e-10)
-        costs.append(square + now.square - step @ (pull + now.gradient))
-    if min(costs) < best - 1e-9:
-        vector[number] = tried[np.argmin(costs)]
-        chosen = _linear_solved(model.at(vector), *prior, rows, whitening)[1]
-    return model.at(np.clip(chosen.vector(), low, high))
-
-
-def _rows_of(model: Model, rows: Rows, number: int) -> Rows:
-    """Return the rows of all specimens that a declared number moves."""
-    key = ("of", number)
-    if key not in rows.cache or rows.cache[key][0] is not model.declared:
-        moved = np.any([index == number for index in model.declared.index.values()], axis=0)[rows.condition]
-        specimen = rows.codes("specimen")
-        touched = np.bincount(specimen, moved) > 0
-        rows.cache[key] = (model.declared, rows.subset(touched[specimen]))
-    return rows.cache[key][1]
 
 
 def linear_solved(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
@@ -183,34 +132,35 @@ def _linear_prior(model: Model) -> tuple[np.ndarray, np.ndarray]:
 def _linear_solved(
     model: Model, precision: np.ndarray, centre: np.ndarray, rows: Rows, whitening: Whitening
 ) -> tuple[float, Model]:
-    """Return the whitened sum of squares left by, and the model with, its linear numbers solved for at once."""
-    return _solved(model, _sums(model, rows, whitening, ~model.bent), precision, centre)
+    """Return the whitened sum of squares left, and the model, its linear numbers solved for at once in their bounds.
 
-
-class _Sums(NamedTuple):
-    """What rows say of some numbers: all that least squares needs of them."""
-
-    normal: np.ndarray  # (k, k)
-    gradient: np.ndarray  # (k,)
-    square: float  # of the whitened residual
-
-
-def _sums(model: Model, rows: Rows, whitening: Whitening, chosen: np.ndarray) -> _Sums:
-    """Return the sums over rows for the numbers chosen by a mask, shape (model.size,)."""
+    Without the bounds, a v_s far off can seem the best, with a negative friction that the fit cannot have.
+    """
     force, jacobian = evaluate(model, rows)
     residual = whitening((rows.force - force)[:, None])[:, 0]
-    return _Sums(*whitening.normal(jacobian.columns(chosen), residual), float(residual @ residual))
-
-
-def _solved(model: Model, sums: _Sums, precision: np.ndarray, centre: np.ndarray) -> tuple[float, Model]:
-    """Return what sums over all rows leave, and the model, its linear numbers solved for at once."""
     linear = ~model.bent  # one step far from the optimum would throw the others anywhere
+    normal, gradient = whitening.normal(jacobian.columns(linear), residual)
     vector = model.vector()
     away = vector[linear] - centre
-    gradient = sums.gradient - precision @ away
-    step, *_ = np.linalg.lstsq(sums.normal + precision, gradient, rcond=1e-10)
+    normal, gradient = normal + precision, gradient - precision @ away
+    low, high = (bound[linear] - vector[linear] for bound in bounds_of(model, rows))
+    step = least_squares_within(normal, gradient, low, high)
     vector[linear] += step
-    return float(sums.square + away @ precision @ away - step @ gradient), model.at(vector)
+    left = residual @ residual + away @ precision @ away - 2 * step @ gradient + step @ normal @ step
+    return float(left), model.at(vector)
+
+
+def least_squares_within(normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the x between bounds that minimises x' normal x / 2 - gradient' x, shape (k,)."""
+    step, *_ = np.linalg.lstsq(normal, gradient, rcond=1e-10)
+    if np.all((step >= low) & (step <= high)):
+        return step
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    size, axes = np.linalg.eigh(normal * np.outer(scale, scale))
+    kept = size > 1e-10 * size[-1]
+    root, axes = np.sqrt(size[kept]), axes[:, kept]
+    inside = lsq_linear(root[:, None] * axes.T, (axes.T @ (gradient * scale)) / root, (low / scale, high / scale))
+    return inside.x * scale
 
 
 def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:

@@ -1,13 +1,14 @@
-"""v_s of one series at a time, by its own rows and sums over the others, against all rows at every value."""
+"""The search for v_s and b after an effect has come in, and the linear fit within bounds under it."""
 
 import bins_helpers
 import numpy as np
 import numpy.testing as npt
 import pytest
+from scipy.optimize import lsq_linear
 
 from sealfit.effects import EFFECTS
-from sealfit.fit import descent
-from sealfit.fit.descent import search_nonlinear
+from sealfit.fit.descent import ROWS_FOR_START, bounds_of, least_squares_within, linear_solved, search_nonlinear
+from sealfit.fit.estimate import fitted_at
 from sealfit.fit.rows import make_rows
 from sealfit.fit.start import start_model
 from sealfit.fit.terms import Term
@@ -35,24 +36,43 @@ def astray(one_specimen: bool, aging: bool):
 
 @pytest.mark.parametrize("one_specimen", [False, True])
 @pytest.mark.parametrize("aging", [True, False])
-def test_series_by_themselves_are_found_as_on_all_rows(monkeypatch, one_specimen, aging):
+def test_series_that_lost_their_stribeck_speed_find_it(one_specimen, aging):
     model, rows, curved = astray(one_specimen, aging)
     found = search_nonlinear(model, rows, SCATTER)
-    monkeypatch.setattr(descent, "ALONE", 0.0)
-    whole = search_nonlinear(model, rows, SCATTER)
-    npt.assert_allclose(found.vector(), whole.vector(), rtol=1e-6, atol=1e-9)
     assert np.abs(found.vector()[curved] - model.vector()[curved]).max() > 0.3
     npt.assert_allclose(np.exp(found.vector()[curved]), bins_helpers.TRUE["v_s"], rtol=0.4)  # a grid of twelve
 
 
-def test_few_rows_are_looked_at_for_one_series(monkeypatch):
-    model, rows, curved = astray(one_specimen=False, aging=True)
-    seen = []
-    sums = descent._sums
-    monkeypatch.setattr(descent, "_sums", lambda m, r, *more: seen.append(r.force.size) or sums(m, r, *more))
-    search_nonlinear(model, rows, SCATTER)
-    # Three passes over all rows for each series, 13 each for all series together and for b; the rest on its own rows.
-    assert sum(size == rows.sparse(descent.ROWS_FOR_START).force.size for size in seen) <= 3 * curved.size + 2 * 13
+@pytest.mark.parametrize("gain", [0.0, 1e-5, 3e-4])
+@pytest.mark.parametrize("noise", [0.005, 0.1])
+def test_a_search_never_ends_worse_than_it_began(gain, noise):
+    """With a gain for each file, a v_s far off would fit best with a negative friction."""
+    model, rows, _ = astray(one_specimen=False, aging=False)
+    rows = rows.sparse(ROWS_FOR_START)
+    scatter = Scatter(noise, 0.0, (Component("file", "gain", gain),))
+    begun = linear_solved(model, rows, scatter, rows.force)
+    found = search_nonlinear(model, rows, scatter)
+    low, high = bounds_of(found, rows)
+    assert np.all((found.vector() >= low) & (found.vector() <= high))
+    before, after = (fitted_at(m, rows, scatter, rows.force).deviance for m in (begun, found))
+    assert after <= before
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_least_squares_within_bounds(seed):
+    rng = np.random.default_rng(seed)
+    columns, force = rng.normal(size=(30, 4)), rng.normal(size=30)
+    low, high = -rng.uniform(0.0, 0.2, 4), rng.uniform(0.0, 0.2, 4)
+    found = least_squares_within(columns.T @ columns, columns.T @ force, low, high)
+    npt.assert_allclose(found, lsq_linear(columns, force, (low, high), tol=1e-14).x, atol=1e-6)
+
+
+def test_least_squares_within_bounds_of_columns_that_are_alike():
+    column = np.linspace(1.0, 2.0, 9)[:, None]
+    both = np.hstack([column, column])
+    found = least_squares_within(both.T @ both, both.T @ column[:, 0], np.array([-1.0, -1.0]), np.array([0.3, 2.0]))
+    npt.assert_allclose(found.sum(), 1.0, rtol=1e-6)
+    assert found[0] <= 0.3
 
 
 def test_series_are_searched_though_every_row_of_one_is_held_out():
