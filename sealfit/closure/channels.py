@@ -104,6 +104,8 @@ def find_channels(
             values = settings(level_values(values, rows))
         elif not 2 <= np.unique(values).size <= MOST_LEVELS:
             continue
+        if name == "stroke" and "direction" not in skip and _out_and_back(values, rows):
+            continue
         unit = unit_of(values, rows)
         channel = Channel(name, values, unit)
         if not channel.numeric and _is_grouping(channel, rows):
@@ -189,6 +191,12 @@ def flip_level(unit: str, rows: Rows) -> str:
     if rows.groups.starts["run"].size >= MANY_UNITS:
         return "run"
     return "file" if rows.groups.starts["file"].size >= LEAST_UNITS or unit == "file" else "stroke"
+
+
+def _out_and_back(stroke: np.ndarray, rows: Rows) -> bool:
+    """Whether every stroke of one number goes one way and those of the other the other way: the direction says it."""
+    pairs = np.unique(np.column_stack([stroke, np.sign(rows.speed)]), axis=0)
+    return len(pairs) == 2 and bool((np.ptp(pairs, axis=0) > 0).all())
 
 
 def _is_grouping(channel: Channel, rows: Rows) -> bool:

@@ -41,6 +41,17 @@ def test_a_serial_number_is_a_grouping_and_not_a_channel():
     assert "run_order" in names
 
 
+def test_strokes_out_and_back_are_told_by_the_direction():
+    bins = make_bins(repeats=1, bins=4, directions=(1, -1))
+    bins["stroke"] = np.where(bins["direction"] > 0, 1, 2)
+    names = {c.name for c in find_channels(make_rows(bins, has_aging=True))}
+    assert "direction" in names
+    assert "stroke" not in names
+    assert "stroke" in {c.name for c in find_channels(make_rows(bins, has_aging=True), ["direction"])}
+    bins["stroke"] += 2 * (bins["repeat"] > 0) * (bins.groupby(["run_id", "direction"]).cumcount() > 1)
+    assert "stroke" in {c.name for c in find_channels(make_rows(bins, has_aging=True))}
+
+
 def test_contrasts_inside_files_are_judged_between_runs_where_there_are_twenty():
     rows = rows_of(repeats=2, bins=4)
     assert flip_level("sample", rows) == "run"
