@@ -11,7 +11,7 @@ from worlds.main import read
 from worlds.motion import batches, force_at, integrate
 from worlds.parameters import aged_series, laws_inside
 from worlds.priors import PRIORS
-from worlds.run import read_closure, true_effects
+from worlds.run import copies, read_closure, true_effects
 from worlds.score import NONE, RIGHT, SAME_AT_DESIGN, Target, explained_by, grade, named_rightly, on_variables, scored
 from worlds.summary import alarmed, summarise
 from worlds.true_form import make_rows, z_values
@@ -166,6 +166,8 @@ def test_grades_and_names():
     assert grade(RIPPLE, claim(), 0.0) == RIGHT
     assert grade(RIPPLE, claim(level="run"), 0.0) == NONE
     assert grade(RIPPLE, claim(channels=("time_s",)), 0.99) == SAME_AT_DESIGN
+    by_power = Target(("distance_mm", "speed_mm_s"), (), ("trace",), ("warming_conduction", "warming_power"), False)
+    assert grade(by_power, claim("warming_power", ("time_s", "speed_mm_s", "load_N")), 0.0) == RIGHT
     listed = [{"id": "ripple", "channels": ["displacement_mm"], "acts_on": "force"}]
     assert grade(RIPPLE, claim(channels=("time_s",), alternatives=listed), 0.0) == SAME_AT_DESIGN
     assert named_rightly(RIPPLE, claim())
@@ -179,6 +181,12 @@ def test_a_claim_stands_for_one_effect_and_the_rest_is_extra():
     assert result["effects"][0]["grade"] == RIGHT
     assert (result["extra"], result["extra_on_true_variable"]) == (2, 1)
     assert scored([], [claim()], np.zeros((0, 1)))["extra"] == 1
+
+
+def test_channels_that_order_the_rows_alike_are_one():
+    hours = np.array([0.1, 0.5, 3.0, 9.0])
+    table = pd.DataFrame({"elapsed_h": hours, "run_order": [1, 2, 3, 4], "oil_ppm": [3.0, 1.0, 2.0, 4.0]})
+    assert copies(table, {"elapsed_h"}, {"run_order", "oil_ppm", "batch"}) == {"run_order": "elapsed_h"}
 
 
 def test_a_copy_of_the_variable_explains_an_effect_and_noise_does_not():

@@ -24,6 +24,7 @@ from worlds.world import World, draw_world
 
 LOOK_EVERY_S = 0.2
 LEAST_SHARE = 0.01  # of an effect beside the declared quantities: of less, nothing can be said to be the same
+SAME_ORDER = 0.999  # rank correlation of channels that are one variable, as run_order and elapsed_h
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 POWER = "power"  # sealfit's derived channel: load times speed
 
@@ -151,6 +152,7 @@ def targets(effects: list[dict], rows: Rows) -> list[Target]:
     """Return what each effect must be found as; with a place, the level of the variables alone is right, too."""
     units, found = codes(rows), []
     order = list(CLAIM_LEVEL)
+    both_ways = bool(rows.table.groupby("file")["direction"].nunique().max() > 1)
     for e in effects:
         names = [n for n in e["variables"] if n in rows.table]
         alone = [unit_of(_set(rows, n), units) for n in names]
@@ -158,6 +160,8 @@ def targets(effects: list[dict], rows: Rows) -> list[Target]:
         if not names:  # a plain change in one place: wherever that place is known
             levels |= {CLAIM_LEVEL[unit_of(_set(rows, n), units)] for n in e["place"]}
         added = (e["acts_on"], e["operation"]) == ("force", "add")
+        if both_ways and (added or "direction" in e["variables"]):
+            levels.add("stroke")  # it shows between the strokes of a file
         found.append(Target(e["variables"], e["place"], sorted(levels), e["names"], added))
     return found
 
@@ -184,7 +188,10 @@ def read_closure(world: World, rows: Rows, closure: dict, effects: list[dict]) -
                 scale = np.column_stack([root, root * rows.table["mean"]])
                 explained[j, k] = explained_by(values, rows.columns[:, place] * root, others, scale)
     aims = targets(effects, rows)
-    result = scored(aims, claims, explained)
+    same = copies(
+        table, {n for t in aims for n in (*t.variables, *t.place)}, {n for c in claims for n in c["channels"]}
+    )
+    result = scored(aims, [c | {"channels": [same.get(n, n) for n in c["channels"]]} for c in claims], explained)
     slim = ("id", "channels", "level", "acts_on", "operation", "named", "p_value", "heldout_gain_N", "candidate")
     stated = closure.get("sensitivity")
     merged = []
@@ -199,6 +206,13 @@ def read_closure(world: World, rows: Rows, closure: dict, effects: list[dict]) -
         "floor": closure["noise_floor_N"], "left": closure["left"], "fit_quality": closure.get("fit_quality"),
         "refused": closure.get("refused"), "has_sensitivity": stated is not None,
     }  # fmt: skip
+
+
+def copies(table: pd.DataFrame, true: set[str], claimed: set[str]) -> dict[str, str]:
+    """Return for claimed channels that order the rows as a true variable does (the calendar's do) that variable."""
+    numeric = [n for n in sorted(true) if n in table and table[n].dtype.kind in "fi"]
+    others = [n for n in sorted(claimed - true) if n in table and table[n].dtype.kind in "fi"]
+    return {o: n for n in numeric for o in others if abs(table[n].corr(table[o], method="spearman")) > SAME_ORDER}
 
 
 def _names(variable) -> list[str]:

@@ -3,7 +3,8 @@
 An effect is found where a claim that is no candidate
 
 - stands on the effect's variables, with or without the channels that say where it sits (the direction is free for an
-  added force), at the effect's level; or
+  added force), or is its mechanism of several variables, at the
+  effect's level; or
 - cannot be told from it with these files: the claim lists the effect's variables among its `alternatives`, or a
   smooth function of the claim's channels explains 96 % (correlation 0.98) of what the effect adds beyond the declared
   quantities.
@@ -74,7 +75,9 @@ def on_variables(target: Target, channels: Sequence[str]) -> bool:
 
 def grade(target: Target, claim: Mapping, explained: float) -> int:
     """Return RIGHT, SAME_AT_DESIGN or NONE; `explained`: correlation of a smooth function of the claim's channels."""
-    if on_variables(target, claim["channels"]) and claim["level"] in target.levels:
+    several = len(claim["channels"]) > 1  # then the mechanism's variables are fixed: power is v x load, at a time
+    own_mechanism = several and claim["id"] in target.names and claim["id"] not in CLOSED_FORMS
+    if (own_mechanism or on_variables(target, claim["channels"])) and claim["level"] in target.levels:
         return RIGHT
     listed = any(on_variables(target, a["channels"]) for a in claim.get("alternatives") or ())
     return SAME_AT_DESIGN if listed or explained >= SAME else NONE
