@@ -3,8 +3,7 @@
 An effect is found where a claim that is no candidate
 
 - stands on the effect's variables, with or without the channels that say where it sits (the direction is free for an
-  added force), or is its mechanism of several variables, at the
-  effect's level; or
+  added force), or is its mechanism of several variables, at the effect's level; or
 - cannot be told from it with these files: the claim lists the effect's variables among its `alternatives`, or a
   smooth function of the claim's channels explains 96 % (correlation 0.98) of what the effect adds beyond the declared
   quantities.

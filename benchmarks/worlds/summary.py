@@ -9,6 +9,7 @@ import numpy as np
 from counts import bounds
 
 NEAR_STATED = (0.8, 1.25)  # of the size that `sensitivity` states: an effect of about that size
+BY_SPECIMENS = 4.0  # z counted by specimens above which an effect passes some 80 tests at 0.005 together
 WORSE = 1.05  # error after over error before above which prediction was made worse
 
 
@@ -95,6 +96,7 @@ def summarise(records: list[dict]) -> str:
 def figures(records: list[dict], fine: list[dict]) -> str:
     """Return the table of figures over all worlds."""
     nulls, clear = [r for r in fine if is_null(r)], clear_effects(fine)
+    by_specimens = [e for e in clear if abs(e.get("z_specimens", 0.0)) >= BY_SPECIMENS]
     before, true_form = ratios(fine, "before"), ratios(fine, "true_form")
     pooled = sum(r.get("inside", 0) for r in fine), sum(r.get("with_interval", 0) for r in fine)
     noted = [r["of_tested_specimens"] for r in fine if r.get("of_tested_specimens")]
@@ -113,6 +115,10 @@ def figures(records: list[dict], fine: list[dict]) -> str:
         ("worlds with an effect beyond the true ones", share(sum(r["extra"] > 0 for r in fine), len(fine))),
         ("... on a variable of a true effect", share(sum(r["extra_on_true_variable"] > 0 for r in fine), len(fine))),
         ("clear effects found", share(sum(e["grade"] > 0 for e in clear), len(clear))),
+        (
+            f"... of those with z by specimens >= {BY_SPECIMENS:g}",
+            share(sum(e["grade"] > 0 for e in by_specimens), len(by_specimens)),
+        ),
         ("... and named or honestly unnamed", share(sum(e["named_rightly"] for e in clear), len(clear))),
         ("predict: error after above before by more than 5 %", share(int((before > WORSE).sum()), before.size)),
         ("predict: after over the true form, median, 95th percentile", _quantiles(true_form)),

@@ -12,6 +12,9 @@ effect inside files runs where there are twelve, else files. The t value has as 
 beyond the rank of their means, and is given as the normal z of the same p, at the true amplitude and at the measured
 one; the smaller counts. So z is conservative: what demeaning takes away is not used.
 
+z by specimens: the same with specimens as the clusters, and one degree of freedom less than specimens. Nobody who does
+not know whether specimens differ in their slope along a channel can claim more from them than this.
+
 The true form's error at new points: d of the same generalised least squares, and the derivatives at the points.
 """
 
@@ -230,14 +233,22 @@ def _z(rows: Rows, units: dict, unit: str, place: int, world: World) -> dict:
         inner = means.T @ means
         lost = 1 + float(np.trace(np.linalg.solve(inner + prior, inner)))
         lost += 0 if absorbed is None else int(units[absorbed].max())
-    df = count - lost
-    if df < 1 or power <= 1e-9 * whole:
-        return {"z": 0.0, "z_expected": 0.0, "share": power / max(whole, 1e-300), "clusters": count, "df": df}
+    found = {"share": power / max(whole, 1e-300), "clusters": count, "df": count - lost}
+    if power <= 1e-9 * whole:
+        return {"z": 0.0, "z_expected": 0.0, "z_specimens": 0.0, **found}
     amplitude = float(left @ y) / power
-    score = np.bincount(cluster, left * (less(y) - amplitude * left))
-    se = np.sqrt(float(score @ score) * count / df) / power
-    z = [_normal_z(t / max(se, 1e-300), df) for t in (1 + amplitude, 1.0)]
-    return {"z": z[0], "z_expected": z[1], "share": power / whole, "clusters": count, "df": df}
+
+    def z_of(size: float, cluster: np.ndarray, df: float) -> float:
+        if df < 1:
+            return 0.0
+        score = np.bincount(cluster, left * (less(y) - amplitude * left))
+        se = np.sqrt(float(score @ score) * (int(cluster.max()) + 1) / df) / power
+        return _normal_z(size / max(se, 1e-300), df)
+
+    z = {"z": z_of(1 + amplitude, cluster, count - lost), "z_expected": z_of(1.0, cluster, count - lost)}
+    specimen = units["specimen_id"]
+    by_specimens = z["z"] if unit == "specimen_id" else z_of(1 + amplitude, specimen, float(specimen.max()))
+    return z | {"z_specimens": by_specimens} | found
 
 
 def _normal_z(t: float, df: int) -> float:
