@@ -6,7 +6,7 @@ NO_NETWORK = echo "make: the packages that sealfit needs could not be installed;
 CODE := $(wildcard sealfit tests benchmarks)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test golden lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-solver bench-start bench-speed bench-worlds paper clean
+.PHONY: help demo test golden lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed bench-worlds paper clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -54,9 +54,6 @@ bench-speed: .venv/.installed-test ## seconds and memory beside a bare read and 
 
 bench-loop-cost: .venv/.installed-test
 	$(BIN)/python benchmarks/loop_cost.py
-
-bench-solver: .venv/.installed-bench ## steady and aging fits a second beside curve_fit, least_squares and lmfit (two minutes)
-	.venv/bench/bin/python benchmarks/solver.py
 
 paper: .venv/.installed-test ## simulate and analyse the source paper's campaign, and write docs/paper
 	$(BIN)/python benchmarks/paper.py

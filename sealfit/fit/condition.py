@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from sealfit.fit.batch import project
 from sealfit.fit.interval import constrained_ends
 from sealfit.fit.stribeck import NAMES, flat_p_value, solve_stribeck, stribeck_intervals, tangent
 from sealfit.fit.uncertainty import shifts_of, speed_levels
+from sealfit.fit.variable_projection import project
 from sealfit.physics import stribeck_force
 
 FULL, VISCOUS, CONSTANT = 4, 2, 1  # speed levels within one direction that each model needs

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from sealfit.fit.batch import solve_kept
+from sealfit.fit.variable_projection import solve_kept
 
 FREE = 1e-12  # share of a column's variance that is its own, below which its coefficient is not bounded at all
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealfit.fit.polish_many import polish_many
+from sealfit.fit.least_squares import levenberg_marquardt
 
 if TYPE_CHECKING:
     from sealfit.fit.joint_law import JointLaw
@@ -150,5 +150,5 @@ class _Projected:
             np.array([np.log(LIMITS[name][end]) if name in own else endless for name in self.law.names[LINEAR:]])
             for end, endless in enumerate((-np.inf, np.inf))
         )
-        bent, rss = polish_many(lambda bent, rows: self.solve(bent, of[rows])[1:], bent, low, high)
+        bent, rss = levenberg_marquardt(lambda bent, rows: self.solve(bent, of[rows])[1:], bent, low, high)
         return np.concatenate([self.solve(bent, of)[0], bent], axis=1), rss

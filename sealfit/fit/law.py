@@ -13,12 +13,11 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.sparse import csr_array
 
-from sealfit.fit.batch import BatchFit, at_edge, check
-from sealfit.fit.law_search import search_law
-from sealfit.fit.polish import covariance_of
-from sealfit.fit.polish_many import polish_many
+from sealfit.fit.least_squares import covariance_of, levenberg_marquardt
+from sealfit.fit.variable_projection import BatchFit, global_optimum
 
 SOONEST, LATEST = 1e-9, 1e3  # b is sought from 1e-9 of the first aged day to 1000 times the last
+PER_DECADE = 8  # points of the search along b; ln(1 + t/b) changes over a decade of b
 PROFILED = 17  # points along ln b at which the intervals of a and c are taken
 
 
@@ -49,10 +48,15 @@ def solve_law(days, value, weight) -> BatchFit:
     [0.9, 0.05, 0.3]
     """
     days, value, weight = np.broadcast_arrays(*(np.asarray(x, float) for x in (days, value, weight)))
-    check(value, weight)
     low, high = search_limits(np.where(weight > 0, days, 0.0))
-    found = search_law(days, value, weight, low, high)
-    return BatchFit(found.u, found.coefficients.T, found.rss, at_edge(found.u, low, high))
+    points = int(np.ceil(PER_DECADE * np.max(high - low) / np.log(10))) + 1
+    grid = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
+
+    def basis(u, rows):
+        ratio = days[rows][:, None, :] * np.exp(-u)[..., None]
+        return np.stack([np.ones_like(ratio), -np.log1p(ratio)], axis=-1)
+
+    return global_optimum(basis, value, weight, grid, (False, False))
 
 
 @dataclass(frozen=True)
@@ -177,7 +181,7 @@ def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
         return (whiten @ (model - values.value))[None], (whiten @ slope).T[None]
 
     def polished(x):
-        found, rss = polish_many(evaluate, x[None], low, high)
+        found, rss = levenberg_marquardt(evaluate, x[None], low, high)
         return LawFit(values, found[0], float(rss[0]), (limits[0], limits[1]))
 
     if start is not None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sealfit.fit.law import LawFit, Values
-from sealfit.fit.polish import RANK
-from sealfit.fit.polish_many import polish_many
+from sealfit.fit.least_squares import RANK, levenberg_marquardt
 
 
 class EachSeries:
@@ -66,7 +65,7 @@ class EachSeries:
         x, (low, high) = self.x[series], self.limits[:, series]
         for numbers in (x, low, high):
             numbers[every, at + self.width] = log_b
-        x, chi2 = polish_many(lambda x, rows: self._evaluate(x, series[rows]), x, low, high)
+        x, chi2 = levenberg_marquardt(lambda x, rows: self._evaluate(x, series[rows]), x, low, high)
         tangent = self._evaluate(x, series)[1] * ((x > low) & (x < high))[:, :, None]
         return chi2, x[every, at], _variance(tangent, at)
 

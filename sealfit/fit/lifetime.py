@@ -18,7 +18,7 @@ from sealfit.errors import RequestError
 from sealfit.fit.aged import DRIVERS, Aged
 from sealfit.fit.joint_law import JointLaw
 from sealfit.fit.joint_solve import solved_many
-from sealfit.fit.polish import central_jacobian
+from sealfit.fit.least_squares import central_jacobian
 
 DAYS_PER_YEAR = 365.25
 SPAN_C = (-80.0, 300.0)  # of temperatures of use

@@ -25,7 +25,7 @@ from scipy.special import fdtrc
 from sealfit.fit.aging import PAIRS, steady_covariance, values_of
 from sealfit.fit.condition import FULL, Condition, stacked
 from sealfit.fit.declared import series_of_curve
-from sealfit.fit.polish import covariance_of
+from sealfit.fit.least_squares import covariance_of
 from sealfit.fit.steady import FORCES, solve_conditions
 from sealfit.fit.stribeck import search_grid
 from sealfit.fit.uncertainty import UnitVariance, shifts_of

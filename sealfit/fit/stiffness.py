@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from sealfit.fit.polish import SHRINKS
+from sealfit.fit.least_squares import SHRINKS
 from sealfit.fit.rises import Curve, Rises, Stroke, Tangent
 
 LEAST = 3  # such samples below which nothing can be said

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr
 
-from sealfit.fit.batch import at_edge, check, profile
 from sealfit.fit.interval import constrained_ends
-from sealfit.fit.polish import covariance_of
-from sealfit.fit.stribeck_search import search
+from sealfit.fit.least_squares import covariance_of
+from sealfit.fit.variable_projection import global_optimum, profile
 
 SLOWEST, FASTEST = 1 / 5, 20.0  # v_s is sought from a fifth of the slowest speed to twenty times the fastest:
 # below, E is 1e-11 at every speed and nothing changes any more; above, 1 - E is 0.0025 and follows v^2 throughout
-PER_DECADE = 30  # E changes by at most 6 % of its range from one grid point to the next
+PER_DECADE = 240  # 1 % from one v_s to the next: with four or five speeds a minimum can be that narrow
 HALVINGS = 40  # of one grid cell: ln v_s to 1e-13
 FINE = 61  # points inside the interval of v_s along which the intervals of the others are taken
 NAMES = ("mu_s", "mu_c", "v_s", "sigma_2")
@@ -49,7 +48,7 @@ class StribeckFit:
 
 
 def stribeck_basis(speed, load):
-    """Return the columns of Eq. 14 and their slopes along ln v_s, as `profile` calls them.
+    """Return the columns of Eq. 14 along ln v_s, as `profile` calls them.
 
     Parameters
     ----------
@@ -59,11 +58,8 @@ def stribeck_basis(speed, load):
 
     def basis(u, rows):
         v, n = speed[rows][:, None, :], load[rows][:, None, :]
-        square = (v * np.exp(-u)[..., None]) ** 2
-        decay = np.exp(-square)
-        slope = 2 * square * decay * n
-        columns = np.stack([n * decay, n * (1 - decay), np.broadcast_to(v, decay.shape)], axis=-1)
-        return columns, np.stack([slope, -slope, np.zeros_like(slope)], axis=-1)
+        decay = np.exp(-((v * np.exp(-u)[..., None]) ** 2))
+        return np.stack([n * decay, n * (1 - decay), np.broadcast_to(v, decay.shape)], axis=-1)
 
     return basis
 
@@ -110,12 +106,11 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
     >>> [round(float(value[0]), 8) for value in (fit.mu_s, fit.mu_c, fit.v_s, fit.sigma_2)]
     [0.4, 0.3, 6.0, 0.02]
     """
-    arrays = np.broadcast_arrays(*(np.asarray(x, float) for x in (speed, load, force, weight)))
-    check(arrays[2], arrays[3])
-    limits = search_limits(arrays[0], arrays[3])
-    found = search(*arrays, *limits, nonnegative)
-    mu_s, mu_c, sigma_2 = found.coefficients
-    return StribeckFit(mu_s, mu_c, np.exp(found.u), sigma_2, found.rss, at_edge(found.u, *limits), limits)
+    speed, load, force, weight = np.broadcast_arrays(*(np.asarray(x, float) for x in (speed, load, force, weight)))
+    limits = search_limits(speed, weight)
+    found = global_optimum(stribeck_basis(speed, load), force, weight, even_grid(*limits), nonnegative)
+    mu_s, mu_c, sigma_2 = found.coefficients.T
+    return StribeckFit(mu_s, mu_c, np.exp(found.u), sigma_2, found.rss, found.at_edge, limits)
 
 
 # ---------------------------------------------------------------- intervals
@@ -143,7 +138,7 @@ def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise, *, no
     basis = stribeck_basis(speed, load)
     limit = fit.rss + rise
     u_best = np.log(fit.v_s)
-    rss, _, _ = profile(basis, force, weight, fit.grid, nonnegative)
+    rss, _ = profile(basis, force, weight, fit.grid, nonnegative)
     inside = rss <= limit[:, None]
     (u_low, open_low), (u_high, open_high) = (
         _crossing(basis, force, weight, nonnegative, fit.grid, u_best, inside, limit, sign) for sign in (-1, 1)
@@ -169,7 +164,7 @@ def _crossing(basis, force, weight, nonnegative, grid, u_best, inside, limit, si
     far = np.where(open_, near, far)
     for _ in range(HALVINGS):
         middle = (near + far) / 2
-        value, _, _ = profile(basis, force, weight, sign * middle[:, None], nonnegative)
+        value, _ = profile(basis, force, weight, sign * middle[:, None], nonnegative)
         ok = value[:, 0] <= limit
         near, far = np.where(ok, middle, near), np.where(ok, far, middle)
     return sign * near, open_
@@ -179,7 +174,7 @@ def conditional_ends(basis, force, weight, u, limit, nonnegative):
     """Union over u of the constrained intervals of the coefficients, shape (problems, p) each."""
     rows = np.arange(len(u))
     root = np.sqrt(weight)[:, None, :]
-    columns, _ = basis(u, rows)
+    columns = basis(u, rows)
     low, high = constrained_ends(
         columns * root[..., None], np.broadcast_to((force[:, None, :] * root), columns.shape[:-1]), limit, nonnegative
     )

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.fit.polish import central_jacobian
+from sealfit.fit.least_squares import central_jacobian
 from sealfit.fit.ramps import fit_ramps
 from sealfit.fit.rises import Curve, Rises, Stroke, _followed
 

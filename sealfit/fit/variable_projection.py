@@ -1,7 +1,6 @@
-"""The linear part of least squares with one nonlinear number each, for thousands of small problems at once as arrays.
+"""Least squares that is linear in all but one number: the linear part is solved exactly along the nonlinear one.
 
-The linear coefficients are exact once the nonlinear number is given, so the sum of squares has a profile along it; its
-global minimum is found by `moving`.
+Many problems are solved together, as arrays: the conditions of a campaign, or the draws of a bootstrap.
 Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036 (variable projection).
 """
 
@@ -12,11 +11,14 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from scipy.optimize.elementwise import find_minimum
 
 from sealfit.errors import FitError
 
 DEPENDENT = 1e-13  # share of a column's variance left by the others below which it adds nothing in double precision
-CHUNK = 2_000_000  # numbers per temporary array: 16 MB, stays near the cache and never fills a laptop
+CHUNK = 2_000_000  # numbers per temporary array: 16 MB
+CLOSE = 1e-9  # of the nonlinear number, a logarithm as a rule: nearer, the sum of squares is flat to its last digit
+MOST_STEPS = 60
 
 
 # ---------------------------------------------------------------- the linear part
@@ -117,17 +119,16 @@ class BatchFit:
     at_edge: np.ndarray  # (problems,), -1 at the lower end of the grid, +1 at the upper, else 0
 
 
-Basis = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+Basis = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def profile(basis: Basis, y, weight, u, nonnegative, *, refine: int = 0):
-    """Best weighted sum of squares, its slope and the coefficients at given nonlinear numbers.
+    """Return the best weighted sum of squares and the coefficients at given nonlinear numbers.
 
     Parameters
     ----------
     basis : callable
-        `basis(u, rows)` -> columns and their derivatives along u, each shape (r, g, n, p), for the problems `rows`,
-        shape (r,), at u, shape (r, g).
+        `basis(u, rows)` -> columns, shape (r, g, n, p), for the problems `rows`, shape (r,), at u, shape (r, g).
     y, weight : ndarray, shape (problems, n)
         Measured values and 1/variance; weight 0 for padding.
     u : ndarray, shape (problems, g)
@@ -139,26 +140,64 @@ def profile(basis: Basis, y, weight, u, nonnegative, *, refine: int = 0):
 
     Returns
     -------
-    rss, slope : ndarray, shape (problems, g)
+    rss : ndarray, shape (problems, g)
     coefficients : ndarray, shape (problems, g, p)
     """
     root, rows = np.sqrt(weight), np.arange(len(y))
     p = len(nonnegative)
-    rss, slope = np.empty(u.shape), np.empty(u.shape)
+    rss = np.empty(u.shape)
     coefficients = np.empty((*u.shape, p))
     step = max(1, CHUNK // max(1, u.shape[1] * y.shape[1] * p))
     for start in range(0, len(u), step):
         part = slice(start, start + step)
         chosen = rows[part]
         weights = root[chosen][:, None, :, None]
-        columns, slopes = basis(u[part], chosen)
+        columns = basis(u[part], chosen)
         measured = np.broadcast_to((y[chosen] * root[chosen])[:, None, :], columns.shape[:-1])
         point = project(columns * weights, measured, nonnegative, refine)
-        # the optimum over the coefficients does not move to first order, so only the columns' own change counts
-        change = ((slopes * weights) @ point.coefficients[..., None])[..., 0]
         rss[part], coefficients[part] = point.rss, point.coefficients
-        slope[part] = -2 * np.einsum("rgn,rgn->rg", point.residual, change)
-    return rss, slope, coefficients
+    return rss, coefficients
+
+
+def global_optimum(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
+    """Return the least-squares optimum of each problem over its whole grid.
+
+    Every local minimum of the sum of squares along the grid is refined; the best of them, or an end of the grid, is the
+    answer.
+
+    Parameters
+    ----------
+    basis, y, weight, nonnegative
+        As `profile`.
+    grid : ndarray, shape (problems, g)
+        Rising nonlinear numbers, close enough that no minimum hides between two of them.
+
+    Raises
+    ------
+    FitError
+        If a measured value or weight is not finite, or a weight is negative.
+    """
+    check(y, weight)
+    rss, _ = profile(basis, y, weight, grid, nonnegative)
+    inner = rss[:, 1:-1]
+    problem, k = np.nonzero((inner <= rss[:, :-2]) & (inner <= rss[:, 2:]))
+
+    def solved(u, problem):
+        own = problem.astype(int)
+        return profile(lambda u, rows: basis(u, own[rows]), y[own], weight[own], u[:, None], nonnegative, refine=2)
+
+    bracket = tuple(grid[problem, k + step] for step in range(3))
+    stops = {"xatol": CLOSE, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0}
+    valley = find_minimum(
+        lambda u, problem: solved(u, problem)[0][:, 0], bracket, args=(problem,), tolerances=stops, maxiter=MOST_STEPS
+    ).x
+    every = np.arange(len(y))
+    problem = np.concatenate([problem, every])
+    u = np.concatenate([valley, grid[every, np.argmin(rss, axis=1)]])
+    left, coefficients = (found[:, 0] for found in solved(u, problem))
+    order = np.lexsort([left, problem])
+    best = order[np.unique(problem[order], return_index=True)[1]]
+    return BatchFit(u[best], coefficients[best], left[best], at_edge(u[best], grid[:, 0], grid[:, -1]))
 
 
 def at_edge(u, low, high) -> np.ndarray:

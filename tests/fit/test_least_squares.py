@@ -4,7 +4,7 @@ import numpy as np
 import numpy.testing as npt
 from scipy.optimize import least_squares
 
-from sealfit.fit.polish_many import polish_many
+from sealfit.fit.least_squares import levenberg_marquardt
 
 T = np.linspace(0.1, 4.0, 15)
 LOW, HIGH = np.array([-np.inf, 0.0]), np.array([np.inf, 0.8])
@@ -29,7 +29,7 @@ def drawn():
 
 def test_each_ends_where_one_alone_ends():
     values = drawn()
-    x, rss = polish_many(problems(values), np.ones((4, 2)), LOW, HIGH)
+    x, rss = levenberg_marquardt(problems(values), np.ones((4, 2)), LOW, HIGH)
     for k, own in enumerate(values):
         alone = least_squares(
             lambda p, own=own: p[0] * np.exp(-p[1] * T) - own, [1.0, 0.5], bounds=(LOW, HIGH), xtol=1e-15, ftol=1e-15
@@ -44,7 +44,7 @@ def test_a_number_between_equal_bounds_is_held():
     held = np.array([0.1, 0.2, 0.3, 0.4])
     low, high = np.tile(LOW, (4, 1)), np.tile(HIGH, (4, 1))
     low[:, 1] = high[:, 1] = held
-    x, _ = polish_many(problems(drawn()), np.ones((4, 2)), low, high)
+    x, _ = levenberg_marquardt(problems(drawn()), np.ones((4, 2)), low, high)
     npt.assert_array_equal(x[:, 1], held)
     decay = np.exp(-held[:, None] * T)
     npt.assert_allclose(x[:, 0], (decay * drawn()).sum(axis=1) / (decay**2).sum(axis=1), rtol=1e-10)
@@ -53,5 +53,5 @@ def test_a_number_between_equal_bounds_is_held():
 def test_a_problem_without_a_finite_residual_is_infinite_and_alone_in_it():
     values = drawn()
     values[1, 3] = np.inf
-    _, rss = polish_many(problems(values), np.ones((4, 2)), LOW, HIGH)
+    _, rss = levenberg_marquardt(problems(values), np.ones((4, 2)), LOW, HIGH)
     npt.assert_array_equal(np.isfinite(rss), [True, False, True, True])
