@@ -155,7 +155,10 @@ def least_squares_within(normal: np.ndarray, gradient: np.ndarray, low: np.ndarr
     step, *_ = np.linalg.lstsq(normal, gradient, rcond=1e-10)
     if np.all((step >= low) & (step <= high)):
         return step
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    square = np.diag(normal)
+    scale = 1 / np.sqrt(
+        np.where(square > 1e-30 * square.max(), square, 1.0)
+    )  # a column that does nothing keeps its own
     size, axes = np.linalg.eigh(normal * np.outer(scale, scale))
     kept = size > 1e-10 * size[-1]
     root, axes = np.sqrt(size[kept]), axes[:, kept]

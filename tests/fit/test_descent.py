@@ -75,6 +75,14 @@ def test_least_squares_within_bounds_of_columns_that_are_alike():
     assert found[0] <= 0.3
 
 
+def test_a_column_that_does_nothing_stays_where_it_is():
+    columns = np.column_stack([np.linspace(1.0, 2.0, 9), np.zeros(9), np.full(9, 1e-160)])
+    low, high = np.array([-0.2, -1.0, 0.0]), np.array([0.3, 1.0, np.inf])
+    found = least_squares_within(columns.T @ columns, columns.T @ (2 * columns[:, 0]), low, high)
+    npt.assert_allclose(found[:2], [0.3, 0.0], atol=1e-6)
+    assert np.isfinite(found).all()
+
+
 def test_series_are_searched_though_every_row_of_one_is_held_out():
     model, rows, curved = astray(one_specimen=False, aging=True)
     found = search_nonlinear(model, rows.subset(rows.values("temperature_C") != 80.0), SCATTER)
