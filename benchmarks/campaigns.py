@@ -76,7 +76,7 @@ def campaign(name: str, *, seed: int = 1, size: Size = "small", strength: Streng
     if name == "paper":
         return paper_campaign(seed=seed)
     if name not in names():
-        raise SealfitError(f"there is no campaign '{name}'.", mend=f"Known: {', '.join(names())}.")
+        raise SealfitError(f"there is no campaign '{name}'.", fix=f"Known: {', '.join(names())}.")
     effects: tuple[dict, ...] = ()
     if name in NULLS:
         noise, channels = NULLS[name]

@@ -60,16 +60,16 @@ class Cluster:
         except ModuleNotFoundError as error:
             raise RequestError(
                 f"the workers of {self.scheduler} cannot import {error.name}.",
-                mend=f"Install sealfit {__version__} in the environment that they are started from.",
+                fix=f"Install sealfit {__version__} in the environment that they are started from.",
             ) from error
         if not versions:
-            mend = f"Start one: dask worker {self.scheduler} --nthreads 1"
-            raise RequestError(f"the cluster {self.scheduler} has no workers.", mend=mend)
+            fix = f"Start one: dask worker {self.scheduler} --nthreads 1"
+            raise RequestError(f"the cluster {self.scheduler} has no workers.", fix=fix)
         if others := {worker: found for worker, found in versions.items() if found != __version__}:
             worker, found = next(iter(others.items()))
             raise RequestError(
                 f"the worker {worker} has sealfit {found}, here is {__version__}.",
-                mend="Install the same version everywhere: results are not to depend on where they are computed.",
+                fix="Install the same version everywhere: results are not to depend on where they are computed.",
             )
 
     def require_folders(self, *folders: Path) -> None:
@@ -79,7 +79,7 @@ class Cluster:
                 if not there:
                     raise RequestError(
                         f"the worker {worker} does not see the folder {folder.resolve()}.",
-                        mend="Put campaign and OUT on a file system that all workers share, under the same path.",
+                        fix="Put campaign and OUT on a file system that all workers share, under the same path.",
                     )
 
     def threads(self) -> int:
@@ -120,13 +120,13 @@ class Cluster:
         except KilledWorker as error:
             raise WorkerError(
                 "several workers of the cluster died over the same piece of work.",
-                mend="If memory ran out, give the workers more of it; their logs say more.",
+                fix="If memory ran out, give the workers more of it; their logs say more.",
             ) from error
         except (CancelledError, OSError) as error:
             if sent and sent[0].status == "error":  # the work's own
                 raise
             raise WorkerError(
-                f"the cluster {self.scheduler} went away.", mend="Look at the scheduler, and run the command again."
+                f"the cluster {self.scheduler} went away.", fix="Look at the scheduler, and run the command again."
             ) from error
         finally:
             if sent:
@@ -146,7 +146,7 @@ class Cluster:
             alone = alone + LOOK_S if not self.threads() else 0.0
         raise WorkerError(
             f"the cluster {self.scheduler} has no workers left.",
-            mend="If memory ran out, give them more of it; start them again, then run the command again.",
+            fix="If memory ran out, give them more of it; start them again, then run the command again.",
         )
 
 
@@ -154,23 +154,23 @@ def _connected(scheduler: str) -> Client:
     try:
         from distributed import Client
     except ImportError as error:
-        raise RequestError("Dask is not installed.", mend="Run: pip install 'sealfit[cluster]'") from error
+        raise RequestError("Dask is not installed.", fix="Run: pip install 'sealfit[cluster]'") from error
     try:
         address = json.loads(Path(scheduler).read_text("utf-8"))["address"] if Path(scheduler).is_file() else scheduler
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RequestError(
-            f"{scheduler} is no scheduler file.", mend=f"Give one that Dask wrote, or {EXAMPLE}."
+            f"{scheduler} is no scheduler file.", fix=f"Give one that Dask wrote, or {EXAMPLE}."
         ) from error
     place = re.fullmatch(r"\w+://\[?(?P<host>[^]]+)\]?:(?P<port>\d+)", address)
     if place is None:
-        raise RequestError(f"'{scheduler}' is no address of a scheduler.", mend=f"Write {EXAMPLE}, or its file.")
+        raise RequestError(f"'{scheduler}' is no address of a scheduler.", fix=f"Write {EXAMPLE}, or its file.")
     try:  # by hand first: a client that finds nobody holds the program for a minute
         socket.create_connection((place["host"], int(place["port"])), timeout=CONNECT_S).close()
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise RequestError(
             f"no Dask scheduler answers at {address}.",
-            mend="Start one (dask scheduler), or give the path of its scheduler file.",
+            fix="Start one (dask scheduler), or give the path of its scheduler file.",
         ) from error
 
 

@@ -51,7 +51,7 @@ def add_keys(table: pd.DataFrame, config: Config) -> pd.DataFrame:
     if missing:
         raise SealfitError(
             f"condition column {', '.join(repr(name) for name in missing)} is missing.",
-            mend="Add it, or name other columns in the config's condition and rubber.",
+            fix="Add it, or name other columns in the config's condition and rubber.",
         )
     keys = keys_of({name: table[name].tolist() for name in columns}, len(table), config)
     return table.assign(**{key: pd.array(words, dtype="str") for key, words in keys.items()})

@@ -239,9 +239,9 @@ def read_config(path: ConfigPath = None) -> str:
     try:
         return Path(path).read_text("utf-8-sig")  # Windows editors begin with a byte-order mark
     except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, mend="Check --config.") from error
+        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, fix="Check --config.") from error
     except UnicodeDecodeError as error:
-        raise ConfigError("is not UTF-8.", file=path, mend="Save it as UTF-8.") from error
+        raise ConfigError("is not UTF-8.", file=path, fix="Save it as UTF-8.") from error
 
 
 def parse_config(text: str, name: str) -> Config:
@@ -255,9 +255,9 @@ def parse_config(text: str, name: str) -> Config:
     try:
         return Config.model_validate(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}.", file=name, mend="See configs/ for examples.") from error
+        raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
     except ValidationError as error:
-        raise ConfigError(_explain(error), file=name, mend="See the README for every key.") from error
+        raise ConfigError(_explain(error), file=name, fix="See the README for every key.") from error
 
 
 def _explain(error: ValidationError) -> str:

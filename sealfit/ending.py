@@ -69,8 +69,8 @@ def _bug(error: Exception) -> int:
     """Say that the program, not its input, is at fault: the traceback on stderr, one line of it under --json."""
     traceback.print_exception(error)
     told = " ".join("".join(traceback.format_exception_only(error)).split())
-    mend = "Please report it, with the traceback on stderr."
-    return _fail(f"sealfit: this is a bug. {mend}", [{**_error(told), "kind": "bug", "mend": mend}], BUG)
+    fix = "Please report it, with the traceback on stderr."
+    return _fail(f"sealfit: this is a bug. {fix}", [{**_error(told), "kind": "bug", "fix": fix}], BUG)
 
 
 def _interrupted() -> int:
@@ -79,4 +79,4 @@ def _interrupted() -> int:
 
 
 def _error(reason: str) -> dict:
-    return {"file": None, "line": None, "column": None, "value": None, "mend": "", "reason": reason}
+    return {"file": None, "line": None, "column": None, "value": None, "fix": "", "reason": reason}

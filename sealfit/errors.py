@@ -1,4 +1,4 @@
-"""Everything the user can mend: one root, typed, each with the place and the mend."""
+"""Everything the user can fix: one root, typed, each with the place and the fix."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing found wrong (or worth saying) in a campaign: where, what, what was done, how to mend it.
+    """One thing found wrong (or worth saying) in a campaign: where, what, what was done, how to fix it.
 
     A `Fault` with `severity` "error" stops a run if it concerns the campaign; one that concerns a file or a cell
     leaves that file or row out (`action`) and the run goes on (design: a fault of a file, a fault of a cell).
@@ -25,7 +25,7 @@ class Fault:
     value: str | float | None = None
     severity: Literal["info", "warning", "error"] = "error"
     action: Literal["kept", "row left out", "file left out", "stroke left out", "stopped"] = "stopped"
-    mend: str = ""
+    fix: str = ""
 
     def __str__(self) -> str:
         place = self.file or ""
@@ -40,7 +40,7 @@ class Fault:
             parts.append(repr(self.value))
         head = ": ".join(parts)
         text = f"{head}: {self.reason}" if head else self.reason
-        return f"{text} {self.mend}".strip()
+        return f"{text} {self.fix}".strip()
 
     def as_dict(self) -> dict:
         """Return the fault as plain values, as `--json` prints it."""
@@ -48,7 +48,7 @@ class Fault:
 
 
 class SealfitError(Exception):
-    """Something the user can mend: one line on stderr, exit code 1."""
+    """Something the user can fix: one line on stderr, exit code 1."""
 
     def __init__(
         self,
@@ -58,18 +58,18 @@ class SealfitError(Exception):
         line: int | None = None,
         column: str | None = None,
         value: object = None,
-        mend: str = "",
+        fix: str = "",
     ):
-        self.message, self.line, self.column, self.value, self.mend = message, line, column, value, mend
+        self.message, self.line, self.column, self.value, self.fix = message, line, column, value, fix
         self.file = str(file) if file is not None else None
         place = self.file or ""
         if line is not None:
             place += f":{line}"
         head = ": ".join([p for p in (place, f"column '{column}'" if column else "") if p])
-        super().__init__(" ".join(p for p in (f"{head}: {message}" if head else message, mend) if p))
+        super().__init__(" ".join(p for p in (f"{head}: {message}" if head else message, fix) if p))
 
     def as_dicts(self) -> list[dict]:
-        """Return `[{file, line, column, value, mend, reason}]`, the `errors` of `--json`."""
+        """Return `[{file, line, column, value, fix, reason}]`, the `errors` of `--json`."""
         value = self.value if isinstance(self.value, int | float | str | None) else str(self.value)
         return [
             {
@@ -77,7 +77,7 @@ class SealfitError(Exception):
                 "line": self.line,
                 "column": self.column,
                 "value": value,
-                "mend": self.mend,
+                "fix": self.fix,
                 "reason": self.message,
             }
         ]
@@ -124,7 +124,7 @@ class RequestError(SealfitError):
 
 
 class StaleError(SealfitError):
-    """A step's predecessor is missing or stale; the mend names the command to run."""
+    """A step's predecessor is missing or stale; the fix names the command to run."""
 
 
 class OutError(SealfitError):

@@ -50,7 +50,7 @@ def _take(path: Path) -> int:
             raise OutError(
                 f"cannot be written ({error.strerror}).",
                 file=path.parent,
-                mend="Choose another --out, or mend its rights.",
+                fix="Choose another --out, or fix its rights.",
             ) from error
         try:
             if _locked(handle) and _same_file(handle, path):
@@ -104,7 +104,7 @@ def _busy(path: Path, owner: dict, more: str = "") -> OutError:
     return OutError(
         f"another sealfit (host {host}, process {pid}) is writing here.",
         file=path.parent,
-        mend=f"Wait for it to end, or choose another --out.{more}",
+        fix=f"Wait for it to end, or choose another --out.{more}",
     )
 
 
@@ -115,4 +115,4 @@ def _sign(handle: int, path: Path) -> None:
         os.pwrite(handle, owner, 0)
         os.fsync(handle)
     except OSError as error:
-        raise OutError(f"cannot be written ({error.strerror}).", file=path.parent, mend="Free some space.") from error
+        raise OutError(f"cannot be written ({error.strerror}).", file=path.parent, fix="Free some space.") from error

@@ -44,15 +44,15 @@ def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Pat
         raise ConfigError(
             f"{KEY}: the config lies in {place}, so the folder that it names is not run.",
             file=config.path,
-            mend=f"Name the folder by {OPTION}, or move the config.",
+            fix=f"Name the folder by {OPTION}, or move the config.",
         )
     if not folder.is_dir():
-        raise ConfigError(f"{said}: there is no folder {folder}.", mend="Mend the path.")
+        raise ConfigError(f"{said}: there is no folder {folder}.", fix="Fix the path.")
     for path in (folder, *sorted(folder.glob("*.py"))):
         if place := _place_of(path, data):
             raise ConfigError(
                 f"{said}: {path} lies in {place}, and Python is never run from there.",
-                mend="Read the files; if you trust them, move them to a folder of your own.",
+                fix="Read the files; if you trust them, move them to a folder of your own.",
             )
     return folder.resolve()
 
@@ -101,5 +101,5 @@ def needed(what: str, names: Mapping[str, str | None] | list[str]) -> RequestErr
     files = f" ({', '.join(sorted(names))})" if names else ""
     return RequestError(
         f"{what} your own effects{files}, and Python is run only from a folder that the command line names.",
-        mend=f"Add {OPTION} FOLDER.",
+        fix=f"Add {OPTION} FOLDER.",
     )

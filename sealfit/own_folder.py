@@ -37,14 +37,14 @@ def held(out: Path) -> Iterator[None]:
 def _make(out: Path) -> bool:
     """Make `out` if it is not there, and return whether it was made; refuse a folder that sealfit did not make."""
     if out.exists() and not out.is_dir():
-        raise OutError("is a file.", file=out, mend="Give --out a folder.")
+        raise OutError("is a file.", file=out, fix="Give --out a folder.")
     if out.is_dir():
         strangers = [p.name for p in out.iterdir() if p.name != LOCK and not p.name.startswith(STAGING)]
         if strangers and STATE not in strangers:
             raise OutError(
                 f"is not empty (it holds {sorted(strangers)[0]}) and was not made by sealfit.",
                 file=out,
-                mend="Choose another --out.",
+                fix="Choose another --out.",
             )
         return False
     with disk(out):

@@ -19,21 +19,19 @@ def campaign_folder(path: Path, config: Config) -> Path:
     Raises
     ------
     CampaignError
-        If there is no such folder, or no runs.csv in it where the config needs one; the mend names the likeliest.
+        If there is no such folder, or no runs.csv in it where the config needs one; the fix names the likeliest.
     """
     if path.is_file():
-        mend = (
-            f"Give its folder: {_quoted(path.parent)}" if path.name == RUNS else f"Give the folder that holds {RUNS}."
-        )
-        raise CampaignError([Fault("campaign_folder", f"{path} is a file, not a campaign folder.", mend=mend)])
+        fix = f"Give its folder: {_quoted(path.parent)}" if path.name == RUNS else f"Give the folder that holds {RUNS}."
+        raise CampaignError([Fault("campaign_folder", f"{path} is a file, not a campaign folder.", fix=fix)])
     if not path.is_dir():
-        raise CampaignError([Fault("campaign_folder", f"there is no folder {path}.", mend=_did_you_mean(path))])
+        raise CampaignError([Fault("campaign_folder", f"there is no folder {path}.", fix=_did_you_mean(path))])
     if config.files.glob is None and not (path / RUNS).is_file():
         below = sorted(child.parent for child in path.glob(f"*/{RUNS}"))
-        mend = f"It lists the trace files; or set files.glob in a config (--config). Files here: {_some_files(path)}"
+        fix = f"It lists the trace files; or set files.glob in a config (--config). Files here: {_some_files(path)}"
         if below:
-            mend = "Did you mean " + " or ".join(_quoted(folder) for folder in below[:3]) + "?"
-        raise CampaignError([Fault("runs_csv", f"{path} has no {RUNS}.", file=RUNS, mend=mend)])
+            fix = "Did you mean " + " or ".join(_quoted(folder) for folder in below[:3]) + "?"
+        raise CampaignError([Fault("runs_csv", f"{path} has no {RUNS}.", file=RUNS, fix=fix)])
     return path
 
 
@@ -43,12 +41,12 @@ def existing_out(out: Path) -> Path:
     Raises
     ------
     RequestError
-        If it is not; the mend names the likeliest folder of results, or the command that makes one.
+        If it is not; the fix names the likeliest folder of results, or the command that makes one.
     """
     if out.is_dir():
         return out
-    mend = _did_you_mean(out, lambda folder: (folder / STATE).is_file())
-    raise RequestError(f"there is no folder {out}.", mend=mend or f"Make it: sealfit run CAMPAIGN --out {_quoted(out)}")
+    fix = _did_you_mean(out, lambda folder: (folder / STATE).is_file())
+    raise RequestError(f"there is no folder {out}.", fix=fix or f"Make it: sealfit run CAMPAIGN --out {_quoted(out)}")
 
 
 def existing_file(path: Path, what: str) -> Path:
@@ -56,8 +54,8 @@ def existing_file(path: Path, what: str) -> Path:
     if path.is_file():
         return path
     if path.is_dir():
-        raise RequestError(f"{path} is a folder, not a {what}.", mend="Give the file itself.")
-    raise RequestError(f"there is no {what} {path}.", mend=_did_you_mean(path, Path.is_file))
+        raise RequestError(f"{path} is a folder, not a {what}.", fix="Give the file itself.")
+    raise RequestError(f"there is no {what} {path}.", fix=_did_you_mean(path, Path.is_file))
 
 
 def _did_you_mean(path: Path, fits=Path.is_dir) -> str:

@@ -46,18 +46,18 @@ def read_points(path: Path) -> Points:
     try:
         raw = existing_file(path, "table of points").read_text("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise RequestError("is not UTF-8.", file=path, mend="Save it as CSV UTF-8.") from error
+        raise RequestError("is not UTF-8.", file=path, fix="Save it as CSV UTF-8.") from error
     except OSError as error:
-        raise RequestError(f"cannot be read ({error.strerror}).", file=path, mend="Mend its rights.") from error
+        raise RequestError(f"cannot be read ({error.strerror}).", file=path, fix="Fix its rights.") from error
     lines = csv.reader(io.StringIO(raw, newline=""))
     names = [name.strip() for name in next(lines, [])]
     if not any(names):
-        raise RequestError("is empty.", file=path, mend="Give a line of column names, then one row per point.")
+        raise RequestError("is empty.", file=path, fix="Give a line of column names, then one row per point.")
     if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
-        raise RequestError("is not separated by commas.", file=path, line=1, mend="Save it with commas and points.")
+        raise RequestError("is not separated by commas.", file=path, line=1, fix="Save it with commas and points.")
     doubled = sorted({name for name in names if names.count(name) > 1})
     if doubled:
-        raise RequestError("appears twice.", file=path, line=1, column=doubled[0], mend="Keep one of the two.")
+        raise RequestError("appears twice.", file=path, line=1, column=doubled[0], fix="Keep one of the two.")
     rows = []
     for row in lines:
         if not any(cell.strip() for cell in row):
@@ -67,15 +67,15 @@ def read_points(path: Path) -> Points:
                 f"has {len(row)} cells, and there are {len(names)} columns.",
                 file=path,
                 line=lines.line_num,
-                mend="Mend the row; a comma inside a cell needs quotes, a decimal comma a point.",
+                fix="Fix the row; a comma inside a cell needs quotes, a decimal comma a point.",
             )
         rows.append(row)
     text = pd.DataFrame(rows, columns=names, dtype=object)
     if text.empty:
-        raise RequestError("has no rows.", file=path, mend="Give one row per point.")
+        raise RequestError("has no rows.", file=path, fix="Give one row per point.")
     taken = [name for name in ANSWERS if name in names]
     if taken:
-        raise RequestError("is a column of the answer.", file=path, line=1, column=taken[0], mend="Rename it.")
+        raise RequestError("is a column of the answer.", file=path, line=1, column=taken[0], fix="Rename it.")
     return Points(path, text, text.apply(_numbers))
 
 
@@ -97,11 +97,11 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
         If `output` cannot be written or is the table of points itself.
     """
     if output.exists() and output.resolve() == points.path.resolve():
-        raise RequestError(f"--output {output} is the table of points.", mend="Give another name.")
+        raise RequestError(f"--output {output} is the table of points.", fix="Give another name.")
     if not output.absolute().parent.is_dir():
-        raise RequestError(f"there is no folder {output.parent} for --output.", mend="Make it first.")
+        raise RequestError(f"there is no folder {output.parent} for --output.", fix="Make it first.")
     if output.is_dir():
-        raise RequestError(f"--output {output} is a folder.", mend="Give a file name.")
+        raise RequestError(f"--output {output} is a folder.", fix="Give a file name.")
     # `answers` keeps the rows and their order; the cells of the points are written as they were given.
     table = pd.concat([points.text, answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
     staged = output.with_name(f".{output.name}.{os.getpid()}")
@@ -109,9 +109,7 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
         table.to_csv(staged, index=False, encoding="utf-8", lineterminator="\n")
         os.replace(staged, output)
     except OSError as error:
-        raise RequestError(
-            f"{output} cannot be written ({error.strerror}).", mend="Choose another --output."
-        ) from error
+        raise RequestError(f"{output} cannot be written ({error.strerror}).", fix="Choose another --output.") from error
     finally:
         staged.unlink(missing_ok=True)
     answered = answers["force_after_N"].notna()

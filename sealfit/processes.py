@@ -74,7 +74,7 @@ def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], worker
 
 def _died() -> WorkerError:
     return WorkerError(
-        "a worker process died before it had answered.", mend="If memory ran out, use fewer workers (--workers 1)."
+        "a worker process died before it had answered.", fix="If memory ran out, use fewer workers (--workers 1)."
     )
 
 

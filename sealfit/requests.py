@@ -113,7 +113,7 @@ def lifetime(
 
     store = Store.open(existing_out(out))
     if model not in MODELS:
-        raise RequestError(f"there is no model '{model}'.", mend=f"Choose one of: {', '.join(MODELS)}.")
+        raise RequestError(f"there is no model '{model}'.", fix=f"Choose one of: {', '.join(MODELS)}.")
     goal = goal_of(threshold, loss_pct)
     tables, taken_out = _fits_of(store, model)
     laws = law_of(*tables, quantity, law)
@@ -139,7 +139,7 @@ def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame
         store.require("close-loop")
     except StaleError as error:
         other = "or ask the declared model, without effects: --model before"
-        raise StaleError(error.message, file=error.file, mend=f"{error.mend} ({other})") from error
+        raise StaleError(error.message, file=error.file, fix=f"{error.fix} ({other})") from error
     added = [effect for effect in store.read_json("closure")["effects"] if not effect["candidate"]]
     suffix = "_after" if added else ""
     taken_out = [{key: effect[key] for key in ("id", "label", "reference")} for effect in added]
@@ -195,7 +195,7 @@ def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:
 
     loaded = load_spec(existing_file(spec, "spec"))
     if not force and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
-        raise OutError("is there already.", file=out, mend="Choose another --out, or replace it with --force.")
+        raise OutError("is there already.", file=out, fix="Choose another --out, or replace it with --force.")
     make(loaded, out)
     files = sum(1 for path in out.rglob("*") if path.is_file() and path.name != RUNS)
     return {"campaign": str(out), "truth": str(truth_path(out)), "files": files}

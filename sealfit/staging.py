@@ -94,10 +94,10 @@ def disk(out: Path) -> Iterator[None]:
         yield
     except OSError as error:
         reason = error.strerror or str(error)
-        mend = "Mend the rights of the folder, or choose another --out."
+        fix = "Fix the rights of the folder, or choose another --out."
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            mend = "Free some space and run the command again; the results that were there are untouched."
-        raise OutError(f"cannot be written ({reason}).", file=out, mend=mend) from error
+            fix = "Free some space and run the command again; the results that were there are untouched."
+        raise OutError(f"cannot be written ({reason}).", file=out, fix=fix) from error
 
 
 def file_size(path: str) -> int | None:

@@ -125,10 +125,10 @@ class State:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
-            raise OutError(f"cannot be read ({error.strerror}).", file=path, mend="Mend its rights.") from error
+            raise OutError(f"cannot be read ({error.strerror}).", file=path, fix="Fix its rights.") from error
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise OutError(
-                "is not a state that this version of sealfit can read.", file=path, mend="Choose another --out."
+                "is not a state that this version of sealfit can read.", file=path, fix="Choose another --out."
             ) from error
 
 

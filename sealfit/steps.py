@@ -76,7 +76,7 @@ def run(
     Raises
     ------
     SealfitError
-        CampaignError, ConfigError, OutError, FitError: whatever the user has to mend.
+        CampaignError, ConfigError, OutError, FitError: whatever the user has to fix.
     """
     progress = progress or Silent()
     source = ConfigCopy.at(config)

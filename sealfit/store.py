@@ -71,7 +71,7 @@ class Store:
         state = State.read(out)
         if state is None:
             what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
-            raise OutError(what, file=out, mend=f"Make them with: sealfit run CAMPAIGN --out {shlex.quote(str(out))}")
+            raise OutError(what, file=out, fix=f"Make them with: sealfit run CAMPAIGN --out {shlex.quote(str(out))}")
         effects = own_effects_folder(effects, None, out, state.campaign)
         config = state.config.now()
         hashes = effects_seen(effects, state.effects, state.config, config)
@@ -120,7 +120,7 @@ class Store:
                 raise OutError(
                     f"belongs to the campaign {kept.campaign}, and {campaign} holds other data.",
                     file=out,
-                    mend="Choose another --out.",
+                    fix="Choose another --out.",
                 )
         state = replace(kept, campaign=campaign, config=source, inputs=store_inputs, effects=hashes)
         store = cls(out, state, known=True, kept=kept, effects=effects)
@@ -190,7 +190,7 @@ class Store:
         for name in STEPS[: STEPS.index(step) + 1]:
             why = self.why_stale(name)
             if why:
-                raise StaleError(f"{why}.", file=self.out, mend=f"Run: {self.command(name)}")
+                raise StaleError(f"{why}.", file=self.out, fix=f"Run: {self.command(name)}")
 
     def require_effects(self) -> None:
         """Raise RequestError if the loop is to be closed with the user's own effects and no folder of them is given."""

@@ -97,7 +97,7 @@ QUALITY = Schema(
         Column("severity", "", TEXT, "info | warning | error"),
         Column("action", "", TEXT, "kept | row left out | stroke left out | file left out"),
         Column("reason", "", TEXT, "in a sentence"),
-        Column("mend", "", TEXT, "what to do about it"),
+        Column("fix", "", TEXT, "what to do about it"),
     ),
 )
 TRACES = Schema(

@@ -11,7 +11,7 @@ from sealfit.fingerprint import Fingerprints, fingerprint
 from sealfit.tables import AFTER
 
 FAULT = Fault(
-    "not_a_number", "is not a number.", "a.csv", None, 3, "force_N", "x", "warning", "row left out", "Mend the cell."
+    "not_a_number", "is not a number.", "a.csv", None, 3, "force_N", "x", "warning", "row left out", "Fix the cell."
 )
 ERRORS = {
     "rmse_N": 0.4,

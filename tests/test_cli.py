@@ -122,14 +122,14 @@ def test_wrong_usage_is_2(sealfit, arguments):
 
 
 def test_a_campaign_at_fault_is_1_and_leaves_no_out(sealfit, parts, campaign, out):
-    parts.raises["ingest"] = CampaignError([Fault("twice", "is listed twice.", "runs.csv", None, 3, mend="Drop one.")])
+    parts.raises["ingest"] = CampaignError([Fault("twice", "is listed twice.", "runs.csv", None, 3, fix="Drop one.")])
     ended = sealfit("run", campaign, "--out", out)
     assert (ended.code, ended.stdout) == (1, "")
     assert "sealfit: runs.csv:3: is listed twice. Drop one.\n" in ended.stderr
     assert not out.exists()
     error = sealfit("run", campaign, "--out", out, "--json").json["errors"][0]
-    assert {"file", "line", "column", "value", "mend", "reason"} <= set(error)
-    assert (error["file"], error["line"], error["mend"]) == ("runs.csv", 3, "Drop one.")
+    assert {"file", "line", "column", "value", "fix", "reason"} <= set(error)
+    assert (error["file"], error["line"], error["fix"]) == ("runs.csv", 3, "Drop one.")
 
 
 def test_ctrl_c_is_130_one_line_and_out_is_intact(sealfit, parts, campaign, out):
@@ -179,7 +179,7 @@ def test_a_bug_under_json_leaves_one_object(sealfit, monkeypatch, arguments, at)
     (error,) = ended.json["errors"]
     assert error["kind"] == "bug"
     assert error["reason"] == "ZeroDivisionError: a bug"
-    assert {"file", "line", "column", "value", "mend", "reason"} <= set(error)
+    assert {"file", "line", "column", "value", "fix", "reason"} <= set(error)
     assert "Traceback (most recent call last):" in ended.stderr
 
 
@@ -269,11 +269,11 @@ def test_a_step_without_its_predecessor_names_the_command(sealfit, parts, campai
     (campaign / "a.csv").write_text("2")
     ended = sealfit("fit-steady", out, "--json")
     assert ended.code == 1
-    assert ended.json["errors"][0]["mend"] == f"Run: sealfit ingest {campaign} --out {out}"
+    assert ended.json["errors"][0]["fix"] == f"Run: sealfit ingest {campaign} --out {out}"
 
 
 def test_a_step_that_fails_keeps_those_before_it(sealfit, parts, campaign, out):
-    parts.raises["fit-steady"] = FitError("condition a: too few speeds.", mend="Measure more.")
+    parts.raises["fit-steady"] = FitError("condition a: too few speeds.", fix="Measure more.")
     ended = sealfit("run", campaign, "--out", out)
     assert (ended.code, ended.stdout) == (1, "")
     assert ended.stderr.splitlines()[-1] == "sealfit: condition a: too few speeds. Measure more."
@@ -285,7 +285,7 @@ def test_faults_are_said_and_counted_and_strict_stops(sealfit, parts, campaign, 
     parts.faults = [fake_parts.FAULT]
     ended = sealfit("run", campaign, "--out", out)
     assert ended.code == 0
-    assert "warning: a.csv:3: column 'force_N': 'x': is not a number. Mend the cell. [row left out]" in ended.stderr
+    assert "warning: a.csv:3: column 'force_N': 'x': is not a number. Fix the cell. [row left out]" in ended.stderr
     assert "faults      0 errors, 1 warning; left out: 1 row (table quality)" in ended.stdout
     parts.calls.clear()
     for arguments in (["--strict"], ["--strict", "--force"]):

@@ -47,7 +47,7 @@ def slow_square(number):
 
 
 def wrong(number):
-    raise RequestError(f"{number} is wrong.", mend="Use another.")
+    raise RequestError(f"{number} is wrong.", fix="Use another.")
 
 
 def timed_out(number):

@@ -30,7 +30,7 @@ def nested(number):
 
 def fail_on_three(number):
     if number == 3:
-        raise RequestError("three is wrong.", file="p.csv", line=4, mend="Use another.")
+        raise RequestError("three is wrong.", file="p.csv", line=4, fix="Use another.")
     return number
 
 
@@ -76,7 +76,7 @@ def test_a_map_inside_a_worker_needs_no_further_processes():
 def test_an_error_of_the_function_comes_back_whole(workers):
     with pytest.raises(RequestError, match="three is wrong") as caught:
         list(run_map(fail_on_three, range(8), workers=workers))
-    assert (caught.value.file, caught.value.line, caught.value.mend) == ("p.csv", 4, "Use another.")
+    assert (caught.value.file, caught.value.line, caught.value.fix) == ("p.csv", 4, "Use another.")
 
 
 def test_faults_of_a_campaign_come_back_whole():

@@ -35,7 +35,7 @@ def test_a_terminal_keeps_one_line_of_what_was_counted():
 
 def test_faults_are_said_with_what_was_done_and_remarks_are_not():
     stream = io.StringIO()
-    kept = Fault("gap", "has a gap.", "a.csv", severity="warning", action="kept", mend="Look at the logger.")
+    kept = Fault("gap", "has a gap.", "a.csv", severity="warning", action="kept", fix="Look at the logger.")
     left = Fault("empty", "is empty.", "b.csv", action="file left out")
     Lines(stream).faults([kept, left, Fault("read", "was read.", severity="info", action="kept")])
     assert stream.getvalue() == (

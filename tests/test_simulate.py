@@ -123,13 +123,13 @@ def test_an_effect_that_gives_no_number_is_said_and_nothing_written(tmp_path):
         ('[design]\norder = "undated"\n[[channels]]\nkind = "slow"\nname = "lab_C"', "drifts with the calendar"),
     ],
 )
-def test_a_wrong_spec_is_refused_with_its_mend(tmp_path, text, words):
+def test_a_wrong_spec_is_refused_with_its_fix(tmp_path, text, words):
     path = tmp_path / "spec.toml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=words) as raised:
         load_spec(path)
     assert raised.value.file == str(path)
-    assert raised.value.mend
+    assert raised.value.fix
 
 
 def test_a_missing_spec_is_said(tmp_path):

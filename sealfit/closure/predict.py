@@ -125,7 +125,7 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
         raise RequestError(
             "is missing, and the model needs it.",
             column=name,
-            mend=f"Add the column{f' in {unit}' if unit else ''}"
+            fix=f"Add the column{f' in {unit}' if unit else ''}"
             + (f"; tested from {tested[0]:g} to {tested[1]:g}." if _is_range(tested) else "."),
         )
     if "speed_mm_s" not in table:

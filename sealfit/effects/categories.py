@@ -69,7 +69,7 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
 def _different(id: str, categories: Sequence[str]) -> tuple[str, ...]:
     names = tuple(str(c) for c in categories)
     if len(names) < 2 or len(set(names)) != len(names):
-        raise ParameterError(f"{id}: {list(names)} must be two or more different categories.", mend="List each once.")
+        raise ParameterError(f"{id}: {list(names)} must be two or more different categories.", fix="List each once.")
     return names
 
 

@@ -65,7 +65,7 @@ def smooth_effect(
     """
     places = tuple(float(k) for k in knots)
     if len(places) < 2 or not np.isfinite(places).all() or not (np.diff(places) > 0).all():
-        raise ParameterError(f"smooth: knots {list(places)} must be two or more rising numbers.", mend="Sort them.")
+        raise ParameterError(f"smooth: knots {list(places)} must be two or more rising numbers.", fix="Sort them.")
     zero = _nearest(places, reference)
     free = [j for j in range(len(places)) if j != zero]
     x = places[free[-1]]
@@ -172,7 +172,7 @@ def surface_effect(x_knots: Sequence[float], z_knots: Sequence[float]) -> Effect
     """
     knots = tuple(tuple(float(k) for k in given) for given in (x_knots, z_knots))
     if any(len(given) < 2 or not (np.diff(given) > 0).all() for given in knots):
-        raise ParameterError(f"surface: knots {knots} must be two or more rising numbers.", mend="Sort them.")
+        raise ParameterError(f"surface: knots {knots} must be two or more rising numbers.", fix="Sort them.")
     return Effect(
         id=SURFACE,
         label="smooth in {x} and {z}",
@@ -244,9 +244,9 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
     (('c_2', 'c_3'), [0.0, 2.0, 2.0])
     """
     if id not in FREE:
-        raise ParameterError(f"'{id}' is no free shape.", mend=f"Use one of {', '.join(FREE)}.")
+        raise ParameterError(f"'{id}' is no free shape.", fix=f"Use one of {', '.join(FREE)}.")
     make, needs = FREE[id]
     for need in needs:
         if need not in fixed:
-            raise ParameterError(f"{id}: '{need}' is missing.", mend=f"Give '{need}' in its fixed values.")
+            raise ParameterError(f"{id}: '{need}' is missing.", fix=f"Give '{need}' in its fixed values.")
     return make(fixed)

@@ -36,7 +36,7 @@ def load_user_effects(folder: Path) -> dict[str, Effect]:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ConfigError("there is no such folder.", file=folder, mend="Check loop.effects_folder in the config.")
+        raise ConfigError("there is no such folder.", file=folder, fix="Check loop.effects_folder in the config.")
     found: dict[str, Effect] = {}
     for path in sorted(folder.glob("*.py")):
         if path.name.startswith("_"):
@@ -45,7 +45,7 @@ def load_user_effects(folder: Path) -> dict[str, Effect]:
             _refuse_taken(effect.id, found, path)
             fault = contract_fault(effect)
             if fault:
-                raise ConfigError(f"effect '{effect.id}': {fault}.", file=path, mend=f"Mend the file. {EXAMPLE}")
+                raise ConfigError(f"effect '{effect.id}': {fault}.", file=path, fix=f"Fix the file. {EXAMPLE}")
             found[effect.id] = replace(effect, shape=FileShape(path.resolve(), effect.id, effect.shape))
     return found
 
@@ -77,7 +77,7 @@ def _effects_of(path: Path) -> list[Effect]:
     unique = {id(effect): effect for effect in own if EFFECTS.get(effect.id) is not effect}  # not what it imported
     if not unique:
         raise ConfigError(
-            "holds no effect.", file=path, mend=f"Define one at its top level, or move the file. {EXAMPLE}"
+            "holds no effect.", file=path, fix=f"Define one at its top level, or move the file. {EXAMPLE}"
         )
     return list(unique.values())
 
@@ -93,12 +93,12 @@ def _run(path: Path) -> ModuleType:
         exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
     except ParameterError as error:  # the contract's own words
         del sys.modules[name]
-        raise ConfigError(str(error), file=path, mend=f"Mend the file. {EXAMPLE}") from error
-    except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to mend
+        raise ConfigError(str(error), file=path, fix=f"Fix the file. {EXAMPLE}") from error
+    except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to fix
         del sys.modules[name]
         line = _line_in(path, error)
         message = f"cannot be run: {type(error).__name__}: {error}."
-        raise ConfigError(message, file=path, line=line, mend="Mend the file, or move it out of the folder.") from error
+        raise ConfigError(message, file=path, line=line, fix="Fix the file, or move it out of the folder.") from error
     return module
 
 
@@ -116,11 +116,11 @@ def _line_in(path: Path, error: BaseException) -> int | None:
 
 def _refuse_taken(name: str, found: Mapping[str, Effect], path: Path) -> None:
     if not (isinstance(name, str) and name.isidentifier()):
-        raise ConfigError(f"id {name!r} is not a plain name.", file=path, mend="Use letters, digits and underscores.")
+        raise ConfigError(f"id {name!r} is not a plain name.", file=path, fix="Use letters, digits and underscores.")
     if name in EFFECTS or name in FREE:
-        raise ConfigError(f"the catalogue has an effect '{name}' already.", file=path, mend="Give it another id.")
+        raise ConfigError(f"the catalogue has an effect '{name}' already.", file=path, fix="Give it another id.")
     if name in found:
-        raise ConfigError(f"another file of the folder has an effect '{name}' already.", file=path, mend="Rename one.")
+        raise ConfigError(f"another file of the folder has an effect '{name}' already.", file=path, fix="Rename one.")
 
 
 def contract_fault(effect: Effect) -> str:

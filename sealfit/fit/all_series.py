@@ -197,19 +197,19 @@ def law_of(steady: pd.DataFrame, steady_fit: pd.DataFrame, quantity: str, name: 
         If rubber is not aged, the quantity was not fitted, there are several rubbers, or no such law can be fitted.
     """
     if "aging_days" not in steady_fit.columns:
-        raise RequestError("this rig ages no rubber.", mend="Name aging_days in the config's condition.")
+        raise RequestError("this rig ages no rubber.", fix="Name aging_days in the config's condition.")
     levels = shared_levels(steady, steady_fit)
     known = _quantities(levels)
     rubbers = [rubber for rubber, own in known if own == quantity]
     if not rubbers:
         there = ", ".join(dict.fromkeys(own for _, own in known)) or "none"
-        raise RequestError(f"there is no '{quantity}' to follow.", mend=f"Choose one of: {there}.")
+        raise RequestError(f"there is no '{quantity}' to follow.", fix=f"Choose one of: {there}.")
     if len(rubbers) > 1:
-        raise RequestError(f"there are several rubbers: {', '.join(rubbers)}.", mend="Analyse them one by one.")
+        raise RequestError(f"there are several rubbers: {', '.join(rubbers)}.", fix="Analyse them one by one.")
     if name is not None and name not in LOSSES:
-        raise RequestError(f"there is no law '{name}'.", mend=f"Choose one of: {', '.join(LOSSES)}.")
+        raise RequestError(f"there is no law '{name}'.", fix=f"Choose one of: {', '.join(LOSSES)}.")
     aged = aged_values(levels, rubbers[0], quantity)
     try:
         return fit_laws(aged) if name is None else fit_laws(aged, (name,))
     except FitError as error:
-        raise RequestError(error.message, mend=error.mend) from error
+        raise RequestError(error.message, fix=error.fix) from error

@@ -149,11 +149,11 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
     names = ("mu_0", "a", *shape.parameters, *drivers)
     conditions = len(set(zip(aged.series().tolist(), aged.days.tolist(), strict=True)))
     if not (aged.days > 0).any():
-        raise FitError("no aged rubber was tested.", mend="Test at least two aged conditions.")
+        raise FitError("no aged rubber was tested.", fix="Test at least two aged conditions.")
     if conditions < len(names):
         raise FitError(
             f"{conditions} conditions do not determine the {len(names)} numbers of the law '{loss}'.",
-            mend="Test more days, or choose a law with fewer numbers.",
+            fix="Test more days, or choose a law with fewer numbers.",
         )
     empty = JointLaw(aged, shape, way, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf)
     x, scatter, before = None, 0.05, np.inf

@@ -160,15 +160,15 @@ def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | 
     """Return where the rubber is used, checked."""
     for name, what, value, tested, (least, most), unit in _asked(law, temperature_C, compression_pct):
         if name in law.names and value is None:
-            raise RequestError(f"the rubber was aged at more than one {what}.", mend=f"Say which with --{what}.")
+            raise RequestError(f"the rubber was aged at more than one {what}.", fix=f"Say which with --{what}.")
         if value is not None and not least <= value <= most:
             raise RequestError(
-                f"--{what} {value:g} is no {what} of use.", mend=f"Give {unit} between {least:g} and {most:g}."
+                f"--{what} {value:g} is no {what} of use.", fix=f"Give {unit} between {least:g} and {most:g}."
             )
         only = np.unique(tested[law.aged.days > 0]) if tested is not None else np.array([])
         if value is not None and name not in law.names and not (only.size and np.allclose(value, only)):
             where = f"at {only[0]:g} {unit} only" if only.size else f"at one {what}, which is not on record"
-            raise RequestError(f"the rubber was aged {where}.", mend=f"Leave --{what} away, or test at another {what}.")
+            raise RequestError(f"the rubber was aged {where}.", fix=f"Leave --{what} away, or test at another {what}.")
     at = (None if value is None else np.array([float(value)]) for value in (temperature_C, compression_pct))
     return Aged(np.ones(1), np.zeros(1), *at)
 
@@ -242,9 +242,9 @@ def temperature_for(
         If the rubber was aged at one temperature only, or the years are no time.
     """
     if not 0 < years < np.inf:
-        raise RequestError(f"--years {years:g} is no time to last.", mend="Give a number above 0.")
+        raise RequestError(f"--years {years:g} is no time to last.", fix="Give a number above 0.")
     if "E" not in law.names:
-        raise RequestError("the rubber was aged at one temperature only.", mend="Test at two or more temperatures.")
+        raise RequestError("the rubber was aged at one temperature only.", fix="Test at two or more temperatures.")
     wanted = years * DAYS_PER_YEAR
 
     def longer(celsius: float) -> float:

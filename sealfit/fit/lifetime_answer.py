@@ -22,12 +22,12 @@ def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
     if (threshold is None) == (loss_pct is None):
         raise RequestError(
             "what ends a life is not said." if threshold is None else "two ends of life were given.",
-            mend="Give --threshold VALUE or --loss PERCENT.",
+            fix="Give --threshold VALUE or --loss PERCENT.",
         )
     if threshold is not None and not np.isfinite(threshold):
-        raise RequestError(f"--threshold {threshold:g} is no value to reach.", mend="Give a number.")
+        raise RequestError(f"--threshold {threshold:g} is no value to reach.", fix="Give a number.")
     if loss_pct is not None and not 0 < loss_pct < 100:
-        raise RequestError(f"--loss {loss_pct:g} is no share of the start.", mend="Give percent between 0 and 100.")
+        raise RequestError(f"--loss {loss_pct:g} is no share of the start.", fix="Give percent between 0 and 100.")
     return Goal(threshold) if loss_pct is None else Goal(loss=loss_pct / 100)
 
 
@@ -61,11 +61,11 @@ def answer(
         If the request cannot be answered: see `lifetime` and `temperature_for`.
     """
     if years is not None and temperature_C is not None:
-        raise RequestError("--years asks for the temperature, and --temperature gives it.", mend="Give one of the two.")
+        raise RequestError("--years asks for the temperature, and --temperature gives it.", fix="Give one of the two.")
     if goal.loss is not None and (law.aged.days > 0).all():
         raise RequestError(
             "no unaged rubber was tested: there is no start of which a share could be lost.",
-            mend="Give --threshold VALUE, or test unaged rubber.",
+            fix="Give --threshold VALUE, or test unaged rubber.",
         )
     found = {"law": law.loss.name, "way": law.way, "form": law.loss.form, "criterion": law.bic}
     found |= {"parameters": {name: value for name, value, *_ in law.parameters()}}

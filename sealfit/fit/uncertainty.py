@@ -49,10 +49,10 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     """
     missing = [name for name in NEEDED if name not in steady.columns]
     if missing:
-        raise FitError(f"table steady lacks {', '.join(missing)}.", mend="Run sealfit ingest again.")
+        raise FitError(f"table steady lacks {', '.join(missing)}.", fix="Run sealfit ingest again.")
     rows = steady[steady["used"].to_numpy(bool) & steady["condition"].notna().to_numpy()]
     if rows.empty:
-        raise FitError("no steady window is left to fit.", mend="Look in table quality why each was left out.")
+        raise FitError("no steady window is left to fit.", fix="Look in table quality why each was left out.")
     rows = both_ways_together(rows)
     commanded = rows["speed_set_mm_s"] if "speed_set_mm_s" in rows.columns else pd.Series(np.nan, rows.index)
     numbers = pd.DataFrame(
@@ -78,7 +78,7 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
         first = runs[bad].iloc[0]
         raise FitError(
             f"run {first['run_id']} has speed {first['speed']:g} and force {first['force']:g} in its steady window.",
-            mend="Leave it out of the campaign, or look at its steady window.",
+            fix="Leave it out of the campaign, or look at its steady window.",
         )
     return runs
 

@@ -214,6 +214,4 @@ def check(y, weight) -> None:
         If one is not finite, or a weight is negative.
     """
     if not (np.all(np.isfinite(y)) and np.all(np.isfinite(weight)) and np.all(weight >= 0)):
-        raise FitError(
-            "measured values and weights must be finite, weights not negative.", mend="Look for empty cells."
-        )
+        raise FitError("measured values and weights must be finite, weights not negative.", fix="Look for empty cells.")

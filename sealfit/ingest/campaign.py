@@ -304,4 +304,4 @@ def _nothing_left(faults: Sequence[Fault], files: int) -> list[Fault]:
     errors = [fault for fault in faults if fault.severity == "error"]
     more = len(errors) - SHOWN
     reason = f"none of {files} trace files can be used" + (f"; {more} more faults are not shown." if more > 0 else ".")
-    return [*errors[:SHOWN], Fault("nothing_left", reason, mend="Mend what is said above; start with one file.")]
+    return [*errors[:SHOWN], Fault("nothing_left", reason, fix="Fix what is said above; start with one file.")]

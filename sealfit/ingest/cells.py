@@ -205,22 +205,22 @@ def _cell_faults(at, cells, rows, line, name, decimal, file) -> list[Fault]:
         place = {"file": file, "line": int(line[i]), "column": name, "action": "row left out"}
         if cell is None:
             reason = f"the line ends after {len(rows[i])} cells."
-            return Fault("too_few_cells", reason, mend="Complete or delete the line.", **place)
+            return Fault("too_few_cells", reason, fix="Complete or delete the line.", **place)
         if not cell.strip():
-            return Fault("empty_cell", "the cell is empty.", mend="Fill it or delete the line.", value="", **place)
+            return Fault("empty_cell", "the cell is empty.", fix="Fill it or delete the line.", value="", **place)
         if as_number(cell, decimal) is not None:
-            return Fault("not_finite", "is not a finite number.", value=cell.strip(), mend="Delete the line.", **place)
+            return Fault("not_finite", "is not a finite number.", value=cell.strip(), fix="Delete the line.", **place)
         if match := _REMARK.match(cell):
             remark = match["remark"]
             reason = f"a remark stands beside the number: {remark!r}."
-            mend = "Put the right number alone in the cell."
-            return Fault("remark", reason, value=cell.strip(), mend=mend, **place)
-        mend = decimal_mend(cell, decimal) or "Put a number there or delete the line."
+            fix = "Put the right number alone in the cell."
+            return Fault("remark", reason, value=cell.strip(), fix=fix, **place)
+        fix = decimal_fix(cell, decimal) or "Put a number there or delete the line."
         if i == 0 and len(at) < len(cells) and not any(char.isdigit() for char in cell):
-            mend = "If this is a row of units, set units_row = true in the rig config; otherwise delete the line."
+            fix = "If this is a row of units, set units_row = true in the rig config; otherwise delete the line."
         elif _CLOCK.fullmatch(cell.strip()):
-            mend = "Export the time as seconds, not as time of day."
-        return Fault("not_a_number", "is not a number.", value=cell.strip(), mend=mend, **place)
+            fix = "Export the time as seconds, not as time of day."
+        return Fault("not_a_number", "is not a number.", value=cell.strip(), fix=fix, **place)
 
     def rest(count: int) -> Fault:
         reason = f"and {count} more cells of this column that are not numbers."
@@ -229,8 +229,8 @@ def _cell_faults(at, cells, rows, line, name, decimal, file) -> list[Fault]:
     return listed(at, make, rest)
 
 
-def decimal_mend(cell: str, decimal: str) -> str:
-    """Return the mend for a number written with the other decimal mark; "" if that is not what is wrong."""
+def decimal_fix(cell: str, decimal: str) -> str:
+    """Return the fix for a number written with the other decimal mark; "" if that is not what is wrong."""
     if decimal == "." and as_number(cell, ",") is not None:
         return 'Use a decimal point, or set decimal = "," in the rig config.'
     if decimal == "," and as_number(cell, ".") is not None:
@@ -243,11 +243,11 @@ def _beyond_faults(at, rows, line, width, file) -> list[Fault]:
         value = " ".join(cell.strip() for cell in rows[i][width:] if cell.strip())
         words = f"a remark stands beside the numbers: {value!r}." if as_number(value) is None else ""
         reason = words or f"the line has {len(rows[i])} cells where {width} are named."
-        mend = "Move it to a column with a name of its own, or delete the line."
+        fix = "Move it to a column with a name of its own, or delete the line."
         if not words and len(rows[i]) == 2 * width:
-            mend = "Decimal commas between commas? Export with another separator, or with decimal points."
+            fix = "Decimal commas between commas? Export with another separator, or with decimal points."
         check = "remark" if words else "too_many_cells"
-        return Fault(check, reason, file=file, line=int(line[i]), value=value, action="row left out", mend=mend)
+        return Fault(check, reason, file=file, line=int(line[i]), value=value, action="row left out", fix=fix)
 
     def rest(count: int) -> Fault:
         reason = f"and {count} more lines with cells beyond the last named column."

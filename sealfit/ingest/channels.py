@@ -8,7 +8,7 @@ import numpy as np
 
 from sealfit.config import Config
 from sealfit.errors import Fault
-from sealfit.ingest.cells import OVERLOAD, decimal_mend, listed
+from sealfit.ingest.cells import OVERLOAD, decimal_fix, listed
 from sealfit.ingest.text import as_number
 
 MAX_LABELS = 20  # a text column with more different values, most of them used once, is a clock or a serial number
@@ -89,9 +89,9 @@ def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarr
 
 
 def _left_out(name: str, reason: str, severity: str, file: str) -> Fault:
-    mend = "Fill it, or list it under trace.optional and leave it out of the export." if severity == "warning" else ""
+    fix = "Fill it, or list it under trace.optional and leave it out of the export." if severity == "warning" else ""
     reason = f"{reason}; the column is not used."
-    return Fault("channel_left_out", reason, file=file, column=name, severity=severity, action="kept", mend=mend)
+    return Fault("channel_left_out", reason, file=file, column=name, severity=severity, action="kept", fix=fix)
 
 
 def _cell_faults(name, numbers, texts, at, line, decimal, file) -> list[Fault]:
@@ -99,11 +99,11 @@ def _cell_faults(name, numbers, texts, at, line, decimal, file) -> list[Fault]:
         place = {"file": file, "line": int(line[i]), "column": name, "action": "row left out"}
         cell = None if texts is None else texts[i]
         if cell is not None and as_number(cell, decimal) is None:
-            mend = decimal_mend(cell, decimal) or "Put a number there or delete the line."
-            return Fault("not_a_number", "is not a number.", value=cell, mend=mend, **place)
+            fix = decimal_fix(cell, decimal) or "Put a number there or delete the line."
+            return Fault("not_a_number", "is not a number.", value=cell, fix=fix, **place)
         value = cell if cell is not None else "" if np.isnan(numbers[i]) else str(numbers[i])  # JSON has no inf
         reason = "is no measured number." if value != "" else "the cell holds no number."
-        return Fault("not_finite", reason, value=value, mend="Fill it or delete the line.", **place)
+        return Fault("not_finite", reason, value=value, fix="Fill it or delete the line.", **place)
 
     def rest(count: int) -> Fault:
         reason = f"and {count} more cells of this column that are not numbers."

@@ -46,9 +46,9 @@ def locate(layout: Layout, width: int, settings: TraceFormat, file: str) -> dict
         if len(positions) == 1:
             found[positions[0]] = ours
         elif positions:
-            mend = "Rename one, or name the column by its position in the rig config."
+            fix = "Rename one, or name the column by its position in the rig config."
             faults.append(
-                _fault("duplicate_column", f"stands {len(positions)} times in the header.", layout, file, theirs, mend)
+                _fault("duplicate_column", f"stands {len(positions)} times in the header.", layout, file, theirs, fix)
             )
         elif ours not in settings.optional:
             faults.append(_missing(theirs, layout, width, settings, file))
@@ -88,7 +88,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def suggestion(name: str, known: Sequence[str]) -> str:
-    """Return a mend for a missing column: the nearest name, or the names that there are."""
+    """Return a fix for a missing column: the nearest name, or the names that there are."""
     if close := nearest(name, known):
         case = " (the case of letters matters)" if close.lower() == name.lower() else ""
         return f"Did you mean '{close}'?{case}"
@@ -99,28 +99,26 @@ def required(table: Mapping[str, object], layout: Layout, file: str) -> None:
     """Raise `BadFile` if, after everything is computed, a slot that every trace needs is not there."""
     missing = [name for name in SLOTS[:3] if name not in table]
     if missing:
-        mend = "Name it under [trace.columns], compute it under [trace.compute], or integrate it from a speed column."
+        fix = "Name it under [trace.columns], compute it under [trace.compute], or integrate it from a speed column."
         raise BadFile(
-            *(_fault("missing_column", "there is no such column.", layout, file, name, mend) for name in missing)
+            *(_fault("missing_column", "there is no such column.", layout, file, name, fix) for name in missing)
         )
 
 
 def _missing(theirs: str | int, layout: Layout, width: int, settings: TraceFormat, file: str) -> Fault:
     if isinstance(theirs, int):
         reason = f"there is no column {theirs}: the lines have {width}."
-        mend = "Check delimiter and positions in the rig config."
-        return _fault("missing_column", reason, layout, file, theirs, mend)
-    mend = suggestion(theirs, layout.names)
+        fix = "Check delimiter and positions in the rig config."
+        return _fault("missing_column", reason, layout, file, theirs, fix)
+    fix = suggestion(theirs, layout.names)
     if len(layout.names) <= 1 and layout.names_line is not None:
         line = layout.header[layout.names_line - 1]
         for mark, word in ((";", '";"'), ("\t", '"tab"'), (",", '","'), (" ", '"whitespace"')):
             if len(split_line(line, "tab" if mark == "\t" else mark)) >= 2 and mark != settings.delimiter:
-                mend = f"The header looks separated otherwise: set delimiter = {word} in the rig config."
+                fix = f"The header looks separated otherwise: set delimiter = {word} in the rig config."
                 break
-    return _fault("missing_column", "there is no such column.", layout, file, theirs, mend)
+    return _fault("missing_column", "there is no such column.", layout, file, theirs, fix)
 
 
-def _fault(check: str, reason: str, layout: Layout, file: str, column: str | int, mend: str) -> Fault:
-    return Fault(
-        check, reason, file=file, line=layout.names_line, column=str(column), action="file left out", mend=mend
-    )
+def _fault(check: str, reason: str, layout: Layout, file: str, column: str | int, fix: str) -> Fault:
+    return Fault(check, reason, file=file, line=layout.names_line, column=str(column), action="file left out", fix=fix)

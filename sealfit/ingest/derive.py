@@ -91,10 +91,10 @@ def add_order(entries: Entries, columns: Columns) -> tuple[Columns, list[Fault]]
     started = columns["started_at"]
     texts = [str(value).strip() for value in started.values]
     times = [_time(text) for text in texts]
-    mend = "Write it as 2024-03-01T09:30:00."
+    fix = "Write it as 2024-03-01T09:30:00."
     bad = np.array([*(time is None for time in times), False], bool)[started.codes]
     faults = [
-        entries[i].fault("not_a_time", "is no ISO 8601 time.", "started_at", value=texts[started.codes[i]], mend=mend)
+        entries[i].fault("not_a_time", "is no ISO 8601 time.", "started_at", value=texts[started.codes[i]], fix=fix)
         for i in np.flatnonzero(bad).tolist()
     ]
     if any(time.tzinfo for time in times if time is not None):
@@ -172,7 +172,7 @@ def add_runs(columns: Columns, conditions: Coded, measured: Sequence[float], uni
     if not groups:
         return added, []
     reason = "neither run_id nor a commanded speed is given; files of one condition share a run within 5 % of speed."
-    said = Fault("run_id_derived", reason, severity="info", action="kept", mend="Give run_id or speed_mm_s.")
+    said = Fault("run_id_derived", reason, severity="info", action="kept", fix="Give run_id or speed_mm_s.")
     return added, [said]
 
 
@@ -217,19 +217,19 @@ def disagreements(entries: Entries, columns: Columns, conditions: Coded) -> list
         entry, j, other = entries[i], int(first[i]), int(same_repeat[i])
         if other != i:
             reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
-            mend = "Give every file of a run its own repeat number, or each stroke of a repeat its number."
-            faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], mend=mend))
+            fix = "Give every file of a run its own repeat number, or each stroke of a repeat its number."
+            faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], fix=fix))
         for name, column in told.items():
             mine, theirs = column[i], column[j]
             if mine != theirs and not _same(mine, theirs):
                 there = "none" if theirs is None else _text(theirs)
                 reason = f"differs from the other repeats of run '{run[i]}', {_place(entries[j])}: {there}."
-                mend = "One run is one condition, speed and load: give it another run_id, or correct the cell."
+                fix = "One run is one condition, speed and load: give it another run_id, or correct the cell."
                 value = "none" if mine is None else mine
-                faults.append(entry.fault("run_disagrees", reason, name, value=value, mend=mend))
+                faults.append(entry.fault("run_disagrees", reason, name, value=value, fix=fix))
         if specimen[i] != specimen[j] and _same(told["speed_mm_s"][i], told["speed_mm_s"][j]):
             reason = f"run '{run[i]}' has repeats on several specimens; their scatter counts as that of repeats."
-            place = {"severity": "warning", "action": "kept", "mend": "Give each specimen a run_id of its own."}
+            place = {"severity": "warning", "action": "kept", "fix": "Give each specimen a run_id of its own."}
             faults.append(entry.fault("run_specimens", reason, "specimen_id", value=specimen[i], **place))
     return faults
 

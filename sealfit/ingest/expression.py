@@ -81,14 +81,14 @@ def parse(text: str, *, condition: bool = False) -> Expression:
 + - * / **, parentheses, pi, abs, min, max, sqrt.
     """
     if len(text) > MAX_CHARACTERS:
-        raise ConfigError(f"an expression of {len(text)} characters.", mend=f"Keep it below {MAX_CHARACTERS}.")
+        raise ConfigError(f"an expression of {len(text)} characters.", fix=f"Keep it below {MAX_CHARACTERS}.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # "1if": a remark of Python's about text that is refused below anyway
             tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = getattr(error, "msg", None) or "it is nested too deeply"
-        raise ConfigError(f"{text!r} is not an expression: {reason}.", mend=_mend(condition)) from error
+        raise ConfigError(f"{text!r} is not an expression: {reason}.", fix=_fix(condition)) from error
     names: set[str] = set()
     (_check_condition if condition else _check_number)(tree, text, names, 0)
     return Expression(text, tree, frozenset(names))
@@ -109,22 +109,22 @@ def evaluate(expression: Expression, values: Mapping[str, object]) -> np.ndarray
         if name not in values:
             known = ", ".join(sorted(values)) or "none"
             raise ConfigError(
-                f"in {expression.text!r}: there is no column '{name}'.", column=name, mend=f"Known: {known}."
+                f"in {expression.text!r}: there is no column '{name}'.", column=name, fix=f"Known: {known}."
             )
         if np.asarray(values[name]).dtype.kind not in "fiub":
             raise ConfigError(
-                f"in {expression.text!r}: '{name}' is text, not a number.", column=name, mend="Map it to numbers first."
+                f"in {expression.text!r}: '{name}' is text, not a number.", column=name, fix="Map it to numbers first."
             )
     with np.errstate(all="ignore"):
         return np.asarray(_value(expression.tree, values))
 
 
-def _mend(condition: bool) -> str:
+def _fix(condition: bool) -> str:
     return _ALLOWED + (", and comparisons joined by and, or, not." if condition else ".")
 
 
 def _refuse(text: str, piece: str, condition: bool = False) -> ConfigError:
-    return ConfigError(f'in "{text}": {piece} is not allowed.', mend=_mend(condition))
+    return ConfigError(f'in "{text}": {piece} is not allowed.', fix=_fix(condition))
 
 
 def _fold(function, values):
@@ -156,7 +156,7 @@ def _check_condition(node: ast.expr, text: str, names: set[str], depth: int) -> 
         case _:
             _check_number(node, text, names, depth + 1)  # refuses with its own words what is not even a number
             raise ConfigError(
-                f"in \"{text}\": '{ast.unparse(node)}' compares nothing.", mend="Write for example load_N > 4.9."
+                f"in \"{text}\": '{ast.unparse(node)}' compares nothing.", fix="Write for example load_N > 4.9."
             )
 
 

@@ -120,12 +120,12 @@ def _not_opened(path: str, file: str, error: OSError) -> BadFile:
     return _bad(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.")
 
 
-def _bad(file: str, check: str, reason: str, mend: str) -> BadFile:
-    return BadFile(Fault(check, reason, file=file, action="file left out", mend=mend))
+def _bad(file: str, check: str, reason: str, fix: str) -> BadFile:
+    return BadFile(Fault(check, reason, file=file, action="file left out", fix=fix))
 
 
 def _similar(path: Path) -> str:
-    """Return a mend for a missing file: the same name in other case or place, if there is one."""
+    """Return a fix for a missing file: the same name in other case or place, if there is one."""
     try:
         for other in path.parent.iterdir():
             if other.name.lower() == path.name.lower():

@@ -54,7 +54,7 @@ def form_of(text: bytes, settings: TraceFormat, file: str) -> Form:
     start = layout.start
     if not _has_data(text, start):
         place = {"file": file, "action": "file left out"}
-        raise BadFile(Fault("no_rows", "has a header but no data.", mend="Export it again.", **place))
+        raise BadFile(Fault("no_rows", "has a header but no data.", fix="Export it again.", **place))
     cells = _cells(text, start, settings.delimiter)
     ours = locate(layout, len(layout.names) or cells, settings, file)
     must = numeric_names(settings)

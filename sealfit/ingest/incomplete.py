@@ -13,7 +13,7 @@ CALENDAR = ("run_order", "elapsed_h")  # both from started_at
 
 
 def incomplete_columns(steady: pd.DataFrame) -> list[Fault]:
-    """Return, for every column that some files have no value of, how many, what that does, and the mend.
+    """Return, for every column that some files have no value of, how many, what that does, and the fix.
 
     Parameters
     ----------
@@ -29,9 +29,9 @@ def incomplete_columns(steady: pd.DataFrame) -> list[Fault]:
         missing = used["file"][used[name].isna()].nunique()
         if 0 < missing < files:
             reason = f"{missing} of {files} files have no value: {_what_follows(name, used[name], missing / files)}."
-            mend = "Fill started_at." if name in CALENDAR else "Fill it for these files too."
+            fix = "Fill started_at." if name in CALENDAR else "Fill it for these files too."
             place = {"column": name, "value": float(missing), "severity": "warning", "action": "kept"}
-            faults.append(Fault("incomplete_column", reason, mend=mend, **place))
+            faults.append(Fault("incomplete_column", reason, fix=fix, **place))
     return faults
 
 

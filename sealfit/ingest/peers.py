@@ -74,7 +74,7 @@ class _Leaving:
 
 
 def _against(row: pd.Series, force_N: float, wrong: bool) -> Fault:
-    mend = (
+    fix = (
         "Look for a turned sensor or a turned sign in this file."
         if wrong
         else "If the rig counts force the other way round, change its sign in the config: compute.force_N."
@@ -93,7 +93,7 @@ def _against(row: pd.Series, force_N: float, wrong: bool) -> Fault:
         value=float(force_N),
         severity="error" if wrong else "warning",
         action="stroke left out" if wrong else "kept",
-        mend=mend,
+        fix=fix,
     )
 
 
@@ -121,13 +121,13 @@ def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
 
 def _constant(row: pd.Series, dead: bool) -> Fault:
     check, reason = "coarse", "and other strokes show no noise either: its steps are larger than the noise."
-    mend = "Use a finer range if the sensor has one."
+    fix = "Use a finer range if the sensor has one."
     if dead:
         check, reason = "stuck", "unlike in other strokes."
-        mend = "Check the cable and the logger, and measure again."
+        fix = "Check the cable and the logger, and measure again."
     if dead and row["extreme"]:
         check = "saturated"
-        mend = f"The sensor may be at the end of its range: use a larger one. {mend}"
+        fix = f"The sensor may be at the end of its range: use a larger one. {fix}"
     return Fault(
         check,
         f"the force is {row['force_N']:g} all along the steady window, {reason}",
@@ -137,7 +137,7 @@ def _constant(row: pd.Series, dead: bool) -> Fault:
         value=float(row["force_N"]),
         severity="error" if dead else "info",
         action="stroke left out" if dead else "kept",
-        mend=mend,
+        fix=fix,
     )
 
 
@@ -165,7 +165,7 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
                 value=float(row.force_N),
                 severity="warning",
                 action="file left out" if out else "kept",
-                mend="Look into the notes of that test; quality.drop_outliers in the config leaves such repeats out.",
+                fix="Look into the notes of that test; quality.drop_outliers in the config leaves such repeats out.",
             )
         )
     return steady.assign(outlier=outlier, used=steady["used"].to_numpy(bool) & ~dropped), found

@@ -1,4 +1,4 @@
-"""What is wrong with a stroke by itself, with its mend; and the table of all that was found in a campaign.
+"""What is wrong with a stroke by itself, with its fix; and the table of all that was found in a campaign.
 
 Every rule is scaled by the trace itself (its noise, its resolution, its sampling), so a coarse sensor is not taken for
 a stuck one, nor a slow rig for a gappy one. Single samples are judged in `spikes.py`, the commanded speed where the
@@ -28,7 +28,7 @@ FEW_LEVELS = 5
 NEXT_LEVELS = 30
 BY_CHANCE = 1e-4  # that so many samples lie at the extreme; few strokes come so far that it is asked
 STILL_RISING = 0.01  # share of the force that may be missing where a stroke ends: more, and it was never steady
-FINE_FILE = {"check": "ok", "severity": "info", "action": "kept", "reason": "nothing found.", "mend": ""}
+FINE_FILE = {"check": "ok", "severity": "info", "action": "kept", "reason": "nothing found.", "fix": ""}
 
 
 def suspects(
@@ -88,7 +88,7 @@ def stroke_faults(
                 value=float(len(stroke.rows)),
                 severity="error",
                 action="stroke left out",
-                mend="Slide further or sample faster; or set strokes.min_samples and min_steady_share in the config.",
+                fix="Slide further or sample faster; or set strokes.min_samples and min_steady_share in the config.",
             )
         ]
     whole, steady, settings = slice(stroke.start, stroke.stop), stroke.rows, config.quality
@@ -124,7 +124,7 @@ def rising_faults(file: str, number: int | None, left_N: float, force_N: float, 
             value=abs(left_N),
             severity="info",
             action="kept",
-            mend="Slide further at this speed: five times the rise's length to 63 %, better eleven times.",
+            fix="Slide further at this speed: five times the rise's length to 63 %, better eleven times.",
         )
     ]
 
@@ -147,7 +147,7 @@ def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault
             value=hidden,
             severity="error" if out else "warning",
             action="stroke left out" if out else "kept",
-            mend="Look for lost packets or a full buffer in the logger.",
+            fix="Look for lost packets or a full buffer in the logger.",
         )
     ]
 
@@ -213,9 +213,9 @@ def _stuck(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fau
     return [_broken("stuck", reason, line[first], value, "Check the cable and the logger, and measure again.")]
 
 
-def _broken(check: str, reason: str, line: int, value: float, mend: str) -> Fault:
+def _broken(check: str, reason: str, line: int, value: float, fix: str) -> Fault:
     place = {"line": int(line), "column": "force_N", "value": value}
-    return Fault(check, reason, severity="error", action="stroke left out", mend=mend, **place)
+    return Fault(check, reason, severity="error", action="stroke left out", fix=fix, **place)
 
 
 def stuck_samples(force_N: np.ndarray, samples: int) -> tuple[int, int] | None:
@@ -260,7 +260,7 @@ def speed_column_faults(file: str, number: int | None, measured: float, column: 
             value=float(column),
             severity="warning",
             action="kept",
-            mend="Check the units of both columns; displacement over time is used.",
+            fix="Check the units of both columns; displacement over time is used.",
         )
     ]
 
@@ -278,7 +278,7 @@ def load_faults(file: str, measured: float, declared: float, unit: str) -> list[
             value=float(measured),
             severity="warning",
             action="kept",
-            mend="The measured load is used; check runs.csv.",
+            fix="The measured load is used; check runs.csv.",
         )
     ]
 

@@ -1,4 +1,4 @@
-"""One trace file to one clean table: read, computed, filtered, checked; every fault named with its place and mend."""
+"""One trace file to one clean table: read, computed, filtered, checked; every fault named with its place and fix."""
 
 from __future__ import annotations
 
@@ -179,9 +179,9 @@ def _derive(
 
 
 def _missing(name: str, layout: Layout, file: str) -> Fault:
-    mend = "Name it under [trace.columns], or compute it under [trace.compute]."
+    fix = "Name it under [trace.columns], or compute it under [trace.compute]."
     return replace(
-        _bad_file("missing_column", "there is no such column.", file, mend), column=name, line=layout.names_line
+        _bad_file("missing_column", "there is no such column.", file, fix), column=name, line=layout.names_line
     )
 
 
@@ -206,7 +206,7 @@ def _evaluate(expression, values: Mapping[str, object], file: str) -> np.ndarray
     try:
         return evaluate(expression, values)
     except ConfigError as error:
-        raise BadFile(replace(_bad_file("expression", error.message, file, error.mend), column=error.column)) from error
+        raise BadFile(replace(_bad_file("expression", error.message, file, error.fix), column=error.column)) from error
 
 
 def _kept(rows: Rows, known: Mapping[str, object], settings: TraceFormat, file: str) -> np.ndarray:
@@ -224,10 +224,10 @@ def _too_many(bad: int, counted: int, faults: list[Fault], config: Config, file:
     """Raise `BadFile` if more rows are bad than the config allows."""
     if bad <= config.quality.max_bad_rows * counted:
         return []
-    mends = Counter(fault.mend for fault in faults if fault.action == "row left out" and fault.mend)
-    mend = mends.most_common(1)[0][0] if mends else ""
+    fixes = Counter(fault.fix for fault in faults if fault.action == "row left out" and fault.fix)
+    fix = fixes.most_common(1)[0][0] if fixes else ""
     reason = f"{bad} of {counted} rows are bad, more than {100 * config.quality.max_bad_rows:g} %."
-    raise BadFile(*faults, replace(_bad_file("too_many_bad_rows", reason, file, mend), value=float(bad)))
+    raise BadFile(*faults, replace(_bad_file("too_many_bad_rows", reason, file, fix), value=float(bad)))
 
 
 def _named_beside(rows: Rows, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:
@@ -247,5 +247,5 @@ def _named_beside(rows: Rows, ref: TraceRef, settings: TraceFormat) -> dict[str,
     return columns
 
 
-def _bad_file(check: str, reason: str, file: str, mend: str) -> Fault:
-    return Fault(check, reason, file=file, action="file left out", mend=mend)
+def _bad_file(check: str, reason: str, file: str, fix: str) -> Fault:
+    return Fault(check, reason, file=file, action="file left out", fix=fix)

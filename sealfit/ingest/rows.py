@@ -55,7 +55,7 @@ def _in_order(rows: Rows, names: Sequence[str]) -> bool:
 
 def _row_faults(check: str, reason: str, name: str, rows: Rows, wrong: np.ndarray, file: str) -> list[Fault]:
     place = {"file": file, "column": name, "action": "row left out"}
-    mend = {
+    fix = {
         "time_order": "Check the recorder's clock, or delete the line.",
         "not_finite": "Check [trace.compute].",
         "overload": "Check the sensor's range.",
@@ -64,7 +64,7 @@ def _row_faults(check: str, reason: str, name: str, rows: Rows, wrong: np.ndarra
     def make(i: int) -> Fault:
         value = float(rows.columns[name][i])
         shown = value if np.isfinite(value) else str(value)  # JSON has no nan
-        return Fault(check, reason, line=int(rows.line[i]), value=shown, mend=mend, **place)
+        return Fault(check, reason, line=int(rows.line[i]), value=shown, fix=fix, **place)
 
     def rest(count: int) -> Fault:
         return Fault(check, f"and {count} more rows: {reason}", value=float(count), **place)

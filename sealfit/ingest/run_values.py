@@ -46,20 +46,20 @@ def _column(name: str, cells: Coded, entries: Entries, config: Config) -> tuple[
     if len(wrong) and not known and name not in config.condition:
         i = int(wrong[0])
         reason = f"{len(wrong)} of {count} cells are no numbers; the column is kept as labels."
-        mend = "Empty the cell, or put a number there."
-        place = {"severity": "warning", "action": "kept", "value": labels[i], "mend": mend}
+        fix = "Empty the cell, or put a number there."
+        place = {"severity": "warning", "action": "kept", "value": labels[i], "fix": fix}
         return labels, [entries[i].fault("not_a_number", reason, name, **place)]
-    mend = "Put a number there."
+    fix = "Put a number there."
     faults = [
-        entries[i].fault("not_a_number", "is not a number.", name, value=labels[i], mend=mend) for i in wrong.tolist()
+        entries[i].fault("not_a_number", "is not a number.", name, value=labels[i], fix=fix) for i in wrong.tolist()
     ]
     # nan: not missing, but wrong
     values = Coded(cells.codes, [math.nan if value is None else value for value in number])
     if name not in COUNTS:
         return values, faults
-    mend = f"Number the {COUNTS[name]} 1, 2, 3."
+    fix = f"Number the {COUNTS[name]} 1, 2, 3."
     faults += [
-        entries[i].fault("not_a_number", "is no whole number.", name, value=values[i], mend=mend)
+        entries[i].fault("not_a_number", "is no whole number.", name, value=values[i], fix=fix)
         for i in np.flatnonzero(values.where(lambda value: math.isfinite(value) and value != int(value))).tolist()
     ]
     return values.map(lambda value: int(value) if math.isfinite(value) else -1), faults
@@ -78,8 +78,8 @@ def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
         ("speed_mm_s", lambda value: value == 0, "is no speed to slide at.", "Leave it empty if it is unknown."),
     )
     found = [
-        (i, entries[i].fault("out_of_range", reason, name, value=columns[name][i], mend=mend))
-        for name, wrong, reason, mend in rules
+        (i, entries[i].fault("out_of_range", reason, name, value=columns[name][i], fix=fix))
+        for name, wrong, reason, fix in rules
         if name in columns
         for i in np.flatnonzero(columns[name].where(wrong)).tolist()
     ]

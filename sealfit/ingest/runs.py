@@ -96,8 +96,8 @@ def _kept(files: np.ndarray, entries: Entries, columns: Columns) -> tuple[Entrie
 
 
 def _nothing_left() -> Fault:
-    mend = "Mend what is said above; start with one file."
-    return Fault("nothing_left", "no trace file can be used.", mend=mend)
+    fix = "Fix what is said above; start with one file."
+    return Fault("nothing_left", "no trace file can be used.", fix=fix)
 
 
 def _set_speed(columns: Columns) -> Columns:
@@ -119,8 +119,8 @@ def _config_faults(config: Config) -> list[Fault]:
     """Return what is wrong with the config by itself, before any file is opened."""
     settings, faults = config.trace, []
 
-    def add(column: str, value: str, reason: str, mend: str) -> None:
-        faults.append(Fault("config", reason, file=f"config '{config.name}'", column=column, value=value, mend=mend))
+    def add(column: str, value: str, reason: str, fix: str) -> None:
+        faults.append(Fault("config", reason, file=f"config '{config.name}'", column=column, value=value, fix=fix))
 
     if settings.encoding != "auto":
         try:
@@ -139,8 +139,8 @@ def _config_faults(config: Config) -> list[Fault]:
     if settings.names == "none":
         for ours, theirs in settings.columns.items():
             if isinstance(theirs, str):
-                mend = "Give its position, counted from 1, or names = 'header'."
-                add(f"trace.columns.{ours}", theirs, "is a name, but the files have none.", mend)
+                fix = "Give its position, counted from 1, or names = 'header'."
+                add(f"trace.columns.{ours}", theirs, "is a name, but the files have none.", fix)
     checks = {"quantities": lambda: speed_factor(config.units)}
     if config.files.name_pattern is None:
         checks["files"] = lambda: name_parts("", config.files)
@@ -148,7 +148,7 @@ def _config_faults(config: Config) -> list[Fault]:
         try:
             check()
         except ConfigError as error:
-            add(column, config.name, error.message, error.mend)
+            add(column, config.name, error.message, error.fix)
     return faults
 
 
@@ -164,21 +164,21 @@ def _named(entries: Entries, config: Config) -> tuple[np.ndarray, Columns, list[
         try:
             named = name_parts(entry.file, config.files)
         except ConfigError as error:
-            raise CampaignError([entry.fault("file_name", error.message, error.column, mend=error.mend)]) from error
+            raise CampaignError([entry.fault("file_name", error.message, error.column, fix=error.fix)]) from error
         if not named.matched:
             listed = entry.line is not None
             reason = f"the name '{entry.file}' does not match files.name_pattern."
-            mend = "Rename it, widen the pattern, or list it under files.exclude."
-            place = {"severity": "warning", "action": "kept" if listed else "file left out", "mend": mend}
+            fix = "Rename it, widen the pattern, or list it under files.exclude."
+            place = {"severity": "warning", "action": "kept" if listed else "file left out", "fix": fix}
             faults.append(Fault("not_matched", reason, file=entry.file, **place))
             if not listed:
                 continue
         kept.append(i)
         parts.append(named.channels)
     if not kept:
-        mend = "Check files.name_pattern in the rig config."
+        fix = "Check files.name_pattern in the rig config."
         reason = f"none of {len(entries)} file names is matched."
-        raise CampaignError([*faults[:3], Fault("not_matched", reason, mend=mend)])
+        raise CampaignError([*faults[:3], Fault("not_matched", reason, fix=fix)])
     return np.array(kept), columns_of(parts), faults
 
 
@@ -255,8 +255,8 @@ def _from_traces(
                 added.setdefault(name, {})[i] = _constant(name, values.iloc[0])
             elif name in wanted:
                 reason = f"varies within the file, {values.min()} to {values.max()}; a condition is one value."
-                mend = "Write the value that was set into runs.csv."
-                place = {"file": file, "column": name, "action": "file left out", "mend": mend}
+                fix = "Write the value that was set into runs.csv."
+                place = {"file": file, "column": name, "action": "file left out", "fix": fix}
                 faults.append(Fault("condition_varies", reason, **place))
                 left_out.add(i)
     whole = {**columns, **{name: columns.get(name, none).put(values) for name, values in added.items()}}
@@ -278,11 +278,11 @@ def _missing(entries: Entries, columns: Columns, needed: _Needed) -> list[Fault]
     for name, rows in sorted(lacking.items(), key=lambda one: one[1][:1].tolist()):
         if name in columns:
             for i in rows.tolist():
-                mend = "Fill it: it is one of the config's condition columns."
-                faults.append(entries[i].fault("empty_cell", "the cell is empty.", name, value="", mend=mend))
+                fix = "Fill it: it is one of the config's condition columns."
+                faults.append(entries[i].fault("empty_cell", "the cell is empty.", name, value="", fix=fix))
         elif len(rows):
             reason = "there is no such column in runs.csv, file names, header lines or traces."
-            mend = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."
-            place = {"file": "runs.csv" if entries.lines is not None else None, "column": name, "mend": mend.strip()}
+            fix = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."
+            place = {"file": "runs.csv" if entries.lines is not None else None, "column": name, "fix": fix.strip()}
             faults.append(Fault("missing_column", reason, **place))
     return faults

@@ -96,8 +96,8 @@ def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list
         entries, faults = _by_glob(campaign, config)
     else:
         count = sum(1 for _ in campaign.rglob("*.csv"))
-        mend = f"Write one (the folder holds {count} CSV files), or give a config with files.glob."
-        raise _stop("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", mend, file=RUNS_CSV)
+        fix = f"Write one (the folder holds {count} CSV files), or give a config with files.glob."
+        raise _stop("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", fix, file=RUNS_CSV)
     folders = Folders(campaign)
     outside = folders.outside(entries.files)
     faults = faults + _paths(campaign, entries, outside) + _unlisted(folders, entries, outside, config)
@@ -109,21 +109,21 @@ def natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
 
 
-def _stop(check: str, reason: str, mend: str, **place) -> CampaignError:
-    return CampaignError([Fault(check, reason, mend=mend, **place)])
+def _stop(check: str, reason: str, fix: str, **place) -> CampaignError:
+    return CampaignError([Fault(check, reason, fix=fix, **place)])
 
 
 def _read_runs(campaign: Path, config: Config) -> tuple[Entries, Columns, list[Fault]]:
     try:
         text = as_utf8(read_bytes(campaign, RUNS_CSV), "auto", RUNS_CSV)
     except BadFile as error:
-        raise _stop(error.fault.check, error.fault.reason, error.fault.mend, file=RUNS_CSV) from error
+        raise _stop(error.fault.check, error.fault.reason, error.fault.fix, file=RUNS_CSV) from error
     first, head = next(_lines(text), (1, ""))
     delimiter = max(",;\t", key=head.count)
     names, faults = _our_names(_cells(head, delimiter) if head else [], config)
     if "file" not in names:
-        mend = suggestion("file", _cells(head, delimiter) if head else [])
-        raise _stop("missing_column", "there is no such column.", mend, file=RUNS_CSV, line=1, column="file")
+        fix = suggestion("file", _cells(head, delimiter) if head else [])
+        raise _stop("missing_column", "there is no such column.", fix, file=RUNS_CSV, line=1, column="file")
     lines, columns = _plain_table(text, names, delimiter, first) or _line_by_line(text, names, delimiter, faults)
     if delimiter != ",":  # decimal commas are plain here: no cell of a table of ; or tabs can be split by them
         columns = {name: column.map(_decimal_point) for name, column in columns.items()}
@@ -184,12 +184,12 @@ def _line_by_line(text: bytes, names: list[str], delimiter: str, faults: list[Fa
         cells = _cells(line, delimiter)
         if any(cells[len(names) :]):
             reason = f"the line has {len(cells)} cells where {len(names)} are named."
-            faults.append(Fault("too_many_cells", reason, file=RUNS_CSV, line=number, mend="Quote cells with commas."))
+            faults.append(Fault("too_many_cells", reason, file=RUNS_CSV, line=number, fix="Quote cells with commas."))
             continue
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
         if "file" not in row:
             reason = "no trace file is named."
-            faults.append(Fault("empty_cell", reason, file=RUNS_CSV, line=number, column="file", mend="Name it."))
+            faults.append(Fault("empty_cell", reason, file=RUNS_CSV, line=number, column="file", fix="Name it."))
             continue
         lines.append(number)
         rows.append(row)
@@ -203,21 +203,21 @@ def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault
     faults = []
     for name in sorted({name for name in names if name and names.count(name) > 1}):
         reason = f"stands {names.count(name)} times in the header."
-        faults.append(Fault("duplicate_column", reason, file=RUNS_CSV, line=1, column=name, mend="Rename one."))
+        faults.append(Fault("duplicate_column", reason, file=RUNS_CSV, line=1, column=name, fix="Rename one."))
     for theirs in ours:
         if theirs not in header:
-            reason, mend = "there is no such column, but files.runs_columns names it.", suggestion(theirs, header)
-            faults.append(Fault("missing_column", reason, file=RUNS_CSV, line=1, column=theirs, mend=mend))
+            reason, fix = "there is no such column, but files.runs_columns names it.", suggestion(theirs, header)
+            faults.append(Fault("missing_column", reason, file=RUNS_CSV, line=1, column=theirs, fix=fix))
     wanted = [*dict.fromkeys([*KNOWN, *config.condition])]
     for name in names:
         close = nearest(name, wanted) if name not in wanted and name != "file" else ""
         if close and close.lower() == name.lower() and close not in names:
-            reason, mend = f"differs from '{close}' in the case of letters only.", f"Write '{close}'."
-            faults.append(Fault("column_name", reason, file=RUNS_CSV, line=1, column=name, mend=mend))
+            reason, fix = f"differs from '{close}' in the case of letters only.", f"Write '{close}'."
+            faults.append(Fault("column_name", reason, file=RUNS_CSV, line=1, column=name, fix=fix))
         elif close and close not in names and SequenceMatcher(None, name, close).ratio() > 0.85:
-            reason, mend = f"is kept as a channel; it looks like '{close}'.", f"Write '{close}' if that is meant."
+            reason, fix = f"is kept as a channel; it looks like '{close}'.", f"Write '{close}' if that is meant."
             place = {"file": RUNS_CSV, "line": 1, "column": name}
-            faults.append(Fault("column_name", reason, severity="warning", action="kept", mend=mend, **place))
+            faults.append(Fault("column_name", reason, severity="warning", action="kept", fix=fix, **place))
     return names, faults
 
 
@@ -239,8 +239,8 @@ def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
         raise _stop("path_outside", f"files.glob = {glob!r} leads outside the campaign folder.", "Make it relative.")
     files = sorted((p.relative_to(campaign).as_posix() for p in campaign.glob(glob) if not p.is_dir()), key=natural)
     if not files:
-        mend = "Check the folder, or files.glob in the rig config."
-        raise _stop("missing_file", f"no file in '{campaign}' matches files.glob = {glob!r}.", mend)
+        fix = "Check the folder, or files.glob in the rig config."
+        raise _stop("missing_file", f"no file in '{campaign}' matches files.glob = {glob!r}.", fix)
     faults, kept = [], []
     for file in files:
         if pattern := next((p for p in config.files.exclude if fnmatchcase(file, p)), None):
@@ -258,16 +258,16 @@ def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:
     for entry in () if fine else entries:
         if entry.file in outside:
             reason = "the trace file lies outside the campaign folder."
-            mend = "Copy it into the folder of runs.csv and write its path relative to it."
-            faults.append(entry.fault("path_outside", reason, "file", value=entry.file, mend=mend))
+            fix = "Copy it into the folder of runs.csv and write its path relative to it."
+            faults.append(entry.fault("path_outside", reason, "file", value=entry.file, fix=fix))
         elif entry.file in lines:
             reason = f"the trace file is listed already on line {lines[entry.file]}."
-            faults.append(entry.fault("duplicate_file", reason, "file", value=entry.file, mend="Delete one line."))
+            faults.append(entry.fault("duplicate_file", reason, "file", value=entry.file, fix="Delete one line."))
         lines.setdefault(entry.file, entry.line)
     if entries and not faults and not any((campaign / file).is_file() for file in entries.files):
         reason = f"none of the {len(entries)} trace files listed exists."
-        mend = "Paths are relative to the folder of runs.csv."
-        faults.append(entries[0].fault("missing_file", reason, "file", value=entries[0].file, mend=mend))
+        fix = "Paths are relative to the folder of runs.csv."
+        faults.append(entries[0].fault("missing_file", reason, "file", value=entries[0].file, fix=fix))
     return faults
 
 
@@ -281,9 +281,9 @@ def _unlisted(folders: Folders, entries: Entries, outside: set[str], config: Con
         found = (p for p in folders.campaign.glob(config.files.glob) if p.is_file())
         there |= {p.relative_to(folders.campaign).as_posix() for p in found}
     files = there - listed - {RUNS_CSV}
-    mend = "Add it to runs.csv if it is a trace."
+    fix = "Add it to runs.csv if it is a trace."
     return [
-        Fault("not_listed", f"is not in {RUNS_CSV}.", file=f, severity="info", action="file left out", mend=mend)
+        Fault("not_listed", f"is not in {RUNS_CSV}.", file=f, severity="info", action="file left out", fix=fix)
         for f in sorted(files, key=natural)
         if not any(fnmatchcase(f, pattern) for pattern in config.files.exclude)
     ]

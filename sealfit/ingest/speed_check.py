@@ -106,7 +106,7 @@ def speed_faults(
 
     None if they agree or no speed is commanded. They agree if the commanded speed lies between the measured mean and
     the plateau, or misses them by no more than `quality.speed_disagreement`. Up to a factor of 1.5 the file is kept
-    with a warning: every table holds the measured speed. Beyond, the file is left out, and the mend names the mix-up
+    with a warning: every table holds the measured speed. Beyond, the file is left out, and the fix names the mix-up
     that fits the factor. Arguments as in `measured_speeds`.
     """
     commanded = [_commanded(ref) for ref in refs]
@@ -152,7 +152,7 @@ def _disagreement(
     unit = config.units.unit("speed")
     reason = f"displacement over time gives {measured:.4g} {unit}, commanded are {commanded:.4g} {unit}."
     gross = not 1 / GROSS <= ratio <= GROSS
-    mend = (
+    fix = (
         _mix_up(ratio, time_s, displacement, tolerance) if gross else "Check the commanded speed, or slip in the drive."
     )
     return Fault(
@@ -163,7 +163,7 @@ def _disagreement(
         value=measured,
         severity="error" if gross else "warning",
         action="file left out" if gross else "kept",
-        mend=mend,
+        fix=fix,
     )
 
 
@@ -192,7 +192,7 @@ def _speeds_of_means(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[f
 
 
 def _mix_up(ratio: float, time_s: np.ndarray, displacement: np.ndarray, tolerance: float) -> str:
-    """Return the likely mend for a measured speed that is `ratio` times the commanded one."""
+    """Return the likely fix for a measured speed that is `ratio` times the commanded one."""
     step, travel = float(np.median(np.diff(time_s))), float(np.ptp(displacement))
     time_in_ms = 'Is the time in ms? Set compute.time_s = "time_ms / 1000" in the rig config.'
     metres = "Is the displacement in m? Compute displacement_mm from it, times 1000."
@@ -209,7 +209,7 @@ def _mix_up(ratio: float, time_s: np.ndarray, displacement: np.ndarray, toleranc
         (3600.0, "Is the time in hours?"),
         (1000.0 / 60.0, "Is the commanded speed in m/min?"),
     )
-    factor, mend = min(known, key=lambda row: abs(math.log(ratio / row[0])))
+    factor, fix = min(known, key=lambda row: abs(math.log(ratio / row[0])))
     if abs(math.log(ratio / factor)) <= math.log1p(tolerance):
-        return mend
+        return fix
     return "Check the commanded speed, the decimal mark, and the units of time and displacement."

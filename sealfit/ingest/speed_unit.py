@@ -37,6 +37,6 @@ def speed_factor(units: Units) -> float:
     raise ConfigError(
         f"displacement in {displacement!r} over time in {time!r} does not give a speed in {speed!r}.",
         column="quantities",
-        mend=f"Declare the speed's unit as '{displacement}/{time}', or units known here: "
+        fix=f"Declare the speed's unit as '{displacement}/{time}', or units known here: "
         f"{', '.join([*LENGTH, *ANGLE, *TIME, *SHORT])}.",
     )

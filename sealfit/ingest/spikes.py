@@ -16,7 +16,7 @@ NEIGHBOURS = 5  # a median over five samples is blind to one or two wrong ones, 
 # A spike stands apart, four times as far off as 95 % of the samples (of noise: 7.8 SDs); else it is one of many bursts.
 APART, USUAL = 4.0, 0.95
 STEPS = 5.0  # a spike of displacement is off by more than so many of the usual steps: see `displacement_spikes`
-MEND = "Correct the cell if the true value is known."
+FIX = "Correct the cell if the true value is known."
 
 
 def displacement_suspects(
@@ -111,10 +111,10 @@ def force_spikes(
     spikes = np.flatnonzero(suspects & (steady | _beyond(force_N, suspects, one)))
     if len(spikes) > settings.max_bad_rows * len(force_N):
         reason = f"{len(spikes)} samples jump away from their neighbours: too many to be single wrong samples."
-        mend = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
+        fix = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
         value = float(len(spikes))
         return keep, [
-            Fault("spikes", reason, file, None, None, "force_N", value, severity="warning", action="kept", mend=mend)
+            Fault("spikes", reason, file, None, None, "force_N", value, severity="warning", action="kept", fix=fix)
         ]
     keep[spikes] = False
     starts = np.array([stroke.start for stroke in strokes])
@@ -143,5 +143,5 @@ def _spike(file: str, stroke: int | None, column: str, value: float, off: float,
         value=float(value),
         severity="warning",
         action="row left out",
-        mend=MEND,
+        fix=FIX,
     )

@@ -143,7 +143,7 @@ def _unmoved(bundle: _Bundle, i: int, config: Config) -> Made:
         file=bundle.refs[i].file,
         column="displacement_mm",
         action="file left out",
-        mend="Check the displacement column and its unit, or set strokes.min_travel_mm in the config.",
+        fix="Check the displacement column and its unit, or set strokes.min_travel_mm in the config.",
     )
     return Made((*bundle.faults[i], fault))
 

@@ -158,8 +158,8 @@ def as_number(cell: str, decimal: str = ".") -> float | None:
         return None
 
 
-def _bad(file: str, check: str, reason: str, mend: str, line: int | None = None) -> BadFile:
-    return BadFile(Fault(check, reason, file=file, line=line, action="file left out", mend=mend))
+def _bad(file: str, check: str, reason: str, fix: str, line: int | None = None) -> BadFile:
+    return BadFile(Fault(check, reason, file=file, line=line, action="file left out", fix=fix))
 
 
 def _guess(raw: bytes) -> str:

@@ -10,7 +10,7 @@ from sealfit.errors import ParameterError
 def _checked(days, b):
     days, b = np.asarray(days, float), np.asarray(b, float)
     if not np.all(b > 0):
-        raise ParameterError(f"b = {np.min(b):g} d: the aging law needs b > 0.", mend="Give b > 0.")
+        raise ParameterError(f"b = {np.min(b):g} d: the aging law needs b > 0.", fix="Give b > 0.")
     if np.any(days < 0):
         raise ParameterError(f"aging_days = {np.min(days):g}: aging time cannot be negative.")
     return days, b

@@ -146,7 +146,7 @@ def lugre_force(
     """
     time = np.asarray(time_s, float)
     if time.ndim != 1 or not time.size or not (np.diff(time) > 0).all():
-        raise ParameterError("time_s must be one row of rising times.", mend="Sort the rows and drop repeated times.")
+        raise ParameterError("time_s must be one row of rising times.", fix="Sort the rows and drop repeated times.")
     if not (sigma_1 >= 0 and sigma_2 >= 0):
         raise ParameterError(f"sigma_1 = {sigma_1:g}, sigma_2 = {sigma_2:g}: neither can be negative.")
     share, factor = (np.ones(1), np.ones(1)) if contact is None else contact.elements(load_N)
@@ -200,6 +200,6 @@ def _solved(time: np.ndarray, speed: Callable, limit: Callable, start: np.ndarra
     )  # fmt: skip
     if not found.success:
         raise ParameterError(
-            f"the speed cannot be followed: {found.message}", mend="Give it without jumps, or as numbers."
+            f"the speed cannot be followed: {found.message}", fix="Give it without jumps, or as numbers."
         )
     return found.y.T

@@ -36,7 +36,7 @@ def stribeck_decay(speed_mm_s, v_s):
     """
     v_s = np.asarray(v_s, float)
     if not np.all(v_s > 0):
-        raise ParameterError(f"v_s = {np.min(v_s):g}: the Stribeck speed must be positive.", mend="Give v_s > 0.")
+        raise ParameterError(f"v_s = {np.min(v_s):g}: the Stribeck speed must be positive.", fix="Give v_s > 0.")
     return np.exp(-((np.asarray(speed_mm_s, float) / v_s) ** 2))
 
 

@@ -81,7 +81,7 @@ def quality_findings(quality: pd.DataFrame, config: Config) -> tuple[list[dict],
         place = f"line {int(row['line'])}" if row["line"] is not None else ""
         if row["stroke"] is not None:
             place = f"stroke {int(row['stroke'])}{', ' + place if place else ''}"
-        texts = {name: true_units(row[name] or "", config.units) for name in ("reason", "mend")}
+        texts = {name: true_units(row[name] or "", config.units) for name in ("reason", "fix")}
         column = channel_label(row["column"], config.units) if row["column"] else ""
         rows.append({**row, **texts, "place": place, "column": column, "check": (row["check"] or "").replace("_", " ")})
     return rows, len(effective_df)

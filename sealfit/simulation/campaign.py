@@ -57,7 +57,7 @@ def simulate(spec: Spec, out: Path) -> None:
             os.replace(part / "truth.json", truth_path(out))
         except OSError as error:
             raise OutError(
-                f"cannot be written ({error.strerror}).", file=out, mend="Check the disk and the folder's permissions."
+                f"cannot be written ({error.strerror}).", file=out, fix="Check the disk and the folder's permissions."
             ) from error
     finally:
         if (part / "old").exists() and not out.exists():
@@ -67,22 +67,22 @@ def simulate(spec: Spec, out: Path) -> None:
 
 def _refuse_foreign(out: Path) -> None:
     """Raise unless `out` is missing, empty, or holds nothing but a campaign that `simulate` wrote."""
-    mend = "Give --out another name, or move what is there."
+    fix = "Give --out another name, or move what is there."
     truth = truth_path(out)
     listed: set[str] = set()
     if truth.exists():
         try:
             listed = {"runs.csv", *(row["file"] for row in load_truth(truth)["files"])}
         except (RequestError, KeyError, TypeError) as error:
-            raise OutError("was not written by simulate.", file=truth, mend=mend) from error
+            raise OutError("was not written by simulate.", file=truth, fix=fix) from error
     if not out.exists():
         return
     if not out.is_dir():
-        raise OutError("is a file, not a folder.", file=out, mend=mend)
+        raise OutError("is a file, not a folder.", file=out, fix=fix)
     for path in sorted(out.rglob("*")):
         name = path.relative_to(out).as_posix()
         if name not in listed and not (path.is_dir() and listed):
-            raise OutError(f"holds '{name}', which simulate did not write.", file=out, mend=mend)
+            raise OutError(f"holds '{name}', which simulate did not write.", file=out, fix=fix)
 
 
 def _write(spec: Spec, folder: Path) -> dict:
@@ -175,7 +175,7 @@ def _force(
     limit, viscous, added = (np.broadcast_to(part, motion.time_s.shape) for part in parts)
     if not (np.isfinite(limit + viscous).all() and np.isfinite(added).all()):
         raise ConfigError(
-            f"the effects give no number in {channels['file'][0]}.", mend="Check their parameters and formulas."
+            f"the effects give no number in {channels['file'][0]}.", fix="Check their parameters and formulas."
         )
     if spec.physics.sigma_0 is None:  # all that friction is comes up over one length
         friction = with_presliding(limit + viscous, motion, np.full(motion.time_s.size, spec.design.stiffness_mm))

@@ -98,10 +98,10 @@ def _catalogued(entry: EffectEntry, place: str) -> Effect:
         try:
             return smooth_effect(entry.knots, entry.reference.get("x_ref"))
         except ParameterError as error:
-            raise ConfigError(f"{place}: {error}", mend="Give knots = [...].") from error
+            raise ConfigError(f"{place}: {error}", fix="Give knots = [...].") from error
     if entry.id not in EFFECTS:
         known = ", ".join(sorted({*EFFECTS, SMOOTH, LEVELS, EXPRESSION}))
-        raise ConfigError(f"{place}: there is no such effect.", mend=f"Known: {known}.")
+        raise ConfigError(f"{place}: there is no such effect.", fix=f"Known: {known}.")
     return EFFECTS[entry.id]
 
 
@@ -109,7 +109,7 @@ def _check_reference(entry: EffectEntry, effect: Effect, place: str) -> None:
     known = [f"{name}_ref" for name in effect.reads]
     for name in entry.reference:
         if name not in known:
-            raise ConfigError(f"{place}: has no reference '{name}'.", mend=f"It may have {', '.join(known)}.")
+            raise ConfigError(f"{place}: has no reference '{name}'.", fix=f"It may have {', '.join(known)}.")
 
 
 def _bound_channels(entry: EffectEntry, effect: Effect, place: str) -> tuple[str, ...]:
@@ -117,11 +117,11 @@ def _bound_channels(entry: EffectEntry, effect: Effect, place: str) -> tuple[str
         if len(entry.channels) != len(effect.reads):
             raise ConfigError(
                 f"{place}: reads {len(effect.reads)} channels, {len(entry.channels)} given.",
-                mend=f"Give channels for {', '.join(effect.reads)}, in this order.",
+                fix=f"Give channels for {', '.join(effect.reads)}, in this order.",
             )
         return entry.channels
     if CHANNEL in effect.reads:
-        raise ConfigError(f"{place}: reads a channel of your choice.", mend='Add channels = ["<column>"].')
+        raise ConfigError(f"{place}: reads a channel of your choice.", fix='Add channels = ["<column>"].')
     return effect.reads
 
 
@@ -129,14 +129,14 @@ def _check_parameters(entry: EffectEntry, effect: Effect, place: str) -> None:
     wanted = {p.name: p for p in effect.parameters}
     for name in entry.parameters:
         if name not in wanted:
-            raise ConfigError(f"{place}: has no parameter '{name}'.", mend=f"Its parameters: {', '.join(wanted)}.")
+            raise ConfigError(f"{place}: has no parameter '{name}'.", fix=f"Its parameters: {', '.join(wanted)}.")
     for name, parameter in wanted.items():
         if name not in entry.parameters:
-            raise ConfigError(f"{place}: parameter '{name}' is missing.", mend=f"{name}: {parameter.meaning}.")
+            raise ConfigError(f"{place}: parameter '{name}' is missing.", fix=f"{name}: {parameter.meaning}.")
         low, high = parameter.bounds
         if not parameter.linear and not low <= entry.parameters[name] <= high:
             raise ConfigError(
-                f"{place}: parameter '{name}' is {entry.parameters[name]:g}.", mend=f"Give {low:g} to {high:g}."
+                f"{place}: parameter '{name}' is {entry.parameters[name]:g}.", fix=f"Give {low:g} to {high:g}."
             )
 
 
@@ -150,7 +150,7 @@ def _target(entry: EffectEntry, effect: Effect, place: str) -> tuple[Target, Ope
         return pairs[0]
     known = ", ".join(f"{target} by {operation}" for target, operation in effect.acts_on)
     wanted = " by ".join(part for part in (entry.acts_on, entry.operation) if part)
-    raise ConfigError(f"{place}: cannot act on {wanted}.", mend=f"It acts on {known}; write an expression for others.")
+    raise ConfigError(f"{place}: cannot act on {wanted}.", fix=f"It acts on {known}; write an expression for others.")
 
 
 def _expression(entry: EffectEntry) -> BoundEffect:

@@ -48,7 +48,7 @@ _COMPARE = {
     ast.Eq: np.equal,
     ast.NotEq: np.not_equal,
 }
-_MEND = (
+_FIX = (
     "Allowed are numbers, channel names, pi, + - * / **, comparisons, and, or, not, a category as in batch == 'B', and "
     + ", ".join(FUNCTIONS)
     + "."
@@ -79,14 +79,14 @@ def parse_formula(text: str) -> Formula:
     ('displacement_mm', 'load_N')
     """
     if len(text) > MAX_CHARACTERS:
-        raise ConfigError(f"a formula of {len(text)} characters.", mend=f"Keep it below {MAX_CHARACTERS}.")
+        raise ConfigError(f"a formula of {len(text)} characters.", fix=f"Keep it below {MAX_CHARACTERS}.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # "1if": a remark of Python's about text that is refused below anyway
             tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = getattr(error, "msg", None) or "it is nested too deeply"
-        raise ConfigError(f"{text!r} is no formula: {reason}.", mend=_MEND) from error
+        raise ConfigError(f"{text!r} is no formula: {reason}.", fix=_FIX) from error
     names: set[str] = set()
     _check(tree, text, names, 0)
     return Formula(text, tree, tuple(sorted(names)))
@@ -103,19 +103,19 @@ def evaluate_formula(formula: Formula, channels: Mapping[str, np.ndarray]) -> np
     for name in formula.channels:
         if name not in channels:
             known = ", ".join(sorted(channels))
-            raise ConfigError(f"formula {formula.text!r}: there is no channel '{name}'.", mend=f"Known: {known}.")
+            raise ConfigError(f"formula {formula.text!r}: there is no channel '{name}'.", fix=f"Known: {known}.")
     with np.errstate(all="ignore"):
         try:
             return np.asarray(_value(formula.tree, channels), dtype=float)
         except (TypeError, ValueError) as error:  # numpy's UFuncTypeError is a TypeError
             raise ConfigError(
                 f"formula {formula.text!r}: a category cannot be computed with.",
-                mend="Compare it: where(batch == 'B', 0.05, 0).",
+                fix="Compare it: where(batch == 'B', 0.05, 0).",
             ) from error
 
 
 def _refuse(text: str, piece: str) -> ConfigError:
-    return ConfigError(f"formula {text!r}: {piece} is not allowed.", mend=_MEND)
+    return ConfigError(f"formula {text!r}: {piece} is not allowed.", fix=_FIX)
 
 
 def _check(node: ast.expr, text: str, names: set[str], depth: int) -> None:

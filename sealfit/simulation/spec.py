@@ -79,7 +79,7 @@ class Spec(Strict):
             return self.model_copy(update={"design": Design.model_validate(design)})
         except ValidationError as error:
             raise ConfigError(
-                explain(error), mend="Raise physics.sigma_0: the rise is load * mu / sigma_0 long."
+                explain(error), fix="Raise physics.sigma_0: the rise is load * mu / sigma_0 long."
             ) from error
 
     @model_validator(mode="after")
@@ -118,21 +118,21 @@ def load_spec(path: Path) -> Spec:
     try:
         text = Path(path).read_text("utf-8-sig")  # Windows editors begin with a byte-order mark
     except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, mend="Check the path of SPEC.") from error
+        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, fix="Check the path of SPEC.") from error
     except UnicodeDecodeError as error:
-        raise ConfigError("is not UTF-8.", file=path, mend="Save it as UTF-8.") from error
+        raise ConfigError("is not UTF-8.", file=path, fix="Save it as UTF-8.") from error
     try:
         spec = Spec.model_validate(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(
-            f"is not TOML: {error}.", file=path, mend="See sample_data/simulated.spec.toml for an example."
+            f"is not TOML: {error}.", file=path, fix="See sample_data/simulated.spec.toml for an example."
         ) from error
     except ValidationError as error:
-        raise ConfigError(explain(error), file=path, mend="sample_data/README.md lists every key.") from error
+        raise ConfigError(explain(error), file=path, fix="sample_data/README.md lists every key.") from error
     try:
         resolve_effects(spec.effects)
     except ConfigError as error:
-        raise ConfigError(error.message, file=path, mend=error.mend) from error
+        raise ConfigError(error.message, file=path, fix=error.fix) from error
     return spec
 
 

@@ -35,11 +35,11 @@ def load_truth(path: Path) -> dict:
     try:
         document = json.loads(Path(path).read_text("utf-8"))
     except OSError as error:
-        raise RequestError(f"cannot be read ({error.strerror}).", file=path, mend="Simulate the campaign.") from error
+        raise RequestError(f"cannot be read ({error.strerror}).", file=path, fix="Simulate the campaign.") from error
     except ValueError as error:
         document = error
     if not isinstance(document, dict) or document.get("made_by") != MADE_BY:
-        raise RequestError("is not the truth of a simulated campaign.", file=path, mend="Simulate the campaign anew.")
+        raise RequestError("is not the truth of a simulated campaign.", file=path, fix="Simulate the campaign anew.")
     return document
 
 
@@ -75,10 +75,10 @@ def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
     needed = dict.fromkeys(["speed_mm_s", *own, *(name for e in law.effects for name in e.channels)])
     for name in needed:
         if name not in table:
-            raise RequestError("the points lack a column.", column=name, mend="Add it; the truth depends on it.")
+            raise RequestError("the points lack a column.", column=name, fix="Add it; the truth depends on it.")
         if table[name].isna().any():
             raise RequestError(
-                f"the points have {int(table[name].isna().sum())} empty cells.", column=name, mend="Fill them."
+                f"the points have {int(table[name].isna().sum())} empty cells.", column=name, fix="Fill them."
             )
     channels = {name: table[name].to_numpy() for name in needed}
     return np.broadcast_to(law.force_N(channels), (len(table),)).astype(float)

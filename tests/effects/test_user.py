@@ -79,7 +79,7 @@ def refused(folder: Path, *, file: str, words: str) -> ConfigError:
     with pytest.raises(ConfigError, match=words) as caught:
         load_user_effects(folder)
     assert caught.value.file.endswith(file)
-    assert caught.value.mend
+    assert caught.value.fix
     return caught.value
 
 

@@ -108,7 +108,7 @@ def test_slips_in_a_channel_with_decimal_commas(tmp_path):
     npt.assert_allclose(trace.table["lab_C"].iloc[:3], [20.5, 21.5, 22.5])
     ((fault),) = trace.faults
     assert (fault.line, fault.column, fault.value) == (7, "lab_C", "20.5")
-    assert 'decimal = "."' in fault.mend
+    assert 'decimal = "."' in fault.fix
 
 
 def test_what_cannot_be_computed_is_a_fault_that_json_can_hold(tmp_path):

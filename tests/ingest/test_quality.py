@@ -110,7 +110,7 @@ def test_a_stroke_too_short_says_what_is_needed():
     (fault,) = stroke_faults("f.csv", 3, stroke, time, force, np.arange(18), Config())
     assert (fault.check, fault.stroke, fault.action) == ("too_short", 3, "stroke left out")
     assert "at least 20 are needed" in fault.reason
-    assert "strokes.min_samples" in fault.mend
+    assert "strokes.min_samples" in fault.fix
 
 
 def spikes(time, x, force, **quality):
@@ -187,7 +187,7 @@ def test_a_campaign_that_counts_force_the_other_way_is_kept_and_told():
     keep, found = reversed_strokes(strokes([-20.0, -20.0, -21.0]))
     assert keep.all()
     assert {(f.action, f.severity) for f in found} == {("kept", "warning")}
-    assert "compute.force_N" in found[0].mend
+    assert "compute.force_N" in found[0].fix
 
 
 def test_an_offset_larger_than_the_friction_is_no_wrong_sign():

@@ -23,7 +23,7 @@ def test_plain_file_reads_as_written(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("row", "check", "column", "value", "mend"),
+    ("row", "check", "column", "value", "fix"),
     [
         ("1.0,5.0,abc", "not_a_number", "force_N", "abc", "Put a number"),
         ("1.0,5.0,nan", "not_finite", "force_N", "nan", "Delete"),
@@ -40,12 +40,12 @@ def test_plain_file_reads_as_written(tmp_path):
         ("99.0,5.0,2.1", "time_order", "time_s", 99.0, "clock"),
     ],
 )
-def test_a_bad_cell_costs_its_row_and_is_named_with_line_value_and_mend(tmp_path, row, check, column, value, mend):
+def test_a_bad_cell_costs_its_row_and_is_named_with_line_value_and_fix(tmp_path, row, check, column, value, fix):
     trace = read(tmp_path, changed(10, row))
     (fault,) = trace.faults
     assert (fault.check, fault.line, fault.column, fault.value) == (check, 12, column, value)
     assert (fault.file, fault.action) == ("t.csv", "row left out")
-    assert mend in fault.mend
+    assert fix in fault.fix
     assert len(trace.table) == 99
     assert trace.rows_read == 100
     assert 12 not in trace.line
@@ -78,7 +78,7 @@ def test_one_wrong_time_far_ahead_costs_one_row_and_a_restarted_clock_the_file(t
     assert len(read(tmp_path, changed(50, "900.0,25.0,2.5")).table) == 99
     fault = refused(tmp_path, csv_of(ROWS + ROWS))
     assert "rows are bad" in fault.reason
-    assert "clock" in fault.mend
+    assert "clock" in fault.fix
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_file_that_cannot_be_used_is_left_out_with_a_clear_line(tmp_path, cont
 def test_decimal_commas_everywhere_name_the_config_key(tmp_path):
     rows = [row.replace(",", ";").replace(".", ",") for row in ROWS]
     fault = refused(tmp_path, csv_of(rows, HEADER.replace(",", ";")), 'trace.delimiter = ";"')
-    assert 'decimal = ","' in fault.mend
+    assert 'decimal = ","' in fault.fix
     trace = read(tmp_path, csv_of(rows, HEADER.replace(",", ";")), 'trace.delimiter = ";"\ntrace.decimal = ","')
     npt.assert_allclose(trace.table["displacement_mm"], 0.5 * np.arange(100))
 
@@ -145,7 +145,7 @@ def test_units_mixed_up_are_named_by_speed_times_time(tmp_path, factor_t, factor
     rows = [f"{0.1 * i * factor_t!r},{0.5 * i * factor_x!r},2.0" for i in range(100)]
     fault = refused(tmp_path, csv_of(rows), speed_set_mm_s=speed)
     assert fault.check == "speed_disagreement"
-    assert words in fault.mend
+    assert words in fault.fix
 
 
 def test_speed_within_tolerance_or_resting_agrees_and_a_slip_warns(tmp_path):
@@ -159,10 +159,10 @@ def test_speed_within_tolerance_or_resting_agrees_and_a_slip_warns(tmp_path):
 def test_units_rows_and_clocks_are_recognised_for_what_they_are(tmp_path):
     trace = read(tmp_path, csv_of(["[s],[mm],[N]", *ROWS]))
     assert len(trace.table) == 100
-    assert all("units_row = true" in fault.mend for fault in trace.faults)
+    assert all("units_row = true" in fault.fix for fault in trace.faults)
     assert read(tmp_path, csv_of(["[s],[mm],[N]", *ROWS]), "trace.units_row = true").faults == ()
     clocks = [f"12:00:0{row}" for row in ROWS]
-    assert "as seconds" in refused(tmp_path, csv_of(clocks)).mend
+    assert "as seconds" in refused(tmp_path, csv_of(clocks)).fix
 
 
 def test_many_short_strokes_with_rests_have_the_speed_of_their_plateaus(tmp_path):

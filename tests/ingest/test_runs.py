@@ -179,7 +179,7 @@ def test_faults_of_runs_csv_stop_the_run_with_their_place(tmp_path, old, new, ch
     found = faults(campaign(tmp_path, FULL.replace(old, new)))
     (fault,) = [fault for fault in found if fault.check == check]
     assert (fault.file, fault.line, fault.column) == ("runs.csv", line, column)
-    assert fault.mend
+    assert fault.fix
     assert words in str(fault)
 
 
@@ -203,7 +203,7 @@ def test_a_missing_condition_column_is_one_fault_with_the_nearest_name(tmp_path)
     table = FULL.replace("temperature_C", "temprature_C")
     (fault,) = faults(campaign(tmp_path, table))
     assert (fault.check, fault.column) == ("missing_column", "temperature_C")
-    assert "Did you mean 'temprature_C'?" in fault.mend
+    assert "Did you mean 'temprature_C'?" in fault.fix
 
 
 def test_missing_folder_table_traces_and_links_out(tmp_path):
@@ -211,7 +211,7 @@ def test_missing_folder_table_traces_and_links_out(tmp_path):
     (tmp_path / "c").mkdir()
     trace(tmp_path, "c/a.csv")
     (fault,) = faults(tmp_path / "c")
-    assert "the folder holds 1 CSV files" in fault.mend
+    assert "the folder holds 1 CSV files" in fault.fix
     (tmp_path / "secret.csv").write_text(FULL)
     (tmp_path / "c" / "runs.csv").symlink_to(tmp_path / "secret.csv")
     assert faults(tmp_path / "c")[0].check == "path_outside"
@@ -271,7 +271,7 @@ cells = st.sampled_from(
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.lists(cells, min_size=1, max_size=6).map(",".join), max_size=6), st.binary(max_size=20))
-def test_any_runs_csv_is_read_or_refused_with_a_mend(tmp_path_factory, lines, junk):
+def test_any_runs_csv_is_read_or_refused_with_a_fix(tmp_path_factory, lines, junk):
     folder = tmp_path_factory.mktemp("c")
     trace(folder, "a.csv")
     trace(folder, "b.csv")
@@ -280,7 +280,7 @@ def test_any_runs_csv_is_read_or_refused_with_a_mend(tmp_path_factory, lines, ju
     try:
         refs, _ = list_traces(folder, config(DAYS))
     except CampaignError as error:
-        assert all(fault.reason and fault.mend for fault in error.faults)  # noqa: PT017
+        assert all(fault.reason and fault.fix for fault in error.faults)  # noqa: PT017
         return
     assert len(refs) > 0
     assert all({"run_id", "repeat", "specimen_id", "aging_days"} <= set(ref.channels) for ref in refs)

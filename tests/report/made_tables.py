@@ -383,7 +383,7 @@ def quality(steady):
             "severity": "info",
             "action": "kept",
             "reason": "no fault found",
-            "mend": "",
+            "fix": "",
             "value": "",
         }
         for f in steady["file"]
@@ -398,7 +398,7 @@ def quality(steady):
             "severity": "error",
             "action": "row left out",
             "reason": "not a number.",
-            "mend": "Use a decimal point.",
+            "fix": "Use a decimal point.",
         },
         {
             "file": steady["file"].iloc[3],
@@ -409,7 +409,7 @@ def quality(steady):
             "severity": "warning",
             "action": "kept",
             "reason": "force_N jumps by 40 between two samples.",
-            "mend": "Look at the cable.",
+            "fix": "Look at the cable.",
         },
     ]
     return table("quality", rows)
