@@ -156,9 +156,8 @@ def least_squares_within(normal: np.ndarray, gradient: np.ndarray, low: np.ndarr
     if np.all((step >= low) & (step <= high)):
         return step
     square = np.diag(normal)
-    scale = 1 / np.sqrt(
-        np.where(square > 1e-30 * square.max(), square, 1.0)
-    )  # a column that does nothing keeps its own
+    acts = square > 1e-30 * square.max()  # a column that does nothing keeps its scale
+    scale = 1 / np.sqrt(np.where(acts, square, 1.0))
     size, axes = np.linalg.eigh(normal * np.outer(scale, scale))
     kept = size > 1e-10 * size[-1]
     root, axes = np.sqrt(size[kept]), axes[:, kept]

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from scipy.sparse import csr_array
 
 from sealfit.fit.least_squares import covariance_of, levenberg_marquardt
-from sealfit.fit.variable_projection import BatchFit, global_optimum
+from sealfit.fit.variable_projection import BatchFit, even_grid, global_optimum
 
 SOONEST, LATEST = 1e-9, 1e3  # b is sought from 1e-9 of the first aged day to 1000 times the last
 PER_DECADE = 8  # points of the search along b; ln(1 + t/b) changes over a decade of b
@@ -49,14 +49,12 @@ def solve_law(days, value, weight) -> BatchFit:
     """
     days, value, weight = np.broadcast_arrays(*(np.asarray(x, float) for x in (days, value, weight)))
     low, high = search_limits(np.where(weight > 0, days, 0.0))
-    points = int(np.ceil(PER_DECADE * np.max(high - low) / np.log(10))) + 1
-    grid = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
 
     def basis(u, rows):
         ratio = days[rows][:, None, :] * np.exp(-u)[..., None]
         return np.stack([np.ones_like(ratio), -np.log1p(ratio)], axis=-1)
 
-    return global_optimum(basis, value, weight, grid, (False, False))
+    return global_optimum(basis, value, weight, even_grid(low, high, PER_DECADE), (False, False))
 
 
 @dataclass(frozen=True)

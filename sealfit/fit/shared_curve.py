@@ -27,11 +27,13 @@ from sealfit.fit.condition import FULL, Condition, stacked
 from sealfit.fit.declared import series_of_curve
 from sealfit.fit.least_squares import covariance_of
 from sealfit.fit.steady import FORCES, solve_conditions
-from sealfit.fit.stribeck import search_grid
+from sealfit.fit.stribeck import search_limits
 from sealfit.fit.uncertainty import UnitVariance, shifts_of
+from sealfit.fit.variable_projection import even_grid
 from sealfit.tables import STEADY_FIT
 
 SHARED_P = 0.01  # below, the days of a series do not share v_s and sigma_2
+PER_DECADE = 30  # points of the search along v_s: of all days of a series together no minimum is narrow
 DETERMINED = 0.3  # standard error over value: above, the forces do not tell it
 RANK = 1e-8  # of the columns of a condition: with one speed mu_s and mu_c are one number
 
@@ -156,7 +158,7 @@ class _Curve:
         self.own = own
         self.speed, self.load, self.force, weight = stacked(own)
         self.root = np.sqrt(weight / widened[:, None])
-        grid = search_grid(self.speed.reshape(1, -1), weight.reshape(1, -1))[0]
+        grid = even_grid(*search_limits(self.speed.reshape(1, -1), weight.reshape(1, -1)), PER_DECADE)[0]
         rss = self._along(grid)
         best = int(np.argmin(rss))
         ends = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]

@@ -14,7 +14,7 @@ from scipy.special import stdtr
 
 from sealfit.fit.interval import constrained_ends
 from sealfit.fit.least_squares import covariance_of
-from sealfit.fit.variable_projection import global_optimum, profile
+from sealfit.fit.variable_projection import even_grid, global_optimum, profile
 
 SLOWEST, FASTEST = 1 / 5, 20.0  # v_s is sought from a fifth of the slowest speed to twenty times the fastest:
 # below, E is 1e-11 at every speed and nothing changes any more; above, 1 - E is 0.0025 and follows v^2 throughout
@@ -40,7 +40,7 @@ class StribeckFit:
     @property
     def grid(self) -> np.ndarray:
         """ln v_s over all that was searched, shape (problems, g)."""
-        return even_grid(*self.limits)
+        return even_grid(*self.limits, PER_DECADE)
 
     def values(self) -> np.ndarray:
         """Return mu_s, mu_c, v_s, sigma_2 as columns, shape (problems, 4)."""
@@ -72,17 +72,6 @@ def search_limits(speed, weight) -> tuple[np.ndarray, np.ndarray]:
     return np.log(slowest * SLOWEST), np.log(fastest * FASTEST)
 
 
-def search_grid(speed, weight) -> np.ndarray:
-    """Return ln v_s to be searched, shape (problems, g), the same number of points for every problem."""
-    return even_grid(*search_limits(speed, weight))
-
-
-def even_grid(low, high) -> np.ndarray:
-    """Return even points from `low` to `high`, shape (problems, g)."""
-    points = int(np.ceil(PER_DECADE * np.max(high - low) / np.log(10))) + 1
-    return low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
-
-
 def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> StribeckFit:
     """Global weighted least-squares fit of Eq. 14 to many conditions.
 
@@ -108,7 +97,7 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
     """
     speed, load, force, weight = np.broadcast_arrays(*(np.asarray(x, float) for x in (speed, load, force, weight)))
     limits = search_limits(speed, weight)
-    found = global_optimum(stribeck_basis(speed, load), force, weight, even_grid(*limits), nonnegative)
+    found = global_optimum(stribeck_basis(speed, load), force, weight, even_grid(*limits, PER_DECADE), nonnegative)
     mu_s, mu_c, sigma_2 = found.coefficients.T
     return StribeckFit(mu_s, mu_c, np.exp(found.u), sigma_2, found.rss, found.at_edge, limits)
 

@@ -84,7 +84,7 @@ def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
 
 @dataclass(frozen=True)
 class Point:
-    """The linear optimum at given nonlinear numbers: leading shape (...), and the slope of the rss along them."""
+    """The linear optimum at given nonlinear numbers, leading shape (...)."""
 
     coefficients: np.ndarray
     support: np.ndarray
@@ -198,6 +198,12 @@ def global_optimum(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
     order = np.lexsort([left, problem])
     best = order[np.unique(problem[order], return_index=True)[1]]
     return BatchFit(u[best], coefficients[best], left[best], at_edge(u[best], grid[:, 0], grid[:, -1]))
+
+
+def even_grid(low, high, per_decade: int) -> np.ndarray:
+    """Return even points from `low` to `high`, logarithms, shape (problems, g): so many or more to a factor of ten."""
+    points = int(np.ceil(per_decade * np.max(high - low) / np.log(10))) + 1
+    return low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
 
 
 def at_edge(u, low, high) -> np.ndarray:
