@@ -129,8 +129,9 @@ def solve(conditions: list[Condition]) -> None:
 def _solve_linear(condition: Condition) -> None:
     _, _, force, weight = condition.arrays
     root = np.sqrt(weight)
-    point = project(condition.columns() * root[:, None], force * root, [True] * len(condition.names))
-    condition.values, condition.chi2 = point.coefficients, float(point.rss)
+    held = [True] * len(condition.names)
+    condition.values, chi2 = project(condition.columns() * root[:, None], force * root, held)
+    condition.chi2 = float(chi2)
 
 
 def drop_flat_curve(condition: Condition, unit: float, df: float) -> None:

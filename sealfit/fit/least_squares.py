@@ -19,6 +19,8 @@ def levenberg_marquardt(
     start: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
+    *,
+    damping: float = DAMPING,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the least-squares optima that the starts lead to, and their sums of squares.
 
@@ -31,6 +33,8 @@ def levenberg_marquardt(
         Starting points; moved inside the bounds.
     low, high : ndarray, shape (p,) or (problems, p)
         Closed bounds; infinite where there is none, equal where a number is held.
+    damping : float
+        Of the first step; next to none from starts that are nearly there.
 
     Returns
     -------
@@ -45,7 +49,8 @@ def levenberg_marquardt(
     """
     low, high = np.broadcast_to(low, start.shape), np.broadcast_to(high, start.shape)
     x, todo = np.clip(start, low, high), np.arange(len(start))
-    damping, length = np.full(len(x), DAMPING), np.full(len(x), np.inf)  # length: of the last step, in standard errors
+    damping = np.full(len(x), damping)
+    length = np.full(len(x), np.inf)  # of the last step, in standard errors
     scale = np.zeros(x.shape)
     with np.errstate(all="ignore"):  # a trial step that overflows is a bad step, not an error
         rest, slope = evaluate(x, todo)
@@ -82,8 +87,7 @@ def levenberg_marquardt(
 def _damped(slope: np.ndarray, rest: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """Return the x that minimise |x slope + rest|^2 + damping |x|^2, shape (r, p); slope (r, p, n), rest (r, n)."""
     axes, singular, rows = np.linalg.svd(slope, full_matrices=False)
-    known = singular > RANK**2 * singular.max(axis=1, keepdims=True)
-    share = np.where(known, singular / (singular**2 + damping[:, None]), 0.0)
+    share = np.where(singular > 0, singular / (singular**2 + damping[:, None]), 0.0)
     return -(axes @ (share * (rows @ rest[..., None])[..., 0])[..., None])[..., 0]
 
 
@@ -92,9 +96,7 @@ def _squares(rest: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(squares), squares, np.inf)
 
 
-def central_jacobian(
-    residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, *, together: bool = False
-) -> np.ndarray:
+def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
     """Return the derivative of `residual` at `x`, shape (n, p), by central differences of fourth order.
 
     The step is 1e-4 of each parameter: rounding stays near 1e-12 of the derivative, and a place parameter that is a
@@ -106,16 +108,11 @@ def central_jacobian(
         (p,) -> (n,).
     x : ndarray, shape (p,)
         Where.
-    together : bool
-        Whether `residual` takes many points at once, (..., p) -> (..., n). x may then be (..., p) too, and the answer
-        is (..., n, p).
     """
     h = 1e-4 * np.where(x == 0, 1.0, np.abs(x))
-    steps = np.array([-2, -1, 1, 2])[:, None, None] * (h[..., None] * np.eye(x.shape[-1]))[..., None, :, :]
-    points = x[..., None, None, :] + steps  # (..., 4, p, p)
-    values = residual(points) if together else np.stack([[residual(point) for point in side] for side in points])
-    below2, below, above, above2 = np.moveaxis(values, -3, 0)
-    return np.swapaxes((below2 - 8 * below + 8 * above - above2) / (12 * h[..., None]), -1, -2)
+    points = x + np.array([-2, -1, 1, 2])[:, None, None] * np.diag(h)
+    below2, below, above, above2 = np.array([[residual(point) for point in side] for side in points])
+    return ((below2 - 8 * below + 8 * above - above2) / (12 * h[:, None])).T
 
 
 def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple[np.ndarray, int]:

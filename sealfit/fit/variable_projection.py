@@ -14,11 +14,14 @@ import numpy as np
 from scipy.optimize.elementwise import find_minimum
 
 from sealfit.errors import FitError
+from sealfit.fit.least_squares import levenberg_marquardt
 
 DEPENDENT = 1e-13  # share of a column's variance left by the others below which it adds nothing in double precision
 CHUNK = 2_000_000  # numbers per temporary array: 16 MB
 CLOSE = 1e-9  # of the nonlinear number, a logarithm as a rule: nearer, the sum of squares is flat to its last digit
 MOST_STEPS = 60
+NEXT_TO_NONE = 1e-15  # damping of steps from where the minimum is already known to half its digits
+NUDGES = 1e-3 * np.array([-2, -1, 0, 1, 2])  # of the nonlinear number: a derivative of fourth order
 
 
 # ---------------------------------------------------------------- the linear part
@@ -82,18 +85,8 @@ def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
     return coefficients, keep
 
 
-@dataclass(frozen=True)
-class Point:
-    """The linear optimum at given nonlinear numbers, leading shape (...)."""
-
-    coefficients: np.ndarray
-    support: np.ndarray
-    residual: np.ndarray
-    rss: np.ndarray
-
-
-def project(columns, y, nonnegative, refine: int = 2) -> Point:
-    """Solve for the coefficients of weighted columns (..., n, p) and y (..., n)."""
+def project(columns, y, nonnegative, refine: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Return the coefficients, shape (..., p), of weighted columns (..., n, p) and y (..., n), and the rss, (...)."""
     norm = np.sqrt(np.einsum("...np,...np->...p", columns, columns))
     scaled = columns / np.where(norm > 0, norm, 1.0)[..., None, :]
     transposed = np.swapaxes(scaled, -1, -2)
@@ -105,7 +98,7 @@ def project(columns, y, nonnegative, refine: int = 2) -> Point:
         c = c + solve_kept(gram, (transposed @ rest[..., None])[..., 0], support)
         rest = y - (scaled @ c[..., None])[..., 0]
     c = np.where(nonnegative, np.maximum(c, 0.0), c)
-    return Point(c / np.where(norm > 0, norm, 1.0), support, rest, np.einsum("...n,...n->...", rest, rest))
+    return c / np.where(norm > 0, norm, 1.0), np.einsum("...n,...n->...", rest, rest)
 
 
 # ---------------------------------------------------------------- one nonlinear number, many problems
@@ -154,8 +147,7 @@ def profile(basis: Basis, y, weight, u, nonnegative, *, refine: int = 0):
         weights = root[chosen][:, None, :, None]
         columns = basis(u[part], chosen)
         measured = np.broadcast_to((y[chosen] * root[chosen])[:, None, :], columns.shape[:-1])
-        point = project(columns * weights, measured, nonnegative, refine)
-        rss[part], coefficients[part] = point.rss, point.coefficients
+        coefficients[part], rss[part] = project(columns * weights, measured, nonnegative, refine)
     return rss, coefficients
 
 
@@ -191,6 +183,9 @@ def global_optimum(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
     valley = find_minimum(
         lambda u, problem: solved(u, problem)[0][:, 0], bracket, args=(problem,), tolerances=stops, maxiter=MOST_STEPS
     ).x
+    start = np.column_stack([solved(valley, problem)[1][:, 0], valley])
+    ends = grid[problem][:, [0, -1]]
+    valley = _to_all_digits(basis, y[problem], weight[problem], problem, start, ends, nonnegative)
     every = np.arange(len(y))
     problem = np.concatenate([problem, every])
     u = np.concatenate([valley, grid[every, np.argmin(rss, axis=1)]])
@@ -198,6 +193,26 @@ def global_optimum(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
     order = np.lexsort([left, problem])
     best = order[np.unique(problem[order], return_index=True)[1]]
     return BatchFit(u[best], coefficients[best], left[best], at_edge(u[best], grid[:, 0], grid[:, -1]))
+
+
+def _to_all_digits(basis: Basis, y, weight, problem, start, ends, nonnegative) -> np.ndarray:
+    """Return the nonlinear numbers, shape (r,), that starts near an optimum lead to.
+
+    Along the nonlinear number alone, the sum of squares is flat where half of its digits are known.
+    """
+    root = np.sqrt(weight)
+
+    def evaluate(x, own):
+        columns = basis(x[:, -1:] + NUDGES, problem[own]) * root[own][:, None, :, None]
+        below2, below, here, above, above2 = np.moveaxis(np.einsum("rgnp,rp->rgn", columns, x[:, :-1]), 1, 0)
+        along = (below2 - 8 * below + 8 * above - above2) / (12 * NUDGES[-2])
+        slope = np.concatenate([np.swapaxes(columns[:, 2], 1, 2), along[:, None]], axis=1)
+        return here - y[own] * root[own], slope
+
+    linear = np.tile(np.where(nonnegative, 0.0, -np.inf), (len(start), 1))
+    low = np.column_stack([linear, ends[:, 0]])
+    high = np.column_stack([np.full(linear.shape, np.inf), ends[:, 1]])
+    return levenberg_marquardt(evaluate, start, low, high, damping=NEXT_TO_NONE)[0][:, -1]
 
 
 def even_grid(low, high, per_decade: int) -> np.ndarray:

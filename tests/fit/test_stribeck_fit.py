@@ -53,7 +53,7 @@ def test_exact_data_give_back_all_four_parameters(mu_s, mu_c, v_s, sigma_2, load
     assume(abs(mu_s - mu_c) > 0.01)
     force = stribeck_force(SPEEDS, load, mu_s=mu_s, mu_c=mu_c, v_s=v_s, sigma_2=sigma_2)
     fit = solve_stribeck(SPEEDS[None], np.full((1, 9), load), force[None], np.ones((1, 9)))
-    npt.assert_allclose(fit.values()[0], [mu_s, mu_c, v_s, sigma_2], rtol=1e-5, atol=1e-6)
+    npt.assert_allclose(fit.values()[0], [mu_s, mu_c, v_s, sigma_2], rtol=1e-8, atol=1e-9)
 
 
 def many(problems, seed=3, noise=0.15):
@@ -98,7 +98,7 @@ def test_the_stribeck_speed_does_not_depend_on_the_unit_of_force():
     inner = fit.at_edge == 0
     assert inner.mean() > 0.9
     fine = solve_stribeck(SPEEDS, LOAD, 10 * force, weight / 100)  # the same problems, other rounding
-    npt.assert_allclose(fine.v_s[inner], fit.v_s[inner], rtol=1e-6)
+    npt.assert_allclose(fine.v_s[inner], fit.v_s[inner], rtol=1e-7)
 
 
 def test_padding_and_company_change_nothing():
