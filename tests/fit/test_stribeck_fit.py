@@ -194,8 +194,9 @@ def test_no_stribeck_is_rejected_as_often_as_its_level_says(df):
     base = np.stack([np.full(9, LOAD), SPEEDS], axis=1)
     flat = np.sum((force.T - base @ np.linalg.lstsq(base, force.T, rcond=None)[0]) ** 2, axis=0) / 0.2**2
     variance = np.ones(runs) if np.isinf(df) else rng.chisquare(df, runs) / df
+    grid = fit.grid[0]
     p = [
-        flat_p_value(SPEEDS, np.full(9, LOAD), weight[0], fit.grid[0], gain / s2, df)
+        flat_p_value(SPEEDS, np.full(9, LOAD), weight[0], grid, gain / s2, df)
         for gain, s2 in zip(flat - fit.rss, variance, strict=True)
     ]
     assert 0.03 < np.mean(np.array(p) < 0.05) < 0.065
