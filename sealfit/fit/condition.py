@@ -9,7 +9,15 @@ import numpy as np
 import pandas as pd
 
 from sealfit.fit.interval import constrained_ends
-from sealfit.fit.stribeck import NAMES, flat_p_value, solve_stribeck, stribeck_intervals, tangent
+from sealfit.fit.stribeck import (
+    NAMES,
+    StribeckFit,
+    flat_p_value,
+    search_limits,
+    solve_stribeck,
+    stribeck_intervals,
+    tangent,
+)
 from sealfit.fit.uncertainty import shifts_of, speed_levels
 from sealfit.fit.variable_projection import project
 from sealfit.physics import stribeck_force
@@ -153,7 +161,8 @@ def bound(conditions: list[Condition], rise: np.ndarray) -> None:
     full = [k for k, c in enumerate(conditions) if c.model == FULL and np.isfinite(rise[k])]
     if full:
         arrays = stacked([conditions[k] for k in full])
-        fit = solve_stribeck(*arrays)
+        values, chi2 = (np.array([getattr(conditions[k], name) for k in full]) for name in ("values", "chi2"))
+        fit = StribeckFit(*values.T, chi2, search_limits(arrays[0], arrays[3]))
         lows, highs = stribeck_intervals(*arrays, fit, rise[full])
         for k, low, high in zip(full, lows, highs, strict=True):
             conditions[k].low, conditions[k].high = low, high

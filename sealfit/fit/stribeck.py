@@ -27,14 +27,13 @@ PHYSICAL = (True, True, True)
 
 @dataclass(frozen=True)
 class StribeckFit:
-    """Parameters of every problem, each shape (problems,); `at_edge` -1 or +1 where v_s ends at a search limit."""
+    """Parameters of every problem, each shape (problems,)."""
 
     mu_s: np.ndarray
     mu_c: np.ndarray
     v_s: np.ndarray
     sigma_2: np.ndarray
     rss: np.ndarray
-    at_edge: np.ndarray
     limits: tuple[np.ndarray, np.ndarray]  # (problems,) each: lowest and highest ln v_s searched
 
     @property
@@ -99,7 +98,7 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
     limits = search_limits(speed, weight)
     found = global_optimum(stribeck_basis(speed, load), force, weight, even_grid(*limits, PER_DECADE), nonnegative)
     mu_s, mu_c, sigma_2 = found.coefficients.T
-    return StribeckFit(mu_s, mu_c, np.exp(found.u), sigma_2, found.rss, found.at_edge, limits)
+    return StribeckFit(mu_s, mu_c, np.exp(found.u), sigma_2, found.rss, limits)
 
 
 # ---------------------------------------------------------------- intervals

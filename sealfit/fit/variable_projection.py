@@ -109,7 +109,6 @@ class BatchFit:
     u: np.ndarray  # (problems,)
     coefficients: np.ndarray  # (problems, p)
     rss: np.ndarray  # (problems,), weighted
-    at_edge: np.ndarray  # (problems,), -1 at the lower end of the grid, +1 at the upper, else 0
 
 
 Basis = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -192,7 +191,7 @@ def global_optimum(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
     left, coefficients = (found[:, 0] for found in solved(u, problem))
     order = np.lexsort([left, problem])
     best = order[np.unique(problem[order], return_index=True)[1]]
-    return BatchFit(u[best], coefficients[best], left[best], at_edge(u[best], grid[:, 0], grid[:, -1]))
+    return BatchFit(u[best], coefficients[best], left[best])
 
 
 def _to_all_digits(basis: Basis, y, weight, problem, start, ends, nonnegative) -> np.ndarray:
@@ -219,11 +218,6 @@ def even_grid(low, high, per_decade: int) -> np.ndarray:
     """Return even points from `low` to `high`, logarithms, shape (problems, g): so many or more to a factor of ten."""
     points = int(np.ceil(per_decade * np.max(high - low) / np.log(10))) + 1
     return low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
-
-
-def at_edge(u, low, high) -> np.ndarray:
-    """Return -1 where u is at its lower limit, +1 at the upper, else 0."""
-    return np.where(u <= low, -1, np.where(u >= high, 1, 0))
 
 
 def check(y, weight) -> None:
