@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-from sealfit.report.numbers import power_of_ten
 from sealfit.report.symbols import plain, short
 
-MOST_TICKS = 8  # names of categories that fit below a panel
+MOST_TICKS = 6  # names of categories that fit below a panel
 TICK_APART = 0.11  # of the axis: closer ticks would write over each other
 
 
@@ -37,21 +35,6 @@ def value_ticks(ax: Axes, x: np.ndarray) -> None:
 def round_ticks(*, integer: bool = False) -> MaxNLocator:
     """Return a locator of round numbers, few enough for their labels to stand side by side."""
     return MaxNLocator(5, steps=[1, 2, 5, 10], integer=integer)
-
-
-class PlainNumbers(ScalarFormatter):
-    """Tick labels as plain text, and a power of ten as people write it: a formula for each takes far longer."""
-
-    def get_offset(self) -> str:
-        """Return what the labels are multiplied by and counted from, "×10⁻⁵"; often nothing."""
-        return re.sub(r"([\d.]+)e([-−]?\d+)", self._written, super().get_offset())
-
-    @staticmethod
-    def _written(found: re.Match) -> str:
-        power = f"10{power_of_ten(int(found[2].replace('−', '-')))}"
-        if found.start() == 0:  # a multiple, always of 1
-            return f"×{power}"
-        return power if found[1] == "1" else f"{found[1]}×{power}"
 
 
 def log_axis(ax: Axes) -> None:

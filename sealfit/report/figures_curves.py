@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 
 from sealfit.config import Config
 from sealfit.report.axes import evenly, natural, padded, round_ticks
-from sealfit.report.marks import draw_band, draw_bars
 from sealfit.report.numbers import count, given, number
 from sealfit.report.shown import MOST_PANELS, rms, telling
 from sealfit.report.style import AFTER, CYCLE, FLOOR, QUIET, SKY, Key, Panel, Plot
@@ -44,15 +43,16 @@ def draw_aging(
     for k, quantity in enumerate(quantities):
         colour, marker = CYCLE[k % len(CYCLE)], "os^Dv"[k % 5]
         curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
-        draw_band(ax, curve["aging_days"], curve["lo95"], curve["hi95"], colour, 0.18)
+        ax.fill_between(curve["aging_days"], curve["lo95"], curve["hi95"], color=colour, alpha=0.18, linewidth=0)
         ax.plot(curve["aging_days"], curve["value"], color=colour)
         if before is not None:
             earlier = before[before["quantity"] == quantity].sort_values("aging_days")
             ax.plot(earlier["aging_days"], earlier["value"], color=colour, linestyle=":", linewidth=1.1)
         here = points[points["quantity"] == quantity]
         spread = np.nan_to_num(np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float))
-        draw_bars(ax, here["aging_days"], here["value"], *np.abs(spread), colour=colour, width=0.8, cap=1.5)
-        ax.plot(here["aging_days"], here["value"], color=colour, linestyle="", marker=marker)
+        ax.errorbar(
+            here["aging_days"], here["value"], np.abs(spread), color=colour, fmt=marker, elinewidth=0.8, capsize=1.5
+        )
     ax.xaxis.set_major_locator(round_ticks(integer=True))
     ax.set_xlabel(plain(units.label("aging_days")))
     ax.set_ylabel(
@@ -141,7 +141,9 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
     """
     thin = envelope(along_motion(trace))
     error = thin["force_se_N"].fillna(0)
-    draw_band(ax, thin["displacement_mm"], thin["force_N"] - error, thin["force_N"] + error, AFTER, 0.25)
+    ax.fill_between(
+        thin["displacement_mm"], thin["force_N"] - error, thin["force_N"] + error, color=AFTER, alpha=0.25, linewidth=0
+    )
     whole = thin["n"] == thin["n"].max()  # where a repeat begins later, its own start pulls the mean
     ax.plot(thin["displacement_mm"], thin["force_N"], color=SKY, linewidth=0.8)
     ax.plot(thin["displacement_mm"], thin["force_N"].where(whole), color=AFTER, linewidth=0.9)

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 
 from sealfit.config import Config
 from sealfit.report.axes import evenly, natural, padded
-from sealfit.report.marks import draw_band
 from sealfit.report.numbers import given, number
 from sealfit.report.style import BLACK, FLOOR, Key, Panel, Plot, shades
 from sealfit.report.symbols import ConditionNames, is_unaged, plain, short
@@ -40,7 +39,10 @@ def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], un
         curve = curve.sort_values("distance_mm")
         colour = colours.get(speed, BLACK)
         error = curve["force_se_N"].fillna(0.0)
-        draw_band(ax, curve["distance_mm"], curve["force_N"] - error, curve["force_N"] + error, colour, 0.2)
+        ax.fill_between(
+            curve["distance_mm"], curve["force_N"] - error, curve["force_N"] + error, color=colour, alpha=0.2,
+            linewidth=0,
+        )  # fmt: skip
         ax.plot(
             curve["distance_mm"], curve["force_N"], linestyle="", marker="o" if direction > 0 else "<", markersize=2.6,
             color=colour, markerfacecolor=colour if direction > 0 else "white", markeredgewidth=0.7,

@@ -11,7 +11,6 @@ from matplotlib.ticker import FuncFormatter
 
 from sealfit.config import Config
 from sealfit.report.axes import padded
-from sealfit.report.marks import draw_band
 from sealfit.report.numbers import given, number
 from sealfit.report.shown import MOST_KEYS, MOST_PANELS, spread
 from sealfit.report.style import BLACK, FLOOR, Key, Panel, Plot, shades
@@ -44,7 +43,7 @@ def draw_master_curve(
     aged = values[values["scaled_days"] > 0]
     ax.set_xscale("symlog", linthresh=float(aged["scaled_days"].min()), linscale=0.7)
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], FLOOR, 0.2)
+    ax.fill_between(law["scaled_days"], law["lo95"], law["hi95"], color=FLOOR, alpha=0.2, linewidth=0)
     ax.plot(law["scaled_days"], law["value"], color=FLOOR)
     if before is not None:
         earlier = before[before["kind"] == "law"].sort_values("scaled_days")

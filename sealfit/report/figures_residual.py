@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from sealfit.config import Config
 from sealfit.report.axes import capital, category_ticks, is_logarithmic, log_axis, value_ticks
 from sealfit.report.figures_speed import LOG_SPAN as SPEED_SPAN
-from sealfit.report.marks import draw_band, draw_bars
 from sealfit.report.numbers import number, p_value
 from sealfit.report.shown import MOST_MARKS
 from sealfit.report.style import AFTER, BEFORE, FLOOR, QUIET, Key, Panel, Plot
@@ -51,20 +50,21 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
     for stage, colour, marker, shift in (("before", BEFORE, "o", -apart), ("after", AFTER, "s", apart)):
         spread = Z95 * rows[f"{stage}_se_N"].fillna(0.0).to_numpy(float)
         places, mean = x * np.exp(shift) if log else x + shift, rows[f"{stage}_N"]
-        shared = {"markeredgewidth": 0.6 if many else 0.9, "zorder": 2 if stage == "before" else 3,
-                  "rasterized": len(rows) > MOST_MARKS}  # fmt: skip
-        width, cap = (0.4, 0.0) if many else (0.9, 1.8)
-        draw_bars(ax, places, mean, spread, spread, colour=colour, width=width, cap=cap, **shared)
-        ax.plot(
+        ax.errorbar(
             places,
             mean,
+            spread,
             color=colour,
             marker=marker,
             markersize=1.8 if many else 3.6,
             markerfacecolor="white" if stage == "before" else colour,
+            markeredgewidth=0.6 if many else 0.9,
             linestyle="-" if numeric else "",
             linewidth=0.8,
-            **shared,
+            elinewidth=0.4 if many else 0.9,
+            capsize=0.0 if many else 1.8,
+            zorder=2 if stage == "before" else 3,
+            rasterized=len(rows) > MOST_MARKS,
         )
     if log:
         log_axis(ax)
@@ -154,7 +154,7 @@ def draw_shape(ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units) -> N
     ax.axhline(0.0, color=QUIET, linewidth=0.8, zorder=1)
     if numeric:
         x = rows["x"].to_numpy(float)
-        draw_band(ax, x, lo, hi, AFTER, 0.2)
+        ax.fill_between(x, lo, hi, color=AFTER, alpha=0.2, linewidth=0)
         ax.plot(x, free, color=FLOOR, linestyle="--", linewidth=1.1)
         ax.plot(x, value, color=AFTER)
         ax.set_xlim(x.min(), x.max() if x.max() > x.min() else x.min() + 1)
@@ -163,8 +163,7 @@ def draw_shape(ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units) -> N
     else:
         x = np.arange(len(rows))
         spread = np.nan_to_num(np.abs(np.stack([value - lo, hi - value])))
-        draw_bars(ax, x, value, *spread, colour=AFTER, width=1.4, cap=2.0)
-        ax.plot(x, value, color=AFTER, marker="o", linestyle="")
+        ax.errorbar(x, value, spread, color=AFTER, fmt="o", elinewidth=1.4, capsize=2.0)
         ax.plot(x, free, color=FLOOR, marker="_", linestyle="", markersize=12)
         category_ticks(ax, categories(rows, channel))
     ax.set_xlabel(plain(short(channel_label(channel, units), 44)))

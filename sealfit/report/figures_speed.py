@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 
 from sealfit.config import Config
 from sealfit.report.axes import capital, in_order, is_number, log_axis, natural, padded
-from sealfit.report.marks import draw_band, draw_bars
 from sealfit.report.numbers import count, number
 from sealfit.report.shown import MOST_KEYS, MOST_MARKS, MOST_PANELS, condition_misfits, rms, spread, telling
 from sealfit.report.style import BLACK, CYCLE, FLOOR, HEIGHT, Key, Panel, Plot, shades
@@ -55,26 +54,23 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
     dense = sum(len(line.points) for line in lines) > MOST_MARKS
     for line in lines:
         for curve in line.curves:
-            draw_band(ax, curve["speed"], curve["lo"], curve["hi"], line.colour, 0.2)
+            ax.fill_between(curve["speed"], curve["lo"], curve["hi"], color=line.colour, alpha=0.2, linewidth=0)
             if not curve["before"].equals(curve["after"]):
                 ax.plot(curve["speed"], curve["before"], color=line.colour, linestyle=":", linewidth=0.9, alpha=0.8)
             backward = len(curve) and curve["direction"].iloc[0] < 0
             ax.plot(curve["speed"], curve["after"], color=line.colour, linestyle="--" if backward else "-")
         for direction, points in line.points.groupby("direction") if len(line.points) else ():
-            error = points["sd"].fillna(0.0)
-            draw_bars(
-                ax, points["speed"], points["force"], error, error, colour=line.colour, width=0.8,
-                cap=0.0 if dense else 1.5, markeredgewidth=0.9, rasterized=dense,
-            )  # fmt: skip
-            ax.plot(
+            ax.errorbar(
                 points["speed"],
                 points["force"],
+                points["sd"].fillna(0.0),
                 color=line.colour,
-                linestyle="",
-                marker="o" if direction > 0 else "<",
+                fmt="o" if direction > 0 else "<",
                 markersize=3.4,
                 markerfacecolor=line.colour if direction > 0 else "white",
                 markeredgewidth=0.9,
+                elinewidth=0.8,
+                capsize=0.0 if dense else 1.5,
                 rasterized=dense,
             )
     if log:

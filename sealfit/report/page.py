@@ -13,7 +13,7 @@ from markupsafe import Markup
 from sealfit.config import Config
 from sealfit.profiling import timed
 from sealfit.report import facts
-from sealfit.report.drawn import Drawn, data_uri, draw_plots
+from sealfit.report.drawn import Drawn, data_uri, draw
 from sealfit.report.figures import draw_all
 from sealfit.report.figures_residual import MOST_CHANNELS
 from sealfit.report.law_tables import law_rows
@@ -86,7 +86,7 @@ def build_report(
         closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
     plots = draw_all(tables, closure, config)
     with timed("plots", rows=len(plots), of="plots"):
-        figures = draw_plots(plots)
+        figures = {name: draw(plot) for name, plot in plots.items()}
     images = {name: _images(plot, figures[name]) for name, plot in plots.items()}
     html = _environment().from_string(_text("template.html")).render(
         style=Markup(_text("style.css")), plots=images, **_content(tables, closure, provenance, config)

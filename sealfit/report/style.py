@@ -14,10 +14,9 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import AutoLocator, ScalarFormatter
+from matplotlib.ticker import AutoLocator
 
-from sealfit.report.axes import PlainNumbers, round_ticks
-from sealfit.report.frame import Frame
+from sealfit.report.axes import round_ticks
 from sealfit.report.symbols import plain, symbol_math
 
 # Okabe & Ito, Color Universal Design (2008): told apart by all common kinds of colour vision. Yellow is left out: too
@@ -65,6 +64,8 @@ RC = {
     "lines.markersize": 4,
     "legend.frameon": False,
     "text.parse_math": True,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "sealfit",
 }
 
 Mark = Literal["line", "dotted", "dashed", "band", "point", "open", "left", "bar"]
@@ -118,35 +119,14 @@ def shades(n: int) -> list[str]:
     return [to_hex(scale(0.82 * k / max(n - 1, 1))) for k in range(n)]
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Where the panels of a plot stand, all in inches: the figure's size, its legend's lines, lower left corners."""
-
-    width: float
-    height: float
-    lines: int
-    corners: tuple[tuple[float, float], ...]
-
-    @classmethod
-    def of(cls, plot: Plot) -> Layout:
-        """Return the layout of a plot: up to four panels a row, below its title and its legend."""
-        columns = min(len(plot.panels), 4 if len(plot.panels) > 6 else 3)
-        rows = [plot.panels[k : k + columns] for k in range(0, len(plot.panels), columns)]
-        heights = [max(panel.height for panel in row) for row in rows]
-        width = columns * WIDTH
-        lines = _legend_lines(plot.legend, width)
-        corners = [
-            (c * WIDTH, sum(heights[r:]) + 0.04 - panel.height)
-            for r, row in enumerate(rows)
-            for c, panel in enumerate(row)
-        ]
-        return cls(width, sum(heights) + 0.36 + 0.19 * lines, lines, tuple(corners))
-
-
 def compose(plot: Plot) -> Figure:
-    """Return all panels of a plot in one figure, with title and legend."""
-    layout = Layout.of(plot)
-    width, total = layout.width, layout.height
+    """Return all panels of a plot in one figure, up to four a row, below its title and its legend."""
+    columns = min(len(plot.panels), 4 if len(plot.panels) > 6 else 3)
+    rows = [plot.panels[k : k + columns] for k in range(0, len(plot.panels), columns)]
+    heights = [max(panel.height for panel in row) for row in rows]
+    width = columns * WIDTH
+    lines = _legend_lines(plot.legend, width)
+    total = sum(heights) + 0.36 + 0.19 * lines
     with look():
         figure = Figure(figsize=(width, total), dpi=DPI)
         figure.text(_EDGE / width, 1 - 0.1 / total, plot.title, va="top", weight="bold", size=10)
@@ -155,7 +135,7 @@ def compose(plot: Plot) -> Figure:
                 handles=[_handle(key) for key in plot.legend],
                 loc="upper left",
                 bbox_to_anchor=(_EDGE / width, 1 - 0.32 / total),
-                ncols=math.ceil(len(plot.legend) / layout.lines),
+                ncols=math.ceil(len(plot.legend) / lines),
                 handlelength=1.8,
                 columnspacing=1.4,
                 labelspacing=0.35,
@@ -163,8 +143,17 @@ def compose(plot: Plot) -> Figure:
                 borderpad=0,
                 fontsize=8,
             )
-        for panel, corner in zip(plot.panels, layout.corners, strict=True):
-            _place(figure, panel, *corner)
+        for r, row in enumerate(rows):
+            for c, panel in enumerate(row):
+                _place(figure, panel, c * WIDTH, sum(heights[r:]) + 0.04 - panel.height)
+        return figure
+
+
+def panel_figure(panel: Panel) -> Figure:
+    """Return a figure of one panel, without title and legend."""
+    with look():
+        figure = Figure(figsize=(WIDTH, panel.height), dpi=DPI)
+        _place(figure, panel, 0.0, 0.0)
         return figure
 
 
@@ -180,13 +169,8 @@ def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> Axes:
     panel.draw(ax)
     if ax.get_xscale() == "linear" and isinstance(ax.xaxis.get_major_locator(), AutoLocator):
         ax.xaxis.set_major_locator(round_ticks())
-    for axis in (ax.xaxis, ax.yaxis):
-        if type(axis.get_major_formatter()) is ScalarFormatter:
-            axis.set_major_formatter(PlainNumbers())
     if panel.title:
-        # its height is given too, or every drawing measures all tick labels to see whether they are in its way
-        ax.set_title(plain(panel.title), x=-(panel.left - _EDGE) / (WIDTH - panel.left - _EDGE), y=1.0)
-    ax.add_artist(Frame(ax))
+        ax.set_title(plain(panel.title), x=-(panel.left - _EDGE) / (WIDTH - panel.left - _EDGE))
     return ax
 
 

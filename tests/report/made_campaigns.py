@@ -1,6 +1,7 @@
 """Tables of campaigns with known truth, as a report gets them; the laws are Eq. 14 and Eq. 15, the scatter is drawn."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -200,6 +201,7 @@ def _laws(steady, fits, config):
     return {"aging_laws": table("aging_laws", laws), "master_curve": table("master_curve", curve)}
 
 
+@cache
 def paper_sized():
     """Return 73 conditions at 8 speeds, 1752 files."""
     return aging_campaign(
