@@ -19,8 +19,8 @@ from sealfit.closure.channels import flip_level, unit_of
 from sealfit.closure.intervals import robust_covariance
 from sealfit.closure.result import channels_of, effect_level
 from sealfit.effects import EFFECTS
-from sealfit.effects.categories import LEVELS, levels_effect
 from sealfit.effects.contract import AMPLITUDE, Effect, Parameter
+from sealfit.effects.free import LEVELS, levels_effect
 from sealfit.fit.estimate import Fitted, fit
 from sealfit.fit.joint import Model
 from sealfit.fit.rows import Rows

@@ -14,9 +14,8 @@ from sealfit.closure.linearised import middles
 from sealfit.closure.ripple import Peak
 from sealfit.closure.score_test import Candidate, ScoreTestResult
 from sealfit.closure.stroke_phases import common_wavelength, pass_shifts
-from sealfit.effects.categories import LEVELS, SLOPES
 from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect
-from sealfit.effects.free import SMOOTH, SURFACE, WIDE, free_effect, natural
+from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, WIDE, free_effect, natural
 from sealfit.fit.estimate import Fitted
 from sealfit.fit.rows import Rows
 from sealfit.fit.terms import Term

@@ -1,13 +1,4 @@
-r"""Free shapes, whose size the data decide: a smooth curve of a channel, a surface of two; others are in `categories`.
-
-They name no mechanism. All are rebuilt from plain data by `free_effect`, so a model file holds them whole.
-
-.. math:: h = \sum_j c_j B_j(x)
-
-B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the knot of reference has none. Beyond the
-outer knots the shape keeps its last value: nothing was measured there. It is counted from its mean over the campaign
-where that is given: a constant that came in with it would stand for friction, and what scales friction would miss it.
-"""
+"""Free shapes of one or two channels, sized by the data: splines, levels of a category, means over a bin."""
 
 from __future__ import annotations
 
@@ -16,18 +7,193 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from sealfit.effects.categories import (
-    LESS_MEAN,
-    LEVELS,
-    MEAN_OF_CAMPAIGN,
-    SLOPES,
-    levels_effect,
-    listed,
-    shares,
-    slopes_effect,
-)
-from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter
+from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, reference
 from sealfit.errors import ParameterError
+
+# ---------------------------------------------------------------- averaged
+# What is left of a wave in the mean over the samples of a bin.
+#
+# .. math:: \frac{1}{n} \sum_k \sin(\alpha + \beta_k)
+#           = \frac{\sin(\pi w / \lambda)}{n \sin(\pi w / (n \lambda))} \sin \alpha
+#
+# for n samples that lie evenly over a width w about the phase alpha (the Dirichlet kernel): in a bin that is longer
+# than the wave hardly anything, however long it is.
+
+SAMPLES = "samples"  # in an effect's inputs: how many a row is the mean of
+
+
+def width_of(name: str) -> str:
+    """Return where an effect's inputs hold how far a channel goes within each row."""
+    return f"{name} width"
+
+
+def left_of_wave(inputs: Mapping, name: str, wavelength: float):
+    """Return the factor by which a wave is smaller in each row's mean, shape (n,); 1 where a row is one place.
+
+    Examples
+    --------
+    Two samples half a wave apart cancel; many over a whole wave, too.
+
+    >>> given = {"x width": np.array([1.0, 2.0, 0.5]), "samples": np.array([2.0, 2.0, 1.0])}
+    >>> [round(float(f), 12) for f in left_of_wave(given, "x", 1.0)]
+    [0.0, -1.0, 1.0]
+    """
+    width = inputs.get(width_of(name))
+    if width is None:
+        return 1.0
+    half, samples = np.pi * np.asarray(width, float) / wavelength, np.asarray(inputs[SAMPLES], float)
+    each = np.sin(half / samples)
+    alike = np.abs(each) < 1e-9  # samples whole waves apart all show the same
+    return np.where(alike, np.cos(half) * np.cos(half / samples), np.sin(half) / np.where(alike, 1.0, samples * each))
+
+
+# ---------------------------------------------------------------- categories
+# Free shapes of a category: a level for each, or a straight line in another channel for each.
+#
+# .. math:: h = \sum_k d_k [x = k], \qquad h = \sum_k e_k [z = k] (x - x_{ref})
+#
+# Like the others (`sealfit.effects.free`) they name no mechanism. Levels are counted from their mean over the campaign
+# where that is given: a constant that came in with them would stand for friction.
+
+LEVELS, SLOPES = "levels", "slopes"
+LESS_MEAN = "; less its mean over the campaign"
+MEAN_OF_CAMPAIGN = "mean over {x} in the campaign"  # the reference of a shape less its mean
+
+
+def levels_effect(categories: Sequence[str], means: Sequence[float] | None = None) -> Effect:
+    """Return one level per category of the channel, as differences from the first category.
+
+    Parameters
+    ----------
+    categories : sequence of str
+        At least two different categories.
+    means : sequence of float, optional
+        Share of each category in the campaign, for levels whose mean is zero; else the first category is zero.
+
+    Returns
+    -------
+    Effect
+        Amplitudes `d_1`, `d_2`, ... for the categories after the first. A category that is not listed gives NaN.
+
+    Raises
+    ------
+    ParameterError
+        If there are fewer than two categories, or one stands twice.
+    """
+    names = _different(LEVELS, categories)
+    return Effect(
+        id=LEVELS,
+        label="levels of {x}",
+        equation=r"h = \sum_k d_k [x = k]",
+        form=f"d_k for category k of {listed(names)}; 0 for {names[0]}" + LESS_MEAN * (means is not None),
+        reference=MEAN_OF_CAMPAIGN if means is not None else f"{{x}} = {names[0]}",
+        reads=(CHANNEL,),
+        acts_on=ANYWHERE,
+        parameters=tuple(
+            Parameter(f"d_{k}", "{y}", 0.0, AMPLITUDE, f"{name} less {names[0]}", linear=True)
+            for k, name in enumerate(names[1:], start=1)
+        ),
+        shape=partial(_levels, names, shares(means, len(names))),
+        source="Form: ours. One number per category, as in any analysis of variance.",
+        # By hand: the last category has its own difference.
+        worked=(
+            {CHANNEL: names[-1]},
+            {f"d_{k}": k / 10 for k in range(1, len(names))},
+            (len(names) - 1) / 10 - sum(k / 10 * m for k, m in enumerate(shares(means, len(names)))),
+        ),
+        physical=False,
+    )
+
+
+def _different(id: str, categories: Sequence[str]) -> tuple[str, ...]:
+    names = tuple(str(c) for c in categories)
+    if len(names) < 2 or len(set(names)) != len(names):
+        raise ParameterError(f"{id}: {list(names)} must be two or more different categories.", fix="List each once.")
+    return names
+
+
+def _levels(names: tuple[str, ...], means: tuple[float, ...], inputs: Mapping, **values) -> np.ndarray:
+    given = np.asarray(inputs[CHANNEL]).astype(str)
+    level = [0.0, *(values[f"d_{k}"] for k in range(1, len(names)))]
+    mean = sum(d * m for d, m in zip(level, means, strict=True))
+    result = np.full(given.shape, np.nan)
+    for name, d in zip(names, level, strict=True):
+        result[given == name] = d - mean
+    return result
+
+
+def slopes_effect(categories: Sequence[str]) -> Effect:
+    """Return a straight line in a channel for each category of a second one, all zero at the reference.
+
+    Parameters
+    ----------
+    categories : sequence of str
+        At least two different categories.
+
+    Returns
+    -------
+    Effect
+        Amplitudes `e_1`, `e_2`, ..., the slope of each category. A category that is not listed gives NaN.
+
+    Raises
+    ------
+    ParameterError
+        If there are fewer than two categories, or one stands twice.
+    """
+    names = _different(SLOPES, categories)
+    return Effect(
+        id=SLOPES,
+        label="linear in {x}, by {z}",
+        equation=r"h = \sum_k e_k [z = k] (x - x_{ref})",
+        form=f"e_k (x - x_ref) for category k of {listed(names)}",
+        reference="{x} = {x_ref}",
+        reads=(CHANNEL, SECOND),
+        acts_on=ANYWHERE,
+        parameters=tuple(
+            Parameter(f"e_{k}", "{y}/{x}", 0.0, AMPLITUDE, f"slope for {name}", linear=True)
+            for k, name in enumerate(names, start=1)
+        ),
+        shape=partial(_slopes, names),
+        source="Form: ours. One slope per category, as in any analysis of covariance.",
+        # By hand: 3 above the reference, in the last category.
+        worked=(
+            {CHANNEL: 5.0, "x_ref": 2.0, SECOND: names[-1]},
+            {f"e_{k}": k / 10 for k in range(1, len(names) + 1)},
+            0.3 * len(names),
+        ),
+        physical=False,
+    )
+
+
+def _slopes(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
+    x = np.asarray(inputs[CHANNEL], dtype=float) - reference(inputs, CHANNEL, 0.0)
+    given = np.asarray(inputs[SECOND]).astype(str)
+    slope = np.full(given.shape, np.nan)
+    for k, name in enumerate(names, start=1):
+        slope[given == name] = values[f"e_{k}"]
+    return slope * x
+
+
+def shares(means: Sequence[float] | None, count: int) -> tuple[float, ...]:
+    """Return what is taken off a shape, by its amplitudes: their `means` over the campaign, or nothing."""
+    return (0.0,) * count if means is None else tuple(float(m) for m in means)
+
+
+def listed(values: Sequence[object]) -> str:
+    """Return values in words."""
+    return ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in values)
+
+
+# ---------------------------------------------------------------- free
+# Free shapes, whose size the data decide: a smooth curve of a channel, a surface of two; others are in `categories`.
+#
+# They name no mechanism. All are rebuilt from plain data by `free_effect`, so a model file holds them whole.
+#
+# .. math:: h = \sum_j c_j B_j(x)
+#
+# B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the knot of reference has none. Beyond the
+# outer knots the shape keeps its last value: nothing was measured there. It is counted from its mean over the campaign
+# where that is given: a constant that came in with it would stand for friction, and what scales friction would miss it.
 
 SMOOTH, SURFACE = "smooth", "surface"
 WIDE = 20.0  # a positive channel that spans this factor is looked at on a logarithmic scale

@@ -21,7 +21,7 @@ from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect
 from sealfit.effects.free import FREE
 from sealfit.errors import ConfigError, ParameterError
 
-EXAMPLE = "See sealfit/effects/drift.py for a whole one."
+EXAMPLE = "See sealfit/effects/sensors.py for a whole one."
 TOLERANCE = 1e-9  # of a worked value, which a user may have written with ten digits
 
 

@@ -7,15 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.effects import arrhenius_aging
+from sealfit.effects import aging_laws
 
-GAS_CONSTANT = arrhenius_aging.GAS_CONSTANT / 1000  # kJ/(mol K)
+GAS_CONSTANT = aging_laws.GAS_CONSTANT / 1000  # kJ/(mol K)
 TINY = 1e-300  # of a variance: values without any scatter
 ROUNDING = 1e-14  # of the largest variance: less is not known of a covariance
 
 
 def _inverse(celsius):
-    return 1 / (GAS_CONSTANT * (np.asarray(celsius, float) + arrhenius_aging.ZERO_C))
+    return 1 / (GAS_CONSTANT * (np.asarray(celsius, float) + aging_laws.ZERO_C))
 
 
 def _plain(percent):

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from sealfit.effects.averaged import SAMPLES, width_of
 from sealfit.effects.contract import CHANNEL, SECOND, Effect
+from sealfit.effects.free import SAMPLES, width_of
 from sealfit.fit.rows import ALONG, Rows
 
 WAVES = ("ripple", "sinusoid", "sinusoid_harmonics")  # whose mean over a bin is known

@@ -9,9 +9,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from sealfit.effects import EFFECTS
-from sealfit.effects.categories import LEVELS
 from sealfit.effects.contract import CHANNEL, Effect, Operation, Target
-from sealfit.effects.free import SMOOTH, smooth_effect
+from sealfit.effects.free import LEVELS, SMOOTH, smooth_effect
 from sealfit.errors import ConfigError, ParameterError
 from sealfit.simulation.formula import evaluate_formula, parse_formula
 from sealfit.simulation.strict import Strict

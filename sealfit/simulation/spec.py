@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError, model_validator
 
-from sealfit.effects.categories import LEVELS
+from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
 from sealfit.simulation.channels import Channel
 from sealfit.simulation.design import Design

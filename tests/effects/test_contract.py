@@ -13,9 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealfit.effects import EFFECTS
-from sealfit.effects.categories import levels_effect
 from sealfit.effects.contract import CHANNEL, READS_ANY, Effect, Parameter, fill_unit
-from sealfit.effects.free import smooth_effect
+from sealfit.effects.free import levels_effect, smooth_effect
 from sealfit.errors import ParameterError
 
 FREE = {
@@ -178,15 +177,6 @@ def test_small_steps_beyond_the_lower_bounds_stay_finite(effect):
     for p in effect.nonlinear:
         below = p.bounds[0] - 1e-5 * max(abs(p.bounds[0]), 1e-3)
         assert np.isfinite(effect.shape(inputs, **{**values, p.name: below})).all(), p.name
-
-
-@every_registered
-def test_lives_in_a_file_of_its_own_name(effect):
-    module = sys.modules[effect.shape.__module__]
-    assert Path(module.__file__).stem == effect.id
-    assert EFFECTS[effect.id] is effect
-    assert getattr(module, effect.id.upper()) is effect
-    assert module.__doc__.count(".. math::") == 1
 
 
 def test_every_effect_file_is_registered():

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sealfit.effects.categories import levels_effect, slopes_effect
-from sealfit.effects.free import free_effect, roughness, smooth_effect, surface_effect
+from sealfit.effects.free import free_effect, levels_effect, roughness, slopes_effect, smooth_effect, surface_effect
 from sealfit.errors import ParameterError
 
 

@@ -42,7 +42,7 @@ def test_an_empty_folder_has_no_effects(tmp_path):
 
 
 def test_an_imported_effect_of_the_catalogue_is_not_the_files_own(tmp_path):
-    write(tmp_path, "patch.py", "from sealfit.effects.linear import LINEAR\n" + WORN_PATCH)
+    write(tmp_path, "patch.py", "from sealfit.effects.closed_forms import LINEAR\n" + WORN_PATCH)
     assert list(load_user_effects(tmp_path)) == ["worn_patch"]
 
 

@@ -1,0 +1,299 @@
+"""Other laws of aging than Eq. 15."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sealfit.effects.contract import AMPLITUDE, Effect, Parameter, not_negative, positive, reference
+
+GAS_CONSTANT = 8.314462618  # J/(mol K), CODATA 2018
+ZERO_C = 273.15  # K
+STANDARD_C = 23.0  # degC, standard laboratory temperature of rubber tests, ISO 23529
+
+
+def arrhenius_aging_shape(inputs, *, A, E):
+    r"""Arrhenius acceleration of aging with temperature: the loss a, or the time b of its onset, follows the oven.
+
+    Oxidation and the breaking and joining of network bonds need an activation energy E, so their rate grows as
+    :math:`e^{-E / R T}`. A share A of the aging is of that kind; the rest, physical relaxation, is taken as the same at
+    every temperature,
+
+    .. math:: h = A [e^{E / R\, (1 / T_{ref} - 1 / T)} - 1]
+
+    with T in kelvin. A = 1 is Arrhenius' law itself, a factor :math:`e^{E / R\, (1 / T_{ref} - 1 / T)}`. On a it is the
+    rate of the loss, E positive. On b, a time, E is negative: A = 1 then shifts the whole curve of Eq. 15 along the
+    logarithm of time, which is time-temperature superposition. Unaged rubber is unchanged whatever its temperature.
+
+    Two temperatures determine one number, three tell A from E; where the exponent is small, only A E is determined. The
+    declared model has an a and a b of its own for each series, and where temperature makes series they take all of it
+    up: there is something to find only where one series holds several, as with a config whose `condition` leaves it
+    out.
+
+    Factor minus one, shape (n,); `temperature_C` of aging in degrees Celsius (NaN at or below absolute zero).
+    """
+    kelvin = positive(np.asarray(inputs["temperature_C"], dtype=float) + ZERO_C)
+    at_reference = reference(inputs, "temperature_C", STANDARD_C) + ZERO_C
+    return A * np.expm1(E / GAS_CONSTANT * (1 / at_reference - 1 / kelvin))
+
+
+ARRHENIUS_AGING = Effect(
+    id="arrhenius_aging",
+    label="Arrhenius acceleration of aging with temperature",
+    equation=r"h = A [e^{E / R\, (1 / T_{ref} - 1 / T)} - 1]",
+    form="A (exp(E / R (1 / T_ref - 1 / T)) - 1)",
+    reference="{temperature_C} = {temperature_C_ref}",
+    reads=("temperature_C",),
+    acts_on=(("a", "multiply"), ("b", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 1.0, (-10.0, 10.0), "share of the aging that is thermally activated", linear=True),
+        Parameter(
+            "E",
+            "J/mol",
+            8e4,
+            (-3e5, 3e5),
+            "activation energy; negative on b, which is a time",
+            search=(-1.2e5, -8e4, -4e4, 2e4, 4e4, 8e4, 1.2e5),
+        ),
+    ),
+    shape=arrhenius_aging_shape,
+    source="Arrhenius 1889, Z. Phys. Chem. 4, 226-248; for the life of rubber: ISO 11346. With a share that is not "
+    "activated: ours.",
+    # By hand: E = R T_ref ln 16 and T = 2 T_ref: the exponent is ln 16 / 2 = ln 4, and 0.5 (4 - 1) = 1.5. In numbers:
+    # T_ref = 300 K, E = 8.314462618 * 300 * 2.772588722239781, T = 600 K.
+    worked=(
+        {"temperature_C": 326.85, "temperature_C_ref": 26.85},
+        {"A": 0.5, "E": 8.314462618 * 300 * 2.772588722239781},
+        1.5,
+    ),
+)
+
+
+def compression_factor_shape(inputs, *, A):
+    r"""Compression while aging: rubber held at a lower height ages, and rubs, differently.
+
+    A seal ages under squeeze. Strain holds the chains apart in one place and together in another while bonds form and
+    break (compression set), and shuts the surface off from air. With c the height in per cent of the original one, the
+    height taken away counts to first order,
+
+    .. math:: h = A (100 - c) / 100
+
+    A is the relative change per whole height taken away, so that 80 % gives A / 5; rubber that was not compressed is
+    the reference. On a or b aging itself changes; on mu the friction of unaged rows follows their cell, too.
+
+    The declared model has an a and a b of its own for each series, and where compression makes series they take up all
+    of a change of a or b: there is something to find on them only where one series holds several heights.
+
+    Factor minus one, shape (n,); `compression_ratio_pct` in per cent of the original height.
+    """
+    return A * (100.0 - np.asarray(inputs["compression_ratio_pct"], dtype=float)) / 100.0
+
+
+COMPRESSION_FACTOR = Effect(
+    id="compression_factor",
+    label="compression while aging",
+    equation=r"h = A (100 - c) / 100",
+    form="A (100 - c) / 100",
+    reference="not compressed (100 %)",
+    reads=("compression_ratio_pct",),
+    acts_on=(("a", "multiply"), ("b", "multiply"), ("mu", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
+    parameters=(Parameter("A", "{y}", 0.5, AMPLITUDE, "relative change per whole height taken away", linear=True),),
+    shape=compression_factor_shape,
+    source="Friction after aging at 80, 90 and 100 % of the height: Wu et al. 2020, Polymers 12(1), 102, "
+    "doi:10.3390/polym12010102. First order: ours.",
+    # By hand: a fifth of the height taken away.
+    worked=({"compression_ratio_pct": 80.0}, {"A": 0.6}, 0.12),
+)
+
+
+def aging_floor_shape(inputs, *, A, t_f):
+    r"""Aging with a floor: from some day on the coefficient falls less than the logarithm says.
+
+    Eq. 15 falls for ever; real aging ends when what reacts is used up. Beyond a day t_f part of the fall is given back,
+
+    .. math:: h = A \ln(t / t_f) \quad (t > t_f), \qquad h = 0 \quad (t \le t_f)
+
+    As a change of mu_s or mu_c, A = a stops the fall of :math:`\mu_0 - a \ln(1 + t / b)` altogether for t well beyond
+    b, and a smaller A slows it. As a factor on mu, A is relative to mu.
+
+    Change of the coefficient or factor minus one, shape (n,); `aging_days` in days.
+    """
+    return A * np.log(np.maximum(np.asarray(inputs["aging_days"], dtype=float) / t_f, 1.0))
+
+
+AGING_FLOOR = Effect(
+    id="aging_floor",
+    label="aging with a floor",
+    equation=r"h = A \ln \max(1, t / t_f)",
+    form="A ln(max(1, t / t_f))",
+    reference="no more than {t_f} days",
+    reads=("aging_days",),
+    acts_on=(("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 0.03, (-10.0, 10.0), "fall given back per factor e of the time", linear=True),
+        Parameter("t_f", "{x}", 8.0, (1e-3, 1e5), "day from which it is given back", search="inside"),
+    ),
+    shape=aging_floor_shape,
+    source="Form: ours. The logarithm of Eq. 15, cut off: Wu et al. 2020, Polymers 12(1), 102, "
+    "doi:10.3390/polym12010102.",
+    # By hand: twice the day of the floor, ln 2 = 0.6931471805599453.
+    worked=({"aging_days": 16.0}, {"A": 0.04, "t_f": 8.0}, 0.04 * 0.6931471805599453),
+)
+
+
+def aging_induction_shape(inputs, *, A, t_i):
+    r"""Aging with an induction time: at first less happens than the logarithm says.
+
+    Antioxidants hold oxidation off until they are spent, so the coefficient stays up for a while and then catches up
+    with Eq. 15. What it lies above the law rises from zero at day 0, is largest at t_i and dies out:
+
+    .. math:: h = A \frac{t}{t_i} e^{1 - t / t_i}
+
+    A is that largest lag.
+
+    Factor minus one or change of the coefficient, shape (n,); `aging_days` in days.
+    """
+    ratio = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0) / t_i
+    return A * ratio * np.exp(1 - ratio)
+
+
+AGING_INDUCTION = Effect(
+    id="aging_induction",
+    label="aging with an induction time",
+    equation=r"h = A (t / t_i) e^{1 - t / t_i}",
+    form="A (t / t_i) exp(1 - t / t_i)",
+    reference="unaged",
+    reads=("aging_days",),
+    acts_on=(("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 0.05, (-10.0, 10.0), "largest lag behind the logarithmic law", linear=True),
+        Parameter("t_i", "{x}", 2.0, (1e-3, 1e5), "day of the largest lag", search="inside"),
+    ),
+    shape=aging_induction_shape,
+    source="Form: ours. The simplest lag that starts at zero, has one maximum and dies out.",
+    # By hand: at twice t_i, 2 exp(-1) = 2 * 0.36787944117144233.
+    worked=({"aging_days": 4.0}, {"A": 0.1, "t_i": 2.0}, 0.1 * 2 * 0.36787944117144233),
+)
+
+
+def aging_delay_shape(inputs, *, A, t_i, b):
+    r"""Aging that starts late: nothing happens until a day t_i, and Eq. 15 runs from there.
+
+    Antioxidants hold oxidation off until they are spent. The declared law runs from day 0, so what is added is the
+    difference of the two clocks,
+
+    .. math:: h = A \left[\ln(1 + t / b) - \ln(1 + \max(t - t_i, 0) / b)\right]
+
+    which is zero at day 0 and dies out as :math:`A t_i / t`. Where A is the declared law's a (as a share of mu, for a
+    factor) and b its b, the declared law and the effect together are Eq. 15 with :math:`t - t_i` for t.
+    `aging_induction` is the smooth lag of a batch whose pieces start one after the other.
+
+    Factor minus one or change of the coefficient, shape (n,); `aging_days` in days.
+    """
+    days = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0)
+    return A * (np.log1p(days / b) - np.log1p(np.maximum(days - t_i, 0.0) / b))
+
+
+AGING_DELAY = Effect(
+    id="aging_delay",
+    label="aging that starts late",
+    equation=r"h = A [\ln(1 + t / b) - \ln(1 + \max(t - t_i, 0) / b)]",
+    form="A (ln(1 + t / b) - ln(1 + max(t - t_i, 0) / b))",
+    reads=("aging_days",),
+    acts_on=(("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 0.05, (-10.0, 10.0), "loss for each unit of the logarithm", linear=True),
+        Parameter("t_i", "{x}", 2.0, (1e-3, 1e5), "day on which aging starts", search="inside"),
+        Parameter("b", "{x}", 0.1, (1e-3, 1e3), "time constant of the law", search=(0.03, 0.1, 0.3, 1.0)),
+    ),
+    shape=aging_delay_shape,
+    reference="unaged",
+    source="Eq. 15 with a later start; the induction period of oxidation: Celina, Gillen & Assink 2005, Polymer "
+    "Degradation and Stability 90(3), 395-404, doi:10.1016/j.polymdegradstab.2005.05.004.",
+    # By hand: day 4, start at day 2, b = 1: ln 5 - ln 3 = 1.6094379124341003 - 1.0986122886681098.
+    worked=({"aging_days": 4.0}, {"A": 0.1, "t_i": 2.0, "b": 1.0}, 0.1 * (1.6094379124341003 - 1.0986122886681098)),
+)
+
+
+def stribeck_speed_aging_shape(inputs, *, A, t_0):
+    r"""Stribeck speed that changes with age: the declared model has one v_s for all days of a series.
+
+    v_s marks where a film or a molecular time scale takes over from boundary friction. Hardening rubber carries less of
+    its roughness flat and relaxes more slowly, so v_s moves with age; like the coefficients it is given the logarithm
+    of time,
+
+    .. math:: h = A \ln(1 + t / t_0)
+
+    A is the relative change of v_s per factor e of the aging time, zero for unaged rubber.
+
+    Factor minus one, shape (n,); `aging_days` in days (NaN where negative).
+    """
+    return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
+
+
+STRIBECK_SPEED_AGING = Effect(
+    id="stribeck_speed_aging",
+    label="Stribeck speed changing with age",
+    equation=r"h = A \ln(1 + t / t_0)",
+    form="A ln(1 + t / t_0)",
+    reference="unaged",
+    reads=("aging_days",),
+    acts_on=(("v_s", "multiply"),),
+    parameters=(
+        Parameter("A", "{y}", 0.1, (-5.0, 20.0), "relative change of v_s per factor e of the aging time", linear=True),
+        Parameter(
+            "t_0",
+            "{x}",
+            1.0,
+            (1e-4, 1e5),
+            "aging time at which the change sets in",
+            search=(0.01, 0.1, 1.0, 10.0, 100.0),
+        ),
+    ),
+    shape=stribeck_speed_aging_shape,
+    source="Form: ours, after the law of the coefficients: Wu et al. 2020, Polymers 12(1), 102, "
+    "doi:10.3390/polym12010102, Eq. 15.",
+    # By hand: t = t_0 gives ln 2 = 0.6931471805599453.
+    worked=({"aging_days": 2.0}, {"A": 0.3, "t_0": 2.0}, 0.3 * 0.6931471805599453),
+)
+
+
+def viscosity_aging_shape(inputs, *, A, t_0):
+    r"""Viscous coefficient that changes with age: the declared model has one sigma_2 for all days of a series.
+
+    What is left of the lubricant, and the rubber's own damping, change as it ages. Like the coefficients, sigma_2 is
+    given the logarithm of time,
+
+    .. math:: h = A \ln(1 + t / t_0)
+
+    A is the change of sigma_2 per factor e of the aging time (as a factor: relative to it), zero for unaged rubber.
+
+    Change of sigma_2 or factor minus one, shape (n,); `aging_days` in days (NaN where negative).
+    """
+    return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
+
+
+VISCOSITY_AGING = Effect(
+    id="viscosity_aging",
+    label="viscous coefficient changing with age",
+    equation=r"h = A \ln(1 + t / t_0)",
+    form="A ln(1 + t / t_0)",
+    reference="unaged",
+    reads=("aging_days",),
+    acts_on=(("sigma_2", "add"), ("sigma_2", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 0.01, AMPLITUDE, "change of sigma_2 per factor e of the aging time", linear=True),
+        Parameter(
+            "t_0",
+            "{x}",
+            1.0,
+            (1e-4, 1e5),
+            "aging time at which the change sets in",
+            search=(0.01, 0.1, 1.0, 10.0, 100.0),
+        ),
+    ),
+    shape=viscosity_aging_shape,
+    source="Form: ours, after the law of the coefficients: Wu et al. 2020, Polymers 12(1), 102, "
+    "doi:10.3390/polym12010102, Eq. 15.",
+    # By hand: t = 9 t_0 gives ln 10 = 2.302585092994046.
+    worked=({"aging_days": 9.0}, {"A": -0.02, "t_0": 1.0}, -0.02 * 2.302585092994046),
+)

@@ -1,0 +1,219 @@
+"""What the force sensor and the set-up add: offsets, drift and a wave along the track."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sealfit.effects.contract import AMPLITUDE, CHANNEL, Effect, Parameter, deviation
+from sealfit.effects.free import left_of_wave
+
+
+def ripple_shape(inputs, *, A, lambda_, phi):
+    r"""Ripple along the rig's position: what a screw, a guide or a worn spot adds once per turn.
+
+    A lead screw with a pitch error, a bent shaft or an eccentric coupling pushes once per turn, so the force is
+    periodic in the rig's own coordinate, with the pitch (or a whole fraction of it, for a screw of several starts) as
+    wavelength. The push is an added force, the same both ways, when the drive strains the sensor; it follows the
+    friction when the contact's pressure or surface repeats along the track. A harmonic is a further ripple of half or a
+    third of the wavelength.
+
+    .. math:: h = A \sin(2 \pi x / \lambda + \varphi)
+
+    The wavelength holds within the run that it was fitted to; positions beyond it are extrapolated in phase.
+
+    Sine of the position, shape (n,), in the unit of A; `displacement_mm` in its slot's unit.
+    """
+    angle = 2 * np.pi * np.asarray(inputs["displacement_mm"], dtype=float) / lambda_ + phi
+    return A * np.sin(angle) * left_of_wave(inputs, "displacement_mm", lambda_)
+
+
+RIPPLE = Effect(
+    id="ripple",
+    label="ripple along the rig's position",
+    equation=r"h = A \sin(2 \pi x / \lambda + \varphi)",
+    form="A sin(2 pi x / lambda + phi)",
+    reference="mean over a wavelength",
+    reads=("displacement_mm",),
+    acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude", linear=True),
+        Parameter(
+            "lambda_", "{x}", 2.0, (1e-4, 1e6), "wavelength: pitch of the screw, or its whole fraction", search="span"
+        ),
+        Parameter(
+            "phi", "rad", 0.0, (-4 * np.pi, 4 * np.pi), "phase at position 0", search=tuple(np.arange(4) * np.pi / 4)
+        ),
+    ),
+    shape=ripple_shape,
+    source="Form: ours. A cyclic error of a screw is periodic in its angle; the sine is its first Fourier term.",
+    # By hand: 0.5 mm of a 2 mm pitch is a quarter turn, pi/2; with phi = pi/3 the sine is cos(pi/3) = 1/2.
+    worked=({"displacement_mm": 0.5}, {"A": 3.0, "lambda_": 2.0, "phi": np.pi / 3}, 1.5),
+)
+
+
+def drift_shape(inputs, *, A):
+    r"""Drift of the force channel along a record: a strain-gauge bridge or its amplifier warming up.
+
+    .. math:: h = A t
+
+    A is the rate. The force is added as it stands, with no regard to the direction of motion: an instrument does not
+    know which way the sample slides. Time is the file's own clock, so the drift starts anew with every file that is
+    zeroed.
+
+    Added force, shape (n,), in the force slot's unit; `time_s` in its slot's unit.
+    """
+    return A * np.asarray(inputs["time_s"], dtype=float)
+
+
+DRIFT = Effect(
+    id="drift",
+    label="sensor drift in time",
+    equation=r"h = A t",
+    form="A t",
+    reference="time 0 of the file",
+    reads=("time_s",),
+    acts_on=(("force", "add"),),
+    parameters=(Parameter("A", "{y}/{x}", 0.01, AMPLITUDE, "drift of the force per time", linear=True),),
+    shape=drift_shape,
+    source="Form: ours. First order in time of a slow change of the zero.",
+    # By hand: 20 s at 0.02 N/s.
+    worked=({"time_s": 20.0}, {"A": 0.02}, 0.4),
+)
+
+
+def zero_offset_shape(inputs, *, A):
+    r"""Zero offset of the force channel: a constant added force, the same both ways.
+
+    .. math:: h = A
+
+    Seen as the half-sum of forward and backward force; with one direction only it cannot be told from friction that
+    does not depend on speed. It reads the direction because only that tells it from mu. Below the sensor's accuracy it
+    says nothing.
+
+    Added force, shape (n,), in the force slot's unit.
+    """
+    return A * np.ones_like(np.asarray(inputs["direction"], dtype=float))
+
+
+ZERO_OFFSET = Effect(
+    id="zero_offset",
+    label="zero offset of the force",
+    equation=r"h = A",
+    form="A",
+    reference="zero offset removed",
+    reads=("direction",),
+    acts_on=(("force", "add"),),
+    parameters=(Parameter("A", "{y}", 0.1, AMPLITUDE, "force shown when none acts", linear=True),),
+    shape=zero_offset_shape,
+    source="Form: ours. Definition of a zero offset.",
+    # By hand: the offset itself, whichever way the sample moves.
+    worked=({"direction": -1.0}, {"A": 0.3}, 0.3),
+)
+
+
+def offset_slope_shape(inputs, *, A, B):
+    r"""Zero offset of the force that changes with a channel, the same both ways.
+
+    .. math:: h = A (x - x_{ref}) + B
+
+    The force on a piston is the pressure times its area, so an area that is wrong by dA leaves dA p in what is taken
+    for friction: A is then the error of the area, and B that error times the reference pressure. An amplifier whose
+    zero moves with the temperature of the room does the same.
+
+    Added force, shape (n,), whichever way the sample moves.
+    """
+    return A * deviation(inputs, CHANNEL) + B
+
+
+OFFSET_SLOPE = Effect(
+    id="offset_slope",
+    label="zero offset of the force that changes with {x}",
+    equation=r"h = A (x - x_{ref}) + B",
+    form="A (x - x_ref) + B",
+    reference="zero offset removed",
+    reads=(CHANNEL, "direction"),
+    acts_on=(("force", "add"),),
+    parameters=(
+        Parameter("A", "{y}/{x}", 0.01, AMPLITUDE, "slope of the offset", linear=True),
+        Parameter("B", "{y}", 0.0, AMPLITUDE, "offset at the reference", linear=True),
+    ),
+    shape=offset_slope_shape,
+    source="Form: ours. Force on a piston, F = p A, and definition of a zero offset.",
+    # By hand: 0.5 * (7 - 3) - 1.5, whichever way.
+    worked=({"x": 7.0, "x_ref": 3.0, "direction": -1.0}, {"A": 0.5, "B": -1.5}, 0.5),
+    physical=False,
+)
+
+
+def asymmetry_shape(inputs, *, A):
+    r"""Direction asymmetry: a parameter that is larger one way than the other.
+
+    A lip seal, a sample glued askew or a polished track rubs differently forward and back. With d = +1 or -1,
+
+    .. math:: h = A d / 2
+
+    so that A is the forward value minus the backward one, relative to (or, for a change that is added, in the unit of)
+    the mean of both, and the mean keeps its meaning.
+
+    Factor minus one or change of the parameter, shape (n,); `direction` is +1 or -1.
+    """
+    return A * np.asarray(inputs["direction"], dtype=float) / 2
+
+
+ASYMMETRY = Effect(
+    id="asymmetry",
+    label="direction asymmetry",
+    equation=r"h = A d / 2",
+    form="A d / 2, d = +1 forward, -1 backward",
+    reference="mean of the two directions",
+    reads=("direction",),
+    acts_on=(
+        ("mu", "multiply"),
+        ("force", "multiply"),
+        ("mu_c", "multiply"),
+        ("mu_s", "multiply"),
+        ("v_s", "multiply"),
+        ("sigma_2", "add"),
+        ("sigma_2", "multiply"),
+        ("a", "multiply"),
+        ("b", "multiply"),
+        ("mu_0", "multiply"),
+    ),
+    parameters=(Parameter("A", "{y}", 0.05, AMPLITUDE, "forward minus backward", linear=True),),
+    shape=asymmetry_shape,
+    source="Form: ours. The odd part in direction of any two values, halved so that A is their difference.",
+    # By hand: backward, half of the difference below the mean.
+    worked=({"direction": -1.0}, {"A": 0.1}, -0.05),
+)
+
+
+def campaign_drift_shape(inputs, *, A):
+    r"""Drift along the campaign: everything that changes a little from day to day of testing.
+
+    A track that polishes, a sensor that ages, rubber that goes on aging in the laboratory's air:
+
+    .. math:: h = A t
+
+    with t the time since the campaign's first file. A is the change per time: of friction, relative, or of the zero.
+    Along the order of runs instead of the clock it is `linear` in `run_order`. Where tests follow the calendar of aging
+    it cannot be told from the aging law.
+
+    Factor minus one or added force, shape (n,); `elapsed_h` in h.
+    """
+    return A * np.asarray(inputs["elapsed_h"], dtype=float)
+
+
+CAMPAIGN_DRIFT = Effect(
+    id="campaign_drift",
+    label="drift along the campaign",
+    equation=r"h = A t",
+    form="A t",
+    reference="start of the campaign",
+    reads=("elapsed_h",),
+    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
+    parameters=(Parameter("A", "{y}/{x}", 1e-4, AMPLITUDE, "change per time of the campaign", linear=True),),
+    shape=campaign_drift_shape,
+    source="Form: ours. First order in time of a slow change.",
+    # By hand: 200 h at 0.05 % per hour.
+    worked=({"elapsed_h": 200.0}, {"A": 5e-4}, 0.1),
+)

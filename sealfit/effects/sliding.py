@@ -1,0 +1,230 @@
+"""Other laws of speed, load and humidity than the declared model's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sealfit.effects.contract import AMPLITUDE, Effect, Parameter, positive, reference
+
+
+def load_exponent_shape(inputs, *, A):
+    r"""Load exponent of rubber: friction grows more slowly than the load, so the coefficient falls with it.
+
+    The true contact area of a smooth elastic asperity goes with the load to the power 2/3, so that :math:`F \propto
+    N^n` and :math:`\mu = \mu_{ref} (N / N_{ref})^{n - 1}` with n between 2/3 and 1. To first order in n - 1,
+
+    .. math:: h = A \ln(N / N_{ref}), \qquad A \approx n - 1
+
+    which is what is fitted: an amplitude then has an exact, linear place in the model. What is left out is
+    :math:`\frac12 A^2 \ln^2(N / N_{ref})`, 0.7 % of friction at A = -1/6 and twice the load; `power` holds the full
+    curve.
+
+    Where the local coefficient goes with the local pressure, :math:`\mu(p) \propto p^{n - 1}`, the load still enters by
+    the same exponent, and the pressure distribution by a constant factor that mu takes up.
+
+    Factor minus one, shape (n,); `load_N` in its slot's unit, positive (NaN where it is not).
+    """
+    return A * np.log(positive(inputs["load_N"]) / reference(inputs, "load_N", 1.0))
+
+
+LOAD_EXPONENT = Effect(
+    id="load_exponent",
+    label="load exponent of rubber",
+    equation=r"h = A \ln(N / N_{ref}),\ A \approx n - 1",
+    form="A ln(N / N_ref), A = n - 1 to first order in mu ~ N^(n-1)",
+    reference="{load_N} = {load_N_ref}",
+    reads=("load_N",),
+    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply")),
+    parameters=(Parameter("A", "{y}", -0.1, (-2.0, 2.0), "load exponent of friction minus one", linear=True),),
+    shape=load_exponent_shape,
+    source="Schallamach 1952, The load dependence of rubber friction, Proc. Phys. Soc. B 65, 657-661. "
+    "First order: ours.",
+    # By hand: twice the reference load, ln 2 = 0.6931471805599453.
+    worked=({"load_N": 100.0, "load_N_ref": 50.0}, {"A": -0.2}, -0.2 * 0.6931471805599453),
+)
+
+
+def stribeck_exponent_shape(inputs, *, A, v_s, n):
+    r"""Stribeck exponent other than 2: friction falls with speed more gradually or more abruptly than declared.
+
+    The declared curve falls from mu_s to mu_c as a Gaussian of the speed. Nothing but custom says so: contacts whose
+    strengths or heights are spread widely let go one after the other, n near 1 or below; a film that takes over all at
+    once makes a cliff, n well above 2. What is added to the declared curve is the difference of the two decays,
+
+    .. math:: h = A [e^{-(|v| / v_s)^n} - e^{-(v / v_s)^2}]
+
+    which is zero at rest, at v_s, far above v_s, and everywhere for n = 2. With A = mu_s - mu_c and the v_s of the
+    declared curve, declared curve and effect together are exactly :math:`\mu_c + (\mu_s - \mu_c) e^{-(|v| / v_s)^n}`.
+    As a factor on mu, A is relative to mu, and the same only as far as mu hardly changes around v_s.
+
+    Three numbers here and four of the declared curve need seven speeds in one direction, several on either side of v_s.
+    Near n = 2 the shape is :math:`A (2 - n) r^2 \ln r\, e^{-r^2}` with :math:`r = |v| / v_s`: there only the product
+    A (2 - n) is determined, and A and n apart only well off 2, or with A held to mu_s - mu_c.
+
+    Added coefficient or factor minus one, shape (n,); signed `speed_mm_s` in its slot's unit; 0 at rest.
+    """
+    ratio = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / v_s
+    return A * (np.exp(-(ratio**n)) - np.exp(-(ratio**2)))
+
+
+STRIBECK_EXPONENT = Effect(
+    id="stribeck_exponent",
+    label="Stribeck exponent other than 2",
+    equation=r"h = A [e^{-(|v| / v_s)^n} - e^{-(v / v_s)^2}]",
+    form="A (exp(-(|v| / v_s)^n) - exp(-(v / v_s)^2))",
+    reference="Stribeck exponent 2",
+    reads=("speed_mm_s",),
+    acts_on=(("mu", "add"), ("mu", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 0.3, (-10.0, 10.0), "drop of friction across the Stribeck curve", linear=True),
+        Parameter("v_s", "{x}", 5.0, (1e-6, 1e6), "Stribeck speed", search="ratio"),
+        Parameter("n", "", 1.0, (0.2, 10.0), "Stribeck exponent", search=(0.4, 0.6, 0.8, 1.0, 1.4, 3.0, 4.0, 6.0)),
+    ),
+    shape=stribeck_exponent_shape,
+    source="Exponents from 1/2 upwards: Bo & Pavelescu 1982, Wear 82(3), 277-289; review: Armstrong-Helouvry, Dupont & "
+    "Canudas de Wit 1994, Automatica 30(7), 1083-1138, doi:10.1016/0005-1098(94)90209-7. As a difference: ours.",
+    # By hand: twice v_s, n = 1: exp(-2) - exp(-4) = 0.1353352832366127 - 0.01831563888873418.
+    worked=(
+        {"speed_mm_s": -10.0},
+        {"A": 0.3, "v_s": 5.0, "n": 1.0},
+        0.3 * (0.1353352832366127 - 0.01831563888873418),
+    ),
+)
+
+
+def log_rate_shape(inputs, *, A):
+    r"""Logarithmic rate dependence: friction that changes by the same amount for every factor of the speed.
+
+    Contacts that break by thermal activation carry a stress that goes with the logarithm of the rate,
+
+    .. math:: h = A \ln(|v| / v_{ref})
+
+    A is the relative change per factor e of the speed: positive where breaking bonds decides (strengthening with rate),
+    negative where the age of the contacts does. Steady sliding only; at rest it says nothing.
+
+    Factor minus one or change, shape (n,); signed `speed_mm_s` in its slot's unit, NaN at rest.
+    """
+    return A * np.log(positive(np.abs(inputs["speed_mm_s"])) / reference(inputs, "speed_mm_s", 1.0))
+
+
+LOG_RATE = Effect(
+    id="log_rate",
+    label="logarithmic rate dependence",
+    equation=r"h = A \ln(|v| / v_{ref})",
+    form="A ln(|v| / v_ref)",
+    reference="{speed_mm_s} = {speed_mm_s_ref}",
+    reads=("speed_mm_s",),
+    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu", "add"), ("mu_c", "add")),
+    parameters=(Parameter("A", "{y}", 0.02, (-2.0, 2.0), "change per factor e of the speed", linear=True),),
+    shape=log_rate_shape,
+    source="Rate term of rate-and-state friction; review: Baumberger & Caroli 2006, Adv. Phys. 55, 279-348.",
+    # By hand: ten times the reference speed, backward: ln 10 = 2.302585092994046.
+    worked=({"speed_mm_s": -50.0, "speed_mm_s_ref": 5.0}, {"A": 0.03}, 0.03 * 2.302585092994046),
+)
+
+
+def power_viscous_shape(inputs, *, A, n):
+    r"""Viscous friction by a power of the speed: shear-thinning grease, or a film that thickens with speed.
+
+    A Newtonian film of fixed thickness drags in proportion to speed, which is the declared sigma_2 v. A shear-thinning
+    film drags as :math:`|v|^n` with n < 1; one that the speed itself drags in, as under a hydrodynamic seal lip, grows
+    as the root of the speed and drags with n near 1/2.
+
+    .. math:: h = A\, \mathrm{sgn}(v)\, (|v| / v_{ref})^n
+
+    A is the force at the reference speed. At n = 1 it is sigma_2 v and cannot be told from it.
+
+    Added force, shape (n,), in the force slot's unit, odd in the speed; 0 at rest.
+    """
+    speed = np.asarray(inputs["speed_mm_s"], dtype=float)
+    return A * np.sign(speed) * (np.abs(speed) / reference(inputs, "speed_mm_s", 1.0)) ** n
+
+
+POWER_VISCOUS = Effect(
+    id="power_viscous",
+    label="viscous friction by a power of the speed",
+    equation=r"h = A\, \mathrm{sgn}(v)\, (|v| / v_{ref})^n",
+    form="A sgn(v) (|v| / v_ref)^n",
+    reference="additional viscous force removed",
+    reads=("speed_mm_s",),
+    acts_on=(("force", "add"),),
+    parameters=(
+        Parameter("A", "{y}", 1.0, AMPLITUDE, "force at the reference speed", linear=True),
+        Parameter("n", "", 0.5, (0.05, 4.0), "exponent of the speed", search=(0.2, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0)),
+    ),
+    shape=power_viscous_shape,
+    source="Form: Ostwald-de Waele power law as a friction term; speed-dependent friction terms: Armstrong-Helouvry, "
+    "Dupont & Canudas de Wit 1994, Automatica 30(7), 1083-1138, doi:10.1016/0005-1098(94)90209-7.",
+    # By hand: four times the reference speed, backward: -2 * sqrt(4).
+    worked=({"speed_mm_s": -20.0, "speed_mm_s_ref": 5.0}, {"A": 2.0, "n": 0.5}, -4.0),
+)
+
+
+def grosch_peak_shape(inputs, *, A, v_p, w):
+    r"""Viscoelastic peak over log speed (Grosch): rubber friction has a maximum where its loss has one.
+
+    Asperities deform rubber at a rate that goes with the speed, and molecules adhere and let go at another; each gives
+    a bell over the logarithm of the speed, moved along by temperature as WLF says,
+
+    .. math:: h = A \exp[-(\log_{10}(|v| / v_p) / w)^2]
+
+    A is the height of the bell, relative to the Stribeck curve or as a coefficient of friction that is added to it. A
+    peak beyond the tested speeds is a slope, and its height is not determined.
+
+    Factor minus one or added coefficient, shape (n,); signed `speed_mm_s` in its slot's unit; 0 at rest.
+    """
+    decades = np.log10(positive(np.abs(inputs["speed_mm_s"])) / v_p)
+    return A * np.nan_to_num(np.exp(-((decades / w) ** 2)), nan=0.0)
+
+
+GROSCH_PEAK = Effect(
+    id="grosch_peak",
+    label="viscoelastic peak over log speed (Grosch)",
+    equation=r"h = A \exp[-(\log_{10}(|v| / v_p) / w)^2]",
+    form="A exp(-(log10(|v| / v_p) / w)^2)",
+    reference="peak over speed removed",
+    reads=("speed_mm_s",),
+    acts_on=(("mu", "multiply"), ("mu", "add"), ("mu_c", "multiply"), ("mu_c", "add")),
+    parameters=(
+        Parameter("A", "{y}", 0.1, (-0.95, 10.0), "height of the peak", linear=True),
+        Parameter("v_p", "{x}", 10.0, (1e-6, 1e6), "speed at the peak", search="ratio"),
+        Parameter("w", "decade", 1.0, (0.05, 10.0), "half-width at 1/e", search=(0.2, 0.4, 0.7, 1.0, 1.5, 2.5)),
+    ),
+    shape=grosch_peak_shape,
+    source="Bell over log speed: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112; shift: Williams, "
+    "Landel & Ferry 1955, J. Am. Chem. Soc. 77, 3701-3707, doi:10.1021/ja01619a008. Gaussian form: ours.",
+    # By hand: two decades above the peak with w = 2: 1/e = 0.36787944117144233.
+    worked=({"speed_mm_s": -100.0}, {"A": 0.3, "v_p": 1.0, "w": 2.0}, 0.3 * 0.36787944117144233),
+)
+
+
+def humidity_shape(inputs, *, A):
+    r"""Humidity of the laboratory: a film of water between rubber and track.
+
+    Water that the surfaces take up from the air weakens the adhesion between them and lubricates at speed; over the
+    humidities of a laboratory a straight line is enough,
+
+    .. math:: h = A (H - H_{ref})
+
+    A is the relative change per per cent of relative humidity. Only where the campaign holds a column `humidity_pct`; a
+    column of another name is found as `linear` in it.
+
+    Factor minus one or added force, shape (n,); `humidity_pct` in per cent.
+    """
+    return A * (np.asarray(inputs["humidity_pct"], dtype=float) - reference(inputs, "humidity_pct", 0.0))
+
+
+HUMIDITY = Effect(
+    id="humidity",
+    label="humidity of the laboratory",
+    equation=r"h = A (H - H_{ref})",
+    form="A (H - H_ref)",
+    reference="{humidity_pct} = {humidity_pct_ref}",
+    reads=("humidity_pct",),
+    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
+    parameters=(Parameter("A", "{y}/{x}", -0.001, AMPLITUDE, "change per per cent of relative humidity", linear=True),),
+    shape=humidity_shape,
+    source="Form: ours. First order in the humidity about its mean.",
+    # By hand: 20 % below the reference at -0.1 % of friction per per cent.
+    worked=({"humidity_pct": 35.0, "humidity_pct_ref": 55.0}, {"A": -0.001}, 0.02),
+)

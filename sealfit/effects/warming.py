@@ -1,0 +1,261 @@
+"""Warming: friction falls as the contact warms, with time, distance or the power of friction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sealfit.effects.contract import AMPLITUDE, Effect, Parameter, reference
+
+
+def warming_time_shape(inputs, *, A, tau):
+    r"""Warming by sliding, seen along time: friction falls as the contact warms, and settles.
+
+    A body of heat capacity C that loses heat by conductance G, heated by the power P of friction, warms as
+    :math:`\Delta T = (P / G)(1 - e^{-t / \tau})` with :math:`\tau = C / G`. Rubber friction falls with temperature
+    above its peak (Grosch 1963), to first order in proportion, so mu is multiplied by one plus
+
+    .. math:: h = -A (1 - e^{-t / \tau})
+
+    A is the share of friction lost when warm; it is negative where friction rises with temperature. Time counts from
+    the stroke's or the file's first row (design: the file's own clock); before 0 the contact is cold. The power is
+    taken as the same in every run; `warming_power` lets it follow speed and load.
+
+    Factor minus one, shape (n,); `time_s` in its slot's unit.
+    """
+    time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
+    return A * np.expm1(-time / tau)
+
+
+WARMING_TIME = Effect(
+    id="warming_time",
+    label="warming by sliding (time)",
+    equation=r"h = -A (1 - e^{-t / \tau})",
+    form="-A (1 - exp(-t / tau))",
+    reference="cold contact (time 0)",
+    reads=("time_s",),
+    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 0.1, (-5.0, 0.95), "share of friction lost when warm", linear=True),
+        Parameter("tau", "{x}", 5.0, (1e-4, 1e7), "time constant of warming", search="span"),
+    ),
+    shape=warming_time_shape,
+    source="Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112. "
+    "Newtonian (lumped) warming: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford.",
+    # By hand: at t = tau the contact has warmed by 1 - 1/e = 0.6321205588285577; a fifth of it is lost.
+    worked=({"time_s": 4.0}, {"A": 0.2, "tau": 4.0}, -0.2 * 0.6321205588285577),
+)
+
+
+def warming_distance_shape(inputs, *, A, s_0):
+    r"""Warming by sliding, seen along distance: friction falls with the work done on the contact, and settles.
+
+    At one normal force the heat that friction makes up to a distance s is its work, mu N s, whatever the speed. Where
+    the contact warms a fixed mass and gives heat to fresh, cold track at a rate that also goes with the distance slid,
+    the temperature approaches its limit over a distance instead of a time:
+
+    .. math:: h = -A (1 - e^{-s / s_0})
+
+    A is the share of friction lost when warm. At one speed it cannot be told from `warming_time`; two speeds separate
+    them.
+
+    Factor minus one, shape (n,); `distance_mm` in its slot's unit, from the stroke's start.
+    """
+    distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0)
+    return A * np.expm1(-distance / s_0)
+
+
+WARMING_DISTANCE = Effect(
+    id="warming_distance",
+    label="warming by sliding (distance)",
+    equation=r"h = -A (1 - e^{-s / s_0})",
+    form="-A (1 - exp(-s / s_0))",
+    reference="cold contact (distance 0)",
+    reads=("distance_mm",),
+    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 0.1, (-5.0, 0.95), "share of friction lost when warm", linear=True),
+        Parameter("s_0", "{x}", 20.0, (1e-4, 1e7), "distance over which the contact warms", search="span"),
+    ),
+    shape=warming_distance_shape,
+    source="Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112. "
+    "Approach over a distance: ours, from the heat balance in the docstring.",
+    # By hand: at s = s_0 ln 2 the exponential is 1/2, so half of A = 0.3 is lost; ln 2 = 0.6931471805599453.
+    worked=({"distance_mm": 6.931471805599453}, {"A": 0.3, "s_0": 10.0}, -0.15),
+)
+
+
+def warming_power_shape(inputs, *, A, tau):
+    r"""Warming by the power of friction: as `warming_time`, but fast and heavily loaded runs warm more.
+
+    The power that friction turns into heat is :math:`P = \mu N |v|`, so the limit :math:`P / G` of a lumped body's
+    warming follows load times speed, and the share of friction lost follows it to first order:
+
+    .. math:: h = -A \frac{N |v|}{N_{ref} v_{ref}} (1 - e^{-t / \tau})
+
+    A is the share lost when warm at the reference load and speed. For a loss that is small against 1: the form is
+    linear in the temperature and takes P without the fall of mu itself. Needs several speeds or loads to be told from
+    `warming_time`.
+
+    Factor minus one, shape (n,); time, speed and load in their slots' units.
+    """
+    time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
+    speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
+    load = np.asarray(inputs["load_N"], dtype=float) / reference(inputs, "load_N", 1.0)
+    return A * load * speed * np.expm1(-time / tau)
+
+
+WARMING_POWER = Effect(
+    id="warming_power",
+    label="warming by sliding (power)",
+    equation=r"h = -A \frac{N |v|}{N_{ref} v_{ref}} (1 - e^{-t / \tau})",
+    form="-A (N |v| / (N_ref v_ref)) (1 - exp(-t / tau))",
+    reference="cold contact (time 0)",
+    reads=("time_s", "speed_mm_s", "load_N"),
+    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
+    parameters=(
+        Parameter(
+            "A", "{y}", 0.05, (-5.0, 0.95), "share of friction lost when warm at reference load and speed", linear=True
+        ),
+        Parameter("tau", "{x}", 5.0, (1e-4, 1e7), "time constant of warming", search="span"),
+    ),
+    shape=warming_power_shape,
+    source="Newtonian (lumped) warming: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford. "
+    "Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112.",
+    # By hand: twice the speed, half the load: the power is the reference's; t = tau gives 1 - 1/e = 0.6321205588285577.
+    worked=(
+        {"time_s": 8.0, "speed_mm_s": -20.0, "speed_mm_s_ref": 10.0, "load_N": 25.0, "load_N_ref": 50.0},
+        {"A": 0.1, "tau": 8.0},
+        -0.1 * 0.6321205588285577,
+    ),
+)
+
+
+def warming_conduction_shape(inputs, *, A):
+    r"""Warming limited by conduction into the rubber: friction falls with the root of speed times distance.
+
+    Rubber conducts badly: during a stroke heat enters a thin layer and nothing leaves on the far side. The surface of a
+    half-space under a steady flux q has warmed by :math:`2 q \sqrt{t / (\pi k \rho c)}` after a time t. Friction's flux
+    is :math:`q \propto \mu p |v|`, and :math:`t = s / |v|`, so
+
+    .. math:: \Delta T \propto p |v| \sqrt{s / |v|} = p \sqrt{|v| s}, \qquad h = -A \sqrt{\frac{|v| s}{v_{ref} s_{ref}}}
+
+    A is the share of friction lost at the reference speed and distance. At one load; with several, the flux follows the
+    load: `warming_conduction_load`. Holds until the warm layer reaches the back of the sample, and for a loss that is
+    small against 1.
+
+    Factor minus one, shape (n,); distance (from the stroke's start) and speed in their slots' units.
+    """
+    distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(inputs, "distance_mm", 1.0)
+    speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
+    return -A * np.sqrt(speed * distance)
+
+
+WARMING_CONDUCTION = Effect(
+    id="warming_conduction",
+    label="warming by sliding (conduction-limited: speed times distance)",
+    equation=r"h = -A \sqrt{|v| s / (v_{ref} s_{ref})}",
+    form="-A sqrt(|v| s / (v_ref s_ref))",
+    reference="cold contact (distance 0)",
+    reads=("distance_mm", "speed_mm_s"),
+    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
+    parameters=(
+        Parameter(
+            "A", "{y}", 0.05, (-5.0, 0.95), "share of friction lost at reference speed and distance", linear=True
+        ),
+    ),
+    shape=warming_conduction_shape,
+    source="Half-space under a steady flux: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford; "
+    "sliding contacts: Jaeger 1942, J. Proc. R. Soc. New South Wales 76, 203-224. "
+    "First order in the temperature: ours.",
+    # By hand: twice the speed and twice the distance: sqrt(4) = 2.
+    worked=(
+        {"distance_mm": 40.0, "distance_mm_ref": 20.0, "speed_mm_s": -10.0, "speed_mm_s_ref": 5.0},
+        {"A": 0.05},
+        -0.1,
+    ),
+)
+
+
+def warming_conduction_load_shape(inputs, *, A):
+    r"""Warming limited by conduction into the rubber, at several loads: as `warming_conduction`, with the flux's load.
+
+    The flux of friction is :math:`q \propto \mu p |v|`; where the contact's area stays the same, its pressure p follows
+    the load, so the surface warms as :math:`N \sqrt{|v| s}` and
+
+    .. math:: h = -A \frac{N}{N_{ref}} \sqrt{\frac{|v| s}{v_{ref} s_{ref}}}
+
+    A is the share of friction lost at the reference load, speed and distance; small against 1.
+
+    Factor minus one, shape (n,); distance (from the stroke's start), speed and load in their slots' units.
+    """
+    distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(inputs, "distance_mm", 1.0)
+    speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
+    load = np.asarray(inputs["load_N"], dtype=float) / reference(inputs, "load_N", 1.0)
+    return -A * load * np.sqrt(speed * distance)
+
+
+WARMING_CONDUCTION_LOAD = Effect(
+    id="warming_conduction_load",
+    label="warming by sliding (conduction-limited, at several loads)",
+    equation=r"h = -A \frac{N}{N_{ref}} \sqrt{|v| s / (v_{ref} s_{ref})}",
+    form="-A (N / N_ref) sqrt(|v| s / (v_ref s_ref))",
+    reference="cold contact (distance 0)",
+    reads=("distance_mm", "speed_mm_s", "load_N"),
+    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
+    parameters=(
+        Parameter(
+            "A", "{y}", 0.05, (-5.0, 0.95), "share of friction lost at reference load, speed and distance", linear=True
+        ),
+    ),
+    shape=warming_conduction_load_shape,
+    source="Half-space under a steady flux: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford; "
+    "sliding contacts: Jaeger 1942, J. Proc. R. Soc. New South Wales 76, 203-224. "
+    "First order in the temperature: ours.",
+    # By hand: three times the load; nine times the distance at the same speed: 3 * sqrt(9) = 9.
+    worked=(
+        {
+            "distance_mm": 90.0,
+            "distance_mm_ref": 10.0,
+            "speed_mm_s": 5.0,
+            "speed_mm_s_ref": 5.0,
+            "load_N": 150.0,
+            "load_N_ref": 50.0,
+        },
+        {"A": 0.05},
+        -0.45,
+    ),
+)
+
+
+def lab_temperature_shape(inputs, *, A):
+    r"""Laboratory temperature: friction follows the room, a few per mille for each degree.
+
+    Above its peak over speed, rubber friction falls with temperature; over the few degrees of a laboratory a straight
+    line is enough,
+
+    .. math:: h = A (T - T_{ref})
+
+    A is the relative change per degree. Only where the campaign holds a column `lab_temperature_C`; a column of another
+    name is found as `linear` in it. The aging temperature is another thing.
+
+    Factor minus one or added force, shape (n,); `lab_temperature_C` in degrees Celsius.
+    """
+    temperature = np.asarray(inputs["lab_temperature_C"], dtype=float)
+    return A * (temperature - reference(inputs, "lab_temperature_C", 0.0))
+
+
+LAB_TEMPERATURE = Effect(
+    id="lab_temperature",
+    label="laboratory temperature",
+    equation=r"h = A (T - T_{ref})",
+    form="A (T - T_ref)",
+    reference="{lab_temperature_C} = {lab_temperature_C_ref}",
+    reads=("lab_temperature_C",),
+    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
+    parameters=(Parameter("A", "{y}/{x}", -0.005, AMPLITUDE, "change per degree", linear=True),),
+    shape=lab_temperature_shape,
+    source="Friction and temperature of rubber: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112. "
+    "First order: ours.",
+    # By hand: 3 degrees above the reference at -0.4 % per degree.
+    worked=({"lab_temperature_C": 25.0, "lab_temperature_C_ref": 22.0}, {"A": -0.004}, -0.012),
+)
