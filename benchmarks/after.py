@@ -23,17 +23,17 @@ from campaigns import STRENGTHS, campaign
 from coverage import Entry, held, report
 from loop_summary import coverage
 
-from sealfit.closure.after_fits import after_fits
+from sealfit.closure.after import after_fits
 from sealfit.closure.loop import close_loop
 from sealfit.config import load_config
-from sealfit.fit.aging import fit_series
-from sealfit.fit.all_series import law_of
-from sealfit.fit.estimate import Fitted
-from sealfit.fit.lifetime import Goal, lifetime, over_laws
-from sealfit.fit.steady import fit_conditions
+from sealfit.engine import one_thread
+from sealfit.fit.aging.all_series import law_of
+from sealfit.fit.aging.lifetime import Goal, lifetime, over_laws
+from sealfit.fit.aging.series import fit_series
+from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.steady.fit import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.simulate import Spec, load_truth, simulate, truth_path
-from sealfit.threads import one_thread
+from sealfit.simulation import Spec, load_truth, simulate, truth_path
 
 KINDS = ("warming_distance", "warming_time", "conditioning", "zero_offset", "lab_temperature", "two_at_once")
 DAYS = 10.0

@@ -3,7 +3,7 @@
     python benchmarks/campaigns.py NAME --seed N --out DIR [--size small|large] [--strength weak|medium|strong]
     python benchmarks/campaigns.py --list
 
-`campaign(name, ...)` gives the SPEC; `sealfit.simulate.simulate` writes it. Small campaigns have about 200 files,
+`campaign(name, ...)` gives the SPEC; `sealfit.simulation.simulate` writes it. Small campaigns have about 200 files,
 large ones about 600. Strengths are chosen against the scatter of `RIG`: weak has an RMS of 0.25 to 1 times one file's,
 medium is three times, strong ten times that; faint is beyond what the files can show. The kinds of effect stand in
 `effect_kinds.py`. Draws depend on the seed and on what they are for only: two nulls of one seed share their run order
@@ -20,7 +20,7 @@ from typing import Literal
 from effect_kinds import DESIGNS, EFFECT_CAMPAIGNS, NEEDS_BOTH_WAYS, Size
 
 from sealfit.errors import SealfitError
-from sealfit.simulate import Spec, simulate
+from sealfit.simulation import Spec, simulate
 
 Strength = Literal["faint", "weak", "medium", "strong"]
 STRENGTHS: dict[Strength, float] = {"weak": 1.0, "medium": 3.0, "strong": 10.0}

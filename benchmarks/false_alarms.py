@@ -20,7 +20,7 @@ from counts import bounds
 from sealfit.closure.loop import close_loop
 from sealfit.config import load_config
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.simulate import simulate
+from sealfit.simulation import simulate
 
 
 def close(name: str, seed: int, *, size: str, strength: str) -> tuple[dict, float]:

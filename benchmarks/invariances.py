@@ -44,7 +44,7 @@ from sealfit.closure.loop import close_loop
 from sealfit.config import parse_config
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.strokes import find_strokes
-from sealfit.simulate import Spec, simulate
+from sealfit.simulation import Spec, simulate
 
 OF_SE = 0.1  # of a standard error, by which a number may move
 BINNED = 0.5  # where the bins are others

@@ -24,7 +24,7 @@ from campaigns import STRENGTHS
 from effect_kinds import EFFECT_CAMPAIGNS
 from one_campaign import Task, run_campaign
 
-from sealfit.threads import ONE_THREAD
+from sealfit.engine import ONE_THREAD
 
 LARGE_SEED = {"effects": 4, "nulls": 20}
 RIVALS_ON_NULLS = 2  # first seeds of each kind of null on which the rivals are learned too: there is nothing to learn

@@ -18,7 +18,7 @@ from pathlib import Path
 from campaigns import campaign
 from process_tree import watched
 
-from sealfit.simulate import Spec, simulate
+from sealfit.simulation import Spec, simulate
 
 NUMBERS = tuple(
     {"kind": "numeric", "name": f"number_{k}", "level": level, "mean": 10.0, "sd": 2.0}

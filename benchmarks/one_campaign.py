@@ -18,18 +18,18 @@ from scoring import Target, correlations, match, misplaced, named_right
 from truths import NO_INTERVAL, TrueEffect, test_true_forms, true_effects, truth_in_claim
 
 from sealfit.closure.loop import Closure, close_loop
-from sealfit.closure.model_record import from_record
+from sealfit.closure.output import from_record
 from sealfit.closure.predict import predict
 from sealfit.closure.score_test import project
 from sealfit.closure.selection import numbered
 from sealfit.closure.subsampling import merged_bins
 from sealfit.config import load_config
-from sealfit.fit.estimate import fitted_at
-from sealfit.fit.joint import Model, evaluate
-from sealfit.fit.rows import Rows, make_rows
-from sealfit.fit.whitening import Component, Scatter
+from sealfit.fit.joint.estimate import fitted_at
+from sealfit.fit.joint.model import Model, evaluate
+from sealfit.fit.joint.rows import Rows, make_rows
+from sealfit.fit.joint.whitening import Component, Scatter
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.simulate import Spec, load_truth, simulate, true_force, truth_path
+from sealfit.simulation import Spec, load_truth, simulate, true_force, truth_path
 
 POINTS = 200
 

@@ -19,14 +19,14 @@ from loop_summary import table as markdown
 from paper_figures import Found, figures
 from paper_numbers import PUBLISHED_LAWS, Line, agreement, compared, printed_errors
 
-from sealfit.engine import cores
+from sealfit.engine import one_thread
+from sealfit.engine.run_map import cores
+from sealfit.pipeline import STEPS, run
 from sealfit.progress import to_stderr
 from sealfit.report.style import compose, look
-from sealfit.simulate import simulate
-from sealfit.simulation.physics import Growth, Physics
-from sealfit.steps import STEPS, run
-from sealfit.store import Store
-from sealfit.threads import one_thread
+from sealfit.simulation import simulate
+from sealfit.simulation.model import Growth, Physics
+from sealfit.store.out_folder import Store
 
 # Published: 0.835 and 0.822 at 60 degC without and with compression to 80 %, where unaged rubber has 0.93513: the loss
 # is 0.885 of that at 80 %. 35.1 N of 49.4 N are left at 80 degC, 0.70319 of 0.93513 at 60 degC: the loss is 1.17 times.

@@ -12,10 +12,10 @@ from paper_numbers import MEASURED, SERIES, UNAGED, as_printed, condition, print
 
 from sealfit.config import Config
 from sealfit.physics import stribeck_force
-from sealfit.report.figures_curves import aging_points, draw_aging
-from sealfit.report.figures_speed import Line, curve_lines, draw_force_speed, run_points
+from sealfit.report.figures.aging import aging_points, draw_aging
+from sealfit.report.figures.speed import Line, curve_lines, draw_force_speed, run_points
+from sealfit.report.notation import ConditionNames, symbol_math
 from sealfit.report.style import BLACK, CYCLE, FLOOR, QUIET, Key, Panel, Plot, shades
-from sealfit.report.symbols import ConditionNames, symbol_math
 
 TEMPERATURES, COMPRESSIONS, DAYS = (20, 40, 60, 80), (80, 90, 100), (1, 2, 4, 8, 12, 16)
 SENSITIVITY = {"mu_s": (0.25, 0.275, 0.30, 0.325, 0.35), "mu_c": (0.20, 0.225, 0.25, 0.275, 0.30)}  # its section 2.3

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.physics import aging_law, aging_law_as_printed
-from sealfit.simulation.physics import Law, Physics, declared_parameters
+from sealfit.simulation.model import Law, Physics, declared_parameters
 
 PUBLISHED_LAWS = {"mu_s": Law(mu_0=0.93513, a=0.04448, b=0.0804), "mu_c": Law(mu_0=0.609, a=0.03307, b=0.1324)}
 PUBLISHED_C = {"mu_s": 0.11159, "mu_c": 0.06621}

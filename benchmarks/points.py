@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.fit.estimate import Fitted
-from sealfit.fit.joint import evaluate
-from sealfit.fit.rows import Rows, point_rows
-from sealfit.simulate import Spec
+from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint.model import evaluate
+from sealfit.fit.joint.rows import Rows, point_rows
+from sealfit.simulation import Spec
 from sealfit.simulation.channels import CategoryChannel, NumericChannel, SlowChannel
 
 BETWEEN = 0.5  # share of the aged points at days between the tested ones

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import find_channels
-from sealfit.fit.rows import Rows
+from sealfit.fit.joint.rows import Rows
 
 MOST_ROWS = 4000
 EBM_ROUNDS = 500  # by itself it goes on, as a file's rows stand on both sides of its validation: no better, 90 s

@@ -32,7 +32,7 @@ from sealfit.closure.sensitivity import sensitivity
 from sealfit.closure.subsampling import merged_bins
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.rows import make_rows
+from sealfit.fit.joint.rows import make_rows
 
 ALIKE = 0.9  # correlation, after projection, from which two effects are one here
 LARGEST_PCT = 30.0  # stated sizes above are not tried: so large an effect is not linear any more

@@ -32,7 +32,7 @@ from campaigns import paper_campaign
 from in_turns import heading
 from many_files import EFFECTS
 
-from sealfit.simulate import simulate
+from sealfit.simulation import simulate
 
 PARTS = ("ingest", "memory", "run", "startup", "growth", "cluster")
 NEEDS_CAMPAIGN = ("ingest", "run", "cluster")

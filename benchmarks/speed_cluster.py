@@ -15,7 +15,7 @@ from dask_here import DaskHere
 from in_turns import in_turns, ratios, show
 from process_tree import Watched, watched
 
-from sealfit.engine import on_cluster, run_map
+from sealfit.engine.run_map import on_cluster, run_map
 
 TASKS, SENT, ANSWERED = 1_000, 60_000, 120_000  # bytes that a part of some 230 files sends and answers
 PER_PART = 230  # files, on average

@@ -21,13 +21,12 @@ from sealfit.closure.result import channels_of, effect_level
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Effect, Parameter
 from sealfit.effects.free import LEVELS, levels_effect
-from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.joint import Model
-from sealfit.fit.rows import Rows
-from sealfit.fit.terms import Term
-from sealfit.simulate import Spec
+from sealfit.fit.joint.estimate import Fitted, fit
+from sealfit.fit.joint.model import Model, Term
+from sealfit.fit.joint.rows import Rows
+from sealfit.simulation import Spec
 from sealfit.simulation.formula import evaluate_formula, parse_formula
-from sealfit.simulation.law import SteadyLaw, steady_law
+from sealfit.simulation.motion import SteadyLaw, steady_law
 
 UNITS = ("stroke", "file", "run", "specimen")
 NO_INTERVAL = {("step", "x_0")}  # any place between two neighbouring values of the channel is the same step

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -10,20 +13,105 @@ from typing import Annotated
 import typer
 
 from sealfit import __version__
-from sealfit.ending import end, exit_code, print_json
-from sealfit.options import (
-    Campaign,
-    ConfigFile,
-    EffectsFolder,
-    Force,
-    Json,
-    Out,
-    Profile,
-    Results,
-    Scheduler,
-    Strict,
-    Workers,
-)
+from sealfit.engine import one_thread
+from sealfit.errors import SealfitError
+
+# ---------------------------------------------------------------- options
+# Arguments and options that several commands share.
+
+Campaign = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder: runs.csv and the trace files.")]
+Results = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results that `ingest` or `run` made.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder of results; made if it is not there.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Rig config (TOML); default: as the README's table.")]
+Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Processes to use. [default: all cores]")]
+Scheduler = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on: tcp://host:port, or its file."),
+]
+Force = Annotated[bool, typer.Option("--force", help="Do it again even if it is current.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
+Profile = Annotated[bool, typer.Option("--profile", help="Print seconds and rows per step.")]
+EffectsFolder = Annotated[
+    Path | None,
+    typer.Option("--effects-folder", metavar="FOLDER", help="Folder of your own effects. Python is run from it."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
+
+
+# ---------------------------------------------------------------- ending
+# How a command ends: what it prints, as text or as one JSON object, and its exit code.
+
+BUG = 70  # EX_SOFTWARE of sysexits.h
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+
+
+def end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: bool) -> None:
+    """Print what `command` made: itself as JSON, or its `lines`."""
+    if as_json:
+        print_json({"ok": True, "command": command, **made})
+    else:
+        typer.echo("\n".join(lines(made)))
+
+
+def print_json(document: dict) -> None:
+    """Print exactly one JSON object."""
+    from sealfit.store.manifest import to_json
+
+    typer.echo(to_json(document), nl=False)
+
+
+def exit_code(app: typer.Typer) -> int:
+    """Run the command line and say how it ended: 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
+    one_thread()
+    try:
+        code = app(standalone_mode=False, prog_name="sealfit") or 0
+        return _interrupted() if code == INTERRUPTED else code
+    except SealfitError as error:
+        return _fail(f"sealfit: {error}", error.as_dicts(), 1)
+    except (KeyboardInterrupt, typer.Abort):  # typer hands on a Ctrl-C as one of these or as the code, by version
+        return _interrupted()
+    except BrokenPipeError:  # `sealfit effects | head`: the reader has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they can do.
+        if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):
+            return _bug(error)
+        text = error.format_message()
+        if "NoArgs" in type(error).__name__:  # `sealfit` alone: its message is the help
+            return _fail(text, [_error("no command was given.")], error.exit_code)
+        usage = error.ctx.get_usage() if getattr(error, "ctx", None) else ""
+        hint = f"Try: {error.ctx.command_path} --help" if usage else ""
+        shown = "\n".join(part for part in (usage, hint, f"sealfit: {text}") if part)
+        return _fail(shown, [_error(text)], error.exit_code)
+
+
+def _fail(message: str, errors: list[dict], code: int) -> int:
+    if "--json" in sys.argv[1:]:
+        print(json.dumps({"ok": False, "errors": errors}, indent=1, ensure_ascii=False, allow_nan=False))
+    print(message, file=sys.stderr)
+    return code
+
+
+def _bug(error: Exception) -> int:
+    """Say that the program, not its input, is at fault: the traceback on stderr, one line of it under --json."""
+    traceback.print_exception(error)
+    told = " ".join("".join(traceback.format_exception_only(error)).split())
+    fix = "Please report it, with the traceback on stderr."
+    return _fail(f"sealfit: this is a bug. {fix}", [{**_error(told), "kind": "bug", "fix": fix}], BUG)
+
+
+def _interrupted() -> int:
+    text = "interrupted; what was complete before is kept."
+    return _fail(f"sealfit: {text}", [_error(text)], INTERRUPTED)
+
+
+def _error(reason: str) -> dict:
+    return {"file": None, "line": None, "column": None, "value": None, "fix": "", "reason": reason}
+
+
+# ---------------------------------------------------------------- cli
+# The commands: paths in, messages out. Everything heavy is imported by the command that needs it.
 
 app = typer.Typer(
     help="From a friction rig's CSV files to the LuGre model of an aging rubber seal, and to what that model lacks.",
@@ -138,7 +226,7 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Do every step that is not current, in order."""
-    from sealfit.fingerprint import STEPS
+    from sealfit.store.manifest import STEPS
 
     own = {"effects_folder": effects_folder}
     _run(STEPS, campaign, out, config, workers, scheduler, force, strict, profile, as_json, **own)
@@ -153,9 +241,10 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Answer the force at new points."""
-    from sealfit import progress, requests, summary_lines
+    from sealfit import commands, progress
+    from sealfit.report import summary_lines
 
-    made = requests.predict(out, points, output, effects_folder=effects_folder, progress=progress.to_stderr())
+    made = commands.predict(out, points, output, effects_folder=effects_folder, progress=progress.to_stderr())
     end("predict", made, summary_lines.predict_lines, as_json)
 
 
@@ -173,11 +262,12 @@ def lifetime(
     as_json: Json = False,
 ) -> None:
     """Tell the days until a quantity reaches a threshold."""
-    from sealfit import requests, summary_life
+    from sealfit import commands
+    from sealfit.report import summary_lines
 
     asked = {"quantity": quantity, "threshold": threshold, "loss_pct": loss, "law": law, "model": model}
     asked |= {"temperature_C": temperature, "compression_pct": compression, "years": years}
-    end("lifetime", requests.lifetime(out, **asked), summary_life.lifetime_lines, as_json)
+    end("lifetime", commands.lifetime(out, **asked), summary_lines.lifetime_lines, as_json)
 
 
 @app.command()
@@ -187,9 +277,10 @@ def effects(
     as_json: Json = False,
 ) -> None:
     """List the catalogue of effects."""
-    from sealfit import requests, summary_lines
+    from sealfit import commands
+    from sealfit.report import summary_lines
 
-    end("effects", requests.effects(out, effects_folder), summary_lines.effects_lines, as_json)
+    end("effects", commands.effects(out, effects_folder), summary_lines.effects_lines, as_json)
 
 
 @app.command()
@@ -200,9 +291,9 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Write a campaign with known truth."""
-    from sealfit import requests
+    from sealfit import commands
 
-    made = requests.simulate(spec, out, force=force)
+    made = commands.simulate(spec, out, force=force)
     end("simulate", made, lambda m: [f"{m['files']} trace files in {m['campaign']}", f"truth: {m['truth']}"], as_json)
 
 
@@ -216,9 +307,10 @@ def check(
 ) -> None:
     """List every fault of a campaign, write nothing."""
     count = _workers(workers, scheduler)
-    from sealfit import progress, requests, summary_lines
+    from sealfit import commands, progress
+    from sealfit.report import summary_lines
 
-    found, faults = requests.check(campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr())
+    found, faults = commands.check(campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr())
     if as_json:
         print_json({"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]})
     else:
@@ -254,7 +346,7 @@ def _run(
         command,
         profile,
         as_json,
-        lambda steps, progress: steps.run(campaign, out, config, steps=names, progress=progress, **options),
+        lambda pipeline, progress: pipeline.run(campaign, out, config, steps=names, progress=progress, **options),
     )
 
 
@@ -269,27 +361,28 @@ def _single(
     **options: Path | None,
 ) -> None:
     options |= {"workers": _workers(workers, scheduler), "scheduler": scheduler, "force": force}
-    _do(step, profile, as_json, lambda steps, progress: steps.single(step, out, progress=progress, **options))
+    _do(step, profile, as_json, lambda pipeline, progress: pipeline.single(step, out, progress=progress, **options))
 
 
 def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
     """Do steps, with progress, and print what they came to."""
-    from sealfit import profiling, progress, steps, summary_lines
+    from sealfit import pipeline, progress
+    from sealfit.report import summary_lines
 
-    with profiling.profiled() as parts:
-        made = work(steps, progress.to_stderr())
+    with progress.profiled() as parts:
+        made = work(pipeline, progress.to_stderr())
     if profile:
-        made["profile"] = profiling.as_dicts(parts)
-    end(command, made, lambda made: summary_lines.lines(made) + profiling.lines(made.get("profile", ())), as_json)
+        made["profile"] = progress.as_dicts(parts)
+    end(command, made, lambda made: summary_lines.lines(made) + progress.lines(made.get("profile", ())), as_json)
 
 
 def _workers(workers: int | None, scheduler: str | None) -> int:
     """Return how many processes of this computer to use."""
-    from sealfit import engine
+    from sealfit.engine import run_map
 
     if workers is not None and scheduler is not None:
         raise typer.BadParameter("use either --workers (this computer) or --scheduler (a Dask cluster), not both.")
-    return workers or engine.cores()
+    return workers or run_map.cores()
 
 
 def main() -> None:

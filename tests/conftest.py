@@ -5,7 +5,7 @@ A shell starts what it puts in the background with Ctrl-C ignored; tests that se
 
 import signal
 
-from sealfit.threads import one_thread
+from sealfit.engine import one_thread
 
 one_thread()
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -7,7 +7,7 @@ import pandas as pd
 from small_tables import small
 
 from sealfit.errors import Fault
-from sealfit.fingerprint import Fingerprints, fingerprint
+from sealfit.store.manifest import Fingerprints, fingerprint
 from sealfit.tables import AFTER
 
 FAULT = Fault(
@@ -148,21 +148,21 @@ def put_in(monkeypatch):
     parts = Parts()
     places = {
         "sealfit.ingest.campaign": ["ingest_campaign", "Place"],
-        "sealfit.fit.steady": ["fit_conditions"],
-        "sealfit.fit.aging": ["fit_series", "aging_curves"],
-        "sealfit.fit.all_series": ["joint_laws"],
-        "sealfit.fit.dynamic": ["fit_dynamic"],
-        "sealfit.closure.after_fits": ["after_fits"],
+        "sealfit.fit.steady.fit": ["fit_conditions"],
+        "sealfit.fit.aging.series": ["fit_series", "aging_curves"],
+        "sealfit.fit.aging.all_series": ["joint_laws"],
+        "sealfit.fit.dynamic.fit": ["fit_dynamic"],
+        "sealfit.closure.after": ["after_fits"],
         "sealfit.closure.loop": ["close_loop"],
         "sealfit.closure.predict": ["predict"],
         "sealfit.report.page": ["build_report"],
-        "sealfit.simulate": ["simulate"],
+        "sealfit.simulation": ["simulate"],
     }
     for place, names in places.items():
         module = ModuleType(place)
         for name in names:
             setattr(module, name, getattr(parts, name))
         monkeypatch.setitem(sys.modules, place, module)
-    sys.modules["sealfit.simulate"].load_spec = lambda path: path.read_text()
-    sys.modules["sealfit.simulate"].truth_path = lambda out: out.with_name(out.name + ".truth.json")
+    sys.modules["sealfit.simulation"].load_spec = lambda path: path.read_text()
+    sys.modules["sealfit.simulation"].truth_path = lambda out: out.with_name(out.name + ".truth.json")
     return parts

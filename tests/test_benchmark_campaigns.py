@@ -5,8 +5,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sealfit.simulate import load_truth, simulate, truth_path
-from sealfit.simulation.design import plan_files
+from sealfit.simulation import load_truth, simulate, truth_path
+from sealfit.simulation.spec import plan_files
 
 PATH = Path(__file__).parents[1] / "benchmarks" / "campaigns.py"
 

@@ -11,9 +11,9 @@ from scoring import LENIENT, NONE, STRICT, Target, correlations, grade, match, m
 from truths import true_effects, true_term, truth_in_claim
 
 from sealfit.effects import EFFECTS
-from sealfit.fit.rows import make_rows
-from sealfit.fit.terms import Term
-from sealfit.simulate import load_truth, simulate, true_force, truth_path
+from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.rows import make_rows
+from sealfit.simulation import load_truth, simulate, true_force, truth_path
 
 OIL = Target("linear", ("oil_ppm",), "run", "mu", "multiply")
 RIPPLE = Target("ripple", ("displacement_mm",), "trace", "force", "add")

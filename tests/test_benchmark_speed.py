@@ -15,7 +15,7 @@ from many_files import MU_C, MU_S, SIGMA_2, V_S, add_files, design_for, write_ca
 from process_tree import watched
 
 from sealfit.config import load_config
-from sealfit.fit.steady import fit_conditions
+from sealfit.fit.steady.fit import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from sealfit import cli
 from sealfit.errors import CampaignError, Fault, FitError
-from sealfit.fingerprint import STEPS
+from sealfit.store.manifest import STEPS
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMANDS = sorted(command.name or command.callback.__name__ for command in cli.app.registered_commands)
@@ -89,7 +89,7 @@ def test_the_command_line_starts_without_the_heavy_libraries():
 
 def test_the_fits_and_the_loop_do_without_scipy_stats():
     """It takes half a second to load, half of what a small campaign's fits take."""
-    fits = "sealfit.fit.steady, sealfit.fit.all_series, sealfit.fit.lifetime, sealfit.fit.dynamic"
+    fits = "sealfit.fit.steady.fit, sealfit.fit.aging.all_series, sealfit.fit.aging.lifetime, sealfit.fit.dynamic.fit"
     program = f"import sys, {fits}, sealfit.closure.loop; print('scipy.stats' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert run.stdout == "False\n"
@@ -157,15 +157,15 @@ def test_a_bug_is_70_and_keeps_its_traceback(sealfit, parts, campaign, out):
 @pytest.mark.parametrize(
     ("arguments", "at"),
     [
-        (["run", "c", "--out", "o"], "sealfit.steps.run"),
-        (["ingest", "c", "--out", "o"], "sealfit.steps.run"),
-        (["close-loop", "o"], "sealfit.steps.single"),
-        (["predict", "o", "--points", "p.csv", "--output", "q.csv"], "sealfit.requests.predict"),
-        (["lifetime", "o"], "sealfit.requests.lifetime"),
-        (["effects"], "sealfit.requests.effects"),
-        (["simulate", "s.toml", "--out", "c"], "sealfit.requests.simulate"),
-        (["check", "c"], "sealfit.requests.check"),
-        (["effects"], "sealfit.state.to_json"),
+        (["run", "c", "--out", "o"], "sealfit.pipeline.run"),
+        (["ingest", "c", "--out", "o"], "sealfit.pipeline.run"),
+        (["close-loop", "o"], "sealfit.pipeline.single"),
+        (["predict", "o", "--points", "p.csv", "--output", "q.csv"], "sealfit.commands.predict"),
+        (["lifetime", "o"], "sealfit.commands.lifetime"),
+        (["effects"], "sealfit.commands.effects"),
+        (["simulate", "s.toml", "--out", "c"], "sealfit.commands.simulate"),
+        (["check", "c"], "sealfit.commands.check"),
+        (["effects"], "sealfit.store.manifest.to_json"),
     ],
 )
 def test_a_bug_under_json_leaves_one_object(sealfit, monkeypatch, arguments, at):

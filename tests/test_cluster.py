@@ -14,15 +14,15 @@ pytest.importorskip("distributed")
 from dask_here import DaskHere
 
 from sealfit.closure import loop, spectrum
-from sealfit.cluster import Cluster
-from sealfit.engine import on_cluster, run_map
+from sealfit.engine.cluster import Cluster
+from sealfit.engine.run_map import on_cluster, run_map
 from sealfit.errors import RequestError, WorkerError
-from sealfit.fit.estimate import fit_declared
-from sealfit.ingest import parts
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.ingest import partitions
+from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED, STEPS, run
 from sealfit.progress import Silent
-from sealfit.simulate import load_spec, simulate
-from sealfit.steps import AFTER, CLOSED, FITTED, INGESTED, STEPS, run
-from sealfit.store import Store
+from sealfit.simulation import load_spec, simulate
+from sealfit.store.out_folder import Store
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -77,7 +77,7 @@ def process_id(_):
 
 
 def test_an_answer_that_comes_as_the_wait_ends_is_taken(dask, monkeypatch):
-    monkeypatch.setattr("sealfit.cluster.LOOK_S", 0.02)
+    monkeypatch.setattr("sealfit.engine.cluster.LOOK_S", 0.02)
     with on_cluster(str(dask.file)):
         assert list(run_map(answer_late, range(120), together=1)) == list(range(120))
         with pytest.raises(TimeoutError, match="too slow"):
@@ -93,7 +93,7 @@ def test_a_map_survives_a_killed_worker(dask):
 
 
 def test_work_that_kills_every_worker_is_a_clear_error(dask, monkeypatch):
-    monkeypatch.setattr("sealfit.cluster.ALONE_S", 3.0)
+    monkeypatch.setattr("sealfit.engine.cluster.ALONE_S", 3.0)
     with on_cluster(str(dask.file)), pytest.raises(WorkerError, match=r"no workers left.*start them again"):
         list(run_map(fatal, range(1)))
 
@@ -107,7 +107,7 @@ def test_a_folder_that_workers_do_not_see_is_refused(dask, tmp_path):
 
 
 def test_no_scheduler_is_a_clear_error(monkeypatch):
-    monkeypatch.setattr("sealfit.cluster.CONNECT_S", 0.5)
+    monkeypatch.setattr("sealfit.engine.cluster.CONNECT_S", 0.5)
     with pytest.raises(RequestError, match=r"no Dask scheduler answers at tcp://127.0.0.1:1\. Start one"):
         Cluster("tcp://127.0.0.1:1")
 
@@ -177,7 +177,7 @@ def campaign(tmp_path_factory):
     design = spec.design.model_copy(update={"temperatures_C": (60.0,), "days": (1.0, 4.0), "max_rows": 150})
     simulate(spec.model_copy(update={"design": design}), folder / "c")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(parts, "PART_FILES", 12)
+        patch.setattr(partitions, "PART_FILES", 12)
         patch.setattr(loop, "JACKKNIFE_UNITS", 6)  # so that the folds search, few runs as there are
         run(folder / "c", folder / "here", steps=STEPS[:-1], workers=1)
     return folder / "c", results(folder / "here")
@@ -188,7 +188,7 @@ def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
     campaign, tmp_path, dask, monkeypatch, at
 ):
     folder, (here, closure) = campaign
-    monkeypatch.setattr(parts, "PART_FILES", 12)
+    monkeypatch.setattr(partitions, "PART_FILES", 12)
     monkeypatch.setattr(loop, "JACKKNIFE_UNITS", 6)
     kills = KillsAt(dask.workers[1], at)
     run(folder, tmp_path / "there", steps=STEPS[:-1], scheduler=str(dask.file), progress=kills)
@@ -198,7 +198,7 @@ def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
 
 def test_the_search_on_a_cluster_gives_the_same_although_a_worker_is_killed(campaign, tmp_path, dask, monkeypatch):
     folder, (here, closure) = campaign
-    monkeypatch.setattr(parts, "PART_FILES", 12)
+    monkeypatch.setattr(partitions, "PART_FILES", 12)
     monkeypatch.setattr(spectrum, "WORTHWHILE", 0)
     monkeypatch.setattr(loop, "JACKKNIFE_UNITS", 6)
     killed = []

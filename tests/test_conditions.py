@@ -1,9 +1,9 @@
 import pandas as pd
 import pytest
 
-from sealfit.conditions import add_keys, condition_columns
 from sealfit.config import Config
 from sealfit.errors import SealfitError
+from sealfit.ingest.categorical import add_keys, condition_columns
 
 
 def keys(table, config=None):

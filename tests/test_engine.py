@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from sealfit.engine import cores, run_map
+from sealfit.engine.run_map import START, cores, run_map
 from sealfit.errors import CampaignError, Fault, RequestError, WorkerError
-from sealfit.processes import START
 
 HERE = Path(__file__).resolve().parent
 
@@ -98,8 +97,8 @@ def test_cores_is_what_this_process_may_use():
 PROGRAM = """
 import sys
 sys.path.insert(0, {tests!r})
-from sealfit.engine import run_map
-from sealfit.processes import in_processes
+from sealfit.engine.run_map import run_map
+from sealfit.engine.run_map import in_processes
 from test_engine import wait_long
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealfit.config import Config, parse_config
-from sealfit.fingerprint import Fingerprint, Fingerprints, changes, fingerprint, step_keys
+from sealfit.store.manifest import Fingerprint, Fingerprints, changes, fingerprint, step_keys
 
 files = st.sampled_from([f"{folder}{name}.csv" for folder in ("", "one/", "two/") for name in "abcd"])
 marks = st.one_of(

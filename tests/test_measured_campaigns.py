@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from measured import emps_plateaus, kidney, kidney_plain, measured
 
-from sealfit.steps import run
-from sealfit.store import Store
+from sealfit.pipeline import run
+from sealfit.store.out_folder import Store
 
 pytestmark = pytest.mark.skipif(measured() is None, reason="SEALFIT_MEASURED names no folder of measured data")
 PRESSURE = '- pressure_bar * 1e5 * pi * (bore_m / 2) ** 2"'

@@ -7,7 +7,7 @@ import pytest
 
 from sealfit.closure.loop import close_loop
 from sealfit.config import load_config
-from sealfit.engine import cores
+from sealfit.engine.run_map import cores
 from sealfit.ingest.campaign import ingest_campaign
 
 ROOT = Path(__file__).parents[1]

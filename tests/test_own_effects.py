@@ -9,12 +9,12 @@ import pandas as pd
 import pytest
 from user_effects import WORN_PATCH
 
-from sealfit import requests
+from sealfit import commands
 from sealfit.errors import ConfigError, RequestError, StaleError
-from sealfit.own_effects import own_effects_folder
-from sealfit.simulate import load_spec, simulate
-from sealfit.state import ConfigCopy
-from sealfit.steps import run, single
+from sealfit.pipeline import run, single
+from sealfit.simulation import load_spec, simulate
+from sealfit.store.manifest import ConfigCopy
+from sealfit.store.paths import own_effects_folder
 
 SPEC = """
 name = "plain"
@@ -88,7 +88,7 @@ def with_own_effect(out: Path) -> None:
 
 
 def predicted(home: Path, **options) -> pd.Series:
-    requests.predict(home / "out", home / "points.csv", home / "q.csv", **options)
+    commands.predict(home / "out", home / "points.csv", home / "q.csv", **options)
     return pd.read_csv(home / "q.csv").iloc[0]
 
 
@@ -105,10 +105,10 @@ def test_a_folder_named_in_the_model_or_the_state_of_out_is_never_run(home):
             keep(out, model=model, state={"config": {"path": path, "text": text}})
             for doing in (
                 lambda: predicted(home),
-                lambda: requests.effects(out),
+                lambda: commands.effects(out),
                 lambda: single("close-loop", out, force=True),
                 lambda: single("report", out, force=True),
-                lambda: requests.lifetime(
+                lambda: commands.lifetime(
                     out, quantity="mu_s", threshold=None, loss_pct=5.0, temperature_C=None, compression_pct=None,
                     years=None, law=None,
                 ),
@@ -147,7 +147,7 @@ def test_other_files_than_the_model_was_made_with_are_said(home):
     words = r"close-loop is stale: your own effects are not those it was made with \(patch\.py\)"
     with pytest.raises(StaleError, match=words + ".*Run: sealfit close-loop .*--effects-folder"):
         predicted(home, effects_folder=home / "mine")
-    assert "are not those it was made with (patch.py)" in requests.effects(home / "out", home / "mine")["note"]
+    assert "are not those it was made with (patch.py)" in commands.effects(home / "out", home / "mine")["note"]
 
 
 def test_the_loop_is_closed_again_only_with_a_folder_that_is_named(home):
@@ -159,12 +159,12 @@ def test_the_loop_is_closed_again_only_with_a_folder_that_is_named(home):
 
 def test_effects_lists_own_effects_from_a_folder_that_is_named(home):
     def ids(*asked):
-        return {effect["id"] for effect in requests.effects(*asked)["effects"]}
+        return {effect["id"] for effect in commands.effects(*asked)["effects"]}
 
     assert "worn_patch" not in ids(home / "out")
-    assert "add --effects-folder" in requests.effects(home / "out")["note"]
+    assert "add --effects-folder" in commands.effects(home / "out")["note"]
     assert "worn_patch" in ids(home / "out", home / "mine")
-    assert requests.effects(home / "out", home / "mine")["note"] is None
+    assert commands.effects(home / "out", home / "mine")["note"] is None
     assert "worn_patch" in ids(None, home / "mine")
 
 
@@ -194,7 +194,7 @@ def test_a_folder_in_the_campaign_or_in_out_is_refused(home, place, way):
     (home / "evil.toml").write_text(f"[loop]\neffects_folder = '{folder}'\n")
     for doing in (
         lambda: predicted(home, effects_folder=folder),
-        lambda: requests.effects(home / "out", folder),
+        lambda: commands.effects(home / "out", folder),
         lambda: single("close-loop", home / "out", force=True, effects_folder=folder),
         lambda: run(home / "campaign", home / "out", effects_folder=folder),
         lambda: run(home / "campaign", home / "out", home / "evil.toml"),

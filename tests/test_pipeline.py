@@ -14,10 +14,10 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
 
-from sealfit.fingerprint import STEPS
-from sealfit.simulate import load_truth, true_force
-from sealfit.steps import AFTER, CLOSED, FITTED, INGESTED
-from sealfit.store import Store
+from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED
+from sealfit.simulation import load_truth, true_force
+from sealfit.store.manifest import STEPS
+from sealfit.store.out_folder import Store
 from sealfit.tables import SCHEMAS
 
 SPEC = """
@@ -87,7 +87,7 @@ def first(campaign):
 def test_ingest_does_without_scipy_where_no_repeat_lies_outside(campaign, tmp_path):
     """It takes a tenth of a second to load, for one function of it."""
     program = (
-        "import pathlib, sys, sealfit.steps; sealfit.steps.ingest(*map(pathlib.Path, sys.argv[1:]));"
+        "import pathlib, sys, sealfit.pipeline; sealfit.pipeline.ingest(*map(pathlib.Path, sys.argv[1:]));"
         "print('scipy' in sys.modules)"
     )
     run = subprocess.run(

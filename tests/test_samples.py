@@ -9,8 +9,8 @@ from bins_helpers import make_bins, make_traces
 from sealfit.closure.loop import _Folds
 from sealfit.closure.selection import numbered, steady_samples
 from sealfit.closure.subsampling import Subsample
-from sealfit.fit.rows import make_rows, thin
-from sealfit.samples import StoredTraces, a_part_at_a_time
+from sealfit.fit.joint.rows import make_rows, thin
+from sealfit.store.parquet import StoredTraces, a_part_at_a_time
 
 
 def stored(traces: pd.DataFrame, folder, files: list[list[str]]) -> list[StoredTraces]:

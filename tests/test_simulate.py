@@ -6,7 +6,7 @@ import pytest
 from simulation_helpers import ONE_CONDITION, effect, tree
 
 from sealfit.errors import ConfigError, OutError
-from sealfit.simulate import Spec, load_spec, simulate, truth_path
+from sealfit.simulation import Spec, load_spec, simulate, truth_path
 
 SAMPLE = Path(__file__).parents[1] / "sample_data"
 SMALL = Spec(design={**ONE_CONDITION, "repeats": 2}, noise=[{"kind": "white", "sd_N": 0.1}])

@@ -18,13 +18,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_tables import small
 
-from sealfit import parquet, staging
 from sealfit.config import parse_config
 from sealfit.errors import OutError, StaleError
-from sealfit.fingerprint import STEPS, Fingerprints, fingerprint, seen_config
-from sealfit.lock import LOCK
-from sealfit.state import ConfigCopy, State, to_json
-from sealfit.store import Store
+from sealfit.store import parquet, staged_writes
+from sealfit.store.lock import LOCK
+from sealfit.store.manifest import STEPS, ConfigCopy, Fingerprints, State, fingerprint, seen_config, to_json
+from sealfit.store.out_folder import Store
 from sealfit.tables import BINS, INPUTS, QUALITY, RUNS
 from sealfit.units import Units
 
@@ -256,7 +255,7 @@ def test_a_step_is_not_given_what_its_key_does_not_hold():
 
 def test_another_version_makes_everything_stale(out, campaign, monkeypatch):
     do_all(out, campaign)
-    for module in ("fingerprint", "store"):
+    for module in ("store.manifest", "store.out_folder"):
         monkeypatch.setattr(f"sealfit.{module}.__version__", "99.0")
     assert stale(out) == list(STEPS)
     with pytest.raises(StaleError, match=r"made by sealfit .*, this is 99.0"):
@@ -429,8 +428,8 @@ WRITER = """
 import sys, time
 sys.path.insert(0, {tests!r})
 from pathlib import Path
-from sealfit.state import ConfigCopy
-from sealfit.store import Store
+from sealfit.store.manifest import ConfigCopy
+from sealfit.store.out_folder import Store
 
 with Store.writing(Path({out!r}), Path({campaign!r}), ConfigCopy.at(None)) as store:
     print("holds", flush=True)
@@ -484,9 +483,9 @@ import os, signal, sys
 sys.path.insert(0, {tests!r})
 from pathlib import Path
 import test_store
-from sealfit import staging, store
+from sealfit.store import out_folder, staged_writes
 
-real_replace, real_write, calls = os.replace, staging.sync, 0
+real_replace, real_write, calls = os.replace, staged_writes.sync, 0
 
 def count(real):
     def counted(*args):
@@ -498,7 +497,7 @@ def count(real):
     return counted
 
 os.replace = count(real_replace)
-store.sync = staging.sync = count(real_write)
+out_folder.sync = staged_writes.sync = count(real_write)
 test_store.do_all(Path({out!r}), Path({campaign!r}), rows=5)
 """
 MOMENTS_PER_STEP = 11  # files written and moved, folders synced
@@ -529,7 +528,7 @@ def test_a_kill_at_any_moment_leaves_complete_tables(out, campaign):
 
 
 def test_a_ctrl_c_while_files_are_moved_waits_until_they_are(out, campaign, monkeypatch):
-    real, moved = staging.Staged.move, []
+    real, moved = staged_writes.Staged.move, []
 
     def interrupted(self, *names):
         moved.append(names)
@@ -541,7 +540,7 @@ def test_a_ctrl_c_while_files_are_moved_waits_until_they_are(out, campaign, monk
         with Store.writing(out, campaign, ConfigCopy.at(None)) as store:
             do(store, "ingest")
 
-    monkeypatch.setattr(staging.Staged, "move", interrupted)
+    monkeypatch.setattr(staged_writes.Staged, "move", interrupted)
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         ingest()
@@ -554,12 +553,12 @@ def full(*_args, **_kwargs):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("place", ["parquet.write", "staging.sync"])
+@pytest.mark.parametrize("place", ["parquet.write", "staged_writes.sync"])
 @pytest.mark.parametrize("step", STEPS)
 def test_a_full_disk_is_one_line_and_leaves_out_as_it_was(out, campaign, monkeypatch, step, place):
     do_all(out, campaign)
     before = content(out)
-    monkeypatch.setattr(f"sealfit.{place}", full)
+    monkeypatch.setattr(f"sealfit.store.{place}", full)
     with (
         pytest.raises(OutError, match=r"No space left on device\)\. Free some space") as caught,
         Store.writing(out, campaign, ConfigCopy.at(None)) as store,
@@ -636,7 +635,7 @@ def test_a_file_in_the_way_of_the_staging_is_one_line(out, campaign, monkeypatch
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
     do_all(out, campaign)
-    monkeypatch.setattr(staging.Path, "mkdir", refuse)
+    monkeypatch.setattr(staged_writes.Path, "mkdir", refuse)
     with pytest.raises(OutError, match=r"Permission denied\)\. Fix the rights"), Store.writing(out) as store:
         do(store, "report")
 

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from sealfit.fit.aged import Aged
-from sealfit.fit.joint_law import fit_laws, rivals_of
-from sealfit.fit.lifetime import Goal, over_laws
-from sealfit.fit.lifetime_answer import answer, finite_ends
-from sealfit.summary_life import lifetime_lines
+from sealfit.fit.aging.joint_law import Aged, fit_laws, rivals_of
+from sealfit.fit.aging.lifetime import Goal, answer, finite_ends, over_laws
+from sealfit.report.summary_lines import lifetime_lines
 
 DAYS = np.array([0.0, *[1.0, 2.0, 4.0, 8.0, 12.0, 16.0] * 3])
 CELSIUS = np.array([23.0, *[40.0] * 6, *[60.0] * 6, *[80.0] * 6])

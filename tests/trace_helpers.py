@@ -6,8 +6,8 @@ import pytest
 
 from sealfit.config import parse_config
 from sealfit.errors import BadFile, CampaignError
-from sealfit.ingest.read import read_trace
-from sealfit.ingest.refs import TraceRef
+from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
 
 HEADER = "time_s,displacement_mm,force_N"

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import BSpline
 
-from sealfit.closure.contrasts import LEAST_UNITS as LEAST_SLOPES
+from sealfit.closure.small_sample_test import LEAST_UNITS as LEAST_SLOPES
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
-from sealfit.fit.declared import SAME_SPEED
-from sealfit.fit.rows import LEVELS, Rows, open_columns
+from sealfit.fit.joint.declared import SAME_SPEED
+from sealfit.fit.joint.rows import LEVELS, Rows, open_columns
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 MANY_UNITS = 20  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up

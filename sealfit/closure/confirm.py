@@ -12,13 +12,12 @@ from sealfit.closure.channels import CALENDAR, LEAST_UNITS, level_values, settin
 from sealfit.closure.forms import describe
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
-from sealfit.closure.stroke_phases import agreement, pass_shifts
+from sealfit.closure.ripples import agreement, pass_shifts
 from sealfit.config import Config
-from sealfit.fit.estimate import Fitted, as_smooth_as_wanted, fit
-from sealfit.fit.joint import Model, evaluate
-from sealfit.fit.rows import LEVELS, Rows
-from sealfit.fit.terms import Term, shape_of
-from sealfit.fit.whitening import Whitening
+from sealfit.fit.joint.estimate import Fitted, as_smooth_as_wanted, fit
+from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
+from sealfit.fit.joint.rows import LEVELS, Rows
+from sealfit.fit.joint.whitening import Whitening
 
 SURE = 0.005  # p-value, over files (Wilcoxon), at which a ripple of free phase helps the half it was not fitted to
 COMPARED = 4  # rivals, best first, that are put to held-out data too

@@ -8,9 +8,9 @@ from numpy.polynomial import Legendre
 from scipy.special import fdtrc
 
 from sealfit.closure.score_test import Candidate
-from sealfit.fit.estimate import Fitted
-from sealfit.fit.rows import LEVELS, Rows
-from sealfit.fit.tangent import OwnColumns, Tangent
+from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint.rows import LEVELS, Rows
+from sealfit.fit.joint.tangent import OwnColumns, Tangent
 
 SHAPES = 3
 """Shapes along strokes that repeats are asked for: a slope, a bend and a wave."""

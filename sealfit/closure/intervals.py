@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from sealfit.closure.contrasts import LARGEST_LEVERAGE, satterthwaite_df
-from sealfit.fit.estimate import Fitted
-from sealfit.fit.rows import LEVELS
-from sealfit.fit.tangent import Tangent
+from sealfit.closure.small_sample_test import LARGEST_LEVERAGE, satterthwaite_df
+from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint.rows import LEVELS
+from sealfit.fit.joint.tangent import Tangent
 
 Interval = tuple[float, float, float]
 """Value and both ends of its 95 % interval."""

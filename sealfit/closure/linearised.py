@@ -12,10 +12,10 @@ import numpy as np
 from sealfit.closure.score_test import LEAST_LEFT, Candidate, project
 from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
-from sealfit.fit.estimate import Fitted, effective_df
-from sealfit.fit.prior import likely_smoothness, penalised, roughness_of
-from sealfit.fit.rows import Rows
-from sealfit.fit.terms import Term, mean_derivatives
+from sealfit.fit.joint.estimate import Fitted, effective_df
+from sealfit.fit.joint.model import Term, mean_derivatives
+from sealfit.fit.joint.prior import likely_smoothness, penalised, roughness_of
+from sealfit.fit.joint.rows import Rows
 
 PART = 32  # points of a grid whitened at once
 UNNAMED = (SMOOTH, SURFACE)

@@ -12,8 +12,7 @@ import pandas as pd
 from sealfit.closure.confirm import PARTLY, AcceptedEffect, RefusedEffect, covered, folds, heldout_level, varies_within
 from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
-from sealfit.closure.model_record import to_record
-from sealfit.closure.plot_tables import channel_table, curve_table, shape_table
+from sealfit.closure.output import channel_table, curve_table, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
 from sealfit.closure.score_test import JACKKNIFE_UNITS
 from sealfit.closure.selection import Selection, Start, grow, numbered, predict_rows, steady_samples
@@ -21,12 +20,12 @@ from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect
-from sealfit.engine import run_map
-from sealfit.fit.estimate import Fitted, fit, fit_declared
-from sealfit.fit.joint import Model
-from sealfit.fit.rows import LEVELS, Rows, make_rows
-from sealfit.profiling import timed
-from sealfit.samples import StoredTraces
+from sealfit.engine.run_map import run_map
+from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
+from sealfit.fit.joint.model import Model
+from sealfit.fit.joint.rows import LEVELS, Rows, make_rows
+from sealfit.progress import timed
+from sealfit.store.parquet import StoredTraces
 
 
 @dataclass(frozen=True)

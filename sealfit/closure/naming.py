@@ -18,12 +18,12 @@ from sealfit.closure.channels import CALENDAR, Channel
 from sealfit.closure.forms import periodic_terms, terms_of
 from sealfit.closure.intervals import robust_covariance
 from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
-from sealfit.closure.ripple import Peak
+from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.descent import linear_solved, search_nonlinear
-from sealfit.fit.estimate import Fitted, fit, reestimated
-from sealfit.fit.whitening import Scatter, Whitening
+from sealfit.fit.joint.estimate import Fitted, fit, reestimated
+from sealfit.fit.joint.search import linear_solved, search_nonlinear
+from sealfit.fit.joint.whitening import Scatter, Whitening
 
 CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly

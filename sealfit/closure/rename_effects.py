@@ -21,7 +21,7 @@ from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import of_channel
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
-from sealfit.fit.estimate import Fitted, fit
+from sealfit.fit.joint.estimate import Fitted, fit
 
 
 @dataclass(frozen=True)

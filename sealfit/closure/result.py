@@ -8,23 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from sealfit.closure.after import reference_of
 from sealfit.closure.channels import FINER, Channel, incomplete_channels, unit_of
 from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, about_means
 from sealfit.closure.error_sizes import errors, lack_of_fit, noise_floor, scatter_list
 from sealfit.closure.forms import describe, free_term
 from sealfit.closure.intervals import effect_intervals
 from sealfit.closure.next_runs import next_runs
-from sealfit.closure.reference import reference_of
-from sealfit.closure.ripple import Peak
+from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
 from sealfit.closure.sensitivity import LEVEL_NAMES, cannot_tell, sensitivity
 from sealfit.config import Config
 from sealfit.effects.contract import Effect, fill_unit
-from sealfit.fit.estimate import Fitted, effective_df, fit
-from sealfit.fit.rows import Rows
-from sealfit.fit.terms import Term
+from sealfit.fit.joint.estimate import Fitted, effective_df, fit
+from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.rows import Rows
 from sealfit.units import Units
 
 WORTH_A_LOOK = 0.05  # p-value of a channel by itself, not adjusted for the search

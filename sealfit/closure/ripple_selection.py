@@ -10,13 +10,12 @@ import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, confirmed
 from sealfit.closure.naming import propose_ripples
-from sealfit.closure.ripple import Peak, find_ripple
+from sealfit.closure.ripples import Peak, find_ripple
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
-from sealfit.fit.estimate import Fitted, fit
-from sealfit.fit.joint import Model
-from sealfit.fit.rows import Rows
-from sealfit.fit.terms import passes
+from sealfit.fit.joint.estimate import Fitted, fit
+from sealfit.fit.joint.model import Model, passes
+from sealfit.fit.joint.rows import Rows
 
 
 class Ripples:

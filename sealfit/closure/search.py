@@ -1,8 +1,11 @@
-"""Does any channel order the residual? Free shapes of every channel, on every quantity they may act on."""
+"""Does a channel order the residual? Free shapes of every channel and of pairs, on every quantity they may act on."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,16 +17,23 @@ from sealfit.closure.channels import (
     FINER,
     FREE_DF,
     Channel,
+    even_knots,
     flip_level,
     free_columns,
     kinks,
+    off_zero,
     scatter_level,
     unit_of,
 )
-from sealfit.closure.multiplicity import judged
-from sealfit.closure.score_test import JACKKNIFE_UNITS, Candidate, ScoreTests
-from sealfit.fit.estimate import Fitted
-from sealfit.fit.rows import POWER, Rows
+from sealfit.closure.score_test import CONSTANT, JACKKNIFE_UNITS, SEARCHES, Candidate, ScoreTests, judged
+from sealfit.closure.small_sample_test import LEAST_ERROR_OF_RUNS, LEAST_UNITS, log_p_of
+from sealfit.effects.free import BENDS, evenly
+from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint.rows import POWER, Rows
+from sealfit.fit.joint.variance_components import orthonormal
+
+# ---------------------------------------------------------------- search
+# Does any channel order the residual? Free shapes of every channel, on every quantity they may act on.
 
 TARGETS = (
     ("mu", "multiply"),
@@ -139,3 +149,269 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool) ->
     if channel.name == "speed_mm_s":
         return acts_on in ("mu", "a")  # mu_s, mu_c, v_s and sigma_2 are themselves the dependence on speed
     return not (channel.name == "load_N" and acts_on == "force")
+
+
+# ---------------------------------------------------------------- pairs
+# Pairs of channels, for an effect that shows only in two of them together.
+#
+# Looked at where no single channel orders the residual. The columns of a pair are mixed terms alone: what either
+# channel does by itself was tested before and is none of the pair's.
+
+BEHIND = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along it each acts
+ALONE = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; the calendar drifts by itself
+LOGARITHMIC = 5.0  # span of a positive channel from which its logarithm is tried as well
+RARE = 2.0  # pairs are many and seldom at work: they get half of their share of the error
+MOST_CATEGORIES = 12  # a slope for each of more would find what single units do
+
+
+def search_pairs(
+    judge: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
+) -> list[Candidate]:
+    """Return candidates of two channels, adjusted over these and the single ones, strongest evidence first.
+
+    Parameters
+    ----------
+    judge : Judge
+        Of the current model.
+    channels : sequence of Channel
+        Where to look.
+    singles : sequence of Candidate
+        What the search of single channels has tried on this model.
+    rng : Generator
+        For the sign flips.
+    """
+    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _of_pair(judge, *pair)]
+    if not found:
+        return []
+    pairs = [c for c in judged(judge, [*found, *singles], rng) if c.pair]
+    return [replace(c, p_value=min(1.0, RARE * c.p_value)) for c in pairs]
+
+
+def pairs_in_disguise(
+    judge: ScoreTests, significant: Sequence[Candidate], channels: Mapping[str, Channel]
+) -> list[Candidate]:
+    """Return the pairs that a channel's change of a or of v_s may stand for.
+
+    a is how mu changes with days, v_s how it changes with speed. The pair explains the same significant structure, so
+    it is tried beside the single channel whatever its own p-value; the fits decide.
+
+    Parameters
+    ----------
+    judge : Judge
+        Of the current model.
+    significant : sequence of Candidate
+        What the search has accepted on it.
+    channels : mapping
+        Channels by name.
+    """
+    best: dict[frozenset, list[Candidate]] = {}
+    for single in significant:
+        pair = frozenset((*single.channels, BEHIND.get(single.acts_on)))
+        if single.pair or len(pair) != 2 or not pair <= channels.keys() or pair in best:
+            continue
+        members = _usable([channels[name] for name in sorted(pair)])
+        found = _of_pair(judge, *members) if len(members) == 2 else []
+        strongest = [max(own, key=lambda c: c.chi2) for t in MAIN_TARGETS if (own := [c for c in found if _on(c, t)])]
+        best[pair] = [
+            replace(c, test_result=c.test_result._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value)
+            for c in strongest
+        ]
+    return list(itertools.chain.from_iterable(best.values()))
+
+
+def _on(candidate: Candidate, target: tuple[str, str]) -> bool:
+    return (candidate.acts_on, candidate.operation) == target
+
+
+def _usable(channels: Sequence[Channel]) -> list[Channel]:
+    return [
+        c
+        for c in channels
+        if not (c.grouping or c.name in ALONE) and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
+    ]
+
+
+def _of_pair(judge: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
+    blocks = mixed_columns(one, other)
+    if not blocks:
+        return []
+    fitted, finer = judge.fitted, min(one.unit, other.unit, key=FINER.get)
+    between = scatter_level((one, other), fitted.rows)
+    level = flip_level(finer, fitted.rows)
+    shapes = np.column_stack(blocks)
+    ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
+    found = []
+    for target in MAIN_TARGETS:
+        if "load_N" in (one.name, other.name) and target[0] == "force":
+            continue
+        variants = judge.variants(shapes * fitted.slope(*target)[:, None], finer)
+        for block, first, last in zip(blocks, ends[:-1], ends[1:], strict=True):
+            test_result = judge([v[:, first:last] for v in variants], between, level, target)
+            if test_result is not None:
+                names = (one.name, other.name)
+                found.append(Candidate(names, *target, level, block, test_result, pair=True))
+    return found
+
+
+def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
+    """Return the mixed terms of two channels, blocks of shape (n, k) to be judged each; none for two categories.
+
+    The plain product, also of logarithms where a channel spans enough for them to matter: what either does alone may
+    hold nearly all of a product, and the rest depends on its exact shape. Then bent terms, for what is no product.
+    """
+    if not (one.numeric or other.numeric):
+        return []
+    if one.numeric and other.numeric:
+        products = [(u * w)[:, None] for u in _scales(one) for w in _scales(other)]
+        u, w = _even(one), _even(other)
+        blocks = [*products, np.column_stack([u**j * w**k for j, k in BENDS])]
+    else:
+        number, category = (one, other) if one.numeric else (other, one)
+        u = _even(number)
+        levels = np.unique(category.values)
+        blocks = [(category.values[:, None] == levels[None, 1:]) * u[:, None]]
+    sizes = [np.sqrt((columns**2).mean(axis=0)) for columns in blocks]
+    blocks = [columns[:, size > 1e-9] / size[size > 1e-9] for columns, size in zip(blocks, sizes, strict=True)]
+    return [columns for columns in blocks if columns.shape[1]]
+
+
+def _scales(channel: Channel) -> list[np.ndarray]:
+    """Return a channel, centred, and its logarithm where that is another shape (from 0 on, moved by its least)."""
+    x = channel.values
+    scales = [x]
+    if x.min() >= 0 and x.max() > LOGARITHMIC * x[x > 0].min(initial=np.inf):
+        scales.append(np.log(off_zero(x)))
+    return [_centred(x) / max(float(np.ptp(x)), 1e-300) for x in scales]
+
+
+def _even(channel: Channel) -> np.ndarray:
+    return _centred(evenly(channel.values, even_knots(channel.values)))
+
+
+def _centred(values: np.ndarray) -> np.ndarray:
+    return values - values.mean()
+
+
+# ---------------------------------------------------------------- masked pairs
+# Two effects that hide each other: each stands in the other's error, and neither passes a test of its own.
+#
+# Looked at where nothing else is significant, in few units. The pairs are simple ones only: two straight lines (an
+# offset, for the direction) that share a channel or of which one is of the direction, and a line along strokes with its
+# change along a coarser channel. Both columns must move each unit along one direction, so that a unit is one number;
+# then  .. math:: F = \frac{(RSS_0 - RSS_{12}) / 2}{RSS_{12} / (d - 2)}  holds both against what the units scatter by
+# beside them, exactly where that scatter is normal and alike. P-values are adjusted for the number of pairs
+# (Bonferroni). A pair counts where each of the two is significant given the other.
+
+OF_DIRECTION = (("force", "add"), ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
+SEPARATE = 1e-3  # singular value of two columns of length 1 below which they are one
+
+
+class MaskedPair(NamedTuple):
+    """Two effects that hide each other: what the tests say of both together, and the keys of their candidates."""
+
+    p_value: float  # adjusted
+    chi2: float  # whitened sum of squares they explain
+    keys: tuple[tuple, ...]  # of those not in the model yet
+
+    def without(self, key: tuple) -> MaskedPair:
+        """Return what is left once one of them is in the model."""
+        return MaskedPair(self.p_value, 0.0, tuple(k for k in self.keys if k != key))
+
+
+def search_masked_pairs(
+    judge: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate], alpha: float
+) -> list[MaskedPair]:
+    """Return the pairs that are significant jointly, most significant first.
+
+    Parameters
+    ----------
+    judge : Judge
+        Of the current model.
+    channels : mapping
+        Channels by name.
+    candidates : sequence of Candidate
+        What the searches of single channels and of pairs have tried on this model.
+    alpha : float
+        Level of the search, and of each of the two given the other.
+    """
+    tested = [(two, _tested(judge, two, level)) for two, level in _pairs(judge, channels, candidates)]
+    tested = [(two, test) for two, test in tested if test is not None]
+    found = [
+        MaskedPair(min(1.0, SEARCHES * len(tested) * float(np.exp(joint))), chi2, tuple(c.key for c in two))
+        for two, (joint, given, chi2) in tested
+        if given <= np.log(alpha)
+    ]
+    return sorted(pair for pair in found if pair.p_value <= alpha)
+
+
+def _pairs(
+    judge: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate]
+) -> Iterator[tuple[tuple[Candidate, Candidate], str]]:
+    """Yield the pairs to be tested and the level of their units."""
+    rows = judge.fitted.rows
+    straight = [c for c in candidates if c.columns.shape[1] == 1 and c.sure]
+    between = {c.channels: [channels[n] for n in c.channels if n != "direction"] for c in straight}
+    level = {id(c): scatter_level(between[c.channels] or [channels["direction"]], rows) for c in straight}
+    lines = [c for c in straight if not c.pair and (c.acts_on, c.operation) in _targets(c)]
+    lines = list({c.key: c for c in reversed(lines)}.values())
+    products = [c for c in straight if c.pair]
+    for one, other in (*itertools.combinations(lines, 2), *itertools.product(lines, products)):
+        shared = level[id(one)] == level[id(other)]
+        few = LEAST_UNITS <= rows.groups.starts[level[id(one)]].size < JACKKNIFE_UNITS
+        if shared and few and _together(one, other, channels):
+            yield (one, other), level[id(one)]
+
+
+def _together(line: Candidate, other: Candidate, channels: Mapping[str, Channel]) -> bool:
+    """Whether a line and another, or a product, are one of the simple pairs."""
+    name = line.channels[-1]
+    if not other.pair:
+        return name == other.channels[-1] or ("direction",) in (line.channels, other.channels)
+    inside = [channels[n].unit == "sample" for n in other.channels]
+    return (
+        name in other.channels and channels[name].unit == "sample" and not all(inside) and line.acts_on == other.acts_on
+    )
+
+
+def _targets(candidate: Candidate) -> Sequence[tuple[str, str]]:
+    return OF_DIRECTION if candidate.channels == ("direction",) else MAIN_TARGETS
+
+
+def _tested(judge: ScoreTests, two: tuple[Candidate, Candidate], level: str) -> tuple[float, float, float] | None:
+    """Return log p of two candidates jointly, the larger of each given the other, and what they explain; else None.
+
+    None is where they are no pair. Of all variants in which they must hold, what says least.
+    """
+    fitted = judge.fitted
+    columns = np.column_stack([c.columns * fitted.slope(c.acts_on, c.operation)[:, None] for c in two])
+    unit = min((c.unit for c in two), key=lambda name: fitted.rows.groups.starts[name].size)
+    white = fitted.whitening(columns)
+    numbers = judge.few[level].along(_larger(white, fitted.rows.groups, level))
+    found = []
+    for left in judge.variants(columns, unit):
+        own = fitted.rows.groups.sums(numbers.direction[:, None] * left, level)
+        if ((own**2).sum(axis=0) <= CONSTANT * (left**2).sum(axis=0)).any() or not left.any(axis=0).all():
+            return None
+        made = numbers.root @ own
+        made = made / np.sqrt((made**2).sum(axis=0))
+        basis = orthonormal(made, SEPARATE)
+        if basis.shape[1] < 2 or numbers.df - 2 < LEAST_ERROR_OF_RUNS:
+            return None
+        joint = log_p_of(numbers.values[None, :], basis, 0.0, numbers.df)[0]
+        given = max(_given(numbers.values, *made.T[order], numbers.df) for order in ([0, 1], [1, 0]))
+        found.append((joint, given, -float(((orthonormal(left, SEPARATE).T @ fitted.white_residual) ** 2).sum())))
+    joint, given, chi2 = np.max(found, axis=0).tolist()
+    return joint, given, -chi2
+
+
+def _given(values: np.ndarray, one: np.ndarray, other: np.ndarray, df: int) -> float:
+    """Return log p of one column of independent numbers given another, all of shape (d,), the columns of length 1."""
+    rest = one - (one @ other) * other
+    left = values - (values @ other) * other
+    return float(log_p_of(left[None, :], rest[:, None] / np.linalg.norm(rest), 0.0, df - 1)[0])
+
+
+def _larger(white: np.ndarray, groups, level: str) -> np.ndarray:
+    """Return in each unit the larger of two columns, shape (n,): the direction along which both may move it."""
+    size = groups.sums(white**2, level)
+    return white[np.arange(len(white)), size.argmax(axis=1)[groups.codes[level]]]

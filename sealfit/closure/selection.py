@@ -11,24 +11,28 @@ import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel, channels_of
 from sealfit.closure.confirm import TRIES, WEAK, AcceptedEffect, RefusedEffect, confirmed
-from sealfit.closure.forms import PERIODIC
+from sealfit.closure.forms import AGING, PERIODIC, richer_laws
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.masked_pairs import MaskedPair, search_masked_pairs
 from sealfit.closure.naming import HALF, propose, rivals
-from sealfit.closure.pairs import pairs_in_disguise, search_pairs
 from sealfit.closure.rename_effects import Renaming
-from sealfit.closure.richer_laws import AGING, richer_laws
-from sealfit.closure.ripple import Peak
 from sealfit.closure.ripple_selection import Ripples
+from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate, ScoreTests
-from sealfit.closure.search import MAIN_TARGETS, search
+from sealfit.closure.search import (
+    MAIN_TARGETS,
+    MaskedPair,
+    pairs_in_disguise,
+    search,
+    search_masked_pairs,
+    search_pairs,
+)
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
-from sealfit.fit.estimate import Fitted, fit, fit_declared
-from sealfit.fit.joint import Model, evaluate
-from sealfit.fit.rows import Rows
-from sealfit.fit.whitening import Scatter
-from sealfit.samples import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
+from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
+from sealfit.fit.joint.model import Model, evaluate
+from sealfit.fit.joint.rows import Rows
+from sealfit.fit.joint.whitening import Scatter
+from sealfit.store.parquet import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
 
 SAMPLED = ("displacement_mm", "time_s", "force_N")  # what the ripple search reads of a sample
 DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at: a far surer one may show in it

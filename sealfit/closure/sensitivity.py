@@ -17,25 +17,33 @@ from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri
 
 from sealfit.closure.channels import Channel, scatter_level
 from sealfit.closure.confirm import LEAST_FALL, LEAST_SIZE, WEAK, about_means
-from sealfit.closure.contrasts import (
+from sealfit.closure.score_test import (
+    CONSTANT,
+    JACKKNIFE_UNITS,
+    SEARCHES,
+    Candidate,
+    ScoreTests,
+    critical_few,
+    critical_many,
+    project,
+)
+from sealfit.closure.selection import Selection
+from sealfit.closure.small_sample_test import (
     LARGE,
     LEAST_UNITS,
     WAYS,
+    ClusterTests,
     ContrastTest,
+    SmallSampleTest,
     contrast_test,
     enough_specimens,
     least_share,
     moderated,
 )
-from sealfit.closure.multiplicity import SEARCHES, critical_few, critical_many
-from sealfit.closure.score_test import CONSTANT, JACKKNIFE_UNITS, Candidate, ScoreTests, project
-from sealfit.closure.selection import Selection
-from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest
-from sealfit.fit.estimate import Fitted
-from sealfit.fit.reml import orthonormal
-from sealfit.fit.rows import LEVELS
-from sealfit.fit.scatter import estimate_scatter
-from sealfit.fit.whitening import Whitening
+from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint.rows import LEVELS
+from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
+from sealfit.fit.joint.whitening import Whitening
 
 POWER = 0.8
 """Chance with which the smallest effect is found."""

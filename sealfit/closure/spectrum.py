@@ -1,8 +1,4 @@
-"""The spectrum of strokes along an axis, summed over units: no amplitude of a single one is kept.
-
-Strokes that share a grid are transformed together, and units are added block by block, so that memory does not grow
-with the campaign. Workers may share the blocks: they are the same whoever sums them up, and so are the sums.
-"""
+"""The spectrum of strokes along an axis, summed over units, and the background that a peak stands out of."""
 
 from __future__ import annotations
 
@@ -14,10 +10,159 @@ import numpy as np
 import pandas as pd
 from scipy.fft import next_fast_len
 from scipy.sparse import csr_array
+from scipy.special import digamma, polygamma
 
-from sealfit.closure.background import LOBE
-from sealfit.closure.stroke_signals import Strokes
-from sealfit.engine import run_map
+from sealfit.engine.run_map import run_map
+
+# ---------------------------------------------------------------- stroke signals
+# Strokes of some samples along an axis, each to be laid on an even grid.
+
+LEAST_SAMPLES = 16  # a stroke with fewer steady samples says nothing of a ripple
+
+
+@dataclass(frozen=True)
+class Strokes:
+    """Strokes along an axis, m of them with n samples together, and the grids that they are transformed on."""
+
+    place: np.ndarray  # (n,) along the axis, in its unit, as `residual` a stroke after the other
+    residual: np.ndarray  # (n,) in N
+    start: np.ndarray  # (m,) first sample
+    size: np.ndarray  # (m,) samples
+    low: np.ndarray  # (m,) where each begins
+    span: np.ndarray  # (m,) how far it goes
+    unit: np.ndarray  # (m,) number of its file
+    direction: np.ndarray  # (m,)
+
+    @classmethod
+    def of(cls, samples: pd.DataFrame, axis: str) -> Strokes:
+        """Return the strokes of some samples that are long enough to say something of a ripple."""
+        place, residual = (samples[name].to_numpy(dtype=float) for name in (axis, "residual_N"))
+        stroke = samples["stroke_id"].to_numpy()
+        start = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]][: stroke.size])
+        size = np.diff(np.r_[start, stroke.size])
+        low, high = (part.reduceat(place, start) if start.size else place for part in (np.minimum, np.maximum))
+        good = (size >= LEAST_SAMPLES) & (high > low)
+        unit, direction = (samples[name].to_numpy()[start[good]] for name in ("unit", "direction"))
+        return cls(place, residual, start[good], size[good], low[good], (high - low)[good], unit, direction)
+
+    def only(self, chosen: np.ndarray) -> Strokes:
+        """Return some strokes and their samples alone."""
+        size = self.size[chosen]
+        start = np.cumsum(size) - size
+        own = np.repeat(self.start[chosen] - start, size) + np.arange(size.sum())
+        others = (getattr(self, name)[chosen] for name in ("low", "span", "unit", "direction"))
+        return Strokes(self.place[own], self.residual[own], start, size, *others)
+
+    def on_grids(self, chosen: np.ndarray, step: float, size: int) -> np.ndarray:
+        """Return residuals of chosen strokes on even grids of `size` places from where each begins, (strokes, size)."""
+        grid = step * np.arange(size)
+        found = np.empty((chosen.size, size))
+        for row, k in zip(found, chosen, strict=True):
+            row[:] = np.interp(self.low[k] + grid, *self.along(k))
+        return found
+
+    def along(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return places and residuals of one stroke, sorted by place."""
+        own = slice(self.start[k], self.start[k] + self.size[k])
+        order = np.argsort(self.place[own], kind="stable")
+        return self.place[own][order], self.residual[own][order]
+
+    def together(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return places and residuals of strokes of one size n, each sorted by place, shape (strokes, n) both."""
+        own = self.start[chosen, None] + np.arange(self.size[chosen[0]])
+        order = np.argsort(self.place[own], axis=1, kind="stable")
+        return np.take_along_axis(self.place[own], order, 1), np.take_along_axis(self.residual[own], order, 1)
+
+
+# ---------------------------------------------------------------- background
+# The background of a spectrum, from each frequency's neighbours: what a peak stands out of.
+
+NEIGHBOURS = 25  # frequencies on each side that make the local background
+LOBE = 4  # frequencies on each side that the taper smears a peak over
+
+
+def alike(ratio: np.ndarray) -> np.ndarray:
+    """Return of how many independent powers a spectrum behaves like the mean, by its neighbours' spread, shape (f,).
+
+    The logarithm of a mean of c powers has the variance trigamma(c); its spread is taken from the quartiles, which a
+    few peaks do not move.
+    """
+    low, high = _quantiles(_neighbours(np.log(np.maximum(ratio, 1e-300))), (0.25, 0.75))
+    spread = ((high - low) / 1.349) ** 2
+    numbers = np.geomspace(1e5, 1.0, 200)
+    return np.interp(spread, polygamma(1, numbers), numbers)
+
+
+def _quantiles(windows: np.ndarray, levels: Sequence[float]) -> list[np.ndarray]:
+    """Return quantiles of each row, NaN left out, by linear interpolation, each of shape (f,).
+
+    numpy's nanquantile takes the rows one by one, a hundred times slower.
+    """
+    ordered = np.sort(windows, axis=1)  # NaN last
+    last = np.maximum(np.isfinite(windows).sum(axis=1) - 1, 0)
+    every = np.arange(last.size)
+    found = []
+    for level in levels:
+        place = level * last
+        low = np.floor(place).astype(int)
+        high = np.minimum(low + 1, last)
+        found.append(ordered[every, low] + (place - low) * (ordered[every, high] - ordered[every, low]))
+    return found
+
+
+def _neighbours(value: np.ndarray) -> np.ndarray:
+    """Return each frequency's neighbours, its own main lobe and what lies beyond the ends NaN, shape (f, window)."""
+    padded = np.pad(value, NEIGHBOURS, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1).copy()
+    windows[:, np.abs(np.arange(-NEIGHBOURS, NEIGHBOURS + 1)) <= LOBE] = np.nan
+    return windows
+
+
+def tops(power: np.ndarray) -> np.ndarray:
+    """Return where a spectrum is highest within a main lobe each side, both ends left out, shape (f,).
+
+    At the low end stand the smooth shapes of a stroke (warming, drift), which are no ripple; at the high end only the
+    strokes that are sampled most finely are left, and their noise is not that of all.
+    """
+    padded = np.pad(power, LOBE, constant_values=np.inf)
+    highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * LOBE + 1).max(axis=1)
+    return power >= highest
+
+
+def smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Return the background of a mean of `count` powers: a straight line in log-log through each point's neighbours.
+
+    Correlated noise falls steeply towards high frequencies, which a plain median of neighbours would take for a peak at
+    the low end. Neighbours that stand out are clipped, the peak's own main lobe left out.
+    """
+    value = np.log(np.maximum(power, 1e-300))
+    place = np.log(frequency)
+    y, x = _neighbours(value), _neighbours(place)
+    for _ in range(3):
+        weight = np.isfinite(y).astype(float)
+        total = weight.sum(axis=1)
+        mean_x = np.nansum(np.where(weight > 0, x, 0.0), axis=1) / total
+        mean_y = np.nansum(y, axis=1) / total
+        dx = np.where(weight > 0, x - mean_x[:, None], 0.0)
+        dy = np.where(weight > 0, y - mean_y[:, None], 0.0)
+        slope = (dx * dy).sum(axis=1) / np.maximum((dx**2).sum(axis=1), 1e-300)
+        line = mean_y[:, None] + slope[:, None] * (x - mean_x[:, None])
+        spread = np.sqrt(np.nanmean((y - line) ** 2, axis=1))[:, None]
+        y = np.minimum(y, line + 2 * spread)
+    level = mean_y + slope * (place - mean_x)
+    return np.exp(level - (digamma(count) - np.log(count)))
+
+
+def background(power: np.ndarray) -> np.ndarray:
+    """Return the median of each frequency's neighbours, the peak's own main lobe left out."""
+    return np.maximum(_quantiles(_neighbours(power), (0.5,))[0], 1e-300)
+
+
+# ---------------------------------------------------------------- spectrum
+# The spectrum of strokes along an axis, summed over units: no amplitude of a single one is kept.
+#
+# Strokes that share a grid are transformed together, and units are added block by block, so that memory does not grow
+# with the campaign. Workers may share the blocks: they are the same whoever sums them up, and so are the sums.
 
 MOST_NUMBERS = 1 << 19  # of the grids of a block: 4 MB
 WORTHWHILE = 400_000  # samples from which it takes longer to transform them than to start processes and send them
@@ -62,7 +207,7 @@ def spectra_of(
     Parameters
     ----------
     samples : DataFrame
-        As for `sealfit.closure.ripple.find_ripple`.
+        As for `sealfit.closure.ripples.find_ripple`.
     axes : sequence of str
         Columns to look along.
     known : sequence of (axis, wavelength)

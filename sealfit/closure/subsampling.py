@@ -17,9 +17,9 @@ from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
-from sealfit.fit.declared import declare
-from sealfit.fit.estimate import Fitted, fit, fitted_at
-from sealfit.fit.rows import POWER, Rows, make_rows, merge, thin
+from sealfit.fit.joint.declared import declare
+from sealfit.fit.joint.estimate import Fitted, fit, fitted_at
+from sealfit.fit.joint.rows import POWER, Rows, make_rows, merge, thin
 
 STROKES = 4_000  # that are searched; of more, whole runs are dealt,
 RUNS = 1_000  # at least so many, as they are the evidence of most channels,

@@ -1,5 +1,4 @@
-"""A campaign folder to tables: every file read, split and judged, repeats averaged; part by part, on any number of
-processes."""
+"""A campaign folder to tables: every file read, split and judged, repeats averaged; part by part."""
 
 from __future__ import annotations
 
@@ -14,19 +13,14 @@ import pandas as pd
 import pyarrow as pa
 
 from sealfit.config import Config
-from sealfit.engine import run_map
+from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault
-from sealfit.fingerprint import Fingerprints
-from sealfit.ingest.incomplete import incomplete_columns
-from sealfit.ingest.inputs import inputs_table
-from sealfit.ingest.part import SAMPLED, Asked
-from sealfit.ingest.parts import plan_parts
-from sealfit.ingest.peers import constant_strokes, outlying_files, reversed_strokes
+from sealfit.ingest.file_names import Listing
+from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, plan_parts, shaped
 from sealfit.ingest.quality import quality_table
-from sealfit.ingest.refs import Listing
+from sealfit.ingest.repeat_checks import constant_strokes, outlying_files, reversed_strokes
 from sealfit.ingest.runs import list_traces
-from sealfit.ingest.shaped import STEADY_ONLY, shaped
-from sealfit.ingest.stored import (
+from sealfit.ingest.stored_parts import (
     Made,
     agrees,
     common_columns,
@@ -36,9 +30,109 @@ from sealfit.ingest.stored import (
     seen_by_parts,
     stored_strokes,
 )
-from sealfit.parquet import spelled_out
-from sealfit.profiling import timed
+from sealfit.progress import timed
+from sealfit.store.manifest import Fingerprints, fingerprint
+from sealfit.store.parquet import spelled_out
 from sealfit.tables import RUNS, STEADY
+
+# ---------------------------------------------------------------- incomplete
+# Columns of the campaign that some of its files have no value of.
+
+LEAST_KNOWN = 0.8  # share of the files that have a value, from which the search for effects still looks at a column
+NO_VALUE = "(no value)"  # level of a category in files without one
+CALENDAR = ("run_order", "elapsed_h")  # both from started_at
+
+
+def incomplete_columns(steady: pd.DataFrame) -> list[Fault]:
+    """Return, for every column that some files have no value of, how many, what that does, and the fix.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`; rows with `used` false are left out.
+    """
+    used = steady[steady["used"].to_numpy(bool)]
+    files = used["file"].nunique()
+    fixed, faults = set(STEADY.names()) - set(CALENDAR) - {"load_N"}, []
+    for name in used.columns:
+        if name in fixed:
+            continue
+        missing = used["file"][used[name].isna()].nunique()
+        if 0 < missing < files:
+            reason = f"{missing} of {files} files have no value: {_what_follows(name, used[name], missing / files)}."
+            fix = "Fill started_at." if name in CALENDAR else "Fill it for these files too."
+            place = {"column": name, "value": float(missing), "severity": "warning", "action": "kept"}
+            faults.append(Fault("incomplete_column", reason, fix=fix, **place))
+    return faults
+
+
+def _what_follows(name: str, column: pd.Series, share: float) -> str:
+    if name == "load_N":
+        return "the loop fits forces in place of coefficients"
+    if name in CALENDAR or (_is_number(column) and share > 1 - LEAST_KNOWN):
+        return "the search for effects leaves the column out"
+    if _is_number(column):
+        return "the search for effects takes them at the mean of their run, else of all files"
+    return f"they are a level of their own, {NO_VALUE}"
+
+
+def _is_number(column: pd.Series) -> bool:
+    return pd.api.types.is_numeric_dtype(column)
+
+
+# ---------------------------------------------------------------- inputs
+# Table `inputs`: every file of a campaign, what was read of it, and whether it is used.
+
+
+def inputs_table(
+    campaign: Path,
+    marks: Fingerprints,
+    plan: Sequence[np.ndarray],
+    parts: Sequence[Made],
+    used: np.ndarray,
+    faults: Sequence[Fault],
+) -> tuple[pd.DataFrame, Fingerprints]:
+    """Return table `inputs`, every trace file of the campaign and those that are not used, and their fingerprints.
+
+    Parameters
+    ----------
+    campaign : Path
+        Campaign folder.
+    marks : Fingerprints
+        The files of the listing, as they were read.
+    plan : sequence of ndarray
+        The files of each part, by their numbers in the listing.
+    parts : sequence of Made
+        The parts.
+    used : ndarray of bool, shape (files,)
+        Which files of the listing have a stroke that is used.
+    faults : sequence of Fault
+        All findings; those that leave out files which are not in the listing name them.
+    """
+    others: dict[str, str] = {}  # files that are not in the listing, and their status
+    for fault in faults:
+        if fault.file is not None and fault.file not in marks.places and fault.action == "file left out":
+            others.setdefault(fault.file, "left out" if fault.severity == "error" else "not matched")
+    marks |= {file: fingerprint(campaign / file) for file in others}
+    counts = np.zeros((2, len(marks)), np.int64)
+    counts[:, np.concatenate(plan)] = np.concatenate([[part.rows, part.found] for part in parts], axis=1)
+    table = pd.DataFrame(
+        {
+            "file": pd.array(list(marks), "str"),
+            "size": pd.array(marks.size, "Int64"),
+            "mtime_ns": pd.array(marks.mtime_ns, "Int64"),
+            "sha256": pd.array(marks.sha256, "str"),
+            "rows": counts[0],
+            "strokes": counts[1],
+            "status": pd.array([*np.where(used, "used", "left out").tolist(), *others.values()], "str"),
+        }
+    )
+    return table, marks.readable()
+
+
+# ---------------------------------------------------------------- campaign
+# A campaign folder to tables: every file read, split and judged, repeats averaged; part by part, on any number of
+# processes.
 
 OF_SAMPLES = (
     "time_s",

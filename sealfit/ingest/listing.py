@@ -1,14 +1,30 @@
-"""What lies in the folders of a campaign: each folder is looked into once, however many files are listed in it."""
+"""Which trace files a campaign has and what its table or its folder says of each: runs.csv, or a glob."""
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Collection, Iterable
+import re
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from difflib import SequenceMatcher
+from fnmatch import fnmatchcase
+from itertools import islice
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from sealfit.ingest.folder import inside
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+
+from sealfit.config import Config
+from sealfit.errors import BadFile, CampaignError, Fault
+from sealfit.ingest.categorical import Coded, Columns
+from sealfit.ingest.columns import nearest, suggestion
+from sealfit.ingest.files import as_number, as_utf8, inside, read_bytes, split_line
+
+# ---------------------------------------------------------------- listing
+# What lies in the folders of a campaign: each folder is looked into once, however many files are listed in it.
 
 
 class _Names(NamedTuple):
@@ -74,3 +90,271 @@ def _ending(file: str) -> str:
     name = file.rpartition("/")[2]
     dot = name.rfind(".")
     return name[dot:] if 0 < dot < len(name) - 1 else ""
+
+
+# ---------------------------------------------------------------- runs csv
+# Which trace files a campaign has and what its table or its folder says of each: runs.csv, or a glob.
+
+RUNS_CSV = "runs.csv"
+KNOWN = (
+    "run_id",
+    "repeat",
+    "specimen_id",
+    "temperature_C",
+    "compression_ratio_pct",
+    "aging_days",
+    "load_N",
+    "speed_mm_s",
+    "started_at",
+)
+
+
+MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
+_DETOURS = ("\\", "//", "/./", "/../")
+_BLANK = b" \t,;\n"  # a line of nothing else is none
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """The place of one trace file in the list, for messages."""
+
+    file: str
+    line: int | None = None  # in runs.csv; None where the file was found by the glob
+
+    def fault(self, check: str, reason: str, column: str | None = None, **rest) -> Fault:
+        """Return a fault at this entry's place: its line in runs.csv, or the file itself."""
+        place = {"file": RUNS_CSV, "line": self.line} if self.line is not None else {"file": self.file}
+        return Fault(check, reason, column=column, **place, **rest)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Entries(Sequence[Entry]):
+    """The trace files of a campaign in order, and their lines in runs.csv, shape (files,), where there is one."""
+
+    files: list[str]
+    lines: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, i: int) -> Entry:
+        return Entry(self.files[i], None if self.lines is None else int(self.lines[i]))
+
+    def take(self, files: np.ndarray) -> Entries:
+        """Return some of the files, by their numbers."""
+        return Entries([self.files[i] for i in files.tolist()], None if self.lines is None else self.lines[files])
+
+
+def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list[Fault]]:
+    """Return the trace files of a campaign in order, what runs.csv says of them, and what was found amiss.
+
+    Cells are text, those that say that there is nothing left out; errors stop the run.
+
+    runs.csv is read where there is one; otherwise the config's glob finds the files, in natural order (2 before 10).
+
+    Raises
+    ------
+    CampaignError
+        If there is no folder, or neither runs.csv nor a glob, or runs.csv cannot be read as a table.
+    """
+    if not campaign.is_dir():
+        what = "is no folder." if campaign.exists() else "does not exist."
+        raise _stop("missing_folder", f"the campaign folder '{campaign}' {what}", "Check the path.")
+    cells: Columns = {}
+    if (campaign / RUNS_CSV).exists() or (campaign / RUNS_CSV).is_symlink():
+        entries, cells, faults = _read_runs(campaign, config)
+    elif config.files.glob is not None:
+        entries, faults = _by_glob(campaign, config)
+    else:
+        count = sum(1 for _ in campaign.rglob("*.csv"))
+        fix = f"Write one (the folder holds {count} CSV files), or give a config with files.glob."
+        raise _stop("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", fix, file=RUNS_CSV)
+    folders = Folders(campaign)
+    outside = folders.outside(entries.files)
+    faults = faults + _paths(campaign, entries, outside) + _unlisted(folders, entries, outside, config)
+    return entries, cells, faults
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """Return a sort key that puts `run2` before `run10`."""
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+
+
+def _stop(check: str, reason: str, fix: str, **place) -> CampaignError:
+    return CampaignError([Fault(check, reason, fix=fix, **place)])
+
+
+def _read_runs(campaign: Path, config: Config) -> tuple[Entries, Columns, list[Fault]]:
+    try:
+        text = as_utf8(read_bytes(campaign, RUNS_CSV), "auto", RUNS_CSV)
+    except BadFile as error:
+        raise _stop(error.fault.check, error.fault.reason, error.fault.fix, file=RUNS_CSV) from error
+    first, head = next(_lines(text), (1, ""))
+    delimiter = max(",;\t", key=head.count)
+    names, faults = _our_names(_cells(head, delimiter) if head else [], config)
+    if "file" not in names:
+        fix = suggestion("file", _cells(head, delimiter) if head else [])
+        raise _stop("missing_column", "there is no such column.", fix, file=RUNS_CSV, line=1, column="file")
+    lines, columns = _plain_table(text, names, delimiter, first) or _line_by_line(text, names, delimiter, faults)
+    if delimiter != ",":  # decimal commas are plain here: no cell of a table of ; or tabs can be split by them
+        columns = {name: column.map(_decimal_point) for name, column in columns.items()}
+    files = _posix_paths(campaign, columns.pop("file").cells())
+    if not files and not any(fault.severity == "error" for fault in faults):
+        raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=RUNS_CSV)
+    return Entries(files, lines), {name: column.map(_said) for name, column in columns.items()}, faults
+
+
+def _lines(text: bytes) -> Iterator[tuple[int, str]]:
+    """Yield number and text of every line that is not blank."""
+    for number, line in enumerate(io.BytesIO(text), start=1):
+        if line.strip(_BLANK):
+            yield number, line.decode().removesuffix("\n")
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    return [cell.strip() for cell in split_line(line, delimiter)]
+
+
+def _said(cell: str) -> str | None:
+    return None if cell.lower() in MISSING else cell
+
+
+def _decimal_point(cell: str) -> str:
+    return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
+
+
+def _plain_table(text: bytes, names: list[str], delimiter: str, first: int) -> tuple[np.ndarray, Columns] | None:
+    """Return what `_line_by_line` would, at once; None unless every line has a cell for every name, none in quotes."""
+    if first > 1 or b'"' in text or len(set(names)) < len(names):
+        return None
+    places = [str(i) for i in range(len(names))]
+    try:
+        table = pa_csv.read_csv(
+            pa.BufferReader(text),
+            pa_csv.ReadOptions(column_names=places, skip_rows=1, block_size=len(text) + 1, use_threads=False),
+            pa_csv.ParseOptions(delimiter=delimiter, quote_char=False, ignore_empty_lines=False),
+            pa_csv.ConvertOptions(column_types=dict.fromkeys(places, pa.dictionary(pa.int32(), pa.string()))),
+        )
+    except pa.ArrowInvalid:
+        return None
+    columns: Columns = {}
+    for name, found in zip(names, table.unify_dictionaries().columns, strict=True):
+        cells = found.combine_chunks()
+        coded = Coded(cells.indices.to_numpy(), cells.dictionary.to_pylist()).map(lambda cell: cell.strip() or None)
+        if name == "file" and not coded.known.all():
+            return None
+        if name:
+            columns[name] = coded
+    return np.arange(2, len(table) + 2), columns
+
+
+def _line_by_line(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) -> tuple[np.ndarray, Columns]:
+    """Return the line of every trace file, shape (files,), and the columns that have a name; adds to `faults`."""
+    lines, rows = [], []
+    for number, line in islice(_lines(text), 1, None):
+        cells = _cells(line, delimiter)
+        if any(cells[len(names) :]):
+            reason = f"the line has {len(cells)} cells where {len(names)} are named."
+            faults.append(Fault("too_many_cells", reason, file=RUNS_CSV, line=number, fix="Quote cells with commas."))
+            continue
+        row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
+        if "file" not in row:
+            reason = "no trace file is named."
+            faults.append(Fault("empty_cell", reason, file=RUNS_CSV, line=number, column="file", fix="Name it."))
+            continue
+        lines.append(number)
+        rows.append(row)
+    return np.array(lines, int), {name: Coded.of(row.get(name) for row in rows) for name in names if name}
+
+
+def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault]]:
+    """Return our name of every column of runs.csv, and faults: missing, doubled, or misspelt columns."""
+    ours = {theirs: name for name, theirs in config.files.runs_columns.items()}
+    names = [ours.get(name, name) for name in header]
+    faults = []
+    for name in sorted({name for name in names if name and names.count(name) > 1}):
+        reason = f"stands {names.count(name)} times in the header."
+        faults.append(Fault("duplicate_column", reason, file=RUNS_CSV, line=1, column=name, fix="Rename one."))
+    for theirs in ours:
+        if theirs not in header:
+            reason, fix = "there is no such column, but files.runs_columns names it.", suggestion(theirs, header)
+            faults.append(Fault("missing_column", reason, file=RUNS_CSV, line=1, column=theirs, fix=fix))
+    wanted = [*dict.fromkeys([*KNOWN, *config.condition])]
+    for name in names:
+        close = nearest(name, wanted) if name not in wanted and name != "file" else ""
+        if close and close.lower() == name.lower() and close not in names:
+            reason, fix = f"differs from '{close}' in the case of letters only.", f"Write '{close}'."
+            faults.append(Fault("column_name", reason, file=RUNS_CSV, line=1, column=name, fix=fix))
+        elif close and close not in names and SequenceMatcher(None, name, close).ratio() > 0.85:
+            reason, fix = f"is kept as a channel; it looks like '{close}'.", f"Write '{close}' if that is meant."
+            place = {"file": RUNS_CSV, "line": 1, "column": name}
+            faults.append(Fault("column_name", reason, severity="warning", action="kept", fix=fix, **place))
+    return names, faults
+
+
+def _posix_paths(campaign: Path, files: list[str]) -> list[str]:
+    text = "/" + "/\n/".join(files) + "/"
+    return [_posix(campaign, file) for file in files] if any(mark in text for mark in _DETOURS) else files
+
+
+def _posix(campaign: Path, file: str) -> str:
+    """Return a path as listed with forward slashes and without detours; Windows' backslashes are understood."""
+    if "\\" in file and not (campaign / file).exists():
+        file = file.replace("\\", "/")
+    return os.path.normpath(file) if file else file
+
+
+def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
+    glob = config.files.glob
+    if PurePosixPath(glob).is_absolute() or ".." in PurePosixPath(glob).parts or not glob:
+        raise _stop("path_outside", f"files.glob = {glob!r} leads outside the campaign folder.", "Make it relative.")
+    files = sorted((p.relative_to(campaign).as_posix() for p in campaign.glob(glob) if not p.is_dir()), key=natural)
+    if not files:
+        fix = "Check the folder, or files.glob in the rig config."
+        raise _stop("missing_file", f"no file in '{campaign}' matches files.glob = {glob!r}.", fix)
+    faults, kept = [], []
+    for file in files:
+        if pattern := next((p for p in config.files.exclude if fnmatchcase(file, p)), None):
+            reason = f"excluded by files.exclude = {pattern!r}."
+            faults.append(Fault("excluded", reason, file=file, severity="info", action="file left out"))
+        else:
+            kept.append(file)
+    return Entries(kept), faults
+
+
+def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:
+    """Return faults of the listed paths: outside the campaign, listed twice, or none of them there."""
+    faults, lines = [], {}
+    fine = not outside and len(set(entries.files)) == len(entries)
+    for entry in () if fine else entries:
+        if entry.file in outside:
+            reason = "the trace file lies outside the campaign folder."
+            fix = "Copy it into the folder of runs.csv and write its path relative to it."
+            faults.append(entry.fault("path_outside", reason, "file", value=entry.file, fix=fix))
+        elif entry.file in lines:
+            reason = f"the trace file is listed already on line {lines[entry.file]}."
+            faults.append(entry.fault("duplicate_file", reason, "file", value=entry.file, fix="Delete one line."))
+        lines.setdefault(entry.file, entry.line)
+    if entries and not faults and not any((campaign / file).is_file() for file in entries.files):
+        reason = f"none of the {len(entries)} trace files listed exists."
+        fix = "Paths are relative to the folder of runs.csv."
+        faults.append(entries[0].fault("missing_file", reason, "file", value=entries[0].file, fix=fix))
+    return faults
+
+
+def _unlisted(folders: Folders, entries: Entries, outside: set[str], config: Config) -> list[Fault]:
+    """Return files that runs.csv does not list: beside the traces and of the same ending, or matched by the glob."""
+    if not entries or entries.lines is None:
+        return []
+    listed = set(entries.files)
+    there = folders.beside(listed - outside)
+    if config.files.glob and ".." not in config.files.glob and not config.files.glob.startswith("/"):
+        found = (p for p in folders.campaign.glob(config.files.glob) if p.is_file())
+        there |= {p.relative_to(folders.campaign).as_posix() for p in found}
+    files = there - listed - {RUNS_CSV}
+    fix = "Add it to runs.csv if it is a trace."
+    return [
+        Fault("not_listed", f"is not in {RUNS_CSV}.", file=f, severity="info", action="file left out", fix=fix)
+        for f in sorted(files, key=natural)
+        if not any(fnmatchcase(f, pattern) for pattern in config.files.exclude)
+    ]

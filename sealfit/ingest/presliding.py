@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealfit.ingest.pieces import median, quantile
+from sealfit.ingest.segments import median, quantile
 
 SETTLED = np.log(50000.0)  # the rise is over when 1/50000 is left: 1/5000 showed in means over a campaign
 AFTER_RAMP = 3.0  # rise lengths after the speed ramp: the bristles follow the changing speed over one rise length

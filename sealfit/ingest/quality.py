@@ -14,9 +14,9 @@ import pandas as pd
 
 from sealfit.config import Config, Quality
 from sealfit.errors import Fault
-from sealfit.ingest.pieces import Pieces
-from sealfit.ingest.spikes import resolution
+from sealfit.ingest.segments import Pieces
 from sealfit.ingest.strokes import Stroke
+from sealfit.ingest.trace_checks import resolution
 from sealfit.tables import QUALITY
 
 LOAD_TOLERANCE = 0.1  # dead weights are better than that, and a wrong plate is worse

@@ -14,12 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sealfit.conditions import condition_columns
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, ConfigError, Fault
-from sealfit.ingest.coded import Columns, columns_of, in_order, nothing, overlaid
+from sealfit.ingest.categorical import Columns, columns_of, condition_columns, in_order, nothing, overlaid
 from sealfit.ingest.columns import RESERVED, beside, suggestion
-from sealfit.ingest.derive import (
+from sealfit.ingest.derived_columns import (
     add_order,
     add_repeats,
     add_runs,
@@ -27,16 +26,14 @@ from sealfit.ingest.derive import (
     as_set,
     condition_keys,
     disagreements,
+    out_of_range,
+    to_values,
 )
-from sealfit.ingest.folder import read_bytes
-from sealfit.ingest.names import TEXT_COLUMNS, name_parts, names_speak
-from sealfit.ingest.read import read_trace
-from sealfit.ingest.refs import Listing, TraceRef
-from sealfit.ingest.run_values import out_of_range, to_values
-from sealfit.ingest.runs_csv import Entries, list_entries
-from sealfit.ingest.speed_check import measured_speed
-from sealfit.ingest.speed_unit import speed_factor
-from sealfit.ingest.text import as_utf8, find_layout, header_fields
+from sealfit.ingest.file_names import TEXT_COLUMNS, Listing, TraceRef, name_parts, names_speak
+from sealfit.ingest.files import as_utf8, find_layout, header_fields, read_bytes
+from sealfit.ingest.listing import Entries, list_entries
+from sealfit.ingest.reader import read_trace
+from sealfit.ingest.trace_checks import measured_speed, speed_factor
 
 
 def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:

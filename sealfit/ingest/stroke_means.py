@@ -1,18 +1,20 @@
-"""Traces to what is known of their strokes: which are of use, their means, and the samples with their place in them."""
+"""Trace files to what is known of their strokes: which are of use, their means, and their samples."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.errors import Fault
-from sealfit.ingest.average import standard_errors
-from sealfit.ingest.pieces import Pieces
+from sealfit.errors import BadFile, Fault
+from sealfit.ingest.averages import standard_errors
+from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.files import Folder
 from sealfit.ingest.quality import (
     equal_neighbours,
     load_faults,
@@ -21,11 +23,20 @@ from sealfit.ingest.quality import (
     stroke_faults,
     suspects,
 )
-from sealfit.ingest.read import Trace
-from sealfit.ingest.refs import TraceRef
-from sealfit.ingest.speed_unit import speed_factor
-from sealfit.ingest.spikes import displacement_spikes, displacement_suspects, force_spikes, force_suspects
+from sealfit.ingest.reader import Trace, read_traces
+from sealfit.ingest.segments import Pieces
 from sealfit.ingest.strokes import Found, displacement_noises_mm, find_all
+from sealfit.ingest.trace_checks import (
+    displacement_spikes,
+    displacement_suspects,
+    force_spikes,
+    force_suspects,
+    speed_factor,
+)
+from sealfit.store.manifest import Fingerprint
+
+# ---------------------------------------------------------------- stroke means
+# Traces to what is known of their strokes: which are of use, their means, and the samples with their place in them.
 
 OWN_SPEED = "speed_file_mm_s"  # what the reader calls a speed column of the trace itself
 ALONG = "speed_bin_mm_s"  # the speed at a sample, of which bins have the mean
@@ -268,3 +279,82 @@ def _most_frequent(labels: np.ndarray) -> str | None:
     """Return the most frequent of labels; null of nothing."""
     found = pd.Series(labels).mode()
     return found.iloc[0] if len(found) else None
+
+
+# ---------------------------------------------------------------- trace file
+# Trace files from the reader to their strokes, the means of these and their samples: what is done per file.
+
+BATCH_BYTES = 4_000_000  # of files held at once, and hardly more: bounds the memory where files are long
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FileStrokes:
+    """What one file gives: its fingerprint, findings, a row per stroke, and its samples as columns of equal length."""
+
+    file: str
+    mark: Fingerprint
+    rows: int
+    faults: tuple[Fault, ...]
+    strokes: tuple[Mapping[str, object], ...] = ()
+    samples: Mapping[str, np.ndarray] | None = None
+
+
+def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
+    """Return the strokes of one trace file; without strokes where the file must be left out, and why.
+
+    Parameters
+    ----------
+    ref : TraceRef
+        The file, and what is known of it as a whole.
+    campaign : Path
+        Campaign folder.
+    config : Config
+        The rig.
+    """
+    (made,) = read_files([ref], campaign, config)
+    return made
+
+
+def read_files(refs: Sequence[TraceRef], campaign: Path, config: Config) -> list[FileStrokes]:
+    """Return the strokes of several trace files, in their order; those that are written alike are read in one go.
+
+    What is returned does not depend on which files are read together, but for the last digit of sums.
+
+    Parameters
+    ----------
+    refs : sequence of TraceRef
+        Some 32 or 64 files; more gain nothing.
+    campaign : Path
+        Campaign folder.
+    config : Config
+        The rig.
+    """
+    folder = Folder(campaign)
+    made: list[FileStrokes] = []
+    batch: list[tuple[TraceRef, Fingerprint, bytes | BadFile]] = []
+    held = 0
+    for ref in refs:
+        try:
+            raw, mark = folder.read(ref.file)
+            batch.append((ref, mark, raw))
+            held += len(raw)
+        except BadFile as error:
+            batch.append((ref, folder.fingerprint(ref.file), error))
+        if held > BATCH_BYTES:
+            made += _strokes_of_batch(batch, config)
+            batch, held = [], 0
+    return made + _strokes_of_batch(batch, config)
+
+
+def _strokes_of_batch(
+    batch: Sequence[tuple[TraceRef, Fingerprint, bytes | BadFile]], config: Config
+) -> list[FileStrokes]:
+    read = iter(read_traces([(ref, raw) for ref, _, raw in batch if isinstance(raw, bytes)], config))
+    found = [next(read) if isinstance(raw, bytes) else raw for _, _, raw in batch]
+    strokes = iter(strokes_of([trace for trace in found if isinstance(trace, Trace)], config))
+    return [
+        FileStrokes(ref.file, mark, made.rows_read, *next(strokes))
+        if isinstance(made, Trace)
+        else FileStrokes(ref.file, mark, 0, made.faults)
+        for (ref, mark, _), made in zip(batch, found, strict=True)
+    ]

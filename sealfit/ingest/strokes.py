@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealfit.config import Strokes
-from sealfit.ingest.pieces import Pieces, median, quantile
-from sealfit.ingest.running import running_mean, running_median
+from sealfit.ingest.segments import Pieces, median, quantile, running_mean, running_median
 from sealfit.ingest.window import slopes, speeds_along, steady_windows
 
 

@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealfit.ingest.pieces import Pieces, median, weighted_medians
 from sealfit.ingest.presliding import Start, rises
-from sealfit.ingest.running import running_median
+from sealfit.ingest.segments import Pieces, median, running_median, weighted_medians
 
 REST = 0.5  # slower than this share of the plateau is a rest, not a ripple of the speed
 STANDSTILL = 0.05  # slower than this share of the plateau: not moving yet, or no more

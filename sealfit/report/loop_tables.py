@@ -8,20 +8,27 @@ import pandas as pd
 from markupsafe import Markup
 
 from sealfit.config import Config
-from sealfit.report.figures_loop import LEVELS
-from sealfit.report.numbers import NOTHING, given, known, measured, number, of_unit, p_value, together
-from sealfit.report.symbols import (
+from sealfit.report.figures.residual import LEVELS
+from sealfit.report.notation import (
+    NOTHING,
     ConditionNames,
     channel_label,
     channel_words,
     effect_label,
+    given,
     joined,
+    known,
+    measured,
+    number,
+    of_unit,
+    p_value,
     split_channels,
     symbol_html,
+    together,
     true_units,
 )
+from sealfit.report.summary import WITHIN
 from sealfit.report.words import PARTS, acts, meaning, target_html
-from sealfit.verdict import WITHIN
 
 MOST_TESTS = 40
 FREE = {

@@ -9,9 +9,22 @@ import pandas as pd
 from markupsafe import Markup
 
 from sealfit.config import Config
-from sealfit.report.numbers import NOTHING, known, measured, number, of_unit, p_value, together
-from sealfit.report.symbols import channel_label, channel_words, effect_label, joined, split_channels, symbol_html
-from sealfit.verdict import power_clause, quality_clause, untold_clause
+from sealfit.report.notation import (
+    NOTHING,
+    channel_label,
+    channel_words,
+    effect_label,
+    joined,
+    known,
+    measured,
+    number,
+    of_unit,
+    p_value,
+    split_channels,
+    symbol_html,
+    together,
+)
+from sealfit.report.summary import power_clause, quality_clause, untold_clause
 
 FLAT = 0.02  # of its span: a shape that crosses zero by less is of one sign
 STARTS = (

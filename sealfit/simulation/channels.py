@@ -9,9 +9,8 @@ import pandas as pd
 from pydantic import Field, model_validator
 
 from sealfit.errors import ConfigError
-from sealfit.simulation.draws import Draws, remembering
+from sealfit.simulation.base import Draws, Strict, remembering
 from sealfit.simulation.formula import evaluate_formula, parse_formula
-from sealfit.simulation.strict import Strict
 
 Level = Literal["file", "run", "specimen", "condition"]
 GROUPS = {"file": "file", "run": "run_id", "specimen": "specimen_id", "condition": "condition"}

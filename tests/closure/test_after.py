@@ -6,22 +6,19 @@ import pandas as pd
 import pytest
 from bins_helpers import TRUE, make_bins, make_traces, warm
 
-from sealfit.closure.after_fits import after_fits
-from sealfit.closure.after_law import after_laws, law_df
+from sealfit.closure.after import KEPT, after_fits, after_laws, at_reference, law_df, reference_of, without_effects
 from sealfit.closure.intervals import t_quantile
-from sealfit.closure.reference import KEPT, at_reference, reference_of, without_effects
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.all_series import law_of
-from sealfit.fit.dynamic import fit_dynamic
-from sealfit.fit.estimate import fit, fit_declared
-from sealfit.fit.joint import evaluate
-from sealfit.fit.lifetime import Goal, lifetime
-from sealfit.fit.rows import make_rows
-from sealfit.fit.shared_curve import shared_levels
-from sealfit.fit.steady import fit_conditions
-from sealfit.fit.terms import Term
-from sealfit.fit.uncertainty import shifts_of
+from sealfit.fit.aging.all_series import law_of
+from sealfit.fit.aging.lifetime import Goal, lifetime
+from sealfit.fit.dynamic.fit import fit_dynamic
+from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint.model import Term, evaluate
+from sealfit.fit.joint.rows import make_rows
+from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.steady.shared_curve import shared_levels
+from sealfit.fit.steady.uncertainty import shifts_of
 from sealfit.tables import AFTER, STEADY_FIT
 
 SCATTER = {"setup": 0.003, "specimen": 0.005, "bins": 10}

@@ -8,9 +8,9 @@ from bins_helpers import make_bins
 from sealfit.closure.confirm import Gain, blocks, confirmed, gain_between_settings, heldout_gain, varies_within
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.estimate import fit, fit_declared
-from sealfit.fit.rows import make_rows
-from sealfit.fit.terms import Term
+from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.rows import make_rows
 
 
 def test_a_form_of_one_number_is_not_asked_between_settings():

@@ -7,14 +7,13 @@ from bins_helpers import make_bins, make_traces
 from scipy import stats
 
 from sealfit.closure.channels import find_channels, level_values, scatter_level, settings, unit_of
-from sealfit.closure.contrasts import ContrastTest, contrast_test, log_p_of_t, slope_log_p, specimens_agree
 from sealfit.closure.loop import close_loop
-from sealfit.closure.pairs import search_pairs
 from sealfit.closure.score_test import ScoreTests
-from sealfit.closure.search import search
+from sealfit.closure.search import search, search_pairs
+from sealfit.closure.small_sample_test import ContrastTest, contrast_test, log_p_of_t, slope_log_p, specimens_agree
 from sealfit.config import Config
-from sealfit.fit.estimate import fit_declared
-from sealfit.fit.rows import make_rows
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.rows import make_rows
 
 FEW_SPEEDS = (1.0, 4.0, 16.0, 64.0)
 

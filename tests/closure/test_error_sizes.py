@@ -2,8 +2,8 @@ import numpy as np
 from bins_helpers import make_bins
 
 from sealfit.closure.error_sizes import lack_of_fit
-from sealfit.fit.estimate import fit_declared
-from sealfit.fit.rows import make_rows
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.rows import make_rows
 
 
 def p_value(seed: int, slope_N: float = 0.0) -> float:

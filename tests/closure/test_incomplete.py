@@ -10,12 +10,12 @@ import pytest
 from campaigns import RIG, SPEEDS
 from effect_kinds import COLUMN, GRADES
 
-from sealfit.fit.rows import make_rows
-from sealfit.ingest.incomplete import NO_VALUE, incomplete_columns
-from sealfit.simulate import Spec, simulate
-from sealfit.steps import STEPS, run
-from sealfit.store import Store
-from sealfit.summary_lines import lines
+from sealfit.fit.joint.rows import make_rows
+from sealfit.ingest.campaign import NO_VALUE, incomplete_columns
+from sealfit.pipeline import STEPS, run
+from sealfit.report.summary_lines import lines
+from sealfit.simulation import Spec, simulate
+from sealfit.store.out_folder import Store
 
 
 @pytest.fixture(scope="module")

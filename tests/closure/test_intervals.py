@@ -5,9 +5,9 @@ from sealfit.closure.intervals import FEW_UNITS, Sandwich, mean_half_width, sand
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.config import Config
-from sealfit.fit.estimate import fit_declared
-from sealfit.fit.rows import make_rows
-from sealfit.fit.tangent import Tangent
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.rows import make_rows
+from sealfit.fit.joint.tangent import Tangent
 
 
 def width(model: dict, points) -> np.ndarray:

@@ -6,9 +6,9 @@ from sealfit.closure.forms import MOST_PLACES, grid_of
 from sealfit.closure.linearised import Linearised, middles
 from sealfit.closure.score_test import Candidate, ScoreTestResult
 from sealfit.effects import EFFECTS
-from sealfit.fit.estimate import fit_declared
-from sealfit.fit.rows import make_rows
-from sealfit.fit.terms import Term
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.rows import make_rows
 
 
 @pytest.mark.parametrize("place", [20, 47.3])

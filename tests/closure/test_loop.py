@@ -10,8 +10,8 @@ from sealfit.closure.predict import predict
 from sealfit.closure.result import BeforeAfter
 from sealfit.config import Config
 from sealfit.errors import RequestError
-from sealfit.fit.estimate import fit_declared
-from sealfit.fit.rows import make_rows
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.rows import make_rows
 from sealfit.tables import RESIDUALS_AFTER, SCHEMAS
 
 CHANNELS = {"lab_temperature_C": lambda rng: 22 + rng.normal(), "batch": lambda rng: str(rng.choice(list("ABC")))}

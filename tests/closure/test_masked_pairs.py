@@ -6,13 +6,11 @@ from bins_helpers import make_bins, make_traces
 
 from sealfit.closure.channels import find_channels
 from sealfit.closure.loop import close_loop
-from sealfit.closure.masked_pairs import search_masked_pairs
-from sealfit.closure.pairs import search_pairs
 from sealfit.closure.score_test import ScoreTests
-from sealfit.closure.search import search
+from sealfit.closure.search import search, search_masked_pairs, search_pairs
 from sealfit.config import Config
-from sealfit.fit.estimate import fit_declared
-from sealfit.fit.rows import make_rows
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.rows import make_rows
 
 FOUR = (1.0, 4.0, 16.0, 64.0)
 PRESSURE = {"pressure_bar": lambda rng: float(rng.integers(1, 8))}

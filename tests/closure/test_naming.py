@@ -7,11 +7,11 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure import naming
-from sealfit.closure.ripple import Peak
+from sealfit.closure.ripples import Peak
 from sealfit.closure.selection import numbered
 from sealfit.effects import EFFECTS
-from sealfit.fit.estimate import fit_declared
-from sealfit.fit.rows import make_rows
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.rows import make_rows
 
 PRICE = 11.5  # of a number, where many strokes are the evidence
 

@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.aliases import find_aliases
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.next_runs import where_apart
+from sealfit.closure.next_runs import find_aliases, where_apart
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Parameter
-from sealfit.fit.estimate import fit_declared, fitted_at
-from sealfit.fit.rows import make_rows
-from sealfit.fit.terms import Term
+from sealfit.fit.joint.estimate import fit_declared, fitted_at
+from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.rows import make_rows
 
 
 def bound(fitted, effect, channel, **values):

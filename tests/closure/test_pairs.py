@@ -4,10 +4,10 @@ from bins_helpers import make_bins, make_traces
 
 from sealfit.closure.channels import Channel
 from sealfit.closure.loop import close_loop
-from sealfit.closure.pairs import mixed_columns
 from sealfit.closure.predict import predict
+from sealfit.closure.search import mixed_columns
 from sealfit.config import Config
-from sealfit.engine import cores
+from sealfit.engine.run_map import cores
 
 COLUMNS = {
     "oil_ppm": lambda rng: rng.normal(50, 10),

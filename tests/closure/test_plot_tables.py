@@ -3,10 +3,10 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.closure.plot_tables import POINTS, curve_table
-from sealfit.fit.estimate import fit
-from sealfit.fit.rows import make_rows
-from sealfit.fit.start import start_model
+from sealfit.closure.output import POINTS, curve_table
+from sealfit.fit.joint.estimate import fit
+from sealfit.fit.joint.rows import make_rows
+from sealfit.fit.joint.search import start_model
 
 
 def test_curves_go_both_ways_over_the_speeds_of_each_condition_at_its_mean_load():

@@ -12,9 +12,9 @@ from sealfit.closure.search import search
 from sealfit.closure.selection import grow, numbered, steady_samples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.estimate import fit, fit_declared
-from sealfit.fit.rows import make_rows
-from sealfit.fit.terms import Term
+from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.rows import make_rows
 
 OIL = {"oil_ppm": lambda rng: rng.normal(50, 10)}
 

@@ -2,7 +2,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sealfit.closure.ripple import find_ripple
+from sealfit.closure.ripples import find_ripple
 
 
 def make_samples(

@@ -5,8 +5,8 @@ from bins_helpers import make_bins
 from sealfit.closure.channels import find_channels, flip_level, free_columns, unit_of
 from sealfit.closure.score_test import ScoreTests, log_p_of
 from sealfit.closure.search import search
-from sealfit.fit.estimate import fit_declared
-from sealfit.fit.rows import make_rows
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.rows import make_rows
 
 CHANNELS = {"lab_temperature_C": lambda rng: 22 + rng.normal(), "batch": lambda rng: str(rng.choice(list("ABC")))}
 

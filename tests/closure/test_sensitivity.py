@@ -10,8 +10,8 @@ from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
 from sealfit.closure.sensitivity import cannot_tell, sensitivity
 from sealfit.config import Config
-from sealfit.fit.estimate import fit_declared
-from sealfit.fit.rows import make_rows
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.rows import make_rows
 
 SMALL = {"temperatures": (60.0,), "days": (1.0, 4.0), "bins": 6, "noise_N": 0.1, "setup": 0.003}
 OIL = {"oil_ppm": lambda rng: rng.normal(100.0, 10.0)}

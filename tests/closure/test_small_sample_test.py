@@ -7,9 +7,9 @@ from sealfit.closure.channels import find_channels
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.small_sample_test import ClusterTests, Root, log_p_of, small_root
-from sealfit.fit.estimate import fit_declared
-from sealfit.fit.rows import make_rows
-from sealfit.fit.tangent import Tangent
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.rows import make_rows
+from sealfit.fit.joint.tangent import Tangent
 
 DAYS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 

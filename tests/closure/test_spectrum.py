@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 from sealfit.closure import spectrum
-from sealfit.closure.ripple import AXES
+from sealfit.closure.ripples import AXES
 from sealfit.closure.spectrum import spectra_of
 
 LENGTH_MM, A_N, PHASE = 2.5, 0.3, 0.8

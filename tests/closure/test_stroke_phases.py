@@ -3,9 +3,9 @@ import pandas as pd
 import pytest
 from bins_helpers import make_bins
 
+from sealfit.closure.ripples import agreement, common_wavelength, pass_shifts
 from sealfit.closure.spectrum import _on_grid
-from sealfit.closure.stroke_phases import agreement, common_wavelength, pass_shifts
-from sealfit.fit.rows import make_rows
+from sealfit.fit.joint.rows import make_rows
 
 
 def made(seed=0, files=10, wavelength=3.0, amplitude=0.1, trend=4.0, noise_N=0.1, periods=9.0):

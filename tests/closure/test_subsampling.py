@@ -11,10 +11,10 @@ from sealfit.closure.selection import grow, numbered, steady_samples
 from sealfit.closure.subsampling import FURTHER, MOST_ROWS, PER_STROKE, ROWS, merged_bins, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.declared import declare
-from sealfit.fit.estimate import fit, fit_declared
-from sealfit.fit.joint import evaluate
-from sealfit.fit.rows import make_rows
+from sealfit.fit.joint.declared import declare
+from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint.model import evaluate
+from sealfit.fit.joint.rows import make_rows
 
 
 @pytest.mark.parametrize(("bins", "repeats"), [(20, 1), (60, 3), (200, 6)])

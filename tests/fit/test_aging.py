@@ -5,10 +5,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from sealfit.config import Config
-from sealfit.fit.aging import aging_curves, fit_series
-from sealfit.fit.law import Values, between_scatter, fit_law, solve_law
-from sealfit.fit.lawprofile import curve_intervals
-from sealfit.fit.steady import fit_conditions
+from sealfit.fit.aging.law import Values, between_scatter, fit_law, solve_law
+from sealfit.fit.aging.law_profiles import curve_intervals
+from sealfit.fit.aging.series import aging_curves, fit_series
+from sealfit.fit.steady.fit import fit_conditions
 from sealfit.physics import aging_law
 from sealfit.tables import AGING_CURVES, AGING_FIT
 

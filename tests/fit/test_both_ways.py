@@ -3,9 +3,9 @@
 import pytest
 
 from sealfit.config import Config
-from sealfit.fit.both_ways import both_ways_together
-from sealfit.fit.steady import fit_conditions
-from sealfit.fit.uncertainty import run_means
+from sealfit.fit.joint.rows import both_ways_together
+from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.steady.uncertainty import run_means
 
 
 def test_one_row_a_file_and_the_offset_between_the_ways_cancels(campaign):

@@ -7,12 +7,18 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from sealfit.effects import EFFECTS
-from sealfit.fit.descent import ROWS_FOR_START, bounds_of, least_squares_within, linear_solved, search_nonlinear
-from sealfit.fit.estimate import fitted_at
-from sealfit.fit.rows import make_rows
-from sealfit.fit.start import start_model
-from sealfit.fit.terms import Term
-from sealfit.fit.whitening import Component, Scatter
+from sealfit.fit.joint.estimate import fitted_at
+from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.rows import make_rows
+from sealfit.fit.joint.search import (
+    ROWS_FOR_START,
+    bounds_of,
+    least_squares_within,
+    linear_solved,
+    search_nonlinear,
+    start_model,
+)
+from sealfit.fit.joint.whitening import Component, Scatter
 
 SCATTER = Scatter(
     0.1, 0.0, (Component("file", "offset", 0.01), Component("run", "gain", 1e-5), Component("specimen", "gain", 1e-5))

@@ -8,17 +8,17 @@ import pandas.testing as pdt
 import pytest
 
 from sealfit.config import load_config
-from sealfit.fit.dynamic import fit_dynamic
-from sealfit.fit.rises import Curve, Stroke
-from sealfit.fit.starts import starts_of, strokes_along
-from sealfit.fit.steady import fit_conditions
-from sealfit.fit.stiffness import fit_stiffness
-from sealfit.ingest import parts
+from sealfit.fit.dynamic.bristle_model import Curve, Stroke
+from sealfit.fit.dynamic.fit import fit_dynamic
+from sealfit.fit.dynamic.starts import starts_of, strokes_along
+from sealfit.fit.dynamic.stiffness import fit_stiffness
+from sealfit.fit.steady.fit import fit_conditions
+from sealfit.ingest import partitions
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.physics import lugre_force
-from sealfit.simulate import Spec, simulate
-from sealfit.steps import STEPS, run
-from sealfit.store import Store
+from sealfit.pipeline import STEPS, run
+from sealfit.simulation import Spec, simulate
+from sealfit.store.out_folder import Store
 
 MODEL = {"mu_s": 0.9, "mu_c": 0.6, "v_s": 5.0, "sigma_2": 0.05, "sigma_0": 100.0, "sigma_1": 0.5}
 LOAD = 49.03
@@ -214,7 +214,7 @@ def test_warming_along_the_stroke_is_no_break_away(tmp_path):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_traces_that_are_read_condition_by_condition_give_the_same(tmp_path, monkeypatch, workers):
-    monkeypatch.setattr(parts, "PART_FILES", 20)
+    monkeypatch.setattr(partitions, "PART_FILES", 20)
     run(SIMULATED, tmp_path, steps=STEPS[:2])
     store = Store.open(tmp_path)
     assert len(store.traces()) > 3

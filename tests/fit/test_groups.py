@@ -1,7 +1,7 @@
 import numpy as np
 import numpy.testing as npt
 
-from sealfit.fit.groups import Groups
+from sealfit.fit.joint.rows import Groups
 
 
 def test_sums_and_means_of_groups():

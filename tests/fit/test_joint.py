@@ -7,12 +7,11 @@ import pytest
 
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
-from sealfit.fit.declared import declare, speed_clusters
-from sealfit.fit.estimate import fit, fit_declared
-from sealfit.fit.joint import Model, evaluate
-from sealfit.fit.rows import make_rows, thin
-from sealfit.fit.start import start_model
-from sealfit.fit.terms import Term, shape_of, term_derivatives
+from sealfit.fit.joint.declared import declare, speed_clusters
+from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
+from sealfit.fit.joint.rows import make_rows, thin
+from sealfit.fit.joint.search import start_model
 
 WAVE = Effect(
     id="wave",

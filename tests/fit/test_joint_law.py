@@ -10,13 +10,20 @@ import pytest
 from scipy.optimize import least_squares
 
 from sealfit.errors import FitError, RequestError
-from sealfit.fit.aged import Aged
-from sealfit.fit.joint_law import fit_joint_law, fit_laws, left_out, rivals_of
-from sealfit.fit.joint_solve import solved_many, solved_without
+from sealfit.fit.aging.joint_law import Aged, fit_joint_law, fit_laws, left_out, rivals_of
+from sealfit.fit.aging.joint_least_squares import solved_many, solved_without
+from sealfit.fit.aging.lifetime import (
+    DAYS_PER_YEAR,
+    Goal,
+    answer,
+    goal_of,
+    lifetime,
+    over_laws,
+    resampled,
+    temperature_for,
+)
 from sealfit.fit.least_squares import central_jacobian
-from sealfit.fit.lifetime import DAYS_PER_YEAR, Goal, lifetime, over_laws, resampled, temperature_for
-from sealfit.fit.lifetime_answer import answer, goal_of
-from sealfit.physics.losses import LOSSES
+from sealfit.physics.aging_laws import LOSSES
 
 MEASURED = os.environ.get("SEALFIT_MEASURED")
 R = 8.314462618e-3

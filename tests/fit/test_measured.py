@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from sealfit.fit.law import solve_law
-from sealfit.fit.stribeck import solve_stribeck
-from sealfit.fit.variable_projection import global_optimum
+from sealfit.fit.aging.law import solve_law
+from sealfit.fit.least_squares import global_optimum
+from sealfit.fit.steady.stribeck import solve_stribeck
 
 MEASURED = os.environ.get("SEALFIT_MEASURED")
 pytestmark = pytest.mark.skipif(MEASURED is None, reason="SEALFIT_MEASURED names no folder of measured data")

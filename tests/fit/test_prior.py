@@ -10,10 +10,10 @@ import pytest
 from sealfit.closure.channels import Channel
 from sealfit.closure.forms import free_term
 from sealfit.effects.free import natural, roughness
-from sealfit.fit.estimate import effective_df, fit, fit_declared
-from sealfit.fit.prior import likely_smoothness, penalised
-from sealfit.fit.rows import make_rows
-from sealfit.fit.terms import shape_of
+from sealfit.fit.joint.estimate import effective_df, fit, fit_declared
+from sealfit.fit.joint.model import shape_of
+from sealfit.fit.joint.prior import likely_smoothness, penalised
+from sealfit.fit.joint.rows import make_rows
 
 KNOTS = tuple(np.linspace(0.0, 1.0, 20))
 

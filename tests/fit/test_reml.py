@@ -2,9 +2,9 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.fit.groups import Groups
-from sealfit.fit.reml import RestrictedLikelihood, orthonormal, reml
-from sealfit.fit.tangent import Tangent
+from sealfit.fit.joint.rows import Groups
+from sealfit.fit.joint.tangent import Tangent
+from sealfit.fit.joint.variance_components import RestrictedLikelihood, orthonormal, reml
 
 
 def nested(files_per_run, runs_per_specimen, specimens):

@@ -4,9 +4,9 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
+from sealfit.fit.dynamic.bristle_model import Curve, Rises, Stroke, _followed
+from sealfit.fit.dynamic.starts import fit_ramps
 from sealfit.fit.least_squares import central_jacobian
-from sealfit.fit.ramps import fit_ramps
-from sealfit.fit.rises import Curve, Rises, Stroke, _followed
 
 CURVE = Curve(44.0, 29.0, 5.0, 0.05)
 

@@ -7,12 +7,13 @@ from scipy.optimize import least_squares
 from steady_tables import MU_C, MU_S
 
 from sealfit.config import Config, Quantity
-from sealfit.fit import all_series, steady
-from sealfit.fit.all_series import aged_values, joint_laws
-from sealfit.fit.joint_law import fit_joint_law
-from sealfit.fit.shared_curve import shared_levels
-from sealfit.fit.steady import fit_conditions
-from sealfit.fit.uncertainty import run_means
+from sealfit.fit.aging import all_series
+from sealfit.fit.aging.all_series import aged_values, joint_laws
+from sealfit.fit.aging.joint_law import fit_joint_law
+from sealfit.fit.steady import fit
+from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.steady.shared_curve import shared_levels
+from sealfit.fit.steady.uncertainty import run_means
 from sealfit.physics import aging_law, stribeck_force
 
 R = 8.314462618e-3
@@ -47,8 +48,8 @@ def run_table(table):
 def test_several_processes_give_the_same_tables(campaign, monkeypatch):
     table, config = campaign(noise=0.01, series=SERIES, laws=arrhenius(), days=DAYS, ways=(1,)), Config()
     one = fit_conditions(table, config)
-    monkeypatch.setattr(steady, "TOGETHER", 10)
-    monkeypatch.setattr(steady, "MANY", 0)
+    monkeypatch.setattr(fit, "TOGETHER", 10)
+    monkeypatch.setattr(fit, "MANY", 0)
     monkeypatch.setattr(all_series, "MANY", 0)
     pdt.assert_frame_equal(fit_conditions(table, config, workers=2), one)
     for alone, shared in zip(joint_laws(table, one, config), joint_laws(table, one, config, workers=2), strict=True):

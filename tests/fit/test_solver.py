@@ -5,8 +5,8 @@ import numpy.testing as npt
 import pytest
 from scipy.optimize import curve_fit, least_squares, nnls
 
-from sealfit.fit.law import solve_law
-from sealfit.fit.stribeck import solve_stribeck
+from sealfit.fit.aging.law import solve_law
+from sealfit.fit.steady.stribeck import solve_stribeck
 
 PROBLEMS = 150
 KINDS = ("plain", "shared", "loads", "limits", "falling", "noisy", "padded", "few")

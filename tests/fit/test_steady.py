@@ -6,8 +6,8 @@ from scipy.optimize import curve_fit
 
 from sealfit.config import Config, Quantity, Sensor
 from sealfit.errors import FitError
-from sealfit.fit.steady import fit_conditions
-from sealfit.fit.uncertainty import likelier, run_means, speed_levels, unit_variance
+from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.steady.uncertainty import likelier, run_means, speed_levels, unit_variance
 from sealfit.tables import STEADY_FIT
 
 TRUTH = {"mu_s": 0.7, "mu_c": 0.45, "v_s": 6.0, "sigma_2": 0.03}

@@ -6,9 +6,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize, nnls
 
 from sealfit.errors import FitError
-from sealfit.fit.interval import constrained_ends
-from sealfit.fit.stribeck import flat_p_value, solve_stribeck, stribeck_intervals
-from sealfit.fit.variable_projection import least_squares_of
+from sealfit.fit.least_squares import least_squares_of
+from sealfit.fit.steady.stribeck import constrained_ends, flat_p_value, solve_stribeck, stribeck_intervals
 from sealfit.physics import stribeck_force
 
 SPEEDS = np.array([0.5, 1.0, 2.0, 4.0, 7.0, 12.0, 25.0, 50.0, 100.0])

@@ -4,10 +4,10 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.fit.groups import Groups
-from sealfit.fit.reml import RestrictedLikelihood, orthonormal
-from sealfit.fit.tangent import Layout, OwnColumns, Tangent, blocks_of
-from sealfit.fit.whitening import Component, Scatter, Whitening
+from sealfit.fit.joint.rows import Groups
+from sealfit.fit.joint.tangent import Layout, OwnColumns, Tangent, blocks_of
+from sealfit.fit.joint.variance_components import RestrictedLikelihood, orthonormal
+from sealfit.fit.joint.whitening import Component, Scatter, Whitening
 
 SETS = [frozenset({0, 2, 3}), frozenset({0}), frozenset({0, 1, 4, 5}), frozenset({0, 6, 7, 8}), frozenset({0, 4, 5})]
 SPECIMENS = np.array([0, 2, 1, 3, 4, 0, 3, 2])  # which set each specimen depends on

@@ -5,9 +5,9 @@ import numpy.testing as npt
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealfit.fit.groups import Groups
-from sealfit.fit.tangent import Tangent
-from sealfit.fit.whitening import Component, Scatter, Whitening
+from sealfit.fit.joint.rows import Groups
+from sealfit.fit.joint.tangent import Tangent
+from sealfit.fit.joint.whitening import Component, Scatter, Whitening
 
 CODES = {
     "stroke": np.repeat(np.arange(10), 3),

@@ -50,7 +50,7 @@ def simulated(name: str) -> Callable[[Path], list[str]]:
     def make(folder: Path) -> list[str]:
         from campaigns import campaign
 
-        from sealfit.simulate import simulate
+        from sealfit.simulation import simulate
 
         simulate(campaign(name, seed=1, strength="strong", rows=120), folder / "campaign")
         return [str(folder / "campaign")]

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealfit.config import Bins
-from sealfit.ingest.average import bin_table, common_by_group, standard_error
-from sealfit.ingest.mean_traces import mean_traces
+from sealfit.ingest.averages import bin_table, common_by_group, mean_traces, standard_error
 
 
 def test_standard_error_of_white_noise_is_s_over_root_n():

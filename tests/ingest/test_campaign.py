@@ -9,7 +9,7 @@ import pytest
 
 from sealfit.config import Bins, Config, Strokes, load_config
 from sealfit.errors import CampaignError
-from sealfit.fit.rows import LEVELS, make_rows
+from sealfit.fit.joint.rows import LEVELS, make_rows
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.tables import SCHEMAS
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sealfit.ingest.coded import Coded, columns_of, in_order, overlaid
+from sealfit.ingest.categorical import Coded, columns_of, in_order, overlaid
 
 cells = st.lists(st.sampled_from([None, "a", "b", "1", 1.0, -0.0, 0.0, 2.5]), min_size=1, max_size=12)
 

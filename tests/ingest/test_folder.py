@@ -3,8 +3,8 @@ import os
 import pytest
 
 from sealfit.errors import BadFile
-from sealfit.fingerprint import Fingerprint, fingerprint
-from sealfit.ingest.folder import Folder
+from sealfit.ingest.files import Folder
+from sealfit.store.manifest import Fingerprint, fingerprint
 
 
 def test_bytes_come_with_the_fingerprint_of_the_file(tmp_path):

@@ -8,7 +8,7 @@ import numpy.testing as npt
 import pytest
 
 from sealfit.config import load_config
-from sealfit.ingest.read import read_trace
+from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
 
 ROOT = Path(__file__).resolve().parents[2]

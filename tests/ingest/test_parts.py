@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealfit.config import Config
-from sealfit.ingest import parts
+from sealfit.ingest import partitions
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.ingest.parts import MOST, PART_FILES, plan_parts
-from sealfit.steps import ingest
-from sealfit.store import Store
+from sealfit.ingest.partitions import MOST, PART_FILES, plan_parts
+from sealfit.pipeline import ingest
+from sealfit.store.out_folder import Store
 
 SAMPLED = ("traces", "traces_mean", "bins")
 SMALL = ("inputs", "runs", "quality", "steady")
@@ -31,24 +31,27 @@ def plan_of(conditions):
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=900))
 def test_every_file_is_in_one_part_and_no_run_is_cut(numbers):
     plan, runs = plan_of([f"day {n}" for n in numbers])
-    assert Counter(i for part in plan for i in part) == Counter(range(len(runs)))
-    assert max(Counter(runs[i] for part in plan for i in {min(part), *part}).values()) == 3
-    homes = Counter(run for part in plan for run in {runs[i] for i in part})
+    assert Counter(i for partitions in plan for i in partitions) == Counter(range(len(runs)))
+    assert max(Counter(runs[i] for partitions in plan for i in {min(partitions), *partitions}).values()) == 3
+    homes = Counter(run for partitions in plan for run in {runs[i] for i in partitions})
     assert set(homes.values()) == {1}
-    assert all(len(part) <= MOST * PART_FILES + 3 for part in plan)
-    assert all(part == sorted(part) for part in plan)
+    assert all(len(partitions) <= MOST * PART_FILES + 3 for partitions in plan)
+    assert all(partitions == sorted(partitions) for partitions in plan)
 
 
 def test_a_condition_lies_in_no_part_but_those_whose_names_span_it():
     conditions = [f"day {(37 * i) % 101}" for i in range(2_000)]
     plan, _ = plan_of(conditions)
-    spans = [(min(conditions[i // 3] for i in part), max(conditions[i // 3] for i in part)) for part in plan]
+    spans = [
+        (min(conditions[i // 3] for i in partitions), max(conditions[i // 3] for i in partitions))
+        for partitions in plan
+    ]
     assert len(spans) > 15
     assert sum(low <= "day 50" <= high for low, high in spans) <= 2
 
 
 def test_large_files_make_parts_of_few():
-    assert [len(part) for part in plan_parts(["a"] * 6, list("112233"), [50_000_000] * 6)] == [2, 2, 2]
+    assert [len(partitions) for partitions in plan_parts(["a"] * 6, list("112233"), [50_000_000] * 6)] == [2, 2, 2]
 
 
 def test_files_added_to_one_condition_change_one_part_in_a_hundred():
@@ -56,13 +59,13 @@ def test_files_added_to_one_condition_change_one_part_in_a_hundred():
     before, _ = plan_of(conditions)
     after, _ = plan_of([*conditions, "day 500"])
     assert len(before) > 80
-    assert len({tuple(part) for part in after} - {tuple(part) for part in before}) <= 3
+    assert len({tuple(partitions) for partitions in after} - {tuple(partitions) for partitions in before}) <= 3
 
 
 # ---------------------------------------------------------------- stored
 @pytest.fixture
 def small_parts(monkeypatch):
-    monkeypatch.setattr(parts, "PART_FILES", 6)
+    monkeypatch.setattr(partitions, "PART_FILES", 6)
 
 
 def write(folder, day, repeat, rows=60, level=30.0, **columns):
@@ -146,15 +149,15 @@ def test_three_added_files_leave_the_other_parts_as_they_are(campaign, tmp_path,
 
 
 def count_reading(monkeypatch, read):
-    from sealfit.ingest import part
+    from sealfit.ingest import partitions
 
-    real = part.read_files
+    real = partitions.read_files
 
     def counted(refs, *args):
         read.extend(ref.file for ref in refs)
         return real(refs, *args)
 
-    monkeypatch.setattr(part, "read_files", counted)
+    monkeypatch.setattr(partitions, "read_files", counted)
 
 
 def test_a_changed_file_and_a_deleted_one_are_seen(campaign, tmp_path):
@@ -252,8 +255,8 @@ def test_tables_do_not_depend_on_the_number_of_processes(campaign, tmp_path, wor
 
 
 def test_a_full_disk_leaves_the_tables_as_they_were(campaign, tmp_path, monkeypatch):
-    from sealfit import parquet
     from sealfit.errors import OutError
+    from sealfit.store import parquet
 
     out = tmp_path / "out"
     ingest(campaign, out)

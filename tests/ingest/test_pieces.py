@@ -3,8 +3,7 @@ import numpy.testing as npt
 import pytest
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from sealfit.ingest.pieces import Pieces, median, quantile, weighted_medians
-from sealfit.ingest.running import running_mean, running_median
+from sealfit.ingest.segments import Pieces, median, quantile, running_mean, running_median, weighted_medians
 
 SIZES = (40, 9, 1, 200, 7, 2, 31)
 

@@ -6,8 +6,8 @@ import pytest
 
 from sealfit.config import Config, Strokes
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.ingest.pieces import Pieces
 from sealfit.ingest.presliding import Start, rises
+from sealfit.ingest.segments import Pieces
 from sealfit.ingest.strokes import find_all
 
 LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N

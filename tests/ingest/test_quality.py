@@ -4,10 +4,10 @@ import pytest
 
 from sealfit.config import Config, Quality, Strokes
 from sealfit.errors import Fault
-from sealfit.ingest.peers import constant_strokes, outlying_files, reversed_strokes
 from sealfit.ingest.quality import load_faults, quality_table, speed_column_faults, stroke_faults, stuck_samples
-from sealfit.ingest.spikes import displacement_spikes, force_spikes, resolution
+from sealfit.ingest.repeat_checks import constant_strokes, outlying_files, reversed_strokes
 from sealfit.ingest.strokes import Stroke, find_strokes
+from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, resolution
 from sealfit.tables import QUALITY
 
 

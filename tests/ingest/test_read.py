@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from trace_helpers import HEADER, ROWS, changed, config, csv_of, read, refused
 
 from sealfit.errors import BadFile
-from sealfit.ingest.read import read_trace
-from sealfit.ingest.refs import TraceRef
+from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.reader import read_trace
 
 
 def test_plain_file_reads_as_written(tmp_path):

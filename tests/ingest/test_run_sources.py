@@ -3,8 +3,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trace_helpers import DAYS, HEADER, channels, config, faults, trace
 
+from sealfit.ingest.listing import natural
 from sealfit.ingest.runs import list_traces
-from sealfit.ingest.runs_csv import natural
 
 NAMED = """
 condition = ["drive"]

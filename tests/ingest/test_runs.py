@@ -4,8 +4,8 @@ from hypothesis import strategies as st
 from trace_helpers import DAYS, campaign, channels, config, faults, trace
 
 from sealfit.errors import CampaignError
-from sealfit.ingest.coded import Coded
-from sealfit.ingest.derive import condition_keys
+from sealfit.ingest.categorical import Coded
+from sealfit.ingest.derived_columns import condition_keys
 from sealfit.ingest.runs import list_traces
 
 FULL = """

@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 from scipy.optimize import nnls
 
-from sealfit.ingest.outlying import outlying_repeats
+from sealfit.ingest.repeat_checks import outlying_repeats
 from sealfit.ingest.scatter import repeat_means, repeat_scatter, two_nonnegative
 
 S0, G = 0.1, 0.01

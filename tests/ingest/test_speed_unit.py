@@ -1,7 +1,7 @@
 import pytest
 
 from sealfit.errors import ConfigError
-from sealfit.ingest.speed_unit import speed_factor
+from sealfit.ingest.trace_checks import speed_factor
 from sealfit.units import Units
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sealfit.config import Quality, Strokes
-from sealfit.ingest.pieces import Pieces
-from sealfit.ingest.spikes import displacement_spikes, displacement_suspects, force_spikes, force_suspects
+from sealfit.ingest.segments import Pieces
 from sealfit.ingest.strokes import displacement_noises_mm, find_all
+from sealfit.ingest.trace_checks import displacement_spikes, displacement_suspects, force_spikes, force_suspects
 
 
 def traces(seed, count=40):

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealfit.config import Strokes
-from sealfit.ingest.pieces import Pieces
 from sealfit.ingest.presliding import rise_end_mm
+from sealfit.ingest.segments import Pieces
 from sealfit.ingest.strokes import displacement_noises_mm, find_all, find_strokes, turning_rows
 from sealfit.ingest.window import slopes
 

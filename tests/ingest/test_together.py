@@ -4,9 +4,9 @@ import pytest
 from trace_helpers import HEADER, ROWS, changed, config, csv_of
 
 from sealfit.errors import BadFile
-from sealfit.ingest.folder import read_bytes
-from sealfit.ingest.read import Trace, read_trace, read_traces
-from sealfit.ingest.refs import TraceRef
+from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.files import read_bytes
+from sealfit.ingest.reader import Trace, read_trace, read_traces
 
 WITH_CHANNEL = [f"{row},{20 + i % 3}" for i, row in enumerate(ROWS)]
 WITH_GAPS = [*WITH_CHANNEL[:7], f"{ROWS[7]},", *WITH_CHANNEL[8:]]

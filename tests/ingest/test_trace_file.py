@@ -3,9 +3,9 @@ import numpy.testing as npt
 import pytest
 from trace_helpers import config
 
-from sealfit.ingest import stroke_means, trace_file
-from sealfit.ingest.refs import TraceRef
-from sealfit.ingest.trace_file import read_files, read_strokes
+from sealfit.ingest import stroke_means
+from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.stroke_means import read_files, read_strokes
 
 
 def stroke_file(folder, file, *, strokes=1, rows=300, resolution=0.0, spoil=None, channel=None):
@@ -63,7 +63,7 @@ def refs(tmp_path):
 
 @pytest.mark.parametrize(("batch_bytes", "bundle_rows"), [(4_000_000, 16_384), (20_000, 500)])
 def test_files_read_together_give_what_each_gives_alone(tmp_path, refs, monkeypatch, batch_bytes, bundle_rows):
-    monkeypatch.setattr(trace_file, "BATCH_BYTES", batch_bytes)
+    monkeypatch.setattr(stroke_means, "BATCH_BYTES", batch_bytes)
     monkeypatch.setattr(stroke_means, "BUNDLE_ROWS", bundle_rows)
     found = read_files(refs, tmp_path, config())
     assert {fault.check for made in found for fault in made.faults} >= {"spike", "stuck", "no_motion", "empty_file"}

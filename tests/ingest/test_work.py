@@ -8,10 +8,10 @@ import pandas as pd
 import pytest
 from trace_helpers import campaign, config
 
-from sealfit.ingest import listing, outlying, peers, run_values
-from sealfit.ingest.folder import inside
+from sealfit.ingest import derived_columns, listing, repeat_checks
+from sealfit.ingest.files import inside
 from sealfit.ingest.listing import Folders
-from sealfit.ingest.outlying import outlying_repeats
+from sealfit.ingest.repeat_checks import outlying_repeats
 from sealfit.ingest.runs import list_traces
 
 HEAD = "file,run_id,repeat,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s,started_at"
@@ -42,7 +42,7 @@ def test_listing_follows_links_per_folder_and_reads_each_different_cell_once(tmp
     work = []
     for files in (30, 300):
         folder = listed(tmp_path / str(files), files)
-        resolved, parsed = counted(monkeypatch, listing, "inside"), counted(monkeypatch, run_values, "as_number")
+        resolved, parsed = counted(monkeypatch, listing, "inside"), counted(monkeypatch, derived_columns, "as_number")
         looked = counted(monkeypatch, os, "scandir")
         refs, faults = list_traces(folder, config())
         assert (len(refs), faults) == (files, [])
@@ -103,7 +103,7 @@ def repeats(runs, seed, far):
 def test_fits_of_the_scatter_do_not_grow_with_the_number_of_far_repeats(monkeypatch):
     fits = []
     for runs in (2_000, 8_000):
-        calls = counted(monkeypatch, outlying, "fit_scatter")
+        calls = counted(monkeypatch, repeat_checks, "fit_scatter")
         found = outlying_repeats(repeats(runs, 1, runs // 50), 0.001)
         assert len(found) >= runs // 50
         fits.append(len(calls))
@@ -115,7 +115,7 @@ def test_fits_of_the_scatter_do_not_grow_with_the_number_of_far_repeats(monkeypa
 def test_taken_together_the_same_repeats_are_found_as_one_by_one(seed, monkeypatch):
     means = repeats(1_500, seed, 20)
     together = outlying_repeats(means, 0.001).set_index("file").sort_index()
-    monkeypatch.setattr(outlying, "TOGETHER", 0.0)
+    monkeypatch.setattr(repeat_checks, "TOGETHER", 0.0)
     alone = outlying_repeats(means, 0.001).set_index("file").sort_index()
     assert together.index.tolist() == alone.index.tolist()
     np.testing.assert_allclose(together["run_mean_N"], alone["run_mean_N"], rtol=1e-3)
@@ -128,7 +128,7 @@ def test_strokes_with_turned_signs_are_not_each_compared_with_all(monkeypatch):
         {"file": [f"{k}.csv" for k in range(60)], "run": [f"r{k // 3}" for k in range(60)], "stroke": 1,
          "several": False, "direction": 1, "force_N": [-20.0] * 59 + [20.0], "used": True}
     )  # fmt: skip
-    keep, found = peers.reversed_strokes(strokes)
+    keep, found = repeat_checks.reversed_strokes(strokes)
     assert (keep.all(), len(found), len(looked)) == (True, 59, 0)
 
 
@@ -138,7 +138,7 @@ def test_a_turned_stroke_is_held_against_the_median_of_its_mates():
         {"file": list("abcdef"), "stroke": 1, "several": False, "run": ["x"] * 4 + ["y"] * 2, "direction": 1,
          "force_N": forces, "used": True}
     )  # fmt: skip
-    keep, found = peers.reversed_strokes(strokes)
+    keep, found = repeat_checks.reversed_strokes(strokes)
     # -21 against the median 22 of 20, 22, 24; -9 against the median 22 of 20, 22, -21, 24, 30: not below -11.
     assert keep.tolist() == [True, True, False, True, True, True]
     assert [fault.severity for fault in found] == ["error", "warning"]

@@ -27,9 +27,9 @@ from report.made_tables import (
     trace,
 )
 
-from sealfit.conditions import add_keys
 from sealfit.config import Config
-from sealfit.fit.all_series import joint_laws
+from sealfit.fit.aging.all_series import joint_laws
+from sealfit.ingest.categorical import add_keys
 
 NAMES = (
     "inputs",

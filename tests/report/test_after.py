@@ -6,9 +6,8 @@ import pytest
 from report.made_campaigns import Made, aging_campaign
 from report.test_page import Page
 
-from sealfit.report.law_tables import law_rows
 from sealfit.report.page import FITS, build_report, with_answer
-from sealfit.report.parameters import parameter_tables
+from sealfit.report.parameter_tables import law_rows, parameter_tables
 
 HIGHER = 1.04
 

@@ -13,15 +13,11 @@ from report.made_campaigns import Made, aging_campaign, not_run, paper_sized, to
 from report.made_tables import DROP, empty, shapes, table
 
 from sealfit.config import Config
-from sealfit.report.axes import is_logarithmic, value_ticks
-from sealfit.report.drawn import draw
 from sealfit.report.figures import draw_all
-from sealfit.report.figures_curves import draw_aging, draw_trace, envelope, example_runs, traces_mean
-from sealfit.report.figures_laws import draw_master_curve
-from sealfit.report.figures_loop import draw_errors, draw_levels, run_means
-from sealfit.report.figures_residual import channel_order, draw_channel, draw_shape
-from sealfit.report.figures_speed import curve_lines, force_speed, run_points
-from sealfit.report.style import Key, Panel, Plot, panel_figure
+from sealfit.report.figures.aging import draw_aging, draw_master_curve, draw_trace, envelope, example_runs, traces_mean
+from sealfit.report.figures.residual import channel_order, draw_channel, draw_errors, draw_levels, draw_shape, run_means
+from sealfit.report.figures.speed import curve_lines, force_speed, run_points
+from sealfit.report.style import Key, Panel, Plot, draw, is_logarithmic, panel_figure, value_ticks
 from sealfit.units import Units
 
 TORQUE = Units({"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")})

@@ -3,7 +3,7 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealfit.report.numbers import decimals, measured, number, p_value, together, uncertain
+from sealfit.report.notation import decimals, measured, number, p_value, together, uncertain
 
 SIGNS = str.maketrans("−⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "--0123456789")
 sizes = st.floats(1e-12, 1e12)

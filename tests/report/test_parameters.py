@@ -3,7 +3,7 @@ from report.made_campaigns import aging_campaign, torque_campaign
 from report.made_tables import empty, table
 
 from sealfit.config import Config
-from sealfit.report.parameters import parameter_tables
+from sealfit.report.parameter_tables import parameter_tables
 
 
 def test_a_row_per_condition_with_u_sys_apart():

@@ -6,13 +6,13 @@ from report.made_campaigns import aging_campaign
 from report.made_tables import table
 
 from sealfit.config import Config
-from sealfit.report import facts
-from sealfit.report.drawn import draw
-from sealfit.report.figures_curves import aging
-from sealfit.report.figures_speed import force_speed
+from sealfit.report import page
+from sealfit.report.excerpts import condition_misfits, spread, telling
+from sealfit.report.figures.aging import aging
+from sealfit.report.figures.speed import force_speed
 from sealfit.report.page import build_report
-from sealfit.report.parameters import break_away_rows, parameter_tables
-from sealfit.report.shown import condition_misfits, spread, telling
+from sealfit.report.parameter_tables import break_away_rows, parameter_tables
+from sealfit.report.style import draw
 
 TEMPERATURES = (20, 30, 40, 50, 60, 70, 80)
 
@@ -85,7 +85,7 @@ def steady_rows(days, runs=1):
 
 def drawn_of(rows):
     names = ("curves", "steady_fit", "residuals_after")
-    return force_speed({**facts.complete({}, names), "steady": rows}, Config())
+    return force_speed({**page.complete({}, names), "steady": rows}, Config())
 
 
 def test_many_days_of_a_series_are_thinned():
@@ -132,7 +132,7 @@ def test_break_aways_are_cut_and_counted():
 
 def test_inputs_are_cut_and_counted():
     every = [{"file": f"{k}.csv", "size": 10, "sha256": "ab"} for k in range(2500)]
-    found = facts.provenance_facts({"inputs": every})
+    found = page.provenance_facts({"inputs": every})
     assert (len(found["inputs"]), found["inputs_in_all"], found["bytes"]) == (2000, 2500, 25000)
     html = build_report({}, None, {"inputs": every}, Config()).html
     assert "The first 2000 of 2500; all of them stand in inputs.parquet." in html

@@ -1,7 +1,7 @@
 import pytest
 
 from sealfit.config import Config
-from sealfit.report.symbols import (
+from sealfit.report.notation import (
     ConditionNames,
     channel_label,
     plain,

@@ -1,7 +1,7 @@
 import pandas as pd
 import pytest
 
-from sealfit.simulate import Spec, load_truth, simulate, truth_path
+from sealfit.simulation import Spec, load_truth, simulate, truth_path
 
 
 @pytest.fixture

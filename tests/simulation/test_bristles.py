@@ -5,7 +5,7 @@ from simulation_helpers import ONE_CONDITION
 
 from sealfit.errors import ConfigError
 from sealfit.physics import lugre_force
-from sealfit.simulate import Spec, simulate
+from sealfit.simulation import Spec, simulate
 
 MODEL = {"mu_s": 0.8, "mu_c": 0.5, "v_s": 5.0, "sigma_0": 60.0, "sigma_1": 0.3, "sigma_2": 0.05}
 PHYSICS = {

@@ -10,7 +10,7 @@ from simulation_helpers import ONE_CONDITION, POINT, effect, mean_forces, steady
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect, Parameter
 from sealfit.errors import ConfigError, RequestError
-from sealfit.simulate import Spec, simulate, true_force
+from sealfit.simulation import Spec, simulate, true_force
 
 
 @pytest.mark.parametrize(

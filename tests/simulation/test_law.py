@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from simulation_helpers import ONE_CONDITION, POINT, mean_forces, steady
 
-from sealfit.simulate import Spec, true_force
+from sealfit.simulation import Spec, true_force
 
 
 def test_steady_force_is_eq_14_by_hand(campaign):

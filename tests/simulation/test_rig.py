@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 from simulation_helpers import ONE_CONDITION, effect, mean_forces
 
-from sealfit.simulate import true_force
+from sealfit.simulation import true_force
 
 
 def test_a_trace_rests_ramps_rises_slides_and_stops(campaign):

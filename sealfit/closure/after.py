@@ -1,0 +1,378 @@
+"""Everything that the fits say, once more with the effects taken out at their reference state."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.intervals import degrees_of_freedom, t_quantile
+from sealfit.config import Config
+from sealfit.fit.aging.all_series import joint_laws
+from sealfit.fit.aging.law import search_limits
+from sealfit.fit.aging.law_profiles import CurveInterval
+from sealfit.fit.aging.law_table import Curve, Estimate, covariance_rows, law_rows, without_law
+from sealfit.fit.aging.series import CURVE_POINTS
+from sealfit.fit.dynamic.fit import fit_dynamic
+from sealfit.fit.joint.declared import series_of_curve
+from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint.model import Model, Term, evaluate
+from sealfit.fit.joint.rows import POWER, Rows, point_rows
+from sealfit.fit.steady.fit import FORCES, fit_conditions, parameter_units, table_row
+from sealfit.fit.steady.uncertainty import SHIFT
+from sealfit.progress import timed
+from sealfit.store.parquet import StoredTraces
+from sealfit.tables import AFTER, AGING_CURVES, AGING_FIT, SCHEMAS
+
+# ---------------------------------------------------------------- reference
+# The reference state of the after-model: where its effects are zero, and what they add to the measured forces.
+#
+# The coefficients of the after-model are those at the reference: the contact cold, the offset removed, a column at its
+# reference value. An effect of the condition columns alone (of days, say) is part of a condition and stays in its
+# values.
+
+KEPT = "not taken out: part of the aging condition"
+SMALL = 1e-4  # share of the effects' variance that may be dropped with the smallest principal directions
+
+
+def is_kept(term: Term, config: Config) -> bool:
+    """Return whether an effect is part of the conditions: it reads nothing but their columns."""
+    return set(term.channels) <= {*config.condition, *config.rubber}
+
+
+def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str:
+    """Return in words where an effect is zero, or that it is not taken out.
+
+    Parameters
+    ----------
+    term : Term
+        The effect on its channels.
+    values : mapping of str to float
+        Its fitted parameters.
+    config : Config
+        Names the condition columns, and gives channels their true units.
+    """
+    if is_kept(term, config):
+        return KEPT
+    labels = {name: config.units.label(name) for name in term.channels}
+    known = {"x": labels[term.channels[0]], "z": labels[term.channels[-1]], **labels}
+    known |= {name: f"{value:.4g}" for name, value in (*term.fixed.items(), *values.items()) if np.isscalar(value)}
+    words = term.effect.reference or f"where {term.effect.form} = 0"
+    return re.sub(r"\{(\w+)\}", lambda found: str(known.get(found[1], found[1])), words)
+
+
+def at_reference(model: Model, config: Config) -> Model:
+    """Return the model with its effects at their reference: only those that are part of a condition are left."""
+    kept = [k for k, term in enumerate(model.terms) if is_kept(term, config)]
+    return replace(model, terms=tuple(model.terms[k] for k in kept), values=tuple(model.values[k] for k in kept))
+
+
+def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.DataFrame:
+    """Return table `steady_after`: the strokes' mean forces with the effects taken out at their reference.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`.
+    after : Fitted
+        The after-model, fitted to all bins.
+    config : Config
+        Names the condition columns.
+
+    Returns
+    -------
+    DataFrame
+        `steady` with `force_N` less `effects_N`, the effects' mean over the steady window; `effects_start_N`, their
+        force where the stroke starts; and columns `effects_u1_N`, ...: by how much the force in the direction of motion
+        changes along each principal direction of the effects' uncertainty, for one standard error. A stroke without
+        bins is not used.
+
+    Notes
+    -----
+    The effects' covariance is that of the joint fit. In a linear model, a fit to the corrected forces, with this
+    covariance propagated through it, gives the estimate and the covariance of the joint fit (Frisch & Waugh 1933,
+    Econometrica 1(4), 387-401, doi:10.2307/1907330).
+    """
+    model, rows = after.model, after.rows
+    force, tangent = evaluate(model, rows)
+    reference = at_reference(model, config)
+    effects = force - evaluate(reference, rows, jacobian=False)[0]
+    taken = [k for k, term in enumerate(model.terms) if not is_kept(term, config)]
+    places = np.array([i for k in taken for i in range(*model.place(k).indices(model.size))], int)
+    last = tangent.values.shape[1] - model.size
+    principal = _principal(tangent.values[:, last + places], after.covariance[np.ix_(places, places)], rows)
+    columns = {"effects_N": effects, "effects_start_N": _at_start(model, reference, rows)}
+    columns |= {f"{SHIFT}{k + 1}_N": principal[:, k] * np.sign(rows.speed) for k in range(principal.shape[1])}
+    keys = [rows.table["file"], rows.table["stroke"]]
+    weight = rows.table["n"].astype(float)
+    means = pd.DataFrame(columns).mul(weight, axis=0).groupby(keys).sum().div(weight.groupby(keys).sum(), axis=0)
+    found = means.reindex(pd.MultiIndex.from_frame(steady[["file", "stroke"]])).reset_index(drop=True)
+    known = found["effects_N"].notna()
+    table = steady.reset_index(drop=True).join(found.fillna(0.0))
+    return table.assign(force_N=table["force_N"] - table["effects_N"], used=table["used"].astype(bool) & known)
+
+
+def _principal(columns: np.ndarray, covariance: np.ndarray, rows: Rows) -> np.ndarray:
+    """Return L with L L' = J C J' for derivatives J, shape (n, p), and a covariance C, shape (p, p); few columns.
+
+    Directions whose mean over the strokes is small are dropped: a fit to the strokes does not see them.
+    """
+    if not columns.size:
+        return columns
+    size, axes = np.linalg.eigh(covariance)
+    spread = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))
+    stroke = rows.codes("stroke")
+    means = np.column_stack([np.bincount(stroke, column) for column in spread.T]) / np.bincount(stroke)[:, None]
+    _, singular, turned = np.linalg.svd(means, full_matrices=False)
+    share = np.cumsum(singular[::-1] ** 2)[::-1]
+    kept = share > SMALL * share[0]
+    return spread @ turned[kept].T
+
+
+def _at_start(model: Model, reference: Model, rows: Rows) -> np.ndarray:
+    """Return the effects' force at the start of each row's stroke, shape (n,): at distance and time 0."""
+    table, way = rows.table, np.sign(rows.speed)
+    origin = table["displacement_mm"] - way * table["distance_mm"].to_numpy(float)
+    start = table.assign(displacement_mm=origin, distance_mm=0.0, time_s=0.0)
+    begun = replace(rows, table=start, cache={})
+    return evaluate(model, begun, jacobian=False)[0] - evaluate(reference, begun, jacobian=False)[0]
+
+
+# ---------------------------------------------------------------- after law
+# The law of aging of every series as the after-model has it: Eq. 15 from the joint fit, effects at their reference.
+
+SLOW, FAST = 1e-6, 12.0  # of v_s: there the force is mu_s N, and mu_c N but for the viscous term
+WIDEST = 700.0  # of a logarithm
+
+
+def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return tables `aging_fit_after` and `aging_curves_after`; empty without aging.
+
+    Parameters
+    ----------
+    after : Fitted
+        The after-model, fitted to all bins.
+    steady_fit : DataFrame
+        Table `steady_fit_after`: the values of single conditions, which the laws are compared with.
+    config : Config
+        Names the condition columns and the units.
+
+    Notes
+    -----
+    mu_0, a and b are numbers of the joint fit, and so are their standard errors. Their intervals have Student's t on
+    specimens less the numbers of one coefficient; that of b is symmetric in its logarithm. Effects that are part of the
+    condition (of days) multiply or change the law; the curves hold them.
+    """
+    rows, curves = [], []
+    open_columns = [name for name in config.series_columns if name in steady_fit.columns]
+    for law in _laws(after, config) if config.aging else ():
+        rows += [{"rubber": law.rubber, **row} for row in law.rows(steady_fit)]
+        if law.place is not None:
+            curves.append(law.curve())
+    columns = [*AGING_FIT.names(), *open_columns]
+    drawn = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=AGING_CURVES.names())
+    if not rows:
+        return pd.DataFrame(columns=columns), drawn
+    keys = steady_fit.groupby("series", sort=True)[open_columns].first().reset_index()
+    table = pd.DataFrame(rows).merge(keys, on="series", how="left", validate="many_to_one")
+    return table.assign(model="after")[columns], drawn
+
+
+def law_df(after: Fitted) -> float:
+    """Return the degrees of freedom of the laws' intervals: specimens less the numbers fitted to one coefficient.
+
+    Few specimens show their scatter badly, often as none at all; that of the runs then has too many degrees of freedom.
+    """
+    left = after.rows.groups.starts["specimen"].size - after.model.declared.numbers_of_mu
+    return min(degrees_of_freedom(after), float(max(left, 1)))
+
+
+def _laws(after: Fitted, config: Config) -> Iterator[_Law]:
+    """Yield every series and quantity: those that the forces determine in some condition of the rubber."""
+    conditions, index = after.rows.conditions, after.model.declared.index
+    series = series_of_curve(conditions, aging=True)
+    aged = conditions["aging_days"].to_numpy(float) > 0
+    for name in sorted(set(series[aged])):
+        own = np.flatnonzero((series == name) & aged)
+        rubber = (conditions["rubber"] == conditions["rubber"].iloc[own[0]]).to_numpy()
+        for end in "sc":
+            if (index[f"mu_0{end}"][rubber] >= 0).any():
+                yield _Law(after, config, name, own, end)
+
+
+class _Law:
+    """Eq. 15 of one quantity of one series in the after-model; `place` is None where it has none."""
+
+    def __init__(self, after: Fitted, config: Config, series: str, conditions: np.ndarray, end: str) -> None:
+        self.after, self.config, self.series, self.end = after, config, series, end
+        table, declared = after.rows.conditions, after.model.declared
+        self.conditions = conditions  # aged
+        self.rubber = str(table["rubber"].iloc[conditions[0]])
+        days = table["aging_days"].to_numpy(float)
+        self.unaged = bool((days[(table["rubber"] == self.rubber).to_numpy()] == 0).any())
+        symbol = f"mu_{end}"
+        self.quantity = symbol if declared.has_load else FORCES[symbol]
+        self.unit = parameter_units(config.units, declared.has_load)["mu_s"]
+        names = (f"mu_0{end}", f"a_{end}", f"b_{end}")
+        number = [int(declared.index[name][self.conditions[0]]) for name in names]
+        self.place = number if min(number) >= 0 else None
+        self.curve_of = Curve(series, self.quantity, 0, np.unique(days[self.conditions]))
+        self.df = law_df(after)
+
+    def rows(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
+        """Yield the rows of `aging_fit_after`."""
+        if self.place is None:
+            yield from without_law(self.curve_of, self.unit, self.unaged)
+            return
+        found = self._estimate()
+        words, interval = "; ".join(self._kept_words()), self._interval(found)
+        for row in law_rows(
+            self.curve_of, found, t_quantile(self.df), interval, self.unit, unaged=self.unaged, df=self.df
+        ):
+            yield {**row, "reason": " ".join(part for part in (row["reason"], words) if part)}
+        yield from self._statistics(steady_fit)
+        yield from covariance_rows(self.curve_of, found.covariance, self.unit)
+
+    def _estimate(self) -> Estimate:
+        after, at = self.after, self.place
+        sensor = after.whitening((np.sign(after.rows.speed) * self.config.sensor.u)[:, None])[:, 0]
+        shift = after.covariance[at] @ after.white_jacobian.against(sensor)
+        return Estimate(after.model.theta[at], after.covariance[np.ix_(at, at)], shift)
+
+    def _interval(self, found: Estimate) -> CurveInterval:
+        """Return the 95 % limits of a, b and c; b is open beyond where a law is ever sought."""
+        t, error = t_quantile(self.df), np.sqrt(np.diag(found.covariance))
+        low, high = (found.x[2] + s * t * error[2] for s in (-1, 1))
+        first, last = search_limits(self.curve_of.days)
+        b = (float(np.exp(low)) if low > first else 0.0, float(np.exp(min(high, WIDEST))) if high < last else np.inf)
+        c, half = -found.x[1] * found.x[2], t * found.error_of_c()
+        return CurveInterval((found.x[1] - t * error[1], found.x[1] + t * error[1]), b, (c - half, c + half))
+
+    def _kept_words(self) -> list[str]:
+        changed = {"force", "mu", f"mu_{self.end}", "mu_0", "a", "b"}
+        kept = [t for t in self.after.model.terms if is_kept(t, self.config) and t.acts_on in changed]
+        return [f"The effect {t.effect.id} of {' and '.join(t.channels)} acts on top of it." for t in kept]
+
+    def _statistics(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
+        """Yield how far the values of single conditions lie from the law, and what its intervals rest on."""
+        own = steady_fit[(steady_fit["quantity"] == "steady") & (steady_fit["parameter"] == self.quantity)]
+        own = own[own["identified"].astype(bool)].set_index("condition")["value"]
+        names = self.after.rows.conditions["condition"].to_numpy()[self.conditions]
+        days = self.after.rows.conditions["aging_days"].to_numpy(float)[self.conditions]
+        measured = own.reindex(names).to_numpy(float)
+        law = self._values(days)[0]
+        gap = (law - measured)[np.isfinite(measured)]
+        share = (law / measured - 1)[np.isfinite(measured)]
+        friction = self.after.friction
+        specimen = self.after.scatter.level_variance("specimen", friction).mean() / np.mean(friction**2)
+        for name, value, unit in (
+            ("specimen_sd_pct", 100 * np.sqrt(specimen), "%"),
+            ("error_df", self.df, ""),
+            ("max_error_pct", 100 * np.abs(share).max() if share.size else None, "%"),
+            ("rmse", np.sqrt(np.mean(gap**2)) if gap.size else None, self.unit),
+            ("n_days", self.curve_of.days.size + self.unaged, ""),
+            ("last_day", self.curve_of.days[-1], "d"),
+        ):
+            parameter = f"{self.quantity}:{name}"
+            row = table_row(quantity="statistics", parameter=parameter, value=value, unit=unit, identified=True)
+            yield {**row, "series": self.series}
+
+    def curve(self) -> pd.DataFrame:
+        """Return the law along aging time with its 95 % band, the effects of the condition in it."""
+        days = self.curve_of.days[-1] * np.linspace(0, 1, CURVE_POINTS) ** 2
+        value, error = self._values(days)
+        half = t_quantile(self.df) * error
+        columns = {"aging_days": days, "value": value, "lo95": value - half, "hi95": value + half}
+        return pd.DataFrame({"series": self.series, "quantity": self.quantity, **columns})[AGING_CURVES.names()]
+
+    def _values(self, days: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the coefficient at some days and its standard error, shape (n,) each."""
+        after, config, rows = self.after, self.config, self.after.rows
+        model = at_reference(after.model, config)
+        for number in reversed([k for k, term in enumerate(model.terms) if term.acts_on in ("v_s", "sigma_2")]):
+            model = model.without_term(number)  # they change no coefficient
+        declared = model.declared
+        condition = int(self.conditions[0])
+        index = {name: int(declared.index[name][condition]) for name in ("v_s", "sigma_2")}
+        v_s = float(np.exp(model.theta[index["v_s"]])) if index["v_s"] >= 0 else 1.0
+        theta = model.theta.copy()
+        if index["sigma_2"] >= 0:
+            theta[index["sigma_2"]] = 0.0
+        load = float(rows.load.mean())
+        first = rows.table[rows.condition == condition].iloc[[0]]
+        table = pd.concat([first] * days.size, ignore_index=True)
+        table = table.assign(aging_days=days, speed_mm_s=v_s * (SLOW if self.end == "s" else FAST), load_N=load)
+        code = np.full(days.size, condition)
+        at = point_rows(
+            table.drop(columns=[POWER], errors="ignore"),
+            code,
+            rows.conditions,
+            has_load=rows.has_load,
+            has_aging=rows.has_aging,
+        )
+        force, tangent = evaluate(replace(model, theta=theta), replace(at, days=days))
+        kept = [np.arange(after.model.size)[after.model.place(after.model.terms.index(term))] for term in model.terms]
+        slope = np.zeros((days.size, after.model.size))
+        slope[:, np.concatenate([np.arange(theta.size), *kept])] = tangent.toarray()
+        slope[:, list(index.values())] = 0.0
+        scale = load if rows.has_load else 1.0
+        return force / scale, np.sqrt(np.einsum("ni,ij,nj->n", slope, after.covariance, slope)) / scale
+
+
+# ---------------------------------------------------------------- after fits
+# Everything that the fits say, once more with the after-model's effects taken out at their reference.
+
+
+def after_fits(
+    after: Fitted,
+    steady: pd.DataFrame,
+    traces: pd.DataFrame | Sequence[StoredTraces],
+    config: Config,
+    *,
+    workers: int = 1,
+) -> dict[str, pd.DataFrame]:
+    """Return the tables `*_after` by name, without rows where no effect was added: the fits before are the answer then.
+
+    Parameters
+    ----------
+    after : Fitted
+        The after-model, fitted to all bins.
+    steady : DataFrame
+        Table `steady`.
+    traces : DataFrame or sequence of StoredTraces
+        Table `traces`, or where it lies.
+    config : Config
+        The rig.
+    workers : int
+        Processes.
+
+    Notes
+    -----
+    The laws of single series are those of the joint fit. Single conditions, from which the laws for all series, the
+    starts and the break-away follow, are fitted to the strokes' forces without the effects; the effects' covariance is
+    carried through these fits.
+    """
+    if not after.model.terms:
+        return {schema.name: pd.DataFrame(columns=schema.names()) for schema in AFTER}
+    free = without_effects(steady, after, config)
+    with timed("after: conditions", rows=len(free), of="strokes"):
+        conditions = fit_conditions(free, config, workers=workers)
+    with timed("after: laws"):
+        law, curves = after_laws(after, conditions, config)
+        laws, master = joint_laws(free, conditions, config, workers=workers)
+    with timed("after: starts", rows=len(free), of="strokes"):
+        dynamic = fit_dynamic(traces, free, conditions, config, workers=workers)
+    found = {
+        "steady_after": free,
+        "steady_fit_after": conditions,
+        "aging_fit_after": law,
+        "aging_curves_after": curves,
+        "aging_laws_after": laws,
+        "master_curve_after": master,
+        "dynamic_fit_after": dynamic.fit,
+        "dynamic_curves_after": dynamic.curves,
+    }
+    return {name: t.assign(model="after") if "model" in SCHEMAS[name].names() else t for name, t in found.items()}

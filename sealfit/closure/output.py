@@ -1,0 +1,317 @@
+"""What the loop leaves behind: the fitted model as plain data, and the tables that the report draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from sealfit.closure.channels import Channel, unit_of
+from sealfit.closure.forms import free_term
+from sealfit.closure.intervals import (
+    degrees_of_freedom,
+    mean_half_width,
+    mean_se,
+    robust_covariance,
+    sandwiches,
+    t_quantile,
+)
+from sealfit.closure.result import parameter_unit
+from sealfit.closure.selection import Selection
+from sealfit.config import Config
+from sealfit.effects import EFFECTS
+from sealfit.effects.contract import SECOND, Effect
+from sealfit.effects.free import FREE, free_effect
+from sealfit.fit.joint.declared import QUANTITIES, Declared, JointParameter, tested_speeds
+from sealfit.fit.joint.estimate import Fitted, fit
+from sealfit.fit.joint.model import Model, Term, evaluate, term_derivatives
+from sealfit.fit.joint.rows import Rows, open_columns, point_rows
+from sealfit.fit.joint.tangent import Tangent
+from sealfit.store.paths import needed
+from sealfit.tables import CHANNELS, CURVES, SHAPES
+
+# ---------------------------------------------------------------- model record
+# The fitted model as plain data: what `predict` needs, written to OUT/model.json.
+
+
+def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
+    """Return both fitted models with covariance, scatter and tested ranges as JSON-able values."""
+    rows = after.rows
+    return {
+        "schema": 1,
+        "config": _without_effects(config).model_dump(mode="json"),
+        "conditions": rows.conditions.to_dict(orient="list"),
+        "has_load": rows.has_load,
+        "has_aging": rows.has_aging,
+        "declared": {
+            "parameters": [[p.quantity, p.owner] for p in after.model.declared.parameters],
+            "index": {q: after.model.declared.index[q].tolist() for q in QUANTITIES},
+            "stribeck": dict(after.model.declared.stribeck),
+            "law": {k: bool(v) for k, v in after.model.declared.law.items()},
+        },
+        "before": _model(before.model),
+        "after": _model(after.model),
+        "covariance": after.covariance.tolist(),
+        "sandwiches": [
+            {
+                "covariance": own.covariance.tolist(),
+                "information": [[numbers.tolist(), block.tolist()] for numbers, block in own.information],
+            }
+            for own in sandwiches(after)
+        ],
+        "df": degrees_of_freedom(after),
+        "scatter": {
+            "s0": float(after.scatter.s0),
+            "g": float(after.scatter.g),
+            "alike": float(after.scatter.alike),
+            "shape": float(after.scatter.shape),
+            "components": [
+                {"level": c.level, "kind": c.kind, "variance": float(c.variance)} for c in after.scatter.components
+            ],
+        },
+        "ranges": _ranges(rows),
+        "speeds_mm_s": _speeds(rows),
+    }
+
+
+def _without_effects(config: Config) -> Config:
+    """Return the config without the folder of the user's own effects: whoever predicts names theirs."""
+    return config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
+
+
+def _model(model: Model) -> dict:
+    return {
+        "theta": model.theta.tolist(),
+        "terms": [
+            {
+                "id": term.effect.id,
+                "channels": list(term.channels),
+                "acts_on": term.acts_on,
+                "operation": term.operation,
+                "fixed": {k: ({} if k == "shift" else _plain(v)) for k, v in term.fixed.items()},
+                "values": {k: float(v) for k, v in values.items()},
+                "smoothness": term.smoothness,
+            }
+            for term, values in zip(model.terms, model.values, strict=True)
+        ],
+    }
+
+
+def _plain(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _ranges(rows: Rows) -> dict:
+    """Return what was tested: the range of each numeric channel, the set of each category."""
+    ranges: dict = {}
+    for name in rows.channels:
+        values = np.abs(rows.speed) if name == "speed_mm_s" else rows.values(name)
+        if values.dtype.kind == "f":
+            known = values[np.isfinite(values)]
+            if known.size:
+                ranges[name] = [float(known.min()), float(known.max())]
+        else:
+            ranges[name] = sorted({str(v) for v in values})
+    return ranges
+
+
+def _speeds(rows: Rows) -> dict[str, list[float]]:
+    """Return the tested speeds of each series, without signs."""
+    series = rows.conditions["series"].to_numpy(dtype=object)[rows.condition]
+    return {name: tested_speeds(rows, np.flatnonzero(series == name)).tolist() for name in pd.unique(series)}
+
+
+def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[Model, Model, pd.DataFrame]:
+    """Return the models before and after and the table of conditions from a record.
+
+    Parameters
+    ----------
+    record : dict
+        As `to_record` returned it; nothing in it is run.
+    own : mapping of str to Effect, optional
+        The user's own effects, by id.
+
+    Raises
+    ------
+    RequestError
+        If the model has an effect that is neither in the catalogue nor in `own`.
+    """
+    raw = record["declared"]
+    declared = Declared(
+        tuple(JointParameter(*p) for p in raw["parameters"]),
+        {q: np.array(v, dtype=int) for q, v in raw["index"].items()},
+        tuple(record["conditions"]["condition"]),
+        record["has_load"],
+        raw["stribeck"],
+        raw["law"],
+    )
+    effects = {**EFFECTS, **(own or {})}
+    ids = {term["id"] for stage in ("before", "after") for term in record[stage]["terms"]}
+    if unknown := sorted(ids - effects.keys() - FREE.keys()):
+        raise needed("the model holds", unknown)
+    models = []
+    for stage in ("before", "after"):
+        model = Model(declared, np.array(record[stage]["theta"], dtype=float))
+        for raw_term in record[stage]["terms"]:
+            fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in raw_term["fixed"].items()}
+            effect = free_effect(raw_term["id"], fixed) if raw_term["id"] in FREE else effects[raw_term["id"]]
+            own = (raw_term["acts_on"], raw_term["operation"], fixed, raw_term.get("smoothness"))
+            model = model.with_term(Term(effect, tuple(raw_term["channels"]), *own), raw_term["values"])
+        models.append(model)
+    return models[0], models[1], pd.DataFrame(record["conditions"])
+
+
+# ---------------------------------------------------------------- plot tables
+# Tables that the report draws of the loop: residual by channel, effect shapes, force against speed.
+
+GROUPS = 12  # groups of a numeric channel in the residual plot
+POINTS = 60  # points of a drawn curve
+
+
+def channel_table(grown: Selection, before: Fitted, after: Fitted) -> pd.DataFrame:
+    """Return the mean residual by channel, before and after, with standard errors from whole files."""
+    rows = before.rows
+    files = rows.codes("file")
+    records = []
+    for name, known in grown.channels.items():
+        values = rows.values(name) if name != "speed_mm_s" else np.abs(rows.speed)
+        if known.numeric:
+            edges = np.unique(np.quantile(values, np.linspace(0, 1, GROUPS + 1)))
+            distinct = np.unique(values)
+            if distinct.size <= GROUPS:
+                code, middle = np.searchsorted(distinct, values), distinct
+            else:
+                code = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
+                middle = np.bincount(code, values) / np.maximum(np.bincount(code), 1)
+            labels: list = [None] * middle.size
+        else:
+            labels, code = np.unique(values, return_inverse=True)
+            middle = [None] * len(labels)
+        for group in np.unique(code):
+            inside = code == group
+            record = {"channel": name, "x": middle[group], "label": labels[group], "n": int(inside.sum())}
+            for stage, fitted in (("before", before), ("after", after)):
+                weight, residual = rows.weight[inside], fitted.residual[inside]
+                mean = weight @ residual / weight.sum()
+                per_file = np.bincount(files[inside], weight * (residual - mean))
+                record[f"{stage}_N"] = mean
+                record[f"{stage}_se_N"] = float(np.sqrt((per_file**2).sum()) / weight.sum())
+            records.append(record)
+    return pd.DataFrame(records, columns=CHANNELS.names())
+
+
+def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
+    """Return each effect's shape along its channel with a 95 % band, and the free shape beside it."""
+    records: list[dict] = []
+    reach = t_quantile(degrees_of_freedom(after))
+    for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True)):
+        place = after.model.place(number)
+        covariance = (robust_covariance(after, "file") if "held" in term.fixed else after.covariance)[place, place]
+        inputs, x, labels = _along(term, after)
+        value = np.asarray(term.effect.shape(inputs, **values), dtype=float)
+        tangent = np.column_stack([np.broadcast_to(d, value.shape) for d in term_derivatives(term, values, inputs)])
+        se = mean_se(Tangent.dense(tangent), covariance)
+        free = _free_shape(after, number, x)
+        unit = parameter_unit("{y}", term, config.units)
+        for k in range(value.size):
+            records.append(
+                {
+                    "effect": number,
+                    "id": term.effect.id,
+                    "channel": term.channels[0],
+                    "x": x[k] if labels is None else None,
+                    "label": None if labels is None else labels[k],
+                    "value": value[k],
+                    "lo95": value[k] - reach * se[k],
+                    "hi95": value[k] + reach * se[k],
+                    "free": None if free is None else free[k],
+                    "unit": unit,
+                }
+            )
+    return pd.DataFrame(records, columns=SHAPES.names())
+
+
+def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
+    """Return inputs along a term's first channel, others at their means; and the channel's values or categories."""
+    rows = after.rows
+    first = term.channels[0]
+    values = rows.values(first)
+    if values.dtype.kind != "f":
+        labels = [str(c) for c in np.unique(values)]
+        return {term.effect.reads[0]: np.array(labels), **term.fixed}, np.full(len(labels), np.nan), labels
+    values = np.abs(values) if first == "speed_mm_s" else values
+    low, high = float(values.min()), float(values.max())
+    if "lambda_" in after.model.values[after.model.terms.index(term)]:
+        high = min(high, low + 4 * after.model.values[after.model.terms.index(term)]["lambda_"])
+    distinct = np.unique(values)
+    x = distinct if distinct.size <= 12 else np.linspace(low, high, 4 * POINTS if high < values.max() else POINTS)
+    inputs = {}
+    for name, channel in zip(term.effect.reads, term.channels, strict=True):
+        inputs[name] = x if channel == first else np.full(x.size, _usual(rows.values(channel), pair=name == SECOND))
+    fixed = {key: value for key, value in term.fixed.items() if key != "shift"}
+    return {**inputs, **fixed}, x, None
+
+
+def _usual(values: np.ndarray, *, pair: bool) -> float | str:
+    """Return where a second channel is held in a plot: its mean, nine tenths up for a pair, or the first category."""
+    if values.dtype.kind != "f":
+        return str(np.unique(values)[0])
+    size = np.abs(values)
+    return float(np.quantile(values, 0.9)) if pair else float(size.mean())
+
+
+def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
+    """Return the free shape fitted in place of an effect, level with it on average; None for periodic or level ones."""
+    term = after.model.terms[number]
+    if len(term.channels) != 1 or term.effect.id in ("ripple", "sinusoid", "smooth", "levels") or np.isnan(x).any():
+        return None
+    if term.channels[0] == "direction":
+        return None
+    rows = after.rows
+    values = np.abs(rows.speed) if term.channels[0] == "speed_mm_s" else rows.values(term.channels[0])
+    free = free_term(Channel(term.channels[0], values, unit_of(values, rows)), term.acts_on, term.operation)
+    model = after.model.without_term(number).with_term(free, {p.name: 0.0 for p in free.effect.parameters})
+    fitted = fit(model, rows, after.scatter, turns=0)
+    shape = free.effect.shape({free.effect.reads[0]: x, **free.fixed}, **fitted.model.values[-1])
+    own = term.effect.shape({term.effect.reads[0]: x, **term.fixed}, **after.model.values[number])
+    return shape + float(np.mean(own - shape))
+
+
+def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
+    """Return force against speed per condition, before and after, other channels at their means."""
+    rows = after.rows
+    channels = {name for term in (*before.model.terms, *after.model.terms) for name in term.channels}
+    read = [name for name in rows.table.columns if name in {*CURVES.names(), *channels}]
+    way = np.sign(rows.speed)
+    moving = np.flatnonzero(way != 0)
+    order = moving[np.lexsort((-way[moving], rows.condition[moving]))]  # of a condition, what moves forwards first
+    cuts = np.flatnonzero(np.diff(rows.condition[order]) | (np.diff(way[order]) != 0)) + 1
+    own = {name: pd.Series(rows.values(name), name=name) for name in open_columns(rows.table)}
+    columns = {name: _averaged(own.get(name, rows.table[name]), np.split(order, cuts)) for name in read}
+    speeds = [np.abs(rows.speed[chosen]) for chosen in np.split(order, cuts)]
+    counts = [POINTS if own.max() > 1.02 * own.min() else 1 for own in speeds]
+    first = order[np.r_[0, cuts]]
+    points = pd.DataFrame({**columns, "direction": way[first]}).loc[np.repeat(np.arange(first.size), counts)]
+    along = [np.geomspace(own.min(), own.max(), count) for own, count in zip(speeds, counts, strict=True)]
+    points = points.assign(speed_mm_s=points["direction"].to_numpy() * np.concatenate(along), file="")
+    points = points.reset_index(drop=True)
+    codes = np.repeat(rows.condition[first], counts)
+    at = point_rows(points, codes, rows.conditions, has_load=rows.has_load, has_aging=rows.has_aging)
+    mean, tangent = evaluate(after.model, at)
+    reach = mean_half_width(tangent, after.covariance, degrees_of_freedom(after), sandwiches(after))
+    points = points.assign(
+        force_before_N=evaluate(before.model, at, jacobian=False)[0],
+        force_after_N=mean,
+        force_after_lo95_N=mean - reach,
+        force_after_hi95_N=mean + reach,
+    )
+    return points[CURVES.names()]
+
+
+def _averaged(column: pd.Series, groups: list[np.ndarray]) -> list:
+    """Return the mean of a numeric channel in each group of rows, or the commonest of a category."""
+    if pd.api.types.is_float_dtype(column) or column.name in ("repeat", "stroke"):
+        return [float(column.iloc[rows].mean()) for rows in groups]
+    number, names = pd.factorize(column, sort=True)
+    return [names[np.bincount(number[rows]).argmax()] for rows in groups]

@@ -1,0 +1,298 @@
+"""Ripples: periodic force along displacement or time, sought on the raw samples of the steady windows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from scipy.special import betaincc, gammaincc
+
+from sealfit.closure.spectrum import LOBE, Spectrum, Strokes, alike, background, smooth_background, spectra_of, tops
+from sealfit.fit.joint.model import passes
+from sealfit.fit.joint.rows import Rows
+
+# ---------------------------------------------------------------- ripple
+# Ripples: periodic force along displacement or time, sought on the raw samples of the steady windows.
+#
+# Bins hide what is finer than they are, so every stroke's own samples are transformed: :math:`Z_u(f)` is the complex
+# amplitude of unit u (a file) at frequency f. A ripple of the rig has one phase everywhere, so
+# :math:`R = |\sum_u Z_u|^2 / \sum_u |Z_u|^2` is large; with phases that fall as they like, R is exponential with mean
+# 1. Where each file has an origin of its own only the power is shared: it is held against the local background
+# spectrum.
+
+SHARED = 1e-3  # p-value below which the phase is taken to be common to all files
+ABOVE_BACKGROUND = 4.0  # a peak's power over the median of its neighbours: a smooth trend has no peak
+
+
+@dataclass(frozen=True)
+class Peak:
+    """One periodic component: along which axis, its wavelength, how it acts and how surely it is there."""
+
+    axis: str  # displacement_mm | time_s
+    wavelength: float
+    sign_symmetric: bool  # True: same force both ways (added force); False: follows the direction (factor)
+    common_phase: bool
+    statistic: float
+    p_value: float  # adjusted over the frequencies, axes and ways of acting looked at
+    amplitude: float  # in force units, mean over units
+    energy: float  # squared amplitudes, all passes that reach the frequency: of the largest sure wave along the axis
+
+
+AXES = ("displacement_mm", "time_s")  # time is the rival of displacement: mains, servo
+
+
+def find_ripple(
+    samples: pd.DataFrame, *, common_phase: bool, known: Sequence[tuple[str, float]] = (), workers: int = 1
+) -> Peak | None:
+    """Return the strongest periodic component of the samples' residual, or None where there is none to test.
+
+    Parameters
+    ----------
+    samples : DataFrame
+        Steady samples, those of a stroke one after the other: stroke_id, direction, unit, the axes, `residual_N`.
+    common_phase : bool
+        Whether displacement means the same place in every file (`position_origin = "rig"`).
+    known : sequence of (axis, wavelength)
+        Components already in the model: what is left around them is their own scatter from file to file.
+    workers : int
+        Processes to use where there are many samples.
+    """
+    peaks, locked = [], []
+    for spectrum in spectra_of(samples, AXES, known, workers=workers):
+        if common_phase and spectrum.axis == "displacement_mm":
+            peaks += _coherent(spectrum)
+        elif spectrum.axis == "time_s":  # which counts from the start of every stroke: a wave may be locked to that
+            locked = _coherent(spectrum)
+        peaks.append(_incoherent(spectrum))
+    if not peaks:
+        return None
+    # What is periodic in time shows in displacement too, speed by speed, and the other way round: where both are sure,
+    # the axis along which it is the same wave in all files holds more of it.
+    sure = [peak for peak in peaks if peak.p_value < SHARED]
+    best = max(sure, key=lambda p: p.energy) if sure else min(peaks, key=lambda p: (p.p_value, -p.statistic))
+    # A phase that all files share says more than power alone.
+    shared = [p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED]
+    best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
+    return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
+
+
+def _coherent(spectrum: Spectrum) -> list[Peak]:
+    """Return the best peak of each way of acting: the same force both ways, or following the direction."""
+    peaks = []
+    for common in spectrum.common:
+        total = np.abs(common.total) ** 2
+        statistic = total / np.maximum(common.square, 1e-300)
+        sharp = total / background(np.where(spectrum.taken, np.nan, total)) > ABOVE_BACKGROUND
+        if common.units < 4 or not sharp.any():
+            continue
+        k = int(np.argmax(np.where(sharp & tops(total) & ~spectrum.taken, statistic, 0)))
+        p = _coherence_p(statistic[k], common.units) * spectrum.frequency.size * len(spectrum.common)
+        wavelength, amplitude = _refined(total, spectrum.frequency, k), float(np.abs(common.amplitude[k]))
+        energy = amplitude**2 * float(spectrum.count[k])
+        peaks.append(Peak(spectrum.axis, wavelength, common.symmetric, True, float(statistic[k]), p, amplitude, energy))
+    return peaks
+
+
+def _coherence_p(statistic: float, units: int) -> float:
+    """Return P(R >= statistic) for random phases: R/n is Beta(1, n - 1) where amplitudes are alike."""
+    return float(betaincc(1, max(units - 1, 1), min(statistic / units, 1.0)))
+
+
+def _incoherent(spectrum: Spectrum) -> Peak:
+    """Return the best peak of power shared by all units whatever their phases.
+
+    The mean of U units' powers, each on its own scale, is Gamma(U) about the background; where units share a texture
+    of the track, as if there were fewer of them.
+    """
+    open_power = np.where(spectrum.taken, np.nan, spectrum.power)
+    ratio = spectrum.power / smooth_background(open_power, spectrum.frequency, spectrum.count)
+    count = np.minimum(spectrum.count, alike(np.where(spectrum.taken, np.nan, ratio)))
+    with np.errstate(divide="ignore"):  # -inf: beyond doubt
+        own = np.log(gammaincc(count, ratio * count))
+    peaks = tops(spectrum.power) & ~spectrum.taken
+    k = int(np.argmin(np.where(peaks, own, 1.0)))
+    p = float(np.exp(own[k])) * spectrum.frequency.size
+    wavelength = _refined(spectrum.power, spectrum.frequency, k)
+    energy = spectrum.amplitude**2 * spectrum.count * (1 - 1 / np.maximum(ratio, 1.0))
+    sure = peaks & (own < np.log(SHARED / spectrum.frequency.size))
+    sure[k] = True
+    return Peak(
+        spectrum.axis,
+        wavelength,
+        True,
+        False,
+        float(ratio[k]),
+        p,
+        float(spectrum.amplitude[k]),
+        float(energy[sure].max()),
+    )
+
+
+def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
+    """Return the wavelength at the parabola through the highest point of a peak and its two neighbours."""
+    first = max(k - LOBE, 0)
+    k = first + int(np.argmax(power[first : k + LOBE + 1]))
+    if 0 < k < power.size - 1:
+        left, middle, right = power[k - 1 : k + 2]
+        bend = left - 2 * middle + right
+        if bend < 0:
+            shift = 0.5 * (left - right) / bend
+            return float(1 / (frequency[k] + shift * (frequency[1] - frequency[0])))
+    return float(1 / frequency[k])
+
+
+# ---------------------------------------------------------------- stroke phases
+# The wave of each pass at one wavelength, from the raw samples: a sharp wavelength, and the phases of the passes.
+#
+# A pass is a file in one direction. A stroke's residual is taken as a parabola plus a sine and a cosine of its place,
+# by least squares weighted with a Hann window (ends weigh little, where a stroke starts and stops); the strokes of a
+# pass share the sine and the cosine. No grid of bins or frequencies limits it, and a wave of a few periods is not
+# mistaken for its trend.
+
+MOST_NUMBERS = 1 << 14  # of samples times wavelengths that are computed at once
+LEAST_FILES = 9  # that a test of signs at 0.5 % wants: eight of one sign have p = 0.004, and one may be small
+AROUND = np.linspace(-0.5, 0.5, 101)  # periods per stroke on each side of a peak that are looked at once more
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Normal equations of a sine and a cosine at each of m wavelengths, for p passes in order of file and direction."""
+
+    unit: np.ndarray  # (p,) number of the file
+    direction: np.ndarray  # (p,)
+    square: np.ndarray  # (p, m, 2, 2)
+    product: np.ndarray  # (p, m, 2)
+    total: np.ndarray  # (p,) sum of squares of the residual freed of its trend
+    middle: np.ndarray  # (p,) mean of the strokes' mean places
+
+    @property
+    def amplitudes(self) -> np.ndarray:
+        """Amplitudes of sine and cosine, shape (p, m, 2)."""
+        return np.einsum("pmij,pmj->pmi", np.linalg.pinv(self.square, hermitian=True), self.product)
+
+    @property
+    def share(self) -> np.ndarray:
+        """Share of the sum of squares that the wave explains, shape (p, m)."""
+        return np.einsum("pmi,pmi->pm", self.amplitudes, self.product) / np.maximum(self.total, 1e-300)[:, None]
+
+
+def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
+    """Return the wave of each pass at m wavelengths.
+
+    Parameters
+    ----------
+    samples : DataFrame
+        Samples of a stroke one after the other: stroke_id, unit, direction, the axis, `residual_N`.
+    lengths : ndarray, shape (m,)
+        Wavelengths in the unit of the axis.
+    axis : str
+        Column along which the wave runs.
+    """
+    return _waves(Strokes.of(samples, axis), lengths)
+
+
+def _waves(strokes: Strokes, lengths: np.ndarray) -> Waves:
+    square, product = np.zeros((strokes.size.size, lengths.size, 2, 2)), np.zeros((strokes.size.size, lengths.size, 2))
+    total, middle = np.zeros((2, strokes.size.size))
+    for size in np.unique(strokes.size).tolist():  # those of one size at once, as far as they fit into the cache
+        alike = np.flatnonzero(strokes.size == size)
+        for some in np.array_split(alike, min(alike.size, -(-alike.size * size * lengths.size // MOST_NUMBERS))):
+            place, value = strokes.together(some)
+            square[some], product[some], total[some] = _normal_equations(place, value, lengths)
+            middle[some] = place.mean(axis=1)
+    order = np.lexsort((strokes.direction, strokes.unit))
+    unit, direction = strokes.unit[order], strokes.direction[order]
+    first = np.flatnonzero(np.r_[True, (np.diff(unit) != 0) | (np.diff(direction) != 0)][: order.size])
+    square, product, total, middle = (
+        np.add.reduceat(part[order], first, axis=0) if first.size else part for part in (square, product, total, middle)
+    )
+    return Waves(unit[first], direction[first], square, product, total, middle / np.diff(np.r_[first, order.size]))
+
+
+def _normal_equations(
+    place: np.ndarray, value: np.ndarray, lengths: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `square`, `product` and `total` of strokes of n samples each, shape (s, n), sorted by place."""
+    root = np.sqrt(np.hanning(place.shape[1] + 2)[1:-1])[:, None]
+    even = 2 * (place - place.mean(axis=1, keepdims=True)) / np.ptp(place, axis=1, keepdims=True)
+    trend, _ = np.linalg.qr(root * even[:, :, None] ** [2, 1, 0])
+    turn = 2 * np.pi * place[:, :, None] / lengths
+    columns = root * np.concatenate([np.sin(turn), np.cos(turn), value[:, :, None]], axis=2)
+    columns -= trend @ (trend.transpose(0, 2, 1) @ columns)
+    sine, cosine, y = columns[:, :, : lengths.size], columns[:, :, lengths.size : -1], columns[:, :, -1:]
+    product = np.stack([(sine * y).sum(axis=1), (cosine * y).sum(axis=1)], axis=-1)
+    square = np.empty((*product.shape, 2))
+    square[..., 0, 0], square[..., 1, 1] = (sine * sine).sum(axis=1), (cosine * cosine).sum(axis=1)
+    square[..., 0, 1] = square[..., 1, 0] = (sine * cosine).sum(axis=1)
+    return square, product, (y * y).sum(axis=(1, 2))
+
+
+def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tuple[float, float]:
+    """Return the wavelength near a peak that explains most where each pass has its own phase, and its standard error.
+
+    The error is a jackknife over files.
+    """
+    strokes = Strokes.of(samples, axis)
+    lengths = 1 / (1 / wavelength + AROUND / np.median(strokes.span))
+    waves = _waves(strokes, lengths)
+    files, file = np.unique(waves.unit, return_inverse=True)
+    share = np.zeros((len(files), lengths.size))
+    np.add.at(share, file, waves.share)
+    without = np.array([_top(lengths, share.sum(axis=0) - own) for own in share])
+    spread = (len(files) - 1) / len(files) * ((without - without.mean()) ** 2).sum()
+    return _top(lengths, share.sum(axis=0)), float(np.sqrt(spread))
+
+
+def _top(lengths: np.ndarray, power: np.ndarray) -> float:
+    """Return where a sampled curve is highest, by the parabola through its highest point and two neighbours."""
+    k = int(np.clip(np.argmax(power), 1, power.size - 2))
+    left, middle, right = power[k - 1 : k + 2]
+    bend = left - 2 * middle + right
+    if bend >= 0:
+        return float(lengths[k])
+    return float(lengths[k] + 0.25 * (left - right) / bend * (lengths[k + 1] - lengths[k - 1]))
+
+
+def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis: str) -> np.ndarray:
+    """Return per file how far its two halves hold the same wave: the product of their amplitudes, shape (files,).
+
+    Few files could not reach the level of a sign test: then each pass, a file in one direction, is told by itself.
+
+    Without a wave the phases of the halves are unrelated, and the sign is as often negative as positive.
+
+    Parameters
+    ----------
+    samples : DataFrame
+        As for `waves_of`.
+    first : ndarray of bool, shape (n,)
+        Which samples make the first half.
+    wavelength : float
+        In the unit of the axis.
+    axis : str
+        Column along which the wave runs.
+    """
+    one, other = (waves_of(samples[mask], np.array([wavelength]), axis) for mask in (first, ~first))
+    whole = [np.rec.fromarrays([part.unit, part.direction]) for part in (one, other)]
+    _, mine, its = np.intersect1d(*whole, assume_unique=True, return_indices=True)
+    cross = (one.amplitudes[mine, 0] * other.amplitudes[its, 0]).sum(axis=1)
+    files, file = np.unique(one.unit[mine], return_inverse=True)
+    return np.bincount(file, cross) if files.size >= LEAST_FILES else cross
+
+
+def pass_shifts(samples: pd.DataFrame, rows: Rows, wavelength: float, axis: str) -> dict[str, float]:
+    """Return per pass how far its own origin lies from the wave's, in the unit of the axis.
+
+    Of the origins a wavelength apart the one nearest the pass's middle is taken, so that the phase there holds
+    whatever becomes of the wavelength.
+    """
+    strokes = rows.table.iloc[rows.groups.starts["stroke"]]
+    names = dict(zip(strokes["stroke_id"], passes(strokes), strict=True))
+    first = samples.drop_duplicates(["unit", "direction"]).set_index(["unit", "direction"])["stroke_id"]
+    waves = waves_of(samples, np.array([wavelength]), axis)
+    sine, cosine = waves.amplitudes[:, 0].T
+    shift = wavelength * np.arctan2(cosine, sine) / (2 * np.pi)
+    shift -= wavelength * np.round((waves.middle + shift) / wavelength)
+    keys = zip(waves.unit.tolist(), waves.direction.tolist(), strict=True)
+    return {names[first[key]]: own for key, own in zip(keys, shift.tolist(), strict=True)}

@@ -1,0 +1,207 @@
+"""Commands that keep nothing in OUT: check, predict, lifetime, effects and simulate."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sealfit.engine.run_map import on_cluster
+from sealfit.errors import CampaignError, Fault, OutError, RequestError, StaleError
+from sealfit.pipeline import FAULTY
+from sealfit.progress import Silent
+from sealfit.store.manifest import ConfigCopy
+from sealfit.store.out_folder import Store
+from sealfit.store.paths import (
+    OPTION,
+    RUNS,
+    campaign_folder,
+    existing_file,
+    existing_out,
+    own_effects_folder,
+    what_differs,
+)
+from sealfit.units import Units
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MODELS = ("after", "before")  # with the loop's effects taken out at their reference, and without effects
+
+
+def check(
+    campaign: Path,
+    config: Path | None = None,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    progress: Silent | None = None,
+) -> tuple[dict, list[Fault]]:
+    """Read everything, write nothing, and return what was found and every fault.
+
+    Raises
+    ------
+    ConfigError
+        If the config cannot be used.
+    """
+    from sealfit.ingest.campaign import ingest_campaign
+    from sealfit.report import summary
+
+    source = ConfigCopy.at(config)
+    checked = source.parse()
+    own_effects_folder(None, source, campaign)
+    try:
+        folder = campaign_folder(campaign, checked)
+        with on_cluster(scheduler, folder), (progress or Silent()).counting("reading trace files") as on_file:
+            ingested = ingest_campaign(folder, checked, workers=workers, on_file=on_file)
+    except CampaignError as error:
+        return {"files": None}, list(error.faults)
+    faults = [fault for fault in ingested.faults if fault.severity in FAULTY]
+    return summary.of_ingest(ingested.tables), faults
+
+
+def predict(
+    out: Path,
+    points: Path,
+    output: Path,
+    *,
+    effects_folder: Path | None = None,
+    progress: Silent | None = None,
+) -> dict:
+    """Write the answers to `points` (CSV) to `output` (CSV) and return how many rows were answered.
+
+    `effects_folder` is run: it holds the user's own effects, which the model may need.
+
+    Raises
+    ------
+    StaleError
+        If the loop has not been closed on the campaign as it stands, or with other effects of the user's own.
+    RequestError
+        If the points cannot be read, lack a column that the model needs, the answers cannot be written, or the model
+        needs the user's own effects and no folder of them is given.
+    """
+    from sealfit.closure.predict import predict as answer
+    from sealfit.closure.predict import read_points, write_answers
+
+    store = Store.open(existing_out(out), effects_folder)
+    for warning in store.warnings:
+        (progress or Silent()).warn(warning)
+    store.require("close-loop")
+    asked = read_points(points)
+    answers = answer(store.read_json("model"), asked.values, _own_effects(store.effects))
+    return {"out": str(store.out), "output": str(output), **write_answers(asked, answers, output)}
+
+
+def lifetime(
+    out: Path,
+    *,
+    quantity: str,
+    threshold: float | None,
+    loss_pct: float | None,
+    temperature_C: float | None,
+    compression_pct: float | None,
+    years: float | None,
+    law: str | None,
+    model: str = "after",
+) -> dict:
+    """Return the days until a quantity reaches a threshold by the likeliest law and by its rivals, with intervals.
+
+    Raises
+    ------
+    StaleError
+        If the conditions are not fitted, or the loop is not closed (`model` "after"), or stale.
+    RequestError
+        If the request does not fit the campaign.
+    """
+    from sealfit.fit.aging.all_series import law_of
+    from sealfit.fit.aging.joint_law import rivals_of
+    from sealfit.fit.aging.lifetime import answer, finite_ends, goal_of, over_laws
+
+    store = Store.open(existing_out(out))
+    if model not in MODELS:
+        raise RequestError(f"there is no model '{model}'.", fix=f"Choose one of: {', '.join(MODELS)}.")
+    goal = goal_of(threshold, loss_pct)
+    tables, taken_out = _fits_of(store, model)
+    laws = law_of(*tables, quantity, law)
+    place = {"temperature_C": temperature_C, "compression_pct": compression_pct}
+    chosen = answer(laws[0], goal, years, resample=True, **place)
+    rivals = [answer(rival, goal, years, **place) for rival in rivals_of(laws)] if law is None else []
+    if law is None and years is None:
+        chosen["ci95_over_laws"] = finite_ends(over_laws(laws, goal, **place))
+    asked = {"out": str(store.out), "quantity": quantity, "model": model, "effects": taken_out}
+    before = None
+    if taken_out:
+        with suppress(RequestError):  # the declared model may have no answer where this one has
+            before = answer(law_of(*_fits_of(store, "before")[0], quantity, law)[0], goal, years, **place)
+    return {**asked, **chosen, "rivals": rivals, "before": before}
+
+
+def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame], list[dict]]:
+    """Return tables `steady` and `steady_fit` of a model, and the effects that were taken out of them."""
+    if model == "before":
+        store.require("fit-steady")
+        return (store.read("steady"), store.read("steady_fit")), []
+    try:
+        store.require("close-loop")
+    except StaleError as error:
+        other = "or ask the declared model, without effects: --model before"
+        raise StaleError(error.message, file=error.file, fix=f"{error.fix} ({other})") from error
+    added = [effect for effect in store.read_json("closure")["effects"] if not effect["candidate"]]
+    suffix = "_after" if added else ""
+    taken_out = [{key: effect[key] for key in ("id", "label", "reference")} for effect in added]
+    return (store.read(f"steady{suffix}"), store.read(f"steady_fit{suffix}")), taken_out
+
+
+def _own_effects(folder: Path | None) -> dict:
+    """Return the user's own effects, whose files are run, by id; none without a folder."""
+    if folder is None:
+        return {}
+    from sealfit.effects.user import load_user_effects
+
+    return load_user_effects(folder)
+
+
+def effects(out: Path | None = None, effects_folder: Path | None = None) -> dict:
+    """Return the catalogue; with OUT, in its units and with those that its loop added.
+
+    With `effects_folder`, whose files are run, the user's own effects too. `note` says if OUT has others, or some and
+    none are given.
+    """
+    from sealfit.effects import EFFECTS
+    from sealfit.report import summary
+
+    if out is None:
+        known = EFFECTS | _own_effects(own_effects_folder(effects_folder, None))
+        return {"effects": summary.of_effects(known.values(), Units())}
+    store = Store.open(existing_out(out), effects_folder)
+    known = EFFECTS | _own_effects(store.effects)
+    closed = not store.why_stale("close-loop")
+    added = [effect["id"] for effect in store.read_json("closure")["effects"]] if closed else None
+    listed = {"effects": summary.of_effects(known.values(), store.config.units), "added": added}
+    return {**listed, "note": _note_on_own(store)}
+
+
+def _note_on_own(store: Store) -> str | None:
+    if store.effects is None and store.state.effects:
+        files = ", ".join(store.state.effects)
+        return f"your own effects ({files}) are listed only from a folder that you name: add {OPTION} FOLDER."
+    return what_differs(store.kept_effects, store.state.effects) or None
+
+
+def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:
+    """Write a campaign with known truth to `out`, and the truth beside it, both whole or not at all.
+
+    Raises
+    ------
+    OutError
+        If `out` is there already and `force` is not given, or as `sealfit.simulation.simulate`.
+    """
+    from sealfit.simulation import load_spec, truth_path
+    from sealfit.simulation import simulate as make
+
+    loaded = load_spec(existing_file(spec, "spec"))
+    if not force and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
+        raise OutError("is there already.", file=out, fix="Choose another --out, or replace it with --force.")
+    make(loaded, out)
+    files = sum(1 for path in out.rglob("*") if path.is_file() and path.name != RUNS)
+    return {"campaign": str(out), "truth": str(truth_path(out)), "files": files}

@@ -1,0 +1,183 @@
+"""Chunks of work on a Dask cluster that is running already, their results in order.
+
+Nothing is kept on the cluster: a chunk is sent as bytes, and its answer comes back or, for what is large, lies on the
+file system that all workers share. So Dask may do a chunk again on another worker if one dies, as often as it likes.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import threading
+import uuid
+from collections import deque
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sealfit import __version__
+from sealfit.engine import one_thread
+from sealfit.errors import RequestError, WorkerError
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+WAITING_PER_THREAD = 2  # chunks sent ahead for every thread of the cluster: bounds what the scheduler has to hold
+CONNECT_S = 15.0
+EXAMPLE = "tcp://host:8786"
+LOOK_S = 1.0  # how often a wait for an answer looks whether there is anybody to give it
+ALONE_S = 60.0  # without a single worker before giving up: a batch system takes its time to start the next
+
+
+class Cluster:
+    """A connection to a running Dask scheduler.
+
+    Parameters
+    ----------
+    scheduler : str
+        Its address ("tcp://host:8786"), or the path of the scheduler file that it wrote.
+
+    Raises
+    ------
+    RequestError
+        If Dask is not installed here, nobody answers, there is no worker, or a worker has another sealfit.
+    """
+
+    def __init__(self, scheduler: str) -> None:
+        self.scheduler = scheduler
+        self._client = _connected(scheduler)
+        try:
+            self._check_versions()
+        except BaseException:
+            self.close()
+            raise
+
+    def _check_versions(self) -> None:
+        try:
+            versions = self._client.run(_version)
+        except ModuleNotFoundError as error:
+            raise RequestError(
+                f"the workers of {self.scheduler} cannot import {error.name}.",
+                fix=f"Install sealfit {__version__} in the environment that they are started from.",
+            ) from error
+        if not versions:
+            fix = f"Start one: dask worker {self.scheduler} --nthreads 1"
+            raise RequestError(f"the cluster {self.scheduler} has no workers.", fix=fix)
+        if others := {worker: found for worker, found in versions.items() if found != __version__}:
+            worker, found = next(iter(others.items()))
+            raise RequestError(
+                f"the worker {worker} has sealfit {found}, here is {__version__}.",
+                fix="Install the same version everywhere: results are not to depend on where they are computed.",
+            )
+
+    def require_folders(self, *folders: Path) -> None:
+        """Raise RequestError unless every worker sees these folders."""
+        for folder in folders:
+            for worker, there in self._client.run(_is_folder, str(folder.resolve())).items():
+                if not there:
+                    raise RequestError(
+                        f"the worker {worker} does not see the folder {folder.resolve()}.",
+                        fix="Put campaign and OUT on a file system that all workers share, under the same path.",
+                    )
+
+    def threads(self) -> int:
+        """Return how many pieces of work the cluster can do at once, now."""
+        return sum(self._client.nthreads().values())
+
+    def close(self) -> None:
+        """Leave the cluster; it goes on."""
+        self._client.close()
+
+    def apply(self, function: Callable[[bytes], list], chunks: Iterator[bytes]) -> Iterator[list]:
+        """Yield the list that `function` makes of each chunk.
+
+        Raises
+        ------
+        WorkerError
+            If the cluster gives a chunk up, or goes away.
+        """
+        import dask
+        from distributed import CancelledError, KilledWorker
+
+        sent: deque = deque()
+
+        def send() -> None:
+            room = max(2, WAITING_PER_THREAD * self.threads()) - len(sent)
+            with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):  # a fold is large
+                for chunk in islice(chunks, max(room, 0)):
+                    # A key of its own: equal chunks of two runs are not one piece of work.
+                    sent.append(self._client.submit(function, chunk, key=f"sealfit-{uuid.uuid4().hex}", pure=False))
+
+        try:
+            send()
+            while sent:
+                made = self._result(sent[0])
+                sent.popleft().release()
+                send()
+                yield made
+        except KilledWorker as error:
+            raise WorkerError(
+                "several workers of the cluster died over the same piece of work.",
+                fix="If memory ran out, give the workers more of it; their logs say more.",
+            ) from error
+        except (CancelledError, OSError) as error:
+            if sent and sent[0].status == "error":  # the work's own
+                raise
+            raise WorkerError(
+                f"the cluster {self.scheduler} went away.", fix="Look at the scheduler, and run the command again."
+            ) from error
+        finally:
+            if sent:
+                self._client.cancel(list(sent))
+
+    def _result(self, future: Future) -> list:
+        """Return a chunk's answer; WorkerError where no worker is left for a while to give one."""
+        ended, alone = threading.Event(), 0.0
+        future.add_done_callback(lambda _: ended.set())  # a wait of Dask's own may lose an answer that comes as it ends
+        while alone < ALONE_S:
+            if ended.wait(LOOK_S):
+                try:
+                    return future.result(timeout=ALONE_S)  # not at once if its worker has died since
+                except TimeoutError:
+                    if future.status == "error":  # the work itself ended with one
+                        raise
+            alone = alone + LOOK_S if not self.threads() else 0.0
+        raise WorkerError(
+            f"the cluster {self.scheduler} has no workers left.",
+            fix="If memory ran out, give them more of it; start them again, then run the command again.",
+        )
+
+
+def _connected(scheduler: str) -> Client:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise RequestError("Dask is not installed.", fix="Run: pip install 'sealfit[cluster]'") from error
+    try:
+        address = json.loads(Path(scheduler).read_text("utf-8"))["address"] if Path(scheduler).is_file() else scheduler
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RequestError(
+            f"{scheduler} is no scheduler file.", fix=f"Give one that Dask wrote, or {EXAMPLE}."
+        ) from error
+    place = re.fullmatch(r"\w+://\[?(?P<host>[^]]+)\]?:(?P<port>\d+)", address)
+    if place is None:
+        raise RequestError(f"'{scheduler}' is no address of a scheduler.", fix=f"Write {EXAMPLE}, or its file.")
+    try:  # by hand first: a client that finds nobody holds the program for a minute
+        socket.create_connection((place["host"], int(place["port"])), timeout=CONNECT_S).close()
+        return Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise RequestError(
+            f"no Dask scheduler answers at {address}.",
+            fix="Start one (dask scheduler), or give the path of its scheduler file.",
+        ) from error
+
+
+def _version() -> str:
+    one_thread()
+    return __version__
+
+
+def _is_folder(folder: str) -> bool:
+    return Path(folder).is_dir()

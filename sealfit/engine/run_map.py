@@ -1,0 +1,227 @@
+"""Map work over the cores of this computer or over a Dask cluster, in order; the only file that knows which."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextvars import ContextVar
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from sealfit.engine import one_thread
+from sealfit.errors import WorkerError
+
+if TYPE_CHECKING:
+    from sealfit.engine.cluster import Cluster
+
+
+# ---------------------------------------------------------------- engine
+# Map work over the cores of this computer or over a cluster, in order; the only file that knows which.
+
+Given = TypeVar("Given")
+Made = TypeVar("Made")
+
+CHUNKS_PER_WORKER = 4  # enough to even out items of different cost, few enough to keep the cost of sending low
+MAX_CHUNK = 32  # so that progress is shown often
+
+_cluster: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
+
+
+def cores() -> int:
+    """Return the number of cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def on_cluster(scheduler: str | None, *folders: Path) -> Iterator[None]:
+    """Let every map of the block run on the cluster of a Dask scheduler; on this computer where it is None.
+
+    Parameters
+    ----------
+    scheduler : str or None
+        Address ("tcp://host:8786"), or path of a scheduler file.
+    folders : Path
+        Folders that every worker has to see.
+
+    Raises
+    ------
+    RequestError
+        If the cluster cannot be used; it says why.
+    """
+    if scheduler is None:
+        yield
+        return
+    from sealfit.engine.cluster import Cluster
+
+    cluster = Cluster(scheduler)
+    before = _cluster.set(cluster)
+    try:
+        cluster.require_folders(*folders)
+        yield
+    finally:
+        _cluster.reset(before)
+        cluster.close()
+
+
+def run_map(
+    function: Callable[[Given], Made], items: Iterable[Given], *, workers: int = 1, together: int | None = None
+) -> Iterator[Made]:
+    """Yield `function(item)` for every item, in the order of the items.
+
+    With one worker, one item, or inside a worker, the work is done here; otherwise in `workers` new processes, or on
+    the cluster of `on_cluster`, several items at a time. Results do not depend on where.
+
+    Parameters
+    ----------
+    function : callable
+        A pure function at the top level of a module: processes find it by its name. An exception it raises ends the
+        map and is raised here.
+    items : iterable
+        What to map over; each item is sent to a process, so keep it small.
+    workers : int
+        Processes to use, at least 1; has no meaning on a cluster.
+    together : int, optional
+        Items that are sent to a process at once; by default as many as keep the cost of sending low.
+
+    Raises
+    ------
+    WorkerError
+        If a process dies before it has answered (killed, or out of memory), or the cluster gives up.
+    """
+    items = items if isinstance(items, Sequence) else list(items)
+    cluster = _cluster.get()
+    inside_worker = multiprocessing.parent_process() is not None
+    if inside_worker or (cluster is None and (workers <= 1 or len(items) <= 1)):
+        yield from map(function, items)
+        return
+    workers = min(workers, len(items)) if cluster is None else max(cluster.threads(), 1)
+    size = together or max(1, min(MAX_CHUNK, len(items) // (workers * CHUNKS_PER_WORKER)))
+    # Pickled here, not by another thread later, while the caller goes on to use and change the items.
+    chunks = (pickle.dumps((function, items[start : start + size])) for start in range(0, len(items), size))
+    if cluster is None:
+        made = in_processes(_apply, chunks, workers, load=function_module(function))
+    else:
+        made = cluster.apply(_apply, chunks)
+    with contextlib.closing(made):
+        for results in made:
+            yield from results
+
+
+def function_module(function: Callable) -> str:
+    """Return the name of the module that a function, or a partial one, is found in."""
+    return getattr(function, "func", function).__module__
+
+
+def _apply(pickled: bytes) -> list:
+    function, chunk = pickle.loads(pickled)
+    return [function(item) for item in chunk]
+
+
+# ---------------------------------------------------------------- processes
+# Chunks of work in processes of this computer, their results in order.
+
+WAITING_PER_WORKER = 2  # chunks sent ahead of the one awaited: bounds the memory of results not yet taken
+# Not fork: it copies the locks of pyarrow's and BLAS's threads without the threads that free them. A fork server has
+# no threads, and has loaded what the workers need before the first of them is wanted.
+START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+
+
+def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], workers: int, *, load: str) -> Iterator[list]:
+    """Yield the list that `apply` makes of each chunk.
+
+    Parameters
+    ----------
+    apply : callable
+        At the top level of a module.
+    chunks : iterator of bytes
+        What it is given, one after the other.
+    workers : int
+        Processes to use.
+    load : str
+        Module that the server of processes imports once, so that no process imports it again.
+
+    Raises
+    ------
+    WorkerError
+        If a process dies before it has answered (killed, or out of memory).
+    """
+    context = multiprocessing.get_context(START)
+    if START == "forkserver":
+        context.set_forkserver_preload([load])
+    executor = ProcessPoolExecutor(workers, context, _start_worker)
+    sent: deque[Future[list]] = deque()
+
+    def send(count: int) -> None:
+        with _no_interrupt_for_children():
+            sent.extend(executor.submit(apply, chunk) for chunk in islice(chunks, count))
+
+    finished = False
+    try:
+        send(workers * WAITING_PER_WORKER)
+        while sent:
+            made = sent.popleft().result()
+            send(1)
+            yield made
+        finished = True
+    except (BrokenProcessPool, EOFError) as error:  # the second where it was the server that starts them
+        raise _died() from error
+    finally:
+        processes = list((executor._processes or {}).values())
+        executor.shutdown(wait=finished, cancel_futures=True)
+        if not finished:  # interrupted, failed, or no longer wanted: nobody waits for what is still being computed
+            for process in processes:
+                process.terminate()
+            for process in processes:
+                process.join()
+
+
+def _died() -> WorkerError:
+    return WorkerError(
+        "a worker process died before it had answered.", fix="If memory ran out, use fewer workers (--workers 1)."
+    )
+
+
+@contextlib.contextmanager
+def _no_interrupt_for_children() -> Iterator[None]:
+    """Start processes that do not see Ctrl-C: the parent stops them, so none prints a traceback of its own.
+
+    A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not lost.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # here, as it lets Ctrl-C through again when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker() -> None:
+    if sys.platform == "win32":
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    one_thread()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is gone, or a killed run would leave its workers waiting forever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

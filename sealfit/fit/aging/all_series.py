@@ -1,0 +1,214 @@
+"""Joint laws of aging for the tables of OUT: every law with its evidence, against separate laws of the series."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pandas as pd
+
+from sealfit.config import Config
+from sealfit.engine.run_map import run_map
+from sealfit.errors import FitError, RequestError
+from sealfit.fit.aging.joint_law import Aged, JointLaw, fit_laws, left_out, reference_of, rivals_of
+from sealfit.fit.aging.law import Values, fit_law, law_model
+from sealfit.fit.steady.fit import FORCES, parameter_units
+from sealfit.fit.steady.shared_curve import Levels, shared_levels
+from sealfit.physics.aging_laws import LOSSES
+from sealfit.tables import AGING_LAWS, MASTER_CURVE
+
+TEMPERATURE, COMPRESSION = "temperature_C", "compression_ratio_pct"
+SEPARATE = "separate"  # Eq. 15 with a and b of its own for every series
+MANY = 600  # values of a quantity from which a process of its own is worth its start
+LIKELY = 3  # laws held against data they were not fitted to
+CURVE_POINTS = 61
+START_POINTS = 20  # more, between day 0 and a third of the first day
+
+
+def aged_values(levels: Levels, rubber: str, quantity: str) -> Aged:
+    """Return the values of one quantity of a rubber over its conditions, those that the forces determine.
+
+    Parameters
+    ----------
+    levels : Levels
+        As `shared_levels` gives them.
+    rubber, quantity : str
+        Which; "mu_s", "mu_c", "F_s" or "F_c".
+    """
+    of = (levels.table["rubber"] == rubber) & (levels.table["quantity"] == quantity)
+    rows, here = levels.table[of], of.to_numpy()
+
+    def column(name):
+        return rows[name].to_numpy(float) if name in rows and rows[name].notna().any() else None
+
+    return Aged(
+        rows["aging_days"].to_numpy(float),
+        rows["value"].to_numpy(float),
+        column(TEMPERATURE),
+        column(COMPRESSION),
+        levels.covariance[np.ix_(here, here)],
+    )
+
+
+def joint_laws(
+    steady: pd.DataFrame, steady_fit: pd.DataFrame, config: Config, *, workers: int = 1
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return tables `aging_laws` and `master_curve`; empty without aging or with too few conditions.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`: the forces.
+    steady_fit : DataFrame
+        Table `steady_fit` with the condition columns.
+    config : Config
+        Says whether rubber is aged, and gives the units.
+    workers : int
+        Processes for the quantities of many conditions.
+    """
+    rows, curves = [], []
+    if config.aging and "aging_days" in steady_fit.columns:
+        levels = shared_levels(steady, steady_fit)
+        quantities = _quantities(levels)
+        asked = [
+            (aged_values(levels, rubber, quantity), parameter_units(config.units, quantity in FORCES)["mu_s"])
+            for rubber, quantity in quantities
+        ]
+        many = len(levels.table) > MANY * len(quantities)
+        found = run_map(_told, asked, workers=workers if many else 1, together=1)
+        for (rubber, quantity), told in zip(quantities, found, strict=True):
+            if told is not None:
+                at = {"rubber": rubber, "quantity": quantity}
+                rows += [{**at, **row} for row in told[0]]
+                curves.append(told[1].assign(**at))
+    curves = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
+    return (
+        pd.DataFrame(rows).assign(model="before").reindex(columns=AGING_LAWS.names()),
+        curves.reindex(columns=MASTER_CURVE.names()),
+    )
+
+
+def _told(given: tuple[Aged, str]) -> tuple[list[dict], pd.DataFrame] | None:
+    """Return the rows of both tables on one quantity, given its values and unit; None where no law can be fitted."""
+    aged, unit = given
+    try:
+        laws = fit_laws(aged)
+    except FitError:
+        return None
+    return list(_law_rows(laws, unit)), _master_curve(laws[0])
+
+
+def _quantities(levels: Levels) -> list[tuple[str, str]]:
+    """Return rubber and quantity of all values, in order."""
+    pairs = levels.table[["rubber", "quantity"]].drop_duplicates()
+    return sorted(pairs.itertuples(index=False, name=None))
+
+
+def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
+    best = laws[0]
+    rivals = rivals_of(laws)
+    for number, law in enumerate(laws):
+        held = left_out(law) if number < LIKELY else {}
+        head = {
+            "law": law.loss.name,
+            "way": law.way if best.aged.drivers() else "",
+            "form": law.loss.form,
+            "rank": number + 1,
+            "rival": law in rivals,
+            "criterion": law.bic - best.bic,
+            "scatter_rel": law.scatter,
+            "heldout_series": held.get("series", np.nan),
+            "heldout_last_day": held.get("last_day", np.nan),
+        }
+        units = {"mu_0": unit, "a": unit, "E": "kJ/mol", "kappa": "1/%"}
+        units |= dict(zip(law.loss.parameters, law.loss.units, strict=True))
+        for name, value, low, high, known in law.parameters():
+            yield {
+                **head, "parameter": name, "value": value, "lo95": low, "hi95": high, "unit": units[name],
+                "identified": known,
+            }  # fmt: skip
+    apart = _separate(best)
+    if apart is not None:
+        yield {
+            "law": SEPARATE, "way": "", "form": "mu_0 - a ln(1 + t/b), a and b of each series", "rank": len(laws) + 1,
+            "rival": False, "criterion": apart[0] - best.bic, "heldout_last_day": apart[1], "identified": True,
+        }  # fmt: skip
+
+
+def _separate(law: JointLaw) -> tuple[float, float] | None:
+    """Return Schwarz's criterion of separate laws under the joint law's scatter, and their error at last days.
+
+    None where the series have too few values for laws of their own.
+    """
+    aged, series = law.aged, law.aged.series()
+    days = [np.unique(aged.days[own]).size for own in aged.whole_series()]
+    if len(days) < 2 or min(days) < 3:
+        return None
+    origin = np.zeros(aged.value.size, int)
+    fitted = fit_law(Values(aged.days, aged.value, origin, series, aged.covariance(law.scatter)))
+    bic = fitted.chi2 + aged.spread.log_determinant(law.scatter) + fitted.x.size * np.log(aged.value.size)
+    squares = []
+    for out in aged.last_days() if min(days) > 3 else []:
+        part = fit_law(fitted.values.part(~out))
+        squares += list((law_model(fitted.values, part.x)[0][out] - aged.value[out]) ** 2)
+    return bic, float(np.sqrt(np.mean(squares))) if squares else np.nan
+
+
+def _master_curve(law: JointLaw) -> pd.DataFrame:
+    """Return the values on the master curve, and the law at the reference temperature and compression with its band.
+
+    Where these change the rate of aging the values stand over k t; where they change the loss, a loss is divided by k.
+    """
+    aged = law.aged
+    tested = (aged.temperature_C, aged.compression_pct)
+    scaled, start = law.tested_days(), law.x[0]
+    value = aged.value if law.way == "rate" else start + (aged.value - start) / law.rate(aged)
+    points = {"kind": "value", "scaled_days": scaled, "value": value, "aging_days": aged.days}
+    for name, column in zip((TEMPERATURE, COMPRESSION), tested, strict=True):
+        points[name] = np.nan if column is None else np.where(aged.days > 0, column, np.nan)
+    first = scaled[scaled > 0].min() / 3
+    near = first * np.linspace(0, 1, START_POINTS, endpoint=False) ** 2  # where laws fall fastest
+    days = np.r_[near, np.geomspace(first, scaled.max() * 1.5, CURVE_POINTS)]
+    middle = (None if c is None else np.full(days.size, reference_of(c[aged.days > 0])) for c in tested)
+    at = Aged(days, np.zeros(days.size), *middle)
+    slope = law.slope(at)
+    half = law.t * np.sqrt(np.einsum("in,ij,jn->n", slope, law.covariance, slope))
+    value = law.at(at)
+    curve = {"kind": "law", "scaled_days": days, "value": value, "lo95": value - half, "hi95": value + half}
+    return pd.concat([pd.DataFrame(points), pd.DataFrame(curve)], ignore_index=True)
+
+
+def law_of(steady: pd.DataFrame, steady_fit: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
+    """Return the laws of one quantity, likeliest first; or a named one alone.
+
+    Parameters
+    ----------
+    steady, steady_fit : DataFrame
+        The tables of these names.
+    quantity : str
+        "mu_s", "mu_c", "F_s" or "F_c".
+    name : str, optional
+        Of the law.
+
+    Raises
+    ------
+    RequestError
+        If rubber is not aged, the quantity was not fitted, there are several rubbers, or no such law can be fitted.
+    """
+    if "aging_days" not in steady_fit.columns:
+        raise RequestError("this rig ages no rubber.", fix="Name aging_days in the config's condition.")
+    levels = shared_levels(steady, steady_fit)
+    known = _quantities(levels)
+    rubbers = [rubber for rubber, own in known if own == quantity]
+    if not rubbers:
+        there = ", ".join(dict.fromkeys(own for _, own in known)) or "none"
+        raise RequestError(f"there is no '{quantity}' to follow.", fix=f"Choose one of: {there}.")
+    if len(rubbers) > 1:
+        raise RequestError(f"there are several rubbers: {', '.join(rubbers)}.", fix="Analyse them one by one.")
+    if name is not None and name not in LOSSES:
+        raise RequestError(f"there is no law '{name}'.", fix=f"Choose one of: {', '.join(LOSSES)}.")
+    aged = aged_values(levels, rubbers[0], quantity)
+    try:
+        return fit_laws(aged) if name is None else fit_laws(aged, (name,))
+    except FitError as error:
+        raise RequestError(error.message, fix=error.fix) from error

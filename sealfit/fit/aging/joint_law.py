@@ -1,0 +1,383 @@
+"""One law of aging for all temperatures and compressions of a rubber, and the evidence for its shape."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.special import stdtrit
+
+from sealfit.effects import aging_laws
+from sealfit.errors import FitError
+from sealfit.fit.aging.joint_least_squares import solved, solved_without
+from sealfit.fit.joint.prior import covariance_of
+from sealfit.physics.aging_laws import LOSSES, Loss
+
+# ---------------------------------------------------------------- aged
+# Values of one quantity over aging time, temperature and compression: what a joint law is fitted to.
+
+GAS_CONSTANT = aging_laws.GAS_CONSTANT / 1000  # kJ/(mol K)
+TINY = 1e-300  # of a variance: values without any scatter
+ROUNDING = 1e-14  # of the largest variance: less is not known of a covariance
+
+
+def _inverse(celsius):
+    return 1 / (GAS_CONSTANT * (np.asarray(celsius, float) + aging_laws.ZERO_C))
+
+
+def _plain(percent):
+    return np.asarray(percent, float)
+
+
+DRIVERS = (("E", "temperature_C", _inverse), ("kappa", "compression_pct", _plain))
+"""What changes the pace of aging: its coefficient in ln k (kJ/mol, 1/%), where it stands, what it is multiplied by."""
+
+
+@dataclass(frozen=True)
+class Aged:
+    """Values of one quantity: a specimen, or the mean of those of one condition, each.
+
+    Attributes
+    ----------
+    days, value : ndarray, shape (n,)
+        Aging time in days, and the value measured.
+    temperature_C, compression_pct : ndarray, shape (n,), or None
+        Of aging; whatever stands there for unaged specimens is not read. None where no such thing was varied.
+    variance : ndarray, shape (n,) or (n, n), or None
+        Variance or covariance of the values as measured; the scatter between specimens is estimated and added. None
+        where it is all there is.
+    """
+
+    days: np.ndarray
+    value: np.ndarray
+    temperature_C: np.ndarray | None = None
+    compression_pct: np.ndarray | None = None
+    variance: np.ndarray | None = None
+
+    def part(self, keep: np.ndarray) -> Aged:
+        """Return some of the values; `keep` is a mask, shape (n,)."""
+        taken = {
+            name: None if getattr(self, name) is None else getattr(self, name)[keep]
+            for name in ("temperature_C", "compression_pct")
+        }
+        variance = self.variance
+        if variance is not None:
+            variance = variance[keep] if variance.ndim == 1 else variance[np.ix_(keep, keep)]
+        return replace(self, days=self.days[keep], value=self.value[keep], variance=variance, **taken)
+
+    def covariance(self, scatter: float, about: np.ndarray | None = None) -> np.ndarray:
+        """Return the covariance of the values, shape (n, n).
+
+        Parameters
+        ----------
+        scatter : float
+            Relative standard deviation between specimens, beyond the measured variance.
+        about : ndarray, shape (n,), optional
+            What it is relative to; default the values.
+        """
+        measured = np.zeros(self.value.size) if self.variance is None else self.variance
+        own = (scatter * (self.value if about is None else about)) ** 2 + TINY
+        return (np.diag(measured) if measured.ndim == 1 else measured) + np.diag(own)
+
+    @cached_property
+    def spread(self) -> Spread:
+        """The same for any scatter."""
+        return Spread(self.covariance(0.0), np.abs(self.value))
+
+    def drivers(self) -> tuple[str, ...]:
+        """Return the names of the coefficients in ln k of what was varied."""
+        aged, found = self.days > 0, []
+        for name, column, _ in DRIVERS:
+            at = getattr(self, column)
+            if at is not None and np.unique(at[aged]).size > 1:
+                found.append(name)
+        return tuple(found)
+
+    @cached_property
+    def middle(self) -> dict[str, float]:
+        """The middle of the tested temperatures and compressions, by the name of the coefficient."""
+        there = ((name, getattr(self, column)) for name, column, _ in DRIVERS)
+        return {name: reference_of(at[self.days > 0]) for name, at in there if at is not None}
+
+    def away(self, name: str, middle: float) -> np.ndarray:
+        """Return what a coefficient multiplies in ln k, counted from a temperature or compression, shape (n,)."""
+        column, of = next((column, of) for own, column, of in DRIVERS if own == name)
+        return np.where(self.days > 0, of(middle) - of(getattr(self, column)), 0.0)
+
+    def series(self) -> np.ndarray:
+        """Return the number of each value's series, shape (n,); -1 for unaged specimens."""
+        keys = [at for at in (self.temperature_C, self.compression_pct) if at is not None]
+        number, aged = np.full(self.days.size, -1), self.days > 0
+        number[aged] = 0
+        if keys:
+            number[aged] = np.unique(np.column_stack(keys)[aged], axis=0, return_inverse=True)[1].ravel()
+        return number
+
+    def whole_series(self) -> list[np.ndarray]:
+        """Return the mask of each series, shape (n,) each."""
+        series = self.series()
+        return [series == k for k in np.unique(series[series >= 0])]
+
+    def last_days(self) -> list[np.ndarray]:
+        """Return the mask of each series' last day, shape (n,) each."""
+        return [own & (self.days == self.days[own].max()) for own in self.whole_series()]
+
+
+class Spread:
+    """The covariance C(s) = M + s^2 diag(size)^2 of values for any scatter s, decomposed once.
+
+    Parameters
+    ----------
+    measured : ndarray, shape (n, n)
+        M.
+    size : ndarray, shape (n,)
+        What the scatter is relative to.
+
+    Notes
+    -----
+    Relative to the sizes C is M' + s^2, and the axes of M' are those of C for every s.
+    """
+
+    def __init__(self, measured: np.ndarray, size: np.ndarray) -> None:
+        self._size = np.maximum(size, ROUNDING * size.max())
+        variance, self._axes = np.linalg.eigh(measured / np.outer(self._size, self._size))
+        self._variance = np.maximum(variance, max(ROUNDING * variance[-1], TINY))
+
+    def whitening(self, scatter: float) -> np.ndarray:
+        """Return W with W C W' = 1, shape (n, n)."""
+        return self._axes.T / self._size / np.sqrt(self._variance + scatter**2)[:, None]
+
+    def chi2(self, residual: np.ndarray, scatter: float) -> float:
+        """Return r' C^-1 r of a residual, shape (n,)."""
+        return float(((residual / self._size) @ self._axes) ** 2 @ (1 / (self._variance + scatter**2)))
+
+    def log_determinant(self, scatter: float) -> float:
+        """Return ln det C."""
+        return float(np.log(self._variance + scatter**2).sum() + 2 * np.log(self._size).sum())
+
+
+def reference_of(tested: np.ndarray) -> float:
+    """Return the middle of the tested temperatures or compressions, at which k is 1."""
+    return float(np.median(np.unique(tested)))
+
+
+# ---------------------------------------------------------------- joint law
+# One law of aging for all temperatures and compressions of a rubber, and the evidence for its shape.
+#
+# .. math:: \mu(t, T, C) = \mu_0 - a\, k^{w}\, \varphi(k^{1-w}\, t), \quad
+#     \ln k = \frac{E}{R} \Big(\frac{1}{T_{ref}} - \frac{1}{T}\Big) + \kappa\, (C_{ref} - C)
+#
+# with T in kelvin and C the height while aging in percent. Temperature and compression change the rate of aging (w = 0:
+# time-temperature superposition, all series fall on one master curve over k t) or the loss itself (w = 1). mu_0 is that
+# of the unaged rubber, shared by all. phi is one of `sealfit.physics.aging_laws`; which shape and which way is chosen
+# by Schwarz's criterion, and the rivals are kept beside it.  Ferry 1980, Viscoelastic Properties of Polymers, chapter
+# 11 (superposition); ISO 11346 (life of rubber by Arrhenius).
+
+WAYS = ("rate", "loss")  # what temperature and compression change
+TURNS, SETTLED = 4, 0.02  # of the fit and the scatter, at most; relative change of the scatter that ends them
+RIVAL = 6.0  # of the criterion: a rival law is less likely than the chosen one by less than exp(3)
+KNOWN = np.log(100.0)  # a positive number whose 95 % interval spans more than this is not determined
+
+
+@dataclass(frozen=True)
+class JointLaw:
+    """A law fitted to all series of one quantity.
+
+    Attributes
+    ----------
+    aged : Aged
+        What it was fitted to.
+    loss, way : Loss, str
+        Shape, and what temperature and compression change.
+    names : tuple of str
+        mu_0, a, the shape's own, E, kappa, those that there are.
+    x : ndarray, shape (p,)
+        Estimates in this order; the shape's own as logarithms.
+    covariance : ndarray, shape (p, p)
+        Of x.
+    scatter : float
+        Relative standard deviation between specimens beyond the measured variance.
+    criterion : float
+        Schwarz's: -2 log L + p log n.
+    """
+
+    aged: Aged
+    loss: Loss
+    way: str
+    names: tuple[str, ...]
+    x: np.ndarray
+    covariance: np.ndarray
+    scatter: float
+    bic: float
+
+    @property
+    def df(self) -> int:
+        """Values less parameters."""
+        return self.aged.value.size - self.x.size
+
+    @property
+    def t(self) -> float:
+        """Student's quantile of 95 % intervals."""
+        return float(stdtrit(max(self.df, 1), 0.975))
+
+    def at(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
+        """Return the law at other conditions, shape (n,), or (..., n) for x of shape (..., p).
+
+        The references of temperature and compression are those of the fit.
+        """
+        x = self.x if x is None else x
+        k, own = self.rate(aged, x), self.own(x)
+        lost = self.loss.value(aged.days * k, *own) if self.way == "rate" else k * self.loss.value(aged.days, *own)
+        return x[..., :1] - x[..., 1:2] * lost
+
+    def own(self, x: np.ndarray | None = None) -> list[np.ndarray]:
+        """Return the shape's own numbers, shape (..., 1) each."""
+        x = self.x if x is None else x
+        return [np.exp(x[..., 2 + k, None]) for k in range(len(self.loss.parameters))]
+
+    def rate(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
+        """Return k at some conditions, shape (..., n)."""
+        x, logarithm = self.x if x is None else x, np.zeros(aged.days.size)
+        for name, away in self.away(aged).items():
+            logarithm = logarithm + x[..., self.names.index(name), None] * away
+        return np.exp(np.clip(logarithm, -50, 50))
+
+    def away(self, aged: Aged) -> dict[str, np.ndarray]:
+        """Return what E and kappa, those that there are, multiply in ln k at some conditions, shape (n,) each."""
+        return {name: aged.away(name, self.aged.middle[name]) for name in self.names[2 + len(self.loss.parameters) :]}
+
+    def slope(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
+        """Return the derivative of the law along its parameters, shape (p, n), or (..., p, n) for many x."""
+        x = self.x if x is None else x
+        k, own, a = self.rate(aged, x), self.own(x), x[..., 1:2]
+        if self.way == "rate":
+            lost = self.loss.value(aged.days * k, *own)
+            along_k, *along_own = self.loss.slopes(aged.days * k, *own)
+        else:
+            lost = along_k = k * self.loss.value(aged.days, *own)
+            along_own = [k * slope for slope in self.loss.slopes(aged.days, *own)[1:]]
+        along = [*along_own, *(along_k * away for away in self.away(aged).values())]
+        return np.stack([np.ones_like(lost), -lost, *(-a * slope for slope in along)], axis=-2)
+
+    def tested_days(self) -> np.ndarray:
+        """Return the days of the tests, in the master curve's time where there is one, shape (n,)."""
+        return self.aged.days * (self.rate(self.aged) if self.way == "rate" else 1.0)
+
+    def parameters(self) -> Iterator[tuple[str, float, float, float, bool]]:
+        """Yield name, value, ends of the 95 % interval, and whether the values determine it."""
+        for k, name in enumerate(self.names):
+            half = self.t * float(np.sqrt(self.covariance[k, k]))
+            if name in self.loss.parameters:
+                low, high = (float(np.exp(np.clip(self.x[k] + s * half, -700, 700))) for s in (-1, 1))
+                yield name, float(np.exp(self.x[k])), low, high, bool(2 * half < KNOWN)
+            else:
+                known = np.isfinite(half) and (name != "a" or abs(self.x[k]) > half)
+                yield name, float(self.x[k]), float(self.x[k] - half), float(self.x[k] + half), bool(known)
+
+
+def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
+    """Fit one law to all series of a quantity, the scatter between specimens estimated with it.
+
+    Parameters
+    ----------
+    aged : Aged
+        Values of at least as many conditions as the law has numbers.
+    loss : str
+        Name in `LOSSES`.
+    way : str
+        "rate" or "loss".
+
+    Raises
+    ------
+    FitError
+        If there are fewer different conditions than parameters, or no aged specimen.
+    """
+    shape, drivers = LOSSES[loss], aged.drivers()
+    names = ("mu_0", "a", *shape.parameters, *drivers)
+    conditions = len(set(zip(aged.series().tolist(), aged.days.tolist(), strict=True)))
+    if not (aged.days > 0).any():
+        raise FitError("no aged rubber was tested.", fix="Test at least two aged conditions.")
+    if conditions < len(names):
+        raise FitError(
+            f"{conditions} conditions do not determine the {len(names)} numbers of the law '{loss}'.",
+            fix="Test more days, or choose a law with fewer numbers.",
+        )
+    empty = JointLaw(aged, shape, way, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf)
+    x, scatter, before = None, 0.05, np.inf
+    for _ in range(TURNS):
+        x = solved(empty, aged.spread.whitening(scatter), x)
+        before, scatter = scatter, _scatter(aged, aged.value - empty.at(aged, x), aged.value.size - len(names))
+        if abs(scatter - before) <= SETTLED * before:
+            break
+    bic = aged.spread.chi2(aged.value - empty.at(aged, x), scatter) + aged.spread.log_determinant(scatter)
+    bic += len(names) * float(np.log(aged.value.size))
+    white = aged.spread.whitening(scatter) @ empty.slope(aged, x).T
+    covariance = covariance_of(white.T @ white, np.zeros((len(names),) * 2))
+    return replace(empty, x=x, covariance=covariance, scatter=scatter, bic=bic)
+
+
+def _scatter(aged: Aged, residual: np.ndarray, df: int) -> float:
+    """Return the relative scatter beyond the measured variance at which chi-square is its degrees of freedom.
+
+    Paule & Mandel 1982, J. Res. NBS 87(5), 377-385, doi:10.6028/jres.087.022.
+    """
+    if df < 1:
+        return 0.0
+
+    def excess(tau):
+        return aged.spread.chi2(residual, tau) - df
+
+    if not excess(0.0) > 0:  # also where a start gives no number
+        return 0.0
+    high = float(np.sqrt(np.mean((residual / aged.value) ** 2))) + 1e-9
+    while excess(high) > 0:
+        high *= 2
+    return float(brentq(excess, 0.0, high, xtol=1e-6 * high))
+
+
+def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw]:
+    """Return every law that these values determine, both ways, likeliest first.
+
+    Raises
+    ------
+    FitError
+        If they determine none.
+    """
+    found, first = [], None
+    for loss in losses:
+        both = aged.drivers() and loss != "power"  # a power of k t is a power of k times one of t
+        for way in WAYS if both else WAYS[:1]:
+            try:
+                found.append(fit_joint_law(aged, loss, way))
+            except FitError as error:
+                first = first or error  # of the law with the fewest numbers
+    if not found:
+        raise first
+    return sorted(found, key=lambda law: law.bic)
+
+
+def rivals_of(laws: Sequence[JointLaw]) -> list[JointLaw]:
+    """Return the laws that these values cannot tell from the first."""
+    return [law for law in laws[1:] if law.bic - laws[0].bic < RIVAL]
+
+
+def left_out(law: JointLaw) -> dict[str, float]:
+    """Return the RMS error of a law at whole series, and at last days, that it was not fitted to; NaN without any."""
+    aged, drivers = law.aged, law.aged.drivers()
+    whole = aged.whole_series()
+    held = {"series": whole if len(whole) > 2 else [], "last_day": aged.last_days()}
+    plain = replace(aged, variance=None)  # a matrix that is not asked for here, and large
+    kept = {name: [out for out in masks if plain.part(~out).drivers() == drivers] for name, masks in held.items()}
+    masks = np.array([out for own in kept.values() for out in own])
+    if not len(masks):
+        return dict.fromkeys(kept, np.nan)
+    errors = law.at(aged, solved_without(law, aged.spread.whitening(law.scatter), masks)) - aged.value
+    found, start = {}, 0
+    for name, own in kept.items():
+        squares = errors[start : start + len(own)][masks[start : start + len(own)]] ** 2
+        found[name] = float(np.sqrt(np.mean(squares))) if squares.size else np.nan
+        start += len(own)
+    return found

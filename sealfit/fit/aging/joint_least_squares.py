@@ -1,0 +1,154 @@
+"""The least squares of a joint law of aging: from anywhere, without some of the values, or of many draws of them."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sealfit.fit.least_squares import levenberg_marquardt
+
+if TYPE_CHECKING:
+    from sealfit.fit.aging.joint_law import JointLaw
+
+ENERGIES = (0.0, 50.0, 100.0)  # kJ/mol, to begin with
+SHAPES = {"b": (0.01, 0.3, 10.0), "tau": (0.5, 5.0, 50.0), "beta": (0.5, 1.0), "n": (0.2, 0.5, 1.0), "t_i": (0.3, 3.0)}
+LIMITS = {"b": (1e-9, 1e4), "tau": (1e-6, 1e6), "beta": (0.05, 5.0), "n": (0.01, 5.0), "t_i": (1e-3, 1e3)}
+LINEAR = 2  # mu_0 and a: the law is linear in them
+POLISHED = 4  # points of the grid
+DEPENDENT = 1e-20  # share of a loss beyond mu_0, squared, below which it is one with it
+
+
+def solved(law: JointLaw, white: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+    """Return the parameters of least squares, shape (p,): from a start, or from the best few of a grid.
+
+    Parameters
+    ----------
+    law : JointLaw
+        Gives shape, way, values and the references.
+    white : ndarray, shape (n, n)
+        W with W C W' = 1 for the covariance C of the values.
+    start : ndarray, shape (p,), optional
+        Where to begin.
+    """
+    problem = _Projected(law, white, law.aged.value[None])
+    bent = problem.grid() if start is None else start[None, LINEAR:]
+    x, rss = problem.polished(bent, np.zeros(len(bent), int))
+    return x[np.argmin(rss)]
+
+
+def solved_many(law: JointLaw, white: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the parameters for many draws of the values near the law's own, shape (draws, p), all draws at once.
+
+    Parameters
+    ----------
+    law : JointLaw
+        Where the search begins.
+    white : ndarray, shape (n, n)
+        W with W C W' = 1 for the covariance C of the values of a draw.
+    values : ndarray, shape (draws, n)
+        The draws.
+    """
+    return _Projected(law, white, values).polished(np.tile(law.x[LINEAR:], (len(values), 1)))[0]
+
+
+def solved_without(law: JointLaw, white: np.ndarray, masks: np.ndarray) -> np.ndarray:
+    """Return the parameters without the values of each mask, shape (masks, p), all masks at once.
+
+    Parameters
+    ----------
+    law : JointLaw
+        Where the search begins.
+    white : ndarray, shape (n, n)
+        W with W C W' = 1 for the covariance C of the values.
+    masks : ndarray of bool, shape (masks, n)
+        What is left out.
+    """
+    values = np.broadcast_to(law.aged.value, masks.shape)
+    return _Projected(law, white, values, masks).polished(np.tile(law.x[LINEAR:], (len(masks), 1)))[0]
+
+
+class _Projected:
+    """The least squares of a law on sets of values, mu_0 and a solved for: what is left to search bends less.
+
+    Parameters
+    ----------
+    law : JointLaw
+    white : ndarray, shape (n, n)
+        W with W C W' = 1 for the covariance C of the values of a set.
+    values : ndarray, shape (sets, n)
+    masks : ndarray of bool, shape (sets, n), optional
+        What is left out of each set.
+
+    Notes
+    -----
+    Golub & Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036, with the tangent of Kaufman 1975,
+    BIT 15, 49-57, doi:10.1007/BF01932995.
+    """
+
+    def __init__(self, law: JointLaw, white: np.ndarray, values: np.ndarray, masks: np.ndarray | None = None):
+        self.law, self.values, self.aside = law, values, None
+        level = white.sum(axis=1)  # the column of mu_0
+        if masks is None:
+            self.level = (level @ white / (level @ level))[None]
+            self.white = white - np.outer(level, self.level)
+        else:
+            # a value with a number of its own says nothing: with mu_0, what these numbers' columns reach goes
+            self.white, self.level = white, np.zeros(values.shape)
+            self.aside = np.zeros((len(masks), masks.sum(axis=1).max() + 1, values.shape[1]))
+            for k, out in enumerate(masks):
+                found, upper = np.linalg.qr(np.column_stack([white[:, out], level]))
+                self.aside[k, : out.sum() + 1] = found.T
+                self.level[k] = found[:, -1] @ white / upper[-1, -1]
+        self.measured = self._whitened(values[:, None], np.arange(len(values)))
+        self.reach = float((white**2).sum())
+
+    def _whitened(self, many: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """Return whitened rows, shape (r, m, n), of the sets `of` (r,), with nothing of mu_0 in them."""
+        many = (many.reshape(-1, len(self.white)) @ self.white.T).reshape(many.shape)
+        return many if self.aside is None else many - (many @ np.swapaxes(self.aside[of], 1, 2)) @ self.aside[of]
+
+    def solve(self, bent: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return mu_0 and a, shape (r, 2), the whitened residual, (r, n), and its derivative, (r, p - 2, n).
+
+        Parameters
+        ----------
+        bent : ndarray, shape (r, p - 2)
+            All other parameters.
+        of : ndarray of int, shape (r,)
+            Which set of values.
+        """
+        law, measured = self.law, self.measured[of]
+        unit = np.concatenate([np.tile([0.0, -1.0], (len(bent), 1)), bent], axis=1)  # mu_0 = 0, a = -1: the loss itself
+        plain = law.slope(law.aged, unit)[:, 1:]
+        columns = self._whitened(plain, of)
+        square = (columns[:, :1] ** 2).sum(axis=2, keepdims=True)
+        sound = square > DEPENDENT * self.reach * (plain[:, :1] ** 2).max(axis=2, keepdims=True)
+        column = np.divide(columns[:, :1], np.sqrt(square), out=np.zeros(measured.shape), where=sound)
+        along = (measured * column).sum(axis=2, keepdims=True)
+        a = np.divide(along, np.sqrt(square), out=np.zeros(square.shape), where=sound)
+        slope = columns[:, 1:] - (columns[:, 1:] * column).sum(axis=2, keepdims=True) * column
+        level = self.level[of] if len(self.level) > 1 else self.level
+        mu_0 = ((self.values[of] - a[:, 0] * plain[:, 0]) * level).sum(axis=1, keepdims=True)
+        return np.concatenate([mu_0, a[:, 0]], axis=1), (along * column - measured)[:, 0], -a * slope
+
+    def grid(self) -> np.ndarray:
+        """Return the best few points of a grid, shape (POLISHED, p - 2)."""
+        own = self.law.loss.parameters
+        grids = [[np.log(v) for v in SHAPES[name]] for name in own]
+        grids += [ENERGIES if name == "E" else (0.0,) for name in self.law.names[LINEAR + len(own) :]]
+        bent = np.array(list(product(*grids)))
+        rest = self.solve(bent, np.zeros(len(bent), int))[1]
+        return bent[np.argsort((rest**2).sum(axis=1), kind="stable")[:POLISHED]]
+
+    def polished(self, bent: np.ndarray, of: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return all parameters and the sums of squares, shape (r, p) and (r,), where starts lead to."""
+        of = np.arange(len(bent)) if of is None else of
+        own = self.law.loss.parameters
+        low, high = (
+            np.array([np.log(LIMITS[name][end]) if name in own else endless for name in self.law.names[LINEAR:]])
+            for end, endless in enumerate((-np.inf, np.inf))
+        )
+        bent, rss = levenberg_marquardt(lambda bent, rows: self.solve(bent, of[rows])[1:], bent, low, high)
+        return np.concatenate([self.solve(bent, of)[0], bent], axis=1), rss

@@ -1,0 +1,187 @@
+"""What table `aging_fit` says of one curve: its law, how good it is, and what the days tested cannot determine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtrc
+
+from sealfit.fit.aging.law import LawFit
+from sealfit.fit.aging.law_profiles import CurveInterval
+from sealfit.fit.steady.fit import table_row
+
+DAYS_FOR_LAW = 3  # mu_0, a and b are three numbers
+WIDE_B = 100.0  # a 95 % interval of b over more than this ratio does not determine it
+SIGNIFICANT = 0.05
+LAW = ("mu_0", "a", "b", "c")
+NO_SCATTER = "as many parameters as days: the interval leaves out how specimens scatter, which nothing shows."
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One quantity of one series: its place in the joint fit (-1 without a law) and the days tested."""
+
+    series: str
+    quantity: str
+    place: int
+    days: np.ndarray  # aged days tested, rising
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """mu_0, a and ln b of one curve.
+
+    Attributes
+    ----------
+    x, shift : ndarray, shape (3,)
+        Estimates, and their change when the sensor reads one standard uncertainty too high.
+    covariance : ndarray, shape (3, 3)
+        Of x.
+    """
+
+    x: np.ndarray
+    covariance: np.ndarray
+    shift: np.ndarray
+
+    @classmethod
+    def of(cls, joint: LawFit, curve: Curve, q: int, shift: np.ndarray) -> Estimate:
+        """Return those of a curve of a joint fit; `shift`, shape (p,), is of all its parameters."""
+        m, k = joint.values.origins, joint.values.curves
+        at = [q, m + curve.place, m + k + curve.place]
+        return cls(joint.x[at], joint.covariance[np.ix_(at, at)], shift[at])
+
+    def error_of_c(self) -> float:
+        """Return the standard error of c = -a ln b."""
+        gradient = np.array([0.0, -self.x[2], -self.x[1]])
+        with np.errstate(invalid="ignore"):
+            return float(np.sqrt(gradient @ self.covariance @ gradient))
+
+
+def law_rows(
+    curve: Curve, found: Estimate, t: float, ends: CurveInterval, unit: str, *, unaged: bool, df: float
+) -> Iterator[dict]:
+    """Return the rows of mu_0, a, b and c."""
+    mu_0, a, u = found.x
+    se = np.sqrt(np.diag(found.covariance))
+    b, se_c = np.exp(u), found.error_of_c()
+    beside = "" if df > 0 else NO_SCATTER
+    move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # less is rounding
+    judged = _judge(curve, a, b, ends, unaged)
+    limits = {"mu_0": (mu_0 - t * se[0], mu_0 + t * se[0]), "a": ends.a, "b": ends.b, "c": ends.c}
+    numbers = {
+        "mu_0": (mu_0, se[0], move[0], unit),
+        "a": (a, se[1], move[1], unit),
+        "b": (b, b * se[2], b * move[2], "d"),
+        "c": (-a * u, se_c, -u * move[1] - a * move[2], unit),
+    }
+    for name in LAW:
+        value, error, systematic, its_unit = numbers[name]
+        low, high = limits[name]
+        yield table_row(
+            quantity=curve.quantity,
+            parameter=name,
+            value=value,
+            se=error,
+            lo95=None if name == "b" and low == 0.0 else low,
+            hi95=high,
+            u_sys=abs(systematic),
+            unit=its_unit,
+            identified=judged[name][0],
+            reason=" ".join(filter(None, (judged[name][1], beside))),
+        ) | {"series": curve.series}
+
+
+def _judge(curve: Curve, a: float, b: float, ends: CurveInterval, unaged: bool) -> dict[str, tuple[bool, str]]:
+    verdict = dict.fromkeys(LAW, (True, ""))
+    first, last = curve.days[0], curve.days[-1]
+    low, high = ends.b
+    if ends.a[0] <= 0.0 <= ends.a[1]:
+        why = f"no aging is seen up to {last:g} d: a may be 0, and b then has no meaning."
+        verdict["a"] = (bool(np.all(np.isfinite(ends.a))), why)
+    elif np.isinf(high):
+        why = f"the loss is as good as linear up to {last:g} d: only a/b = {a / b:.3g} per day is determined."
+        verdict["a"] = (False, why)
+    elif low == 0.0 or high > WIDE_B * low:
+        span = f"from {low:.2g} to {high:.2g} d" if low > 0 else f"anything up to {high:.2g} d"
+        why = (
+            f"b may be {span}: it trades off with a and mu_0; tests before {max(min(high, first), 1e-3):.2g} d decide."
+        )
+    else:
+        why = ""
+        if b < first and unaged:
+            verdict["b"] = (True, f"below the first day tested ({first:g} d): it rests on the unaged rubber's value.")
+        elif b > last:
+            verdict["b"] = (True, f"beyond the last day tested ({last:g} d): it rests on how little the loss bends.")
+    if why:
+        verdict["b"] = (False, why)
+        verdict["c"] = (False, f"c = -a ln b, and b is not determined: {why}")
+    if not unaged:
+        verdict["mu_0"] = (not why, "no unaged rubber was tested: mu_0 is extrapolated to day 0 by the law.")
+    return verdict
+
+
+def without_law(curve: Curve, unit: str, unaged: bool) -> Iterator[dict]:
+    """Return empty rows that say how many days are missing."""
+    days = ", ".join(f"{day:g}" for day in ([0.0, *curve.days] if unaged else curve.days)) or "none"
+    reason = f"the law needs {DAYS_FOR_LAW} distinct days where {curve.quantity} is determined; there are: {days}."
+    for name in LAW:
+        yield table_row(
+            quantity=curve.quantity, parameter=name, unit="d" if name == "b" else unit, identified=False, reason=reason
+        ) | {"series": curve.series}
+
+
+def statistics_rows(curve, joint, plain, values, q, tau, df, share, unit) -> Iterator[dict]:
+    """Return how well the law fits the days of this curve."""
+    part, alone = plain
+    own = values.curve == curve.place
+    unaged = (values.curve < 0) & (values.origin == q)
+    left = (alone.values.whitening @ (alone.values.value - alone.model)) ** 2
+    chi2 = float(left[own[part]].sum() + left[unaged[part]].sum() / share)
+    own_df = float(own.sum() - 2 + (unaged.sum() - 1) / share)
+    shown = own | unaged
+    error = joint.model[shown] / values.value[shown] - 1
+    p = float(chdtrc(own_df, chi2)) if own_df > 0 else np.nan
+    reason = ""
+    if not own_df > 0:
+        reason = "as many parameters as days: the law cannot disagree with them."
+    elif p < SIGNIFICANT:
+        reason = (
+            f"the values scatter about the law by {100 * tau:.2g} % more than their steady fits say: specimens differ, "
+            "or the law is another. It is in the intervals; replicate specimens would tell the two apart."
+        )
+    name = curve.quantity
+    for statistic, value, its_unit, why in (
+        ("chi2", chi2, "", "against the steady fits' covariance alone"),
+        ("df", own_df, "", "this series' share, mu_0 being shared"),
+        ("lack_of_fit_p", p, "", reason),
+        ("specimen_sd_pct", 100 * tau, "%", "scatter between specimens beyond the steady fits, all series together"),
+        ("error_df", df, "", "degrees of freedom of the intervals' Student t, all series together"),
+        ("max_error_pct", 100 * np.abs(error).max(), "%", "largest error of the law over the days tested"),
+        ("rmse", np.sqrt(np.mean((joint.model - values.value)[shown] ** 2)), unit, ""),
+        ("n_days", shown.sum(), "", "days tested, day 0 included"),
+        ("last_day", curve.days[-1], "d", ""),
+    ):
+        yield table_row(
+            quantity="statistics",
+            parameter=f"{name}:{statistic}",
+            value=value,
+            unit=its_unit,
+            identified=True,
+            reason=why,
+        ) | {"series": curve.series}
+
+
+def covariance_rows(curve: Curve, covariance: np.ndarray, unit: str) -> Iterator[dict]:
+    """Return the covariance of mu_0, a and ln b, shape (3, 3)."""
+    names, units = ("mu_0", "a", "ln b"), (unit, unit, "")
+    for i in range(3):
+        for j in range(i + 1):
+            yield table_row(
+                quantity="covariance",
+                parameter=f"{curve.quantity}:{names[j]},{curve.quantity}:{names[i]}",
+                value=covariance[j, i],
+                unit=" ".join(f"({u})" for u in (units[j], units[i]) if u),
+                identified=bool(np.isfinite(covariance[j, i])),
+            ) | {"series": curve.series}

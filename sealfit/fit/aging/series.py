@@ -1,0 +1,274 @@
+"""The law by which aging changes mu_s and mu_c (Eq. 15), per series, from the conditions' steady fits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+from scipy.special import ndtri, stdtrit
+
+from sealfit.config import Config
+from sealfit.fit.aging.law import LawFit, Values, between_scatter, fit_law
+from sealfit.fit.aging.law_profiles import curve_intervals
+from sealfit.fit.aging.law_table import (
+    DAYS_FOR_LAW,
+    Curve,
+    Estimate,
+    covariance_rows,
+    law_rows,
+    statistics_rows,
+    without_law,
+)
+from sealfit.fit.steady.condition import FULL
+from sealfit.physics import aging_law
+from sealfit.tables import AGING_CURVES, AGING_FIT
+
+PAIRS = (("mu_s", "mu_c"), ("F_s", "F_c"))
+SMALLEST = 1e-6  # relative standard deviation below which a steady fit is not believed
+CURVE_POINTS = 61
+
+
+def fit_series(steady_fit: pd.DataFrame, config: Config) -> pd.DataFrame:
+    r"""Fit the aging law to every series, mu_0 shared by all series of a rubber.
+
+    .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b), \quad c = -a \ln b
+
+    One generalised least-squares fit per rubber of all its series and both quantities, with the covariance that mu_s
+    and mu_c of a condition have from their steady fit, and the scatter between specimens (one per condition) estimated
+    from what the law leaves.
+
+    Parameters
+    ----------
+    steady_fit : DataFrame
+        Table `steady_fit` with the column `aging_days`; only what it calls identified is used.
+    config : Config
+        Names the condition columns.
+
+    Returns
+    -------
+    DataFrame
+        Table `aging_fit`: per series and quantity mu_0, a, b, c; "statistics" and "covariance" rows, whose `parameter`
+        starts with the quantity ("mu_s:mu_0,mu_s:ln b"). Empty without `aging_days` in the condition or without aged
+        rubber.
+
+    Notes
+    -----
+    `lo95` and `hi95` of a, b and c are profile-likelihood limits, those of mu_0 of the curvature, with Student's t on
+    values less parameters of the quantity: specimens are the unit of evidence. `u_sys` moves all steady values
+    together, as the sensor would, and takes what the fit makes of it.
+    """
+    open_columns = [name for name in config.series_columns if name in steady_fit.columns]
+    columns = [*AGING_FIT.names(), *open_columns]
+    if not config.aging or "aging_days" not in steady_fit.columns:
+        return _empty(columns, steady_fit)
+    rows: list[dict] = []
+    for rubber, own in steady_fit.groupby("rubber", sort=True):
+        rows += [{"rubber": rubber, **row} for row in _fit_rubber(own)]
+    if not rows:
+        return _empty(columns, steady_fit)
+    keys = steady_fit.groupby("series", sort=True)[open_columns].first().reset_index()
+    return pd.DataFrame(rows).merge(keys, on="series", how="left", validate="many_to_one")[columns]
+
+
+def _empty(columns: list[str], like: pd.DataFrame) -> pd.DataFrame:
+    return pd.DataFrame({name: like[name].iloc[:0] for name in columns})
+
+
+# ---------------------------------------------------------------- one rubber
+def _fit_rubber(own: pd.DataFrame) -> list[dict]:
+    found = own[(own["quantity"] == "steady") & own["identified"].to_numpy(bool) & own["value"].notna()]
+    pair = next((pair for pair in PAIRS if found["parameter"].isin(pair).any()), None)
+    if pair is None:
+        return []
+    found = found[found["parameter"].isin(pair) & found["aging_days"].notna()]
+    found = _of_one_meaning(found, own, pair)
+    found = found.assign(quantity=found["parameter"]).sort_values(["condition", "quantity"], kind="stable")
+    aged = own[own["aging_days"].to_numpy(float) > 0]
+    quantities = [name for name in pair if (found["quantity"] == name).any()]
+    unaged = set(found.loc[found["aging_days"] == 0, "quantity"])
+    curves = _curves(found, list(dict.fromkeys(aged["series"])), quantities, unaged)
+    place = {(c.series, c.quantity): c.place for c in curves}
+    number = np.array(
+        [
+            -1 if day == 0 else place[series, quantity] if place[series, quantity] >= 0 else -2
+            for day, series, quantity in zip(found["aging_days"], found["series"], found["quantity"], strict=True)
+        ],
+        int,
+    )
+    used = found[number >= -1]
+    fitted = [name for name in quantities if any(c.place >= 0 and c.quantity == name for c in curves)]
+    used = used[used["quantity"].isin(fitted)]
+    number = number[(number >= -1) & found["quantity"].isin(fitted).to_numpy()]
+    unit = str(found["unit"].iloc[0])
+    if not fitted:
+        return [row for curve in curves for row in without_law(curve, unit, curve.quantity in unaged)]
+    values = Values(
+        used["aging_days"].to_numpy(float),
+        used["value"].to_numpy(float),
+        np.array([fitted.index(name) for name in used["quantity"]], int),
+        number,
+        steady_covariance(used, values_of(own, "covariance")),
+    )
+    return list(_rubber_rows(values, curves, fitted, used, own, unit, unaged))
+
+
+def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
+    """Return the values without Coulomb coefficients of too few speeds, where other conditions have a Stribeck curve.
+
+    Over two or three slow speeds, "mu_c" is what friction is like at them: mu_s included, it is another quantity.
+    """
+    with_curve = set(found.loc[found["parameter"] == pair[0], "condition"])
+    if not with_curve:
+        return found
+    speeds = own[(own["quantity"] == "statistics") & (own["parameter"] == "n_speeds")]
+    few = set(speeds.loc[speeds["value"] < FULL, "condition"]) - with_curve
+    return found[~((found["parameter"] == pair[1]) & found["condition"].isin(few))]
+
+
+def _curves(found: pd.DataFrame, series: list[str], quantities: list[str], unaged: set[str]) -> list[Curve]:
+    aged = found[found["aging_days"] > 0]
+    tested = dict(aged["aging_days"].astype(float).groupby([aged["series"], aged["quantity"]], sort=False).unique())
+    curves, place = [], 0
+    for name in series:
+        for quantity in quantities:
+            days = np.sort(tested.get((name, quantity), np.zeros(0)))
+            enough = days.size + (quantity in unaged) >= DAYS_FOR_LAW
+            curves.append(Curve(name, quantity, place if enough else -1, days))
+            place += enough
+    return curves
+
+
+def values_of(steady_fit: pd.DataFrame, quantity: str) -> dict[tuple[str, str], float]:
+    """Return what table `steady_fit` has under a `quantity`, by condition and parameter."""
+    rows = steady_fit[steady_fit["quantity"] == quantity]
+    return dict(zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"].tolist(), strict=True))
+
+
+def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -> np.ndarray:
+    """Return the covariance of steady values, shape (n, n): full within a condition, none between conditions.
+
+    Parameters
+    ----------
+    used : DataFrame
+        The values: `condition`, `quantity` (mu_s, ...) and `value`.
+    known : dict
+        The covariances: `values_of(steady_fit, "covariance")`.
+    """
+    quantity = used["quantity"].to_numpy(object)
+    covariance = np.diag((SMALLEST * used["value"].to_numpy(float)) ** 2 + 1e-300)
+    for condition, places in used.groupby("condition", sort=False).indices.items():
+        for i in places:
+            for j in places:
+                names = sorted((quantity[i], quantity[j]), reverse=True)  # mu_s before mu_c
+                value = known.get((condition, f"{names[0]},{names[1]}"), np.nan)
+                covariance[i, j] += value if np.isfinite(value) else 0.0
+    return covariance
+
+
+def _with_specimens(values: Values, taus: list[float], model: np.ndarray) -> Values:
+    """Add the scatter between specimens: relative, per quantity, correlated within a condition as the residuals are."""
+    relative = (values.value - model) / model
+    tau = np.array(taus)[values.origin]
+    near = values.covariance != 0
+    link = near & (values.origin[:, None] != values.origin[None, :])
+    correlation = 0.0
+    if link.any() and min(taus) > 0:
+        cross = (np.outer(relative, relative) - values.covariance / np.outer(model, model))[link].mean()
+        correlation = float(np.clip(cross / np.prod(taus), -0.9, 0.9))  # 0.9: one specimen, but never one number
+    added = np.outer(tau * model, tau * model) * (np.eye(len(tau)) + correlation * link)
+    return Values(values.days, values.value, values.origin, values.curve, values.covariance + added)
+
+
+# ---------------------------------------------------------------- what the table says
+def _rubber_rows(values, curves, fitted, used, own, unit, unaged) -> Iterator[dict]:
+    taus, plain, dfs = [], {}, []
+    for q, name in enumerate(fitted):
+        part = np.flatnonzero(values.origin == q)
+        tau, fit = between_scatter(values.part(part))
+        taus.append(tau)
+        plain[name] = (part, fit)
+        dfs.append(fit.df)
+    model = np.empty(values.value.size)
+    for part, fit in plain.values():
+        model[part] = fit.model
+    joint = fit_law(_with_specimens(values, taus, model))
+    t = np.array([stdtrit(df, 0.975) if df > 0 else ndtri(0.975) for df in dfs])
+    intervals = curve_intervals(joint, t**2)
+    shift = _shift(joint, used, own)
+    for curve in curves:
+        if curve.place < 0:
+            yield from without_law(curve, unit, curve.quantity in unaged)
+            continue
+        q = fitted.index(curve.quantity)
+        found = Estimate.of(joint, curve, q, shift)
+        yield from law_rows(
+            curve, found, t[q], intervals[curve.place], unit, unaged=curve.quantity in unaged, df=dfs[q]
+        )
+        share = len({c.series for c in curves if c.place >= 0 and c.quantity == curve.quantity})
+        yield from statistics_rows(curve, joint, plain[curve.quantity], values, q, taus[q], dfs[q], share, unit)
+        yield from covariance_rows(curve, found.covariance, unit)
+
+
+def _shift(joint: LawFit, used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:
+    """Change of every parameter when the sensor reads one standard uncertainty too high in all conditions."""
+    known = values_of(own, "sensor_shift")
+    moved = np.array([known.get(key, 0.0) for key in zip(used["condition"], used["quantity"], strict=True)], float)
+    white = joint.values.whitening
+    weighted = (white @ joint.jacobian).T @ (white @ np.nan_to_num(moved))
+    return np.where(np.isfinite(joint.covariance), joint.covariance, 0.0) @ weighted
+
+
+# ---------------------------------------------------------------- curves
+def aging_curves(aging_fit: pd.DataFrame, days: np.ndarray | None = None) -> pd.DataFrame:
+    """Return the law of every series and quantity along aging time, with its 95 % band.
+
+    Parameters
+    ----------
+    aging_fit : DataFrame
+        Table `aging_fit`.
+    days : ndarray, shape (n,), optional
+        Aging times; default from 0 to the last day tested, denser where the law bends.
+
+    Returns
+    -------
+    DataFrame
+        Table `aging_curves`; the band is that of the law (population mean), from the covariance of mu_0, a and ln b.
+    """
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in AGING_CURVES.names()}
+    for series, own in aging_fit.groupby("series", sort=False) if len(aging_fit) else ():
+        known = dict(zip(zip(own["quantity"], own["parameter"], strict=True), own["value"].tolist(), strict=True))
+        for quantity in [quantity for quantity, parameter in known if parameter == "mu_0"]:
+            curve = _curve(known, quantity, days)
+            for name, values in curve.items():
+                parts[name].append(values)
+            if curve:
+                parts["series"].append(np.full(curve["value"].size, series, object))
+                parts["quantity"].append(np.full(curve["value"].size, quantity, object))
+    texts = {name: "str" if name in ("series", "quantity") else float for name in parts}
+    return pd.DataFrame(
+        {name: pd.Series(np.concatenate(own) if own else [], dtype=texts[name]) for name, own in parts.items()}
+    )
+
+
+def _curve(known: dict[tuple[str, str], float], quantity: str, days: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Return the curve of one quantity, none without a law; `known` are a series' values by quantity and parameter."""
+    mu_0, a, b = (known[quantity, name] for name in ("mu_0", "a", "b"))
+    if np.isnan([mu_0, a, b]).any():
+        return {}
+    names = [f"{quantity}:{name}" for name in ("mu_0", "a", "ln b")]
+    covariance = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            value = known["covariance", f"{names[j]},{names[i]}"]
+            covariance[i, j] = covariance[j, i] = value if np.isfinite(value) else 0.0
+    df = known["statistics", f"{quantity}:error_df"]
+    t = stdtrit(df, 0.975) if df > 0 else ndtri(0.975)
+    if days is None:
+        days = known["statistics", f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
+    days = np.asarray(days, float)
+    ratio = days / b
+    slope = np.stack([np.ones_like(days), -np.log1p(ratio), a * ratio / (1 + ratio)], axis=1)
+    half = t * np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", slope, covariance, slope), 0.0))
+    value = aging_law(days, mu_0=mu_0, a=a, b=b)
+    return {"aging_days": days, "value": value, "lo95": value - half, "hi95": value + half}

@@ -1,0 +1,249 @@
+"""The break-away force: the peak of the force before steady sliding, at each commanded speed and direction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from scipy.special import stdtrit
+
+from sealfit.config import Config
+from sealfit.fit.dynamic.bristle_model import Cells
+from sealfit.fit.dynamic.stiffness import together
+
+SAMPLES, SHARE = 8, 1 / 40  # of the window over which a peak is averaged: samples of a start, share of the distance
+FORCE, RATIO, SLIDING = "F_ba", "F_ba/F", "F"
+TOP, NOISE, PLACES, WHERE, REACH = "top", "noise", "places", "where", "reach"
+AT = ["condition", "speed_set_mm_s", "direction"]
+LARGEST = "F_max/F"
+INTO = "{where:.3g} {unit} into strokes of {reach:.3g} {unit}"
+NO_PEAK = "the force comes up to its sliding value without passing above it"
+FEW = "no repeats: no scatter is known"
+FAMILY = 0.01  # chance of a peak anywhere in a campaign where there is none
+
+
+def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the break-away force F_ba and its share of the sliding force, per file, or per stroke of a single file.
+
+    The sliding force is that of the line through where steady sliding has just begun, taken back to the peak: what
+    warming takes off along a stroke is no break-away. Where the peak lies is read from the mean of the other units, and
+    a start's own force is then taken there: the largest of noisy samples is always too high. For a test of whether
+    there is a peak at all, `top` is its force above sliding where the mean of all is largest, `noise` the standard
+    error of that in those of a sample, and `places` how many places there are; `F` is the sliding force.
+
+    Parameters
+    ----------
+    cells : Cells
+        Of strokes at one condition, in groups of one commanded speed and direction.
+    file : ndarray of int, shape (strokes,)
+        Number of each stroke's file.
+
+    Returns
+    -------
+    dict of ndarray, shape (units,) each
+        By name; `group` is the number of the unit's group. Units where one of the others is not known are left out.
+    """
+    of, count = cells.groups.of, cells.count
+    each = np.arange(len(of))
+    half = np.ceil(count * np.maximum(SAMPLES / cells.samples, SHARE) / 2).astype(int)  # of the window, in cells
+    lines = _Lines(cells)
+    distance = cells.middle_mm[of]
+    sliding = lines.at(distance)
+    force = cells.force_N
+    there = np.isfinite(force)
+    wide = half[of]
+    total, hits, above = (
+        _window(np.where(there, values, 0.0), wide) for values in (force, np.ones(force.shape), force - sliding)
+    )
+    mean = np.where(hits > 0, total / np.maximum(hits, 1), np.nan)
+    unit = _units(of, file)
+    own, whole = _places(above * cells.own, hits * cells.own, unit, cells)
+    peak, line = mean[each, own], sliding[each, own]
+    whole = whole[of]
+    per_cell = (cells.samples / count)[of]
+    error = lines.error(distance[each, whole])
+    table = {
+        FORCE: np.where(peak > 0.0, peak, np.nan),
+        RATIO: np.divide(peak, line, out=np.full(len(of), np.nan), where=(peak > 0.0) & (line > 0.0)),
+        SLIDING: np.where(lines.force > 0.0, lines.force, np.nan),
+        TOP: mean[each, whole] - sliding[each, whole],
+        NOISE: np.hypot(error, 1 / np.sqrt(np.maximum(hits[each, whole] * per_cell, 1.0))),
+        PLACES: np.maximum(count / (2 * half + 1), 1.0)[of],
+        WHERE: distance[each, whole],
+        REACH: cells.reach_mm[of],
+    }
+    made = {name: _mean_of(values, unit) for name, values in table.items()}
+    known = np.all([np.isfinite(values) for values in made.values()], axis=0)
+    first = np.unique(unit, return_index=True)[1]
+    return {name: values[known] for name, values in made.items()} | {"group": of[first][known]}
+
+
+def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: Config) -> pd.DataFrame:
+    """Return rows of table `dynamic_fit` for all break-aways of a campaign.
+
+    The scatter of repeats is pooled within a condition: that of the force as a share of it, that of the ratio as the
+    force above the sliding force over its noise, since what does not cancel in it is the noise of the samples. The
+    force is also widened by the scatter of set-ups, which all repeats of a run share. A peak is one where the largest
+    mean stands above the sliding force by a t-test at 1 % for all places of all starts of the campaign (Bonferroni);
+    elsewhere `reason` says that there is none, and there is no interval.
+
+    Parameters
+    ----------
+    found : DataFrame
+        What `peaks` gave, and the condition, commanded speed and direction of each unit.
+    widened : (float, float)
+        How many times the variance that repeats give them run means have, and on how many degrees of freedom that
+        rests: from the steady fit.
+    config : Config
+        Gives the units and the sensor's accuracy.
+    """
+    logs = {name: np.log(found[name]) for name in (FORCE, RATIO, SLIDING)}
+    shares = {
+        FORCE: logs[FORCE],
+        SLIDING: logs[SLIDING],
+        RATIO: found[FORCE] * (1 - 1 / found[RATIO]) / found[NOISE],
+        TOP: found[TOP] / found[NOISE],
+    }
+    groups = [found[name] for name in AT]
+    spread, df = _pooled(pd.DataFrame(shares), groups)
+    table = pd.DataFrame({name: found[name] for name in (FORCE, TOP, NOISE, PLACES)})
+    table = table.assign(**{f"log {name}": logs[name] for name in (FORCE, RATIO)}).groupby(
+        groups, dropna=False, sort=False
+    )
+    n, places, mean = table.size().to_numpy(), float(table[PLACES].first().sum()), table.mean()
+    setup = max(widened[0] - 1, 0.0) * spread[SLIDING] ** 2
+    error = spread[TOP] * mean[NOISE].to_numpy() / np.sqrt(n)
+    at_least = -stdtrit(np.maximum(df, 1), FAMILY / max(places, 1.0))
+    peak = (df >= 1) & (mean[TOP].to_numpy() > at_least * error)
+    reason = np.where(peak, "", np.where(df >= 1, NO_PEAK, FEW))
+    above = spread[RATIO] * mean[NOISE].to_numpy() / mean[FORCE].to_numpy()
+    force_df = together(((spread[FORCE] ** 2, df), (setup, widened[1])))
+    both = []
+    for name, unit, u_sys, variance, error_df in (
+        (FORCE, config.units.unit("force"), config.sensor.u, spread[FORCE] ** 2 + setup, force_df),
+        (RATIO, "", np.nan, above**2, df),
+    ):
+        value = np.exp(mean[f"log {name}"].to_numpy())
+        error = np.where(peak, np.sqrt(variance / n), np.nan)
+        half = stdtrit(error_df, 0.975) * error
+        row = {"quantity": "break_away", "parameter": name, "value": value, "se": value * error}
+        row |= {"lo95": value * np.exp(-half), "hi95": value * np.exp(half), "u_sys": u_sys, "unit": unit}
+        both.append(pd.DataFrame({**row, "identified": peak, "reason": reason}))
+    keys = mean.index.to_frame(index=False)
+    rows = pd.concat([one.join(keys) for one in both])
+    return rows.sort_index(kind="stable", ignore_index=True)  # the two of a group one after the other
+
+
+def largest_rows(found: pd.DataFrame, config: Config) -> pd.DataFrame:
+    """Return rows of table `dynamic_fit` for the largest force anywhere in strokes, over their sliding force.
+
+    It may come at the end as well as at the start, so it describes strokes and is no break-away; where it lies stands
+    in `reason`.
+
+    Parameters
+    ----------
+    found : DataFrame
+        What `peaks` gave for whole strokes, and the condition, commanded speed and direction of each unit.
+    config : Config
+        Gives the units.
+    """
+    groups = found.assign(**{RATIO: np.log(found[RATIO])}).groupby(AT, dropna=False, sort=False)
+    table = groups.agg({RATIO: "mean", WHERE: "first", REACH: "first"}).reset_index()
+    unit = config.units.unit("displacement")
+    reason = [
+        INTO.format(where=where, reach=reach, unit=unit)
+        for where, reach in zip(table[WHERE], table[REACH], strict=True)
+    ]
+    row = {"quantity": "largest", "parameter": LARGEST, "value": np.exp(table[RATIO]), "unit": "", "identified": True}
+    return table[AT].assign(**row, reason=reason)
+
+
+class _Lines:
+    """The sliding force of every stroke of cells, along the distance."""
+
+    def __init__(self, cells: Cells) -> None:
+        names = ("force_N", "slope_N_mm", "distance_mm", "extent_mm", "rows")
+        values = np.array([[getattr(part.sliding, name) for name in names] for part in cells.parts], float)
+        self.force, self.slope, self.distance, self.extent, self.rows = values.reshape(-1, len(names)).T
+
+    def at(self, distance_mm: np.ndarray) -> np.ndarray:
+        """Return the force that sliding would have had at distances, shape (strokes, n)."""
+        return self.force[:, None] + self.slope[:, None] * (distance_mm - self.distance[:, None])
+
+    def error(self, distance_mm: np.ndarray) -> np.ndarray:
+        """Return the standard error of that at one distance each, in standard deviations of a sample."""
+        away = (distance_mm - self.distance) / np.maximum(self.extent, 1e-300)
+        return np.sqrt(1 / self.rows + away**2)
+
+
+def _pooled(values: pd.DataFrame, groups: Sequence[pd.Series]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return standard deviations within groups, pooled by their first key, and degrees of freedom, (groups,) each."""
+    away = values - values.groupby(groups, dropna=False, sort=False).transform("mean")
+    pool, size = groups[0], values.groupby(groups, dropna=False, sort=False).size()
+    squares = (away**2).groupby(pool, sort=False).sum()
+    df = size.groupby(level=0, sort=False).agg(lambda n: int((n - 1).sum()))
+    own = size.index.get_level_values(0)
+    squares, df = squares.loc[own], df.loc[own].to_numpy()
+    return {
+        name: np.sqrt(np.divide(squares[name].to_numpy(), df, out=np.full(len(df), np.nan), where=df > 0))
+        for name in values
+    }, df
+
+
+def _units(group: np.ndarray, file: np.ndarray) -> np.ndarray:
+    """Return the number of each stroke's unit of evidence: its file; the stroke itself where its group has one file."""
+    each = np.arange(len(file))
+    first = np.searchsorted(group, group)  # groups lie one after the other
+    alone = np.bincount(group, file != file[first], minlength=1)[group] == 0
+    own = np.where(alone, each, len(file) + group * (int(file.max(initial=0)) + 1) + file)
+    return np.unique(own, return_inverse=True)[1]
+
+
+def _mean_of(values: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Return the mean of the known values of every unit, shape (units,); NaN where none is."""
+    known = np.isfinite(values)
+    n = np.bincount(unit, known)
+    return np.where(n > 0, np.bincount(unit, np.where(known, values, 0.0)) / np.maximum(n, 1), np.nan)
+
+
+def _places(above: np.ndarray, hits: np.ndarray, unit: np.ndarray, cells: Cells) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cell where the mean of a group's other units is largest for each stroke, shape (strokes,), and that
+    where the mean of all is, shape (groups,).
+
+    Parameters
+    ----------
+    above, hits : ndarray, shape (strokes, cells)
+        Sum of the force above sliding over a window about each cell, and of how many cells.
+    unit : ndarray of int, shape (strokes,)
+        Of evidence.
+    cells : Cells
+        Of the strokes.
+    """
+
+    def highest(total: np.ndarray, count: np.ndarray) -> np.ndarray:
+        sure = count > count.max(axis=1, keepdims=True) / 2  # a mean of few is mostly noise
+        return np.argmax(np.where(sure, total / np.maximum(count, 1), -np.inf), axis=1)
+
+    of = cells.groups.of
+    total, count = cells.totals(above), cells.totals(hits)
+    order = np.argsort(unit, kind="stable")
+    first = np.flatnonzero(np.r_[True, np.diff(unit[order]) > 0])
+    own_total, own_count = (np.add.reduceat(values[order], first, axis=0)[unit] for values in (above, hits))
+    several = np.bincount(of[order][first])[of] > 1
+    others = highest(
+        total[of] - np.where(several[:, None], own_total, 0.0), count[of] - np.where(several[:, None], own_count, 0.0)
+    )
+    return others, highest(total, count)
+
+
+def _window(values: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Return the sum over each cell and `half`, shape (strokes,), cells to either side, shape of `values`."""
+    most, columns = int(half.max()), values.shape[1]
+    padded = np.pad(values.astype(float), ((0, 0), (most, most)))
+    total = values.astype(float)
+    for away in range(1, most + 1):
+        reached = (half >= away)[:, None]
+        for at in (most - away, most + away):
+            total += np.where(reached, padded[:, at : at + columns], 0.0)
+    return total

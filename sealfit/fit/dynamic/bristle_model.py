@@ -1,0 +1,399 @@
+"""The beginnings of a condition's strokes, averaged over cells of distance and followed by the bristle model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from sealfit.fit.dynamic.starts import LEAST, Part
+from sealfit.ingest.segments import Pieces, median
+from sealfit.physics import bristle_limit
+from sealfit.store.parquet import noise_from_bends
+
+# ---------------------------------------------------------------- cells
+# Strokes in groups, averaged over cells of distance: all groups of a condition together.
+
+MOST_CELLS = 200  # of the distance over which strokes are averaged
+
+
+class Cells:
+    """Cells of distance, for groups of strokes that lie one after the other.
+
+    The cells of a group reach as far as half of its strokes do and are as many as such a stroke has samples,
+    MOST_CELLS at most. Arrays have as many columns as the group with most cells has.
+
+    Attributes
+    ----------
+    parts : sequence of Part, length strokes
+        The strokes, those of a group one after the other.
+    groups : Pieces
+        Which strokes are of which group.
+    count : ndarray of int, shape (groups,)
+        Cells of each group.
+    samples, reach_mm : ndarray, shape (groups,)
+        Median number of samples of a stroke, and the distance that half of the strokes reach.
+    middle_mm : ndarray, shape (groups, cells)
+        Middle of each cell.
+    """
+
+    def __init__(self, parts: Sequence[Part], group: np.ndarray) -> None:
+        self.parts = parts
+        self.groups = Pieces(np.bincount(group)) if len(parts) else Pieces([])
+        self._size = np.array([part.force_N.size for part in parts], np.int64)
+        reach = np.array([part.distance_mm[-1] for part in parts], float)
+        self.samples, self.reach_mm = (
+            np.array([median(values[own]) for own in self.groups.slices]) for values in (self._size, reach)
+        )
+        self.count = np.clip(self.samples.astype(int), LEAST, MOST_CELLS)
+        width = int(self.count.max(initial=0))
+        self.middle_mm = (np.arange(width) + 0.5) * (self.reach_mm / self.count)[:, None]
+        # The cell of every sample in a flat array, one column more taking what lies beyond.
+        distance = np.concatenate([part.distance_mm for part in parts]) if len(parts) else np.zeros(0)
+        count = np.repeat(self.groups.spread(self.count), self._size)
+        cell = (distance / np.repeat(self.groups.spread(self.reach_mm), self._size) * count).astype(np.int64)
+        cell = np.where(cell < count, cell, width)
+        self._cell = cell + np.repeat(np.arange(len(parts)) * (width + 1), self._size)
+        self._shape = len(parts), width + 1
+
+    @cached_property
+    def own(self) -> np.ndarray:
+        """Which cells are those of a stroke's group, shape (strokes, cells)."""
+        return np.arange(self._shape[1] - 1) < self.groups.spread(self.count)[:, None]
+
+    @cached_property
+    def _hits(self) -> np.ndarray:
+        return np.bincount(self._cell, minlength=self._shape[0] * self._shape[1]).reshape(self._shape)[:, :-1]
+
+    def means(self, values: Sequence[np.ndarray]) -> np.ndarray:
+        """Return each stroke's mean in each cell, shape (strokes, cells); NaN where it has no sample.
+
+        Parameters
+        ----------
+        values : sequence of ndarray, shape (n,) each
+            What is averaged, a number per sample of each stroke.
+        """
+        total = np.bincount(self._cell, np.concatenate(values), minlength=self._shape[0] * self._shape[1])
+        return np.where(self._hits > 0, total.reshape(self._shape)[:, :-1] / np.maximum(self._hits, 1), np.nan)
+
+    @cached_property
+    def force_N(self) -> np.ndarray:
+        """Each stroke's mean force, as `means` has it."""
+        return self.means([part.force_N for part in self.parts])
+
+    def totals(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum of values of strokes, shape (strokes, ...), over every group, shape (groups, ...)."""
+        return np.add.reduceat(values, self.groups.start, axis=0)
+
+
+def mean_over(cells: Cells, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the mean of strokes in each cell of their group, its standard error and how many, (groups, cells) each.
+
+    Parameters
+    ----------
+    cells : Cells
+        Of the strokes.
+    values : ndarray, shape (strokes, cells)
+        NaN where a stroke has none.
+    """
+    there = np.isfinite(values)
+    n = cells.totals(there.astype(np.int64))
+    mean = np.where(n > 0, cells.totals(np.where(there, values, 0.0)) / np.maximum(n, 1), np.nan)
+    away = np.where(there, values - np.repeat(mean, cells.groups.size, axis=0), 0.0)
+    variance = cells.totals(away**2) / np.maximum(n - 1, 1)
+    return mean, np.where(n > 1, np.sqrt(variance / np.maximum(n, 1)), np.nan), n
+
+
+# ---------------------------------------------------------------- rises
+# The beginnings of a condition's strokes, which the bristles follow step by step, all strokes together.
+
+STIFFNESSES = 40  # of the grid: the rise's length from a third of a step to the whole stroke
+COARSE = 4  # of them lie between two that are tried first: where the best is, the others follow
+DAMPINGS = np.array([0.0, 0.01, 0.03, 0.1, 0.3, 1.0])  # of the grid: tau as a share of the time that the rise takes
+SHARE = (0.02, 0.98)  # of the rise: samples in between show its length
+FAR = 500.0  # rise lengths after which nothing is left; more of them overflow
+APART = 1e-10  # of what level and start would explain alone: what tells one from the other
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A stroke from where it begins to move to where it slides steadily, in the direction of its motion.
+
+    Attributes
+    ----------
+    file, run : int
+        Numbers of its file and run; of the stroke itself, where there is one file or run alone.
+    share : float
+        Its limit over that of the condition's curve.
+    distance_mm, speed_mm_s, force_N : ndarray, shape (n,)
+        Distance slid, smoothed; speed; force against the motion.
+    """
+
+    file: int
+    run: int
+    share: float
+    distance_mm: np.ndarray
+    speed_mm_s: np.ndarray
+    force_N: np.ndarray
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The Stribeck curve of a condition under its load, in N: F_s, F_c; v_s in mm/s (inf: flat), sigma_2 in N s/mm.
+
+    `covariance`, shape (4, 4), is of these four in this order, with `df` degrees of freedom.
+    """
+
+    static_N: float
+    coulomb_N: float
+    v_s: float
+    sigma_2: float
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((4, 4)))
+    df: int = 1
+
+    @property
+    def known(self) -> bool:
+        """Whether it bends at all."""
+        return bool(np.isfinite(self.v_s))
+
+    def moved(self) -> Iterator[Curve]:
+        """Yield the curve moved by one standard deviation along each principal axis of its covariance."""
+        size = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        unit = np.where(size > 0, size, 1.0)
+        variance, axes = np.linalg.eigh(self.covariance / np.outer(unit, unit))
+        at = np.array([self.static_N, self.coulomb_N, self.v_s, self.sigma_2])
+        for step in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
+            if np.abs(step).max() > 1e-9:
+                static, coulomb, v_s, sigma_2 = at + step * size
+                yield replace(self, static_N=static, coulomb_N=coulomb, v_s=max(v_s, 0.1 * self.v_s), sigma_2=sigma_2)
+
+    def limit_N(self, speed_mm_s: np.ndarray) -> np.ndarray:
+        """Return G, the bristles' force in steady sliding, of the shape of the speed."""
+        if not self.known:
+            return np.full(np.shape(speed_mm_s), self.coulomb_N)
+        return bristle_limit(speed_mm_s, 1.0, mu_s=self.static_N, mu_c=self.coulomb_N, v_s=self.v_s, sigma_0=1.0)
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """What is left of the forces at (log sigma_0, tau), and how it changes, per stroke padded with zeros.
+
+    Attributes
+    ----------
+    level, begin : ndarray, shape (strokes,)
+        Level over the curve's, and the bristles' force at the start over it, in N: solved for exactly.
+    residual : ndarray, shape (strokes, rows)
+        Measured minus model.
+    jacobian : ndarray, shape (2, strokes, rows)
+        Its derivative, the two linear numbers following.
+    """
+
+    level: np.ndarray
+    begin: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+
+    @property
+    def rss(self) -> float:
+        """Sum of squares."""
+        return float(np.einsum("kr,kr->", self.residual, self.residual))
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """J'J of every stroke, shape (strokes, 2, 2)."""
+        return np.einsum("ikr,jkr->kij", self.jacobian, self.jacobian)
+
+    @cached_property
+    def pull(self) -> np.ndarray:
+        """J'r of every stroke, shape (strokes, 2)."""
+        return np.einsum("ikr,kr->ki", self.jacobian, self.residual)
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """The forces that are linear in tau: whole[0] + tau whole[1] from relaxed bristles, start[0] + tau start[1] what a
+    start of 1 N adds; shape (2, strokes, rows) each."""
+
+    whole: np.ndarray
+    start: np.ndarray
+
+    def at(self, tau: float) -> tuple[np.ndarray, np.ndarray]:
+        return self.whole[0] + tau * self.whole[1], self.start[0] + tau * self.start[1]
+
+
+class Rises:
+    """The strokes of a condition, padded to one length, so that all are followed together."""
+
+    def __init__(self, strokes: Sequence[Stroke], curve: Curve) -> None:
+        sizes = np.array([s.force_N.size for s in strokes])
+        self.there = np.arange(sizes.max()) < sizes[:, None]  # (strokes, rows)
+        self.step, self.speed, self.force = (np.zeros(self.there.shape) for _ in range(3))
+        for name, padded in (("distance_mm", self.step), ("speed_mm_s", self.speed), ("force_N", self.force)):
+            padded[self.there] = np.concatenate([getattr(s, name) for s in strokes])
+        self.step[:, 1:] = np.maximum(np.diff(self.step, axis=1), 0.0) * self.there[:, 1:]
+        self.step[:, 0] = 0.0
+        self.share = np.array([s.share for s in strokes])[:, None]
+        self.file = np.unique([s.file for s in strokes], return_inverse=True)[1]
+        self.run = np.unique([s.run for s in strokes], return_inverse=True)[1]
+        self._follow(curve)
+
+    def _follow(self, curve: Curve) -> None:
+        self.limit = curve.limit_N(self.speed) * self.share
+        self.viscous = curve.sigma_2 * self.speed
+        between = self.limit.copy()
+        between[:, 1:] = (self.limit[:, 1:] + self.limit[:, :-1]) / 2
+        self.between, self.lengths = between, self.step / between  # steps, in lengths of a rise of 1 N/mm
+
+    def along(self, curve: Curve) -> Rises:
+        """Return the same strokes on another curve."""
+        other = object.__new__(Rises)
+        other.__dict__.update(self.__dict__)
+        other._follow(curve)
+        return other
+
+    def _columns(self, sigma_0: float, *, slopes: bool) -> list[_Columns]:
+        """Return the forces at a stiffness, and with `slopes` their derivative with respect to its logarithm."""
+        slid = sigma_0 * self.lengths
+        kept = np.exp(-slid)
+        bristles = _followed(slid, (1 - kept) * self.between)
+        start = np.exp(-np.cumsum(slid, axis=1))
+        rate = sigma_0 * self.speed * self.there
+        lag = rate / self.limit
+        whole = np.stack([(bristles + self.viscous) * self.there, rate - bristles * lag])
+        made = [_Columns(whole, np.stack([start * self.there, -start * lag]))]
+        if slopes:
+            before = np.zeros(bristles.shape)
+            before[:, 1:] = bristles[:, :-1]
+            rising = _followed(slid, (self.between - before) * slid * kept)
+            falling = start * np.cumsum(slid, axis=1)
+            whole = np.stack([rising * self.there, rate - (bristles + rising) * lag])
+            made.append(_Columns(whole, np.stack([-falling * self.there, (falling - start) * lag])))
+        return made
+
+    def tangent(self, at: np.ndarray) -> Tangent:
+        """Return the residual at (log sigma_0, tau), and its derivative.
+
+        The derivative of the linear numbers is that of their normal equations (Golub and Pereyra 1973).
+        """
+        (columns, slopes), tau = self._columns(float(np.exp(at[0])), slopes=True), float(at[1])
+        both = np.stack(columns.at(tau), axis=1)  # (strokes, 2, rows)
+        inverse = _inverse(both @ both.transpose(0, 2, 1))
+        level, begin = (inverse @ (both @ self.force[..., None]))[..., 0].T
+        residual = self.force - level[:, None] * both[:, 0] - begin[:, None] * both[:, 1]
+        moved = []
+        for by in (slopes.at(tau), (columns.whole[1], columns.start[1])):
+            by = np.stack(by, axis=1)
+            model = level[:, None] * by[:, 0] + begin[:, None] * by[:, 1]
+            linear = inverse @ (by @ residual[..., None] - both @ model[..., None])
+            moved.append(-model - linear[:, 0] * both[:, 0] - linear[:, 1] * both[:, 1])
+        return Tangent(level, begin, residual, np.stack(moved))
+
+    def solved(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return every stroke's level at (log sigma_0, tau), shape (strokes,), and residual, shape (strokes, rows)."""
+        both = np.stack(self._columns(float(np.exp(at[0])), slopes=False)[0].at(float(at[1])), axis=1)
+        linear = _inverse(both @ both.transpose(0, 2, 1)) @ (both @ self.force[..., None])
+        return linear[:, 0, 0], self.force - (linear * both).sum(axis=1)
+
+    def best_of_grid(self) -> tuple[np.ndarray, tuple[float, float]]:
+        """Return where on a grid the sum of squares is least: (log sigma_0, tau), and the least and largest of the
+        grid's log sigma_0."""
+        level = float(np.median(self.limit[self.there]))
+        steps = self.step[self.step > 0]
+        lengths = np.geomspace(0.3 * np.median(steps), self.step.sum(axis=1).max(), STIFFNESSES)
+        pace = float(np.median(self.speed.max(axis=1)))
+        found = {}
+
+        def try_all(some: Sequence[int]) -> int:
+            for k in set(some) - set(found):
+                tau = DAMPINGS * lengths[k] / pace
+                squares = self._squares(level / lengths[k], tau)
+                best = int(np.argmin(squares))
+                found[k] = squares[best], tau[best]
+            return min(found, key=found.get)
+
+        best = try_all([*range(0, STIFFNESSES, COARSE), STIFFNESSES - 1])
+        best = try_all(range(max(best - COARSE + 1, 0), min(best + COARSE, STIFFNESSES)))
+        low, high = np.log(level / lengths[[-1, 0]])
+        return np.array([np.log(level / lengths[best]), found[best][1]]), (float(low), float(high))
+
+    def _squares(self, sigma_0: float, tau: np.ndarray) -> np.ndarray:
+        """Return the sum of squares at one stiffness and every damping, shape of `tau`, from the columns' products."""
+        columns = self._columns(sigma_0, slopes=False)[0]
+        parts = np.stack([*columns.whole, *columns.start], axis=1)  # (strokes, 4, rows)
+        products, moments = parts @ parts.transpose(0, 2, 1), parts @ self.force[..., None]
+        total = float((self.force**2).sum())
+        mixed = np.zeros((tau.size, 2, 4))  # level and start from the four parts
+        mixed[:, 0, 0] = mixed[:, 1, 2] = 1.0
+        mixed[:, 0, 1] = mixed[:, 1, 3] = tau
+        mixed = mixed[:, None]
+        moment = mixed @ moments
+        solved = _inverse(mixed @ products @ mixed.swapaxes(-1, -2)) @ moment
+        return total - (solved * moment).sum(axis=(1, 2, 3))
+
+    def noise_N(self) -> float:
+        """Return the noise of a sample, from how neighbours bend."""
+        return noise_from_bends(np.diff(self.force, 2, axis=1)[self.there[:, 2:]])
+
+    def gain_of(self, rss: float) -> float:
+        """Return how much better a fit is than a force that is there after one row, in its own residual variances."""
+        there = self.there[:, 1:]
+        force = self.force[:, 1:]
+        mean = force.sum(axis=1) / there.sum(axis=1)
+        flat = float((((force - mean[:, None]) * there) ** 2).sum())
+        rounding = 1e-20 * float((force**2).sum())
+        return (flat - rss) / max(rss / self.there.sum(), rounding)
+
+    def forces(self, residual: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return every stroke's fitted force, from the residual of all samples, shape (strokes, rows)."""
+        fitted = self.force - residual
+        return tuple(own[:n] for own, n in zip(fitted, self.there.sum(axis=1).tolist(), strict=True))
+
+    def run_levels(self, levels: np.ndarray) -> np.ndarray:
+        """Return the mean log level of each run's strokes, shape (runs,)."""
+        return np.bincount(self.run, np.log(np.maximum(levels, 1e-6))) / np.bincount(self.run)
+
+    def inside(self, sigma_0: float, levels: np.ndarray, start_N: np.ndarray) -> int:
+        """Return how many samples lie inside the rise."""
+        slid = np.cumsum(self.step, axis=1)
+        bent = 1 - start_N / np.maximum(levels * self.limit[:, 0], 1e-300)
+        left = np.exp(-slid * sigma_0 / self.limit) * bent[:, None]
+        return int(((left > 1 - SHARE[1]) & (left < 2 - SHARE[0]) & (slid > 0) & self.there).sum())
+
+
+def _followed(slid: np.ndarray, added: np.ndarray, begin: np.ndarray | float = 0.0) -> np.ndarray:
+    r"""Return x of :math:`x_k = e^{-s_k} x_{k-1} + a_k` along the last axis, from x before the first.
+
+    With D the sum of s up to a row, :math:`x_k = e^{-D_k} (x_{-1} + \sum_j a_j e^{D_j})`; where that would overflow,
+    one half of the rows after the other.
+
+    Parameters
+    ----------
+    slid, added : ndarray, shape (strokes, rows)
+        s, not negative, and a.
+    begin : float or ndarray, shape (strokes, 1)
+        x before the first row.
+    """
+    far = np.cumsum(slid, axis=-1)
+    rows = slid.shape[-1]
+    if far[..., -1].max() > FAR and rows > 1:
+        first = _followed(slid[..., : rows // 2], added[..., : rows // 2], begin)
+        return np.concatenate(
+            [first, _followed(slid[..., rows // 2 :], added[..., rows // 2 :], first[..., -1:])], axis=-1
+        )
+    grown = np.exp(np.minimum(far, FAR))
+    return (begin + np.cumsum(added * grown, axis=-1)) / grown
+
+
+def _inverse(gram: np.ndarray) -> np.ndarray:
+    """Return the inverse of products of two columns, shape (..., 2, 2); of the first alone where both are alike."""
+    ww, ss, ws = gram[..., 0, 0], gram[..., 1, 1], gram[..., 0, 1]
+    own = ww * ss - ws**2
+    apart = own > APART * ww * ss
+    own = np.where(apart, own, 1.0)
+    inverse = np.zeros(gram.shape)
+    inverse[..., 0, 0] = np.where(apart, ss / own, 1 / np.maximum(ww, 1e-300))
+    inverse[..., 1, 1] = np.where(apart, ww / own, 0.0)
+    inverse[..., 0, 1] = inverse[..., 1, 0] = np.where(apart, -ws / own, 0.0)
+    return inverse

@@ -1,0 +1,223 @@
+r"""sigma_0 and sigma_1 from the pre-sliding part of traces: one pair for the strokes of a condition.
+
+Over a stroke the bristles' force :math:`B = \sigma_0 z` follows Eqs. 2 and 6 exactly, step by step of the distance x,
+
+.. math::
+    \frac{dB}{dx} = \sigma_0 \Big(1 - \frac{B}{G}\Big), \quad F = B + \tau \dot B + \sigma_2 v, \quad
+    G = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}], \quad \tau = \sigma_1 / \sigma_0,
+
+with the Stribeck curve G of the condition's steady fit. It is linear in where the bristles begin, so each stroke has
+two linear numbers of its own, its level and its start (relaxed, or bent the other way after a reversal), and they are
+solved for exactly; sigma_0 and tau are searched on a grid and polished (Golub and Pereyra 1973, SIAM J. Numer. Anal.
+10(2), 413-432, doi:10.1137/0710036). The rise shows the length G / sigma_0, and its evidence are whole files, as
+neighbouring samples are not independent; what makes a stiffness of it is the level of the strokes, whose evidence are
+runs, as a set-up shifts all files of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from sealfit.fit.dynamic.bristle_model import Curve, Rises, Stroke, Tangent
+from sealfit.fit.least_squares import SHRINKS
+
+LEAST = 3  # such samples below which nothing can be said
+RISES = 30.0  # residual variances by which a rise must do better than none
+MISSED_NOISE, MISSED_LEVEL = 2.0, 0.03  # of the noise and of the sliding force: what a fit leaves that has missed
+STEPS = 200  # of Gauss and Newton, at most
+SETTLED = 1e-11  # of the residual: a step that moves the model by less
+UNSEEN = 1e-7  # of the residual: a step that moves the model by less changes the sum of squares by rounding only
+SHORTEST = 1e-6  # of a step: the sum of squares does not fall along it
+OPEN = np.log(3.0)  # of log sigma_0: an interval that reaches further each way is no estimate
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """sigma_0 in N/mm and tau = sigma_1 / sigma_0 in s, with the covariance of (log sigma_0, tau) between units.
+
+    Attributes
+    ----------
+    sigma_0, tau_s : float
+        Estimates.
+    covariance : ndarray, shape (2, 2)
+        Of log sigma_0 and tau; NaN from fewer than two units.
+    df : ndarray, shape (2,)
+        Satterthwaite's degrees of freedom of the two.
+    within : int
+        Samples inside the rise.
+    gain : float
+        By how many residual variances a force that is there at once fits worse.
+    files : int
+        Files.
+    forces_N : tuple of ndarray, shape (n,) each
+        Fitted force of every stroke.
+    rmse_N, noise_N : float
+        RMS of what the fit leaves, and the noise of a sample as its neighbours tell it.
+    """
+
+    sigma_0: float
+    tau_s: float
+    covariance: np.ndarray
+    df: np.ndarray
+    within: int
+    gain: float
+    files: int
+    forces_N: tuple[np.ndarray, ...]
+    rmse_N: float
+    noise_N: float
+
+    @property
+    def seen(self) -> bool:
+        """Whether the samples show the rise: some lie within it, and a force that is there at once does worse."""
+        return self.within >= LEAST and self.gain > RISES
+
+    def misses(self, level_N: float) -> bool:
+        """Whether the force comes up otherwise than the model's, by more than noise and than matters at this level."""
+        return self.rmse_N > MISSED_NOISE * self.noise_N and self.rmse_N > MISSED_LEVEL * level_N
+
+    @property
+    def quantile(self) -> np.ndarray:
+        """Student's quantile of the 95 % intervals of the two, shape (2,)."""
+        return stdtrit(np.maximum(self.df, 1.0), 0.975)
+
+    def log_half_width(self) -> float:
+        """Return half of the 95 % interval of log sigma_0."""
+        return float(self.quantile[0] * np.sqrt(self.covariance[0, 0]))
+
+    @property
+    def stiffness_known(self) -> bool:
+        """Whether the interval of sigma_0 is one."""
+        return self.seen and np.isfinite(self.covariance[0, 0]) and self.log_half_width() < OPEN
+
+    @property
+    def sigma_1(self) -> float:
+        """sigma_0 tau, in N s/mm."""
+        return self.sigma_0 * self.tau_s
+
+    @property
+    def damping_se(self) -> float:
+        """Standard error of sigma_1 by the delta method, in N s/mm."""
+        slope = np.array([self.sigma_1, self.sigma_0])
+        return float(np.sqrt(slope @ self.covariance @ slope))
+
+    def damping_half_width(self) -> float:
+        """Return half of the 95 % interval of sigma_1, in N s/mm."""
+        return float(self.quantile[1] * self.damping_se)
+
+
+def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
+    """Return sigma_0 and tau of the strokes of a condition; None where there is no stroke.
+
+    Parameters
+    ----------
+    strokes : sequence of Stroke
+        All strokes that begin at rest or at a reversal.
+    curve : Curve
+        Of the condition.
+    """
+    if not strokes:
+        return None
+    rises = Rises(strokes, curve)
+    x, (least, most) = rises.best_of_grid()
+    bounds = np.array([[least - 1.0, 0.0], [most + 1.0, np.inf]])
+    x, found = _descended(rises, x, bounds)
+    level = rises.run_levels(found.level)
+    inverse = np.linalg.pinv(found.normal.sum(axis=0), rcond=1e-12, hermitian=True)
+    shifts = []
+    for other in (rises.along(moved) for moved in curve.moved()):
+        at = x + _step(found.normal.sum(axis=0), np.einsum("ikr,kr->i", found.jacobian, other.solved(x)[1]), x, bounds)
+        shifts.append(at - x + [other.run_levels(other.solved(at)[0]).mean() - level.mean(), 0.0])
+    by_files, df = _between_files(found, inverse, rises.file)
+    by_level = float(level.var(ddof=1) / level.size) if level.size > 1 else np.nan
+    by_curve = np.array(shifts).T @ np.array(shifts) if shifts else np.zeros((2, 2))
+    parts = ((np.diag(by_files), df), (np.array([by_level, 0.0]), level.size - 1), (np.diag(by_curve), curve.df))
+    return Stiffness(
+        sigma_0=float(np.exp(x[0] + level.mean())),
+        tau_s=float(x[1]),
+        covariance=by_files + np.diag([by_level, 0.0]) + by_curve,
+        df=together(parts),
+        gain=rises.gain_of(found.rss),
+        within=rises.inside(float(np.exp(x[0])), found.level, found.begin),
+        files=int(rises.file.max()) + 1,
+        forces_N=rises.forces(found.residual),
+        noise_N=rises.noise_N(),
+        rmse_N=float(np.sqrt(found.rss / rises.there.sum())),
+    )
+
+
+def _descended(rises: Rises, x: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, Tangent]:
+    """Return the least-squares optimum that (log sigma_0, tau) leads to, shape (2,), and the tangent there.
+
+    Gauss-Newton steps within the bounds, halved until the sum of squares falls, until they move the model no more.
+    """
+    x, last = np.clip(x, *bounds), np.inf
+    found = rises.tangent(x)
+    for _ in range(STEPS):
+        step, share = _step(found.normal.sum(axis=0), found.pull.sum(axis=0), x, bounds), 1.0
+        moved = float(np.sqrt(max(step @ found.normal.sum(axis=0) @ step, 0.0) / max(found.rss, 1e-300)))
+        if moved <= SETTLED or UNSEEN > moved > SHRINKS * last:
+            break
+        trial = rises.tangent(x + step)
+        while moved > UNSEEN and not trial.rss < found.rss and share > SHORTEST:
+            share /= 2
+            trial = rises.tangent(x + share * step)
+        if share <= SHORTEST:
+            break
+        x, found, last = x + share * step, trial, moved
+    return x, found
+
+
+def _step(normal: np.ndarray, pull: np.ndarray, x: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Return one Gauss-Newton step from J'J and J'r, shape (p,); what it would carry over a bound is held there."""
+    step, free = np.zeros(x.size), np.ones(x.size, bool)
+    scale = np.sqrt(np.diag(normal))
+    scale = np.where(scale > 0, scale, 1.0)
+    for _ in range(x.size):
+        left = -(pull + normal @ np.where(free, 0.0, step)) / scale
+        scaled = (normal / np.outer(scale, scale))[np.ix_(free, free)]
+        step[free] = np.linalg.lstsq(scaled, left[free], rcond=1e-12)[0] / scale[free]
+        over = free & ((x + step < bounds[0]) | (x + step > bounds[1]))
+        if not over.any():
+            break
+        step[over], free = (np.clip(x + step, *bounds) - x)[over], free & ~over
+    return step
+
+
+def together(parts: Sequence[tuple[np.ndarray, np.ndarray | int]]) -> np.ndarray:
+    """Return the degrees of freedom of sums of variances (Welch and Satterthwaite), shape (p,)."""
+    total = sum(variance for variance, _ in parts)
+    spread = sum(variance**2 / np.maximum(df, 1) for variance, df in parts)
+    return total**2 / np.maximum(spread, 1e-300)
+
+
+def _between_files(found: Tangent, inverse: np.ndarray, file: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the covariance of the estimates from how files pull at them, shape (p, p), and its degrees of freedom.
+
+    Each file's pull is that on a fit without it (the jackknife's, CR3); the degrees of freedom follow from how evenly
+    files share the information.
+
+    Parameters
+    ----------
+    found : Tangent
+        At the optimum.
+    inverse : ndarray, shape (p, p)
+        Of J'J.
+    file : ndarray of int, shape (strokes,)
+        Number of each stroke's file.
+    """
+    files, p = int(file.max()) + 1, len(inverse)
+    if files < 2:
+        return np.full((p, p), np.nan), np.ones(p)
+    own, pull = np.zeros((files, p, p)), np.zeros((files, p))
+    np.add.at(own, file, found.normal)
+    np.add.at(pull, file, found.pull)
+    left = np.eye(p) - own @ inverse
+    moved = (inverse @ np.linalg.pinv(left, rcond=1e-9) @ pull[..., None])[..., 0]
+    covariance = (files - 1) / files * moved.T @ moved
+    information = np.einsum("pq,kqr,rp->kp", inverse, own, inverse) / np.maximum(np.diag(inverse), 1e-300)
+    df = 1 / np.maximum((information**2).sum(axis=0), 1e-12) - 1
+    return covariance, df

@@ -1,0 +1,186 @@
+"""What the declared model can carry at these conditions and speeds, and which fitted number serves which condition."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from sealfit.fit.joint.rows import SAME_SPEED, Rows
+
+QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
+SPEEDS_FOR_STRIBECK = 3
+"""Tested speeds from which a series has a Stribeck curve: three fix it there, with sigma_2 not below 0."""
+
+SPEEDS_BETWEEN = 4
+"""Tested speeds from which the curve is known between them too: mu_s, mu_c, v_s and sigma_2 are four numbers."""
+
+CURVED = ("full", "interpolated")  # forms with mu_s and v_s
+
+SPEEDS_FOR_VISCOUS = 2
+ROUNDING = 1e-24  # of a sum of squares, below which it is none
+DAYS_FOR_LAW = 3  # mu_0, a and b are three numbers
+
+
+@dataclass(frozen=True, slots=True)
+class JointParameter:
+    """One fitted number of the declared model: which quantity, and of which rubber, series or condition."""
+
+    quantity: str
+    owner: str
+
+
+@dataclass(frozen=True)
+class Declared:
+    """Which fitted number each condition uses for each quantity; -1 where the quantity is absent."""
+
+    parameters: tuple[JointParameter, ...]
+    index: Mapping[str, np.ndarray]  # quantity -> (conditions,) number of the parameter
+    conditions: tuple[str, ...]
+    has_load: bool
+    stribeck: Mapping[str, str]  # series -> "full" | "interpolated" | "viscous" | "constant"
+    law: Mapping[str, bool]  # series -> whether Eq. 15 is fitted across its days
+
+    @property
+    def numbers_of_mu(self) -> int:
+        """How many numbers the model fits to one coefficient across conditions: specimens beyond them show scatter."""
+        return sum(p.quantity in ("mu_0c", "a_c", "b_c") for p in self.parameters)
+
+
+def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
+    """Return the declared model that these conditions and speeds can carry.
+
+    A series needs four speeds in one direction for Eq. 14, or three between which friction is not a straight line
+    ("interpolated"), and two for the viscous term; Eq. 15 needs three days, the unaged day included. What cannot be
+    fitted is left out, not guessed. Speeds are counted within one direction, as an offset between directions would
+    otherwise pass for a Stribeck curve. Made once for the same rows. Rows that are a part of a campaign, with its
+    conditions, may carry its model: `as_in` is the campaign.
+    """
+    if ("declared",) not in rows.cache:
+        rows.cache["declared",] = _declare(rows) if as_in is None else declare(as_in)
+    return rows.cache["declared",]
+
+
+def _declare(rows: Rows) -> Declared:
+    conditions = rows.conditions
+    names = tuple(conditions["condition"])
+    aging = rows.has_aging
+    series_of = series_of_curve(conditions, aging)
+    stribeck = _speed_forms(rows, series_of)
+    rubbers, days = (conditions[name].tolist() for name in ("rubber", "aging_days"))
+    unaged_rubbers = {rubber for rubber, day in zip(rubbers, days, strict=True) if day == 0}
+    days_of: dict[str, set[float]] = {}
+    for s, rubber, day in zip(series_of, rubbers, days, strict=True):
+        days_of.setdefault(s, set()).update({day, 0.0} if rubber in unaged_rubbers else {day})
+    law = {s: bool(aging and len(own) >= DAYS_FOR_LAW and max(own) > 0) for s, own in days_of.items()}
+    law_rubbers = {rubber for s, rubber in zip(series_of, rubbers, strict=True) if law[s]}
+    parameters: dict[JointParameter, int] = {}
+    index = {quantity: np.full(len(names), -1) for quantity in QUANTITIES}
+
+    def use(c: int, quantity: str, owner: str) -> None:
+        index[quantity][c] = parameters.setdefault(JointParameter(quantity, owner), len(parameters))
+
+    for c, (name, series, rubber) in enumerate(zip(names, series_of, rubbers, strict=True)):
+        unaged = aging and days[c] == 0 and rubber in law_rubbers
+        for end in "sc":
+            if end == "s" and stribeck[series] not in CURVED:
+                continue
+            if law[series]:
+                for quantity, owner in ((f"mu_0{end}", rubber), (f"a_{end}", series), (f"b_{end}", series)):
+                    use(c, quantity, owner)
+            else:
+                use(c, f"mu_0{end}", rubber if unaged else name)
+        if stribeck[series] in CURVED:
+            use(c, "v_s", series)
+        if stribeck[series] != "constant":
+            use(c, "sigma_2", series)
+    return Declared(tuple(parameters), index, names, rows.has_load, stribeck, law)
+
+
+def series_of_curve(conditions, aging: bool) -> np.ndarray:
+    """Return the series whose v_s and sigma_2 each condition uses: a lone series takes its unaged rubber in.
+
+    Parameters
+    ----------
+    conditions : DataFrame
+        A row per condition with `series`, `rubber` and, where rubber is aged, `aging_days`.
+    aging : bool
+        Whether it is.
+    """
+    series = conditions["series"].to_numpy(dtype=object).copy()
+    if aging:
+        for rubber in conditions["rubber"].unique():
+            own = (conditions["rubber"] == rubber).to_numpy()
+            aged = own & (conditions["aging_days"] > 0).to_numpy()
+            if len(set(series[aged])) == 1:
+                series[own] = series[aged][0]
+    return series
+
+
+def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
+    """Return what the speeds of each series can carry, from the series of each condition."""
+    number, names = pd.factorize(series_of)
+    key = 2 * number[rows.condition] + (rows.speed > 0)
+    order = np.argsort(key, kind="stable")
+    ends = np.searchsorted(key[order], np.arange(2 * names.size + 1))
+    levels = [tested_speeds(rows, order[first:last]).size for first, last in itertools.pairwise(ends)]
+    most = np.reshape(levels, (names.size, 2)).max(axis=1)  # of the two directions
+    forms = {}
+    for k, (name, m) in enumerate(zip(names, most, strict=True)):
+        if m >= SPEEDS_BETWEEN:
+            forms[name] = "full"
+        elif m >= SPEEDS_FOR_STRIBECK and _curved(rows, np.flatnonzero(number[rows.condition] == k)):
+            forms[name] = "interpolated"
+        else:
+            forms[name] = "viscous" if m >= SPEEDS_FOR_VISCOUS else "constant"
+    return forms
+
+
+def _curved(rows: Rows, chosen: np.ndarray) -> bool:
+    """Return whether friction at three speeds is not a straight line, by Akaike's criterion on means of files.
+
+    A curve through three speeds leaves little to judge other effects by, so a line is kept where it will do. Conditions
+    have a level each and share the slope and the bend; the two directions count as repeats.
+    """
+    speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
+    tested = tested_speeds(rows, chosen)
+    table = pd.DataFrame(
+        {
+            "file": rows.codes("file")[chosen],
+            "direction": np.sign(rows.speed[chosen]),
+            "condition": rows.condition[chosen],
+            "middle": np.abs(speed[:, None] - tested).argmin(axis=1) == 1,
+            "slope": speed / load,
+            "mu": np.abs(rows.force[chosen]) / load,
+        }
+    )
+    files = table.groupby(["file", "direction", "condition"], as_index=False).mean()
+    line = np.column_stack([pd.get_dummies(files["condition"], dtype=float), files["slope"]])
+    costs = []
+    for columns in (line, np.column_stack([line, files["middle"]])):
+        found, _, rank, _ = np.linalg.lstsq(columns, files["mu"], rcond=1e-9)
+        left = files["mu"] - columns @ found
+        costs.append(len(files) * np.log(max(left @ left, ROUNDING * (files["mu"] @ files["mu"]))) + 2 * rank)
+    return bool(costs[1] < costs[0])
+
+
+def tested_speeds(rows: Rows, chosen: np.ndarray) -> np.ndarray:
+    """Return the speeds of chosen rows: commanded ones, or means of measured ones that lie within 25 %, ascending."""
+    commanded = np.abs(rows.values("speed_set_mm_s")[chosen])
+    if np.isfinite(commanded).all():
+        return np.unique(np.round(commanded, 9))
+    _, stroke = np.unique(rows.codes("stroke")[chosen], return_inverse=True)
+    return speed_clusters(np.sort(np.bincount(stroke, np.abs(rows.speed[chosen])) / np.bincount(stroke)))
+
+
+def speed_clusters(speeds: np.ndarray) -> np.ndarray:
+    """Return the means of clusters of sorted positive speeds, each within 25 % of its slowest."""
+    cuts, base = [], 0.0
+    for place, speed in enumerate(speeds):
+        if place == 0 or speed > SAME_SPEED * base:
+            base = speed
+            cuts.append(place)
+    return np.array([part.mean() for part in np.split(speeds, cuts[1:])]) if speeds.size else speeds

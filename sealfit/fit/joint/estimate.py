@@ -1,0 +1,197 @@
+r"""One estimator for "before" and "after": generalised least squares with scatter at every level.
+
+The weights come from the variance components (`reml.py`), which are estimated from the residual with the degrees of
+freedom of the model taken out; model and scatter are fitted in turn until neither moves. What is known beforehand of
+some numbers is in `prior.py`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sealfit.fit.joint.model import Model, evaluate, friction_of, term_slope
+from sealfit.fit.joint.prior import centre_of, covariance_of, free_of_others, penalised, precision_of, smoothed
+from sealfit.fit.joint.rows import Rows
+from sealfit.fit.joint.search import descend, search_nonlinear, start_model
+from sealfit.fit.joint.tangent import Tangent
+from sealfit.fit.joint.variance_components import estimate_components, estimate_scatter
+from sealfit.fit.joint.whitening import Scatter, Whitening
+
+COMPARED = 1e-2  # of the whitened sum of squares, where fits are only compared: rivals are several units apart
+ROUGH = 1.0  # as above before anything is known of the scatter
+TURNS = 3  # of model and scatter; the third moves no estimate by a tenth of its standard error
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A model fitted to rows: force and tangent at the optimum, scatter, and the whitened residual and tangent."""
+
+    model: Model
+    scatter: Scatter
+    rows: Rows
+    force: np.ndarray  # (n,)
+    friction: np.ndarray  # (n,) that noise and gains load on: the force less what is added to it
+    jacobian: Tangent  # (n, p)
+    white_residual: np.ndarray  # (n,)
+    white_jacobian: Tangent  # (n, p)
+    deviance: float  # whitened sum of squares + log det: twice the negative log likelihood, constants left out
+    whitening: Whitening  # of columns on the rows, at this scatter and friction
+
+    @property
+    def residual(self) -> np.ndarray:
+        """Measured minus model, shape (n,)."""
+        return self.rows.force - self.force
+
+    @cached_property
+    def basis(self) -> Tangent:
+        """Orthonormal basis of the whitened tangent space, of shape (n, rank)."""
+        return self.white_jacobian.orthonormal(1e-8)
+
+    @cached_property
+    def _widened(self) -> dict[str, np.ndarray]:
+        return {}
+
+    @cached_property
+    def _shares(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        return {}
+
+    @cached_property
+    def _slopes(self) -> dict[tuple[str, str], np.ndarray]:
+        return {}
+
+    def slope(self, acts_on: str, operation: str) -> np.ndarray:
+        """Return the force's derivative with respect to the shape of a term that is not there yet, shape (n,)."""
+        if (acts_on, operation) not in self._slopes:
+            self._slopes[acts_on, operation] = term_slope(self.model, self.rows, acts_on, operation)
+        return self._slopes[acts_on, operation]
+
+    def unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return eigenvalues, shape (g, k), and axes, shape (g, k, k), of what the fit took out of each group.
+
+        The axes are those of the basis's places in the block of the group.
+        """
+        if level not in self._shares:
+            starts = self.rows.groups.starts[level]
+            self._shares[level] = np.linalg.eigh(np.stack([b.T @ b for b in np.split(self.basis.values, starts[1:])]))
+        return self._shares[level]
+
+    def unit_residual(self, level: str) -> np.ndarray:
+        """Return the whitened residual widened by (I - H_gg)^(-1/2) in each group of a level, shape (n,).
+
+        H_gg is the group's block of the projection on the tangent space: what the fit took out of the group
+        (the CR2 correction of Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181).
+        """
+        if level not in self._widened:
+            code = self.rows.codes(level)
+            size, axes = self.unit_shares(level)
+            size = np.clip(size, 0.0, 0.98)  # a group that the fit owns whole has nothing left to widen
+            grow = np.where(size > 1e-12, (1 / np.sqrt(1 - size) - 1) / np.maximum(size, 1e-12), 0.0)
+            inner = self.basis.sums(self.rows.groups, level, self.white_residual).values
+            rotated = np.einsum("gji,gj->gi", axes, inner) * grow
+            back = np.einsum("gij,gj->gi", axes, rotated)
+            self._widened[level] = self.white_residual + (self.basis.values * back[code]).sum(axis=1)
+        return self._widened[level]
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Covariance of all fitted numbers (v_s and b as logarithms), shape (p, p)."""
+        return covariance_of(self.white_jacobian.gram(), precision_of(self.model))
+
+
+def fit_declared(rows: Rows) -> Fitted:
+    """Return the declared model fitted to `rows`: "before"; the better of two starts where series could go astray."""
+    fitted = fit(start_model(rows), rows)
+    if sum(p.quantity == "v_s" for p in fitted.model.declared.parameters) > 1:
+        other = fit(start_model(rows, together=True), rows)
+        return min(fitted, other, key=lambda f: f.deviance)
+    return fitted
+
+
+def fit(
+    model: Model,
+    rows: Rows,
+    scatter: Scatter | None = None,
+    *,
+    turns: int = TURNS,
+    friction: np.ndarray | None = None,
+) -> Fitted:
+    """Return the model fitted to `rows`, physics and effects together.
+
+    Parameters
+    ----------
+    model : Model
+        Where to start; a global search has set v_s and b.
+    rows : Rows
+        What to fit to.
+    scatter : Scatter, optional
+        Scatter to start from; with `turns=0` it is kept.
+    turns : int
+        How often scatter is estimated anew and the model refitted.
+    friction : ndarray, shape (n,), optional
+        Friction that gains and noise load on, where `turns` is 0: fits to be compared must share it.
+    """
+    centre = centre_of(model)
+    if scatter is None:
+        scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
+        model = descend(model, rows, scatter, centre, near=ROUGH)
+    if turns and model.terms:
+        model = search_nonlinear(model, rows, scatter)
+    for turn in range(turns):
+        force, jacobian = evaluate(model, rows)
+        scatter = estimate_scatter(
+            rows, rows.force - force, friction_of(model, rows), jacobian, scatter if turn else None
+        )
+        model = descend(as_smooth_as_wanted(model, rows, scatter), rows, scatter, centre)
+    if not turns:
+        model = descend(model, rows, scatter, centre, friction, near=COMPARED)
+        return fitted_at(model, rows, scatter, friction)
+    return fitted_at(model, rows, scatter)
+
+
+def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Fitted:
+    """Return the `Fitted` of a model as it stands, nothing refitted."""
+    force, jacobian = evaluate(model, rows)
+    friction = friction_of(model, rows) if friction is None else friction
+    whitening = Whitening(scatter, friction, rows.groups)
+    residual, white = whitening((rows.force - force)[:, None])[:, 0], whitening.of(jacobian)
+    deviance = float(residual @ residual) + whitening.logdet
+    return Fitted(model, scatter, rows, force, friction, jacobian, residual, white, deviance, whitening)
+
+
+def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
+    """Return a fit with the variance components that its own residual shows, and the row noise if asked for.
+
+    What a model leaves unexplained between units stands in their variance. Two models are told apart by their deviances
+    only if each has its own; under the larger variance of what is missing they all look alike.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        A fit made under other components; what noise and gains load on is kept, as fits to be compared share it.
+    noise : bool
+        Whether the row noise is estimated anew too. Fits to be compared share it: it is that of the best.
+    """
+    rows, estimate = fitted.rows, estimate_scatter if noise else estimate_components
+    scatter = estimate(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
+    model = as_smooth_as_wanted(fitted.model, rows, scatter, fitted.friction)
+    model = descend(model, rows, scatter, centre_of(model), fitted.friction, near=COMPARED)
+    return fitted_at(model, rows, scatter, fitted.friction)
+
+
+def effective_df(fitted: Fitted, number: int) -> float:
+    """Return how many numbers a term's free shape is worth, held as smooth as it is."""
+    model, white = fitted.model, fitted.white_jacobian
+    place = model.place(number)
+    own, pull = free_of_others(model, white.gram(), white.against(fitted.white_residual), place)
+    return penalised(own, pull, precision_of(model)[place, place])[1]
+
+
+def as_smooth_as_wanted(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Model:
+    """Return the model with its free shapes as smooth as the data want them under this scatter."""
+    if all(term.smoothness is None for term in model.terms):
+        return model
+    at = fitted_at(model, rows, scatter, friction)
+    return smoothed(model, at.white_jacobian.gram(), at.white_jacobian.against(at.white_residual))

@@ -1,0 +1,403 @@
+"""The declared model in one joint fit: Eq. 14 with Eq. 15, and the effects added to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pandas as pd
+
+from sealfit.effects.contract import CHANNEL, SECOND, Effect
+from sealfit.effects.free import SAMPLES, width_of
+from sealfit.fit.joint.declared import QUANTITIES, Declared
+from sealfit.fit.joint.rows import ALONG, Rows
+from sealfit.fit.joint.tangent import Layout, Tangent, blocks_of
+
+# ---------------------------------------------------------------- terms
+# Effects bound to channels: their shapes at the rows, averaged over each row's bin, and the derivatives of these.
+
+WAVES = ("ripple", "sinusoid", "sinusoid_harmonics")  # whose mean over a bin is known
+FINE = ("bump",)  # that may be as fine as a bin
+FEW_SAMPLES, MANY = (
+    tuple((float(place), float(weight) / 2) for place, weight in zip(*np.polynomial.legendre.leggauss(k), strict=True))
+    for k in (2, 4)
+)
+
+
+@dataclass(frozen=True)
+class Term:
+    """An effect bound to the channels it reads and the quantity it acts on, with fixed reference values.
+
+    In `fixed`, `shift` holds each pass's own origin, and `held` the 95 % interval of each parameter that comes from the
+    raw samples and that no fit to bins moves. `smoothness` is the weight on how much a free shape bends (`prior.py`),
+    None where nothing holds its amplitudes.
+    """
+
+    effect: Effect
+    channels: tuple[str, ...]
+    acts_on: str
+    operation: str
+    fixed: Mapping[str, object] = field(default_factory=dict)
+    smoothness: float | None = None
+
+    def inputs(self, rows: Rows) -> dict[str, np.ndarray]:
+        """Return what the effect's shape reads, from the rows' channels."""
+        key = (self.key(), id(self.fixed))
+        if key in rows.cache:
+            return rows.cache[key][1]
+        given = {}
+        for name, channel in zip(self.effect.reads, self.channels, strict=True):
+            values = rows.values(channel)
+            if name in (CHANNEL, SECOND) and channel == "speed_mm_s":
+                values = np.abs(values)  # a form of the speed is one of its size
+            given[name] = values
+        shift = self.fixed.get("shift")
+        if shift is not None:  # each pass has its own origin, NaN where that is unknown
+            given[self.effect.reads[0]] = given[self.effect.reads[0]] + passes(rows.table).map(shift).to_numpy(float)
+        rows.cache[key] = (self.fixed, {**given, **self.fixed})  # holding `fixed` keeps its id its own
+        return rows.cache[key][1]
+
+    def nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
+        """Return (weight, inputs) at the points of each row where the shape is averaged.
+
+        A row is the mean over the samples of a bin. Of a wave that is known; another shape that bends within the bin is
+        averaged by Gauss-Legendre quadrature along it (over an even spread with the variance of n samples), more
+        closely where it may be as fine as the bin. The rest is taken in the middle.
+        """
+        inputs = self.inputs(rows)
+        along = [(n, c) for n, c in zip(self.effect.reads, self.channels, strict=True) if c in ALONG]
+        if not self.effect.nonlinear or not along:
+            return [(1.0, inputs)]
+        key = ("nodes", self.key(), id(self.fixed))
+        if key not in rows.cache:
+            if self.effect.id in WAVES:
+                widths = {width_of(name): rows.bin_width(channel) for name, channel in along}
+                found = [(1.0, {**inputs, SAMPLES: rows.samples, **widths})]
+            else:
+                spread = np.sqrt(1 - 1 / np.maximum(rows.samples, 1.0) ** 2)
+                found = [
+                    (weight, {**inputs, **{n: inputs[n] + 0.5 * place * spread * rows.bin_width(c) for n, c in along}})
+                    for place, weight in (MANY if self.effect.id in FINE else FEW_SAMPLES)
+                ]
+            rows.cache[key] = (self.fixed, found)
+        return rows.cache[key][1]
+
+    def key(self) -> tuple:
+        """Return what makes two terms the same effect."""
+        return (self.effect.id, self.channels, self.acts_on, self.operation)
+
+
+def passes(table: pd.DataFrame) -> pd.Series:
+    """Return the name of each row's pass: its file and the direction in it, as play in a drive shifts one against the
+    other."""
+    return table["file"] + np.where(table["speed_mm_s"] >= 0, "+", "-") if len(table) else table["file"]
+
+
+def mean_derivatives(
+    term: Term, values: Mapping[str, float], rows: Rows, *, only_linear: bool = False
+) -> list[np.ndarray]:
+    """Return the derivatives of a term's shape, averaged over each row's bin, each of shape (n,)."""
+    parts = [
+        (weight, term_derivatives(term, values, inputs, only_linear=only_linear)) for weight, inputs in term.nodes(rows)
+    ]
+    return [_known(term, sum(weight * part[k] for weight, part in parts)) for k in range(len(parts[0][1]))]
+
+
+def _known(term: Term, shape: np.ndarray) -> np.ndarray:
+    """Return a shape with zero where a pass's own origin is not known, shape (n,)."""
+    return np.nan_to_num(shape) if "shift" in term.fixed else shape
+
+
+def term_derivatives(
+    term: Term, values: Mapping[str, float], inputs: Mapping[str, np.ndarray], *, only_linear: bool = False
+) -> list[np.ndarray]:
+    """Return the shape's derivative in each of the effect's parameters (or amplitudes alone), each of shape (n,)."""
+    if not term.effect.nonlinear and not only_linear:
+        return list(_linear_columns(term, inputs).T)
+    result = []
+    zero = {name: 0.0 for name in term.effect.linear}
+    held = () if only_linear else term.fixed.get("held", ())
+    for p in term.effect.parameters:
+        if p.name in held:
+            result.append(np.zeros_like(inputs[term.effect.reads[0]], dtype=float))
+        elif p.linear:
+            result.append(term.effect.shape(inputs, **{**values, **zero, p.name: 1.0}))
+        elif not only_linear:
+            step = 1e-5 * max(abs(values[p.name]), 1e-3)
+            ends = np.clip([values[p.name] - step, values[p.name] + step], *p.bounds)  # beyond, a form need not exist
+            down, up = (term.effect.shape(inputs, **{**values, p.name: float(end)}) for end in ends)
+            result.append((up - down) / (ends[1] - ends[0]))
+    return result
+
+
+def _linear_columns(term: Term, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the shape's columns of an effect that is linear in all its parameters, shape (n, parameters)."""
+    names = [p.name for p in term.effect.parameters]
+    zero = dict.fromkeys(names, 0.0)
+    return np.column_stack([np.asarray(term.effect.shape(inputs, **{**zero, name: 1.0})) for name in names])
+
+
+def shape_of(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
+    """Return the term's shape at the rows, shape (n,); what does not change is made once."""
+    if not term.effect.nonlinear:
+        return _columns_of(term, rows) @ np.array([values[p.name] for p in term.effect.parameters])
+    return _kept(
+        "shape",
+        term,
+        values,
+        rows,
+        lambda: _known(term, sum(weight * term.effect.shape(inputs, **values) for weight, inputs in term.nodes(rows))),
+    )
+
+
+def derivatives_of(term: Term, values: Mapping[str, float], rows: Rows) -> list[np.ndarray] | np.ndarray:
+    """Return the derivatives of a term's shape in each of its parameters; what does not change is made once."""
+    if not term.effect.nonlinear:
+        return _columns_of(term, rows).T
+    return _kept("derivatives", term, values, rows, lambda: mean_derivatives(term, values, rows))
+
+
+def _kept(what: str, term: Term, values: Mapping[str, float], rows: Rows, make: Callable):
+    """Return what was made last for a term at the same values, or make it: a fit moves some terms and not others."""
+    key = (what, term.key(), id(term.fixed))
+    at = tuple(values.values())
+    if key not in rows.cache or rows.cache[key][1] != at:
+        rows.cache[key] = (term.fixed, at, make())  # holding `fixed` keeps its id its own
+    return rows.cache[key][2]
+
+
+def _columns_of(term: Term, rows: Rows) -> np.ndarray:
+    key = ("columns", term.key(), id(term.fixed))
+    if key not in rows.cache:
+        rows.cache[key] = (term.fixed, _linear_columns(term, term.inputs(rows)))
+    return rows.cache[key][1]
+
+
+# ---------------------------------------------------------------- joint
+# The one declared model, everywhere: Eq. 14 with Eq. 15 in one joint fit, and the effects added to it.
+#
+# .. math::
+#     F = \Big[N (\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2})(1 + h_\mu)\,\mathrm{sgn}\,v + \sigma_2 v\Big](1 + h_F) + f,
+#     \quad \mu = \mu_0 - a \ln(1 + t/b)
+#
+# for mu_s and mu_c alike; mu_0 is shared by a rubber's series, v_s and sigma_2 by a series' days. Effects change a
+# parameter first, then act as a factor on mu, then as a factor on the whole force, then as an added force.
+#
+# Every quantity of a row depends on one fitted number at most, so the tangent is a scatter of row derivatives. v_s and
+# b are fitted as logarithms. Wu et al. 2020, Polymers 12(1) 102, doi:10.3390/polym12010102, Eqs. 14 and 15.
+
+LOGARITHMIC = ("b_s", "b_c", "v_s")
+FEW = 24  # declared numbers, of two or three series, which are as quickly held whole as by blocks
+
+
+@dataclass(frozen=True)
+class Model:
+    """Declared model plus terms, with the fitted numbers: `theta` (declared) and `values` per term."""
+
+    declared: Declared
+    theta: np.ndarray
+    terms: tuple[Term, ...] = ()
+    values: tuple[Mapping[str, float], ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Number of fitted numbers."""
+        return self.theta.size + sum(len(t.effect.parameters) for t in self.terms)
+
+    @property
+    def bent(self) -> np.ndarray:
+        """Which numbers act nonlinearly, v_s and b among them, in the order of `vector`, shape (size,)."""
+        declared = [p.quantity in LOGARITHMIC for p in self.declared.parameters]
+        return np.array(declared + [not p.linear for t in self.terms for p in t.effect.parameters], dtype=bool)
+
+    def place(self, number: int) -> slice:
+        """Return where a term's numbers stand in `vector`."""
+        first = self.theta.size + sum(len(t.effect.parameters) for t in self.terms[:number])
+        return slice(first, first + len(self.terms[number].effect.parameters))
+
+    def vector(self) -> np.ndarray:
+        """Return all fitted numbers, declared ones first, shape (size,)."""
+        tail = [v[p.name] for t, v in zip(self.terms, self.values, strict=True) for p in t.effect.parameters]
+        return np.r_[self.theta, tail]
+
+    def at(self, vector: np.ndarray) -> Model:
+        """Return the model with other fitted numbers."""
+        theta, rest, values = vector[: self.theta.size], list(vector[self.theta.size :]), []
+        for term in self.terms:
+            count = len(term.effect.parameters)
+            values.append({p.name: float(x) for p, x in zip(term.effect.parameters, rest[:count], strict=True)})
+            rest = rest[count:]
+        return replace(self, theta=theta, values=tuple(values))
+
+    def with_term(self, term: Term, values: Mapping[str, float]) -> Model:
+        """Return the model with one more term."""
+        return replace(self, terms=(*self.terms, term), values=(*self.values, dict(values)))
+
+    def without_term(self, number: int) -> Model:
+        """Return the model without one of its terms."""
+        keep = [k for k in range(len(self.terms)) if k != number]
+        return replace(self, terms=tuple(self.terms[k] for k in keep), values=tuple(self.values[k] for k in keep))
+
+
+def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.ndarray, Tangent | None]:
+    """Return the model's force, shape (n,), and its tangent, of shape (n, model.size), at every row."""
+    state = _state(model, rows, slopes=jacobian)
+    if not jacobian:
+        return state["force"], None
+    slopes = state["slopes"]
+    layout = _layout(model, rows)
+    values = np.zeros((rows.force.size, layout.index.shape[1]))
+    for quantity in QUANTITIES:
+        number = model.declared.index[quantity][rows.condition]
+        has = np.flatnonzero(number >= 0)
+        if has.size:
+            base = state["base"][quantity] if quantity in LOGARITHMIC else 1.0
+            place = layout.places[layout.block[has], number[has]]
+            values[has, place] = (slopes[quantity] * state["through"].get(quantity, 1.0) * base)[has]
+    column = layout.index.shape[1] - (model.size - model.theta.size)
+    for term, numbers, slope in zip(model.terms, model.values, state["term_slopes"], strict=True):
+        for derivative in derivatives_of(term, numbers, rows):
+            values[:, column] = slope * derivative
+            column += 1
+    return state["force"], Tangent(layout, values)
+
+
+def _layout(model: Model, rows: Rows) -> Layout:
+    """Return the blocks of the model's tangent: the numbers of a specimen's conditions, then those of all terms."""
+    declared, size = model.declared, model.theta.size
+    key, made = ("blocks",), ("layout", model.size)
+    if made in rows.cache and rows.cache[made][0] is declared:
+        return rows.cache[made][1]
+    if key not in rows.cache or rows.cache[key][0] is not declared:
+        used = np.stack([declared.index[quantity] for quantity in QUANTITIES], axis=1)
+        of_condition = [frozenset(numbers[numbers >= 0].tolist()) for numbers in used]
+        specimen, conditions = rows.codes("specimen"), len(used)
+        touched: dict[int, frozenset[int]] = {}
+        for pair in np.unique(specimen * conditions + rows.condition).tolist():
+            number, condition = divmod(pair, conditions)
+            touched[number] = touched.get(number, frozenset()) | of_condition[condition]
+        whole = [frozenset(range(size))]
+        index, block = blocks_of(whole * len(touched) if size <= FEW else list(touched.values()), size)
+        rows.cache[key] = (declared, index, block[specimen])
+    _, index, block = rows.cache[key]
+    added = np.arange(size, model.size)
+    index = np.column_stack([np.where(index == size, model.size, index), np.tile(added, (len(index), 1))])
+    rows.cache[made] = (declared, Layout(model.size, index, block))
+    return rows.cache[made][1]
+
+
+def friction_of(model: Model, rows: Rows) -> np.ndarray:
+    """Return the model's force less what is added to it, shape (n,): what rubber, load and gains scale."""
+    return _state(model, rows, slopes=False)["friction"]
+
+
+def term_slope(model: Model, rows: Rows, acts_on: str, operation: str) -> np.ndarray:
+    """Return the force's derivative with respect to the shape of a term that is not there yet, shape (n,)."""
+    state = _state(model, rows)
+    return _slope_of(acts_on, operation, state)
+
+
+def _state(model: Model, rows: Rows, *, slopes: bool = True) -> dict:
+    declared, theta = model.declared, model.theta
+    base = {}
+    for quantity in QUANTITIES:
+        number = declared.index[quantity]
+        start = 1.0 if quantity in LOGARITHMIC else 0.0
+        fitted = np.where(number >= 0, theta[np.maximum(number, 0)], 0.0)
+        value = np.where(number >= 0, np.exp(fitted), start) if quantity in LOGARITHMIC else fitted
+        base[quantity] = value[rows.condition]
+    shapes = [shape_of(t, v, rows) for t, v in zip(model.terms, model.values, strict=True)]
+    through: dict[str, np.ndarray] = {}
+    now = dict(base)
+
+    def change(target: str, quantities: Sequence[str]) -> None:
+        for quantity in quantities:
+            for term, shape in zip(model.terms, shapes, strict=True):
+                if term.acts_on == target:
+                    if term.operation == "multiply":
+                        now[quantity] = now[quantity] * (1 + shape)
+                        through[quantity] = through.get(quantity, 1.0) * (1 + shape)
+                    else:
+                        now[quantity] = now[quantity] + shape
+
+    for target, quantities in (
+        ("mu_0", ("mu_0s", "mu_0c")),
+        ("a", ("a_s", "a_c")),
+        ("b", ("b_s", "b_c")),
+        ("v_s", ("v_s",)),
+        ("sigma_2", ("sigma_2",)),
+    ):
+        change(target, quantities)
+    for quantity in LOGARITHMIC:  # a change may not carry v_s or b to zero or below
+        now[quantity] = np.maximum(now[quantity], 1e-3 * base[quantity])
+    days = rows.days
+    for end in "sc":
+        now[f"mu_{end}"] = now[f"mu_0{end}"] - now[f"a_{end}"] * np.log1p(days / now[f"b_{end}"])
+        change(f"mu_{end}", (f"mu_{end}",))
+    speed, sign = rows.pace, np.sign(rows.pace)
+    has_stribeck = (declared.index["v_s"] >= 0)[rows.condition]
+    ratio = speed / now["v_s"]
+    decay = np.where(has_stribeck, np.exp(-(ratio**2)), 0.0)
+    mu = now["mu_c"] + (now["mu_s"] - now["mu_c"]) * decay
+    on_mu, on_force, added, mu_added = np.ones_like(speed), np.ones_like(speed), np.zeros_like(speed), 0.0
+    for term, shape in zip(model.terms, shapes, strict=True):
+        if term.acts_on == "mu" and term.operation == "multiply":
+            on_mu = on_mu * (1 + shape)
+        elif term.acts_on == "mu":
+            mu_added = mu_added + shape
+        elif term.acts_on == "force" and term.operation == "multiply":
+            on_force = on_force * (1 + shape)
+        elif term.acts_on == "force":
+            added = added + shape
+    mu_total = mu * on_mu + mu_added
+    friction = rows.load * mu_total * sign
+    sliding = friction + now["sigma_2"] * speed
+    force = sliding * on_force + added
+    if not slopes:
+        return {"force": force, "friction": sliding * on_force}
+    drive = rows.load * sign * on_mu * on_force  # derivative with respect to mu before its factor
+    log_s, log_c = np.log1p(days / now["b_s"]), np.log1p(days / now["b_c"])
+    slope_of = {
+        "mu_s": drive * decay,
+        "mu_c": drive * (1 - decay),
+        "v_s": drive * (now["mu_s"] - now["mu_c"]) * decay * 2 * ratio**2 / now["v_s"],
+        "sigma_2": speed * on_force,
+    }
+    for end, log in (("s", log_s), ("c", log_c)):
+        factor = through.get(f"mu_{end}", 1.0)
+        slope_of[f"mu_0{end}"] = slope_of[f"mu_{end}"] * factor
+        slope_of[f"a_{end}"] = -slope_of[f"mu_{end}"] * factor * log
+        b = now[f"b_{end}"]
+        slope_of[f"b_{end}"] = slope_of[f"mu_{end}"] * factor * now[f"a_{end}"] * days / (b * (b + days))
+    state = {
+        "base": base,
+        "now": now,
+        "through": through,
+        "slopes": slope_of,
+        "force": force,
+        "gained": sliding * on_force,
+        "on_mu": on_mu,
+        "drive_mu": rows.load * sign * on_force,
+        "mu": mu,
+    }
+    state["term_slopes"] = [
+        _slope_of(t.acts_on, t.operation, state, s) for t, s in zip(model.terms, shapes, strict=True)
+    ]
+    return state
+
+
+def _slope_of(acts_on: str, operation: str, state: Mapping, shape: np.ndarray | None = None) -> np.ndarray:
+    """Return dF/dh for a term's shape h; `shape` is the term's own, so that its factor is not counted twice."""
+    own = 1.0 if shape is None or operation == "add" else 1 + shape
+    own = np.where(np.abs(own) < 1e-9, 1e-9, own)
+    if acts_on == "force":
+        return np.ones_like(state["force"]) if operation == "add" else state["gained"] / own
+    if acts_on == "mu":
+        return state["drive_mu"] if operation == "add" else state["drive_mu"] * state["mu"] * state["on_mu"] / own
+    total = 0.0
+    quantities = {"mu_0": ("mu_0s", "mu_0c"), "a": ("a_s", "a_c"), "b": ("b_s", "b_c")}.get(acts_on, (acts_on,))
+    for quantity in quantities:
+        slope = state["slopes"][quantity]
+        total = total + (slope if operation == "add" else slope * state["now"][quantity] / own)
+    return total

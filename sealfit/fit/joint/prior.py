@@ -1,0 +1,140 @@
+r"""What is known beforehand of the fitted numbers: weak priors on v_s and b, and how smooth a free shape is.
+
+v_s and b carry a Gaussian prior on their logarithm (SD 3, a factor of 20) about the global search's value: it holds a
+number that the data do not determine, and is far weaker than any data that do.
+
+A free shape with many knots bends as often as the data ask for and no more. Its amplitudes c carry the precision
+:math:`\lambda S`, with :math:`c^T S c` the integral of the squared second derivative: a smoothing spline, in which a
+straight line costs nothing. :math:`\lambda` has the greatest restricted likelihood,
+
+.. math:: -2 \log L(\lambda) = - g^T (G + \lambda S)^{-1} g + \log |G + \lambda S| - \mathrm{rank}(S) \log \lambda,
+
+with G and g the normal matrix and gradient of the amplitudes, every other number solved for. The intervals are those of
+the posterior. Wood 2011, J. R. Stat. Soc. B 73(1), 3-36, doi:10.1111/j.1467-9868.2010.00749.x; Nychka 1988, J. Am.
+Stat. Assoc. 83(404), 1134-1143, doi:10.1080/01621459.1988.10478711.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sealfit.effects.free import roughness
+from sealfit.fit.joint.model import LOGARITHMIC, Model, Term
+
+PRIOR_SD = 3.0
+DECADES = np.linspace(-8.0, 6.0, 57)  # of the smoothness, about the one that weighs as much as the data
+RIDGE = 1e-10  # of the diagonal: a straight line may stand in the declared model already
+
+
+def roughness_of(term: Term) -> np.ndarray:
+    """Return S of a smooth shape, shape (amplitudes, amplitudes)."""
+    return roughness(tuple(term.fixed["knots"]), term.fixed.get("x_ref"))
+
+
+def precision_of(model: Model) -> np.ndarray:
+    """Return the prior's precision of the fitted numbers, shape (model.size, model.size).
+
+    1/3^2 on log v_s and log b, the smoothness of free shapes on their amplitudes, none elsewhere.
+    """
+    own = [1.0 / PRIOR_SD**2 if p.quantity in LOGARITHMIC else 0.0 for p in model.declared.parameters]
+    precision = np.zeros((model.size, model.size))
+    precision[range(len(own)), range(len(own))] = own
+    for number, term in enumerate(model.terms):
+        if term.smoothness is not None:
+            place = model.place(number)
+            precision[place, place] = term.smoothness * roughness_of(term)
+    return precision
+
+
+def centre_of(model: Model) -> np.ndarray:
+    """Return where the priors lie, shape (model.size,): v_s and b where they stand, amplitudes of free shapes at 0."""
+    centre = model.vector()
+    for number, term in enumerate(model.terms):
+        if term.smoothness is not None:
+            centre[model.place(number)] = 0.0
+    return centre
+
+
+def covariance_of(normal: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """Return the covariance of parameters from the normal matrix and the prior's precision, shape (p, p) each."""
+    normal = normal + precision
+    size = np.sqrt(np.diag(normal))
+    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # 0: a number that nothing here moves
+    return scale[:, None] * np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
+
+
+def likely_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray) -> float:
+    """Return the smoothness of greatest restricted likelihood.
+
+    Parameters
+    ----------
+    normal : ndarray, shape (p, p)
+        G, every other number solved for.
+    gradient : ndarray, shape (p,)
+        g, at amplitudes of zero.
+    rough : ndarray, shape (p, p)
+        S; its null space is the straight line.
+    """
+    unit = np.trace(normal) / np.trace(rough)
+    if not unit > 0:
+        return 1.0
+    tried = unit * 10.0**DECADES
+    posterior = normal + np.diag(RIDGE * np.diag(normal)) + tried[:, None, None] * rough
+    solved = np.linalg.solve(posterior, np.broadcast_to(gradient[:, None], (tried.size, gradient.size, 1)))[..., 0]
+    rank = rough.shape[0] - 1
+    cost = -(solved @ gradient) + np.linalg.slogdet(posterior)[1] - rank * np.log(tried)
+    return float(tried[np.argmin(cost)])
+
+
+def penalised(normal: np.ndarray, gradient: np.ndarray, penalty: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return a free shape's amplitudes, shape (p,), and how many numbers it is worth: tr (G + P)^-1 G, 1 for a line.
+
+    Parameters
+    ----------
+    normal, gradient : ndarray, shape (p, p) and (p,)
+        G and g as above.
+    penalty : ndarray, shape (p, p)
+        P, the prior's precision.
+    """
+    posterior = normal + penalty + np.diag(RIDGE * np.diag(normal))
+    solved = np.linalg.solve(posterior, np.c_[gradient, normal])
+    return solved[:, 0], float(np.trace(solved[:, 1:]))
+
+
+def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
+    """Return the model with each free shape as smooth as the restricted likelihood wants it, one after the other.
+
+    Parameters
+    ----------
+    model : Model
+        The model the tangent is taken at.
+    normal : ndarray, shape (model.size, model.size)
+        Normal matrix of the whitened tangent, no prior in it.
+    gradient : ndarray, shape (model.size,)
+        Whitened tangent times whitened residual.
+    """
+    for number, term in enumerate(model.terms):
+        if term.smoothness is None:
+            continue
+        place = model.place(number)
+        own, pull = free_of_others(model, normal, gradient, place)
+        value = likely_smoothness(own, pull, roughness_of(term))
+        terms = tuple(replace(t, smoothness=value) if k == number else t for k, t in enumerate(model.terms))
+        model = replace(model, terms=terms)
+    return model
+
+
+def free_of_others(
+    model: Model, normal: np.ndarray, gradient: np.ndarray, place: slice
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return G and g of a term's amplitudes, counted from zero, every other number solved for."""
+    others = np.r_[0 : place.start, place.stop : model.size]
+    precision = precision_of(model)
+    pull = (gradient - precision @ (model.vector() - centre_of(model)))[others]
+    cross = normal[place][:, others]
+    by_others = np.linalg.lstsq((normal + precision)[np.ix_(others, others)], np.c_[cross.T, pull], rcond=1e-12)[0]
+    own = normal[place, place] - cross @ by_others[:, :-1]
+    own = (own + own.T) / 2
+    return own, gradient[place] - cross @ by_others[:, -1] + own @ model.vector()[place]

@@ -1,0 +1,436 @@
+"""The rows that the joint model is fitted to: the `bins` table as sorted arrays, with the groups they nest in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pandas as pd
+from scipy.sparse import csr_array
+
+from sealfit.ingest.campaign import LEAST_KNOWN, NO_VALUE
+from sealfit.tables import BINS
+
+# ---------------------------------------------------------------- groups
+# Nested groups of rows: strokes in files, files in runs, runs in specimens.
+
+
+@dataclass(frozen=True, slots=True)
+class Groups:
+    """Nested groups of sorted rows: for each level, the first row of every group and each row's group number."""
+
+    starts: dict[str, np.ndarray]
+    codes: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, codes: dict[str, np.ndarray]) -> Groups:
+        """Return the groups of `codes` (level -> group per row, contiguous, finest level first)."""
+        starts, numbers = {}, {}
+        for level, code in codes.items():
+            change = np.flatnonzero(np.r_[True, code[1:] != code[:-1]][: code.size])  # no rows: no groups
+            starts[level] = change
+            numbers[level] = np.repeat(np.arange(change.size), np.diff(np.r_[change, code.size]))
+        return cls(starts, numbers)
+
+    def sums(self, values: np.ndarray, level: str) -> np.ndarray:
+        """Return the sum of `values`, shape (n,) or (n, k), over each group of a level."""
+        start, n = self.starts[level], values.shape[0]
+        if values.ndim == 1:
+            return np.add.reduceat(values, start)
+        summing = csr_array((np.ones(n), np.arange(n), np.r_[start, n]), shape=(start.size, n))
+        return summing @ values  # ten times as fast as reduceat
+
+    def means(self, values: np.ndarray, level: str) -> np.ndarray:
+        """Return the mean of `values`, shape (n,) or (n, k), in each group of a level."""
+        count = np.diff(np.r_[self.starts[level], values.shape[0]]).astype(float)
+        return self.sums(values, level) / (count if values.ndim == 1 else count[:, None])
+
+    def at(self, level: str) -> Groups:
+        """Return the groups of a table with one row per group of `level`."""
+        first = self.starts[level]
+        levels = list(self.codes)
+        return Groups.of({name: self.codes[name][first] for name in levels[levels.index(level) :]})
+
+    def repeated(self, count: int) -> Groups:
+        """Return the groups of a table with each row `count` times, one copy after the other."""
+        return Groups(
+            {level: count * start for level, start in self.starts.items()},
+            {level: np.repeat(code, count) for level, code in self.codes.items()},
+        )
+
+
+# ---------------------------------------------------------------- both ways
+# Strokes both ways of one file: one set-up and one repeat, so one piece of evidence of how large the friction is.
+
+BOTH = 0  # `direction` of a row that stands for both
+SAME_SPEED = 1.25  # measured speeds within 25 % are one setting: rigs without speed control wander that much
+KEYS = ["file", "run_id"]
+
+
+def both_ways_together(steady: pd.DataFrame) -> pd.DataFrame:
+    """Return table `steady` with one row per record for runs that go both ways at one speed, other rows as they are.
+
+    The size of the force is the mean of the two ways, so that an offset between them cancels; what gain and set-up do
+    to a file they do to both, and neither tells anything that the other does not.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`, rows that are used.
+
+    Returns
+    -------
+    DataFrame
+        The same columns and `half_N`, half of the difference between the ways (NaN in other rows). In a row for both,
+        `direction` is 0, `force_N` and `speed_mm_s` are sizes, and `run_id` has no sign.
+    """
+    rows = steady.assign(half_N=np.nan)
+    run, record = nesting_run(rows), records(rows)
+    pace = rows["speed_mm_s"].abs()
+    if "speed_set_mm_s" in rows.columns:
+        pace = rows["speed_set_mm_s"].abs().fillna(pace)
+    extent = pd.DataFrame({"file": record, "run": run, "way": rows["direction"], "pace": pace})
+    grouped = extent.groupby(["file", "run"])
+    alike = grouped["way"].transform("nunique").eq(2)
+    alike &= grouped["pace"].transform("max") <= SAME_SPEED * grouped["pace"].transform("min")
+    alike = alike.groupby(run).transform("all")
+    if not alike.any():
+        return rows
+    size = {"force_N": rows["force_N"] * rows["direction"], "speed_mm_s": rows["speed_mm_s"].abs()}
+    own = rows.assign(run_id=run, file=record, **size)[alike]
+    numbers = [c for c in own.columns if pd.api.types.is_float_dtype(own[c])]
+    ways = own.groupby([*KEYS, "direction"], sort=False)[numbers].mean()
+    force = ways["force_N"].unstack("direction")
+    together = own.drop(columns=numbers).groupby(KEYS, sort=False).first()
+    together[numbers] = ways.groupby(level=KEYS, sort=False).mean()
+    together = together.assign(direction=BOTH, half_N=(force[1] - force[-1]) / 2)
+    return pd.concat([rows[~alike], together.reset_index()[list(rows.columns)]], ignore_index=True)
+
+
+# ---------------------------------------------------------------- rows
+# The rows that the joint model is fitted to: the `bins` table as sorted arrays, with the groups they nest in.
+
+LEVELS = ("stroke", "file", "run", "specimen")
+"""Grouping levels, finest first; a row of `bins` stands for samples below the stroke."""
+
+ALONG = ("displacement_mm", "distance_mm", "time_s")
+"""Channels that run along a stroke, so that a bin covers a piece of them."""
+
+POWER = "power"
+"""Derived channel where loads differ: load times the size of the speed, the power of friction over its coefficient."""
+
+NOT_CHANNELS = {
+    "file",
+    "run_id",
+    "bin",
+    "stroke_id",
+    "n",
+    "force_N",
+    "force_sd_N",
+    "presliding_N",
+    "speed_bin_mm_s",
+    "specimen_id",
+    "condition",
+    "series",
+    "rubber",
+    "speed_set_mm_s",
+}
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Sorted rows of `bins` as arrays.
+
+    `table` holds them with a fresh index; `order` takes a row here back to its place in the table it came from. Files
+    that hold strokes both ways belong to two runs; they nest in the run without its sign, so that groups are nested.
+    """
+
+    table: pd.DataFrame
+    order: np.ndarray
+    groups: Groups
+    force: np.ndarray  # (n,) measured
+    speed: np.ndarray  # (n,) signed, of the stroke
+    pace: np.ndarray  # (n,) signed, of the bin, where it is seen to differ: what the model's force depends on
+    load: np.ndarray  # (n,) 1 where no load is known
+    days: np.ndarray  # (n,) 0 where there is no aging
+    condition: np.ndarray  # (n,) number in `conditions`
+    conditions: pd.DataFrame  # (c,) condition, series, rubber, aging_days
+    has_load: bool
+    has_aging: bool
+    weight: np.ndarray  # (n,) sums to 1; each file weighs the same
+    filled: dict[str, np.ndarray] = field(default_factory=dict)  # channels that some files lack: `fill_missing`
+    cache: dict = field(default_factory=dict, compare=False, repr=False)  # arrays derived from the table, once
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the columns that may order a residual."""
+        return [name for name in self.table.columns if name not in NOT_CHANNELS]
+
+    def values(self, channel: str) -> np.ndarray:
+        """Return one channel as floats, or as strings if it is a category; with what stands for missing values."""
+        if channel in self.filled:
+            return self.filled[channel]
+        if channel not in self.cache:
+            column = self.table[channel]
+            if pd.api.types.is_numeric_dtype(column):
+                self.cache[channel] = column.to_numpy(dtype=float, na_value=np.nan)
+            else:
+                self.cache[channel] = column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
+        return self.cache[channel]
+
+    def bin_width(self, channel: str) -> np.ndarray:
+        """Return how far a channel goes within each row's bin, shape (n,): its samples times the step between them.
+
+        The step is that of the stroke there: from the middle of one bin to that of the next lie half the samples of
+        both.
+        """
+        key = ("width", channel)
+        if key not in self.cache:
+            values, code, samples = self.values(channel), self.codes("stroke"), self.samples
+            inside = np.diff(code) == 0
+            step = np.where(inside, np.diff(values) / ((samples[1:] + samples[:-1]) / 2), 0.0)
+            left, right = np.r_[0.0, step], np.r_[step, 0.0]
+            own = np.where(left == 0, right, np.where(right == 0, left, (left + right) / 2))
+            self.cache[key] = samples * own
+        return self.cache[key]
+
+    @property
+    def samples(self) -> np.ndarray:
+        """How many samples each row is the mean of, shape (n,); as good as endless where that is not told."""
+        return self.table["n"].to_numpy(dtype=float) if "n" in self.table else np.full(self.force.size, 1e9)
+
+    def codes(self, level: str) -> np.ndarray:
+        """Return each row's group number at a level."""
+        return self.groups.codes[level]
+
+    def sparse(self, most: int) -> Rows:
+        """Return at most about `most` rows of each stroke, evenly spread: enough for what acts on whole strokes."""
+        key = ("sparse", most)
+        if key not in self.cache:
+            start, code = self.groups.starts["stroke"], self.codes("stroke")
+            for channel in (name for name in ALONG if name in self.table):
+                self.bin_width(channel)  # of the bins as they are, not from one kept row to the next
+            place = np.arange(code.size) - start[code]
+            step = -(-np.bincount(code) // most)[code]  # rounded up
+            self.cache[key] = self.subset(place % step == step // 2)
+        return self.cache[key]
+
+    def subset(self, mask: np.ndarray) -> Rows:
+        """Return the rows where `mask` is true; conditions keep their numbers, so that a model fits both."""
+        weight = self.weight[mask]
+        return replace(
+            self,
+            table=self.table[mask].reset_index(drop=True),
+            order=self.order[mask],
+            groups=Groups.of({level: code[mask] for level, code in self.groups.codes.items()}),
+            force=self.force[mask],
+            speed=self.speed[mask],
+            pace=self.pace[mask],
+            load=self.load[mask],
+            days=self.days[mask],
+            condition=self.condition[mask],
+            weight=weight / weight.sum(),
+            filled={name: values[mask] for name, values in self.filled.items()},
+            cache={
+                name: values[mask] for name, values in self.cache.items() if isinstance(name, str) or name[0] == "width"
+            },
+        )
+
+
+def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame | None = None) -> Rows:
+    """Return `bins` as sorted arrays with nested groups.
+
+    Parameters
+    ----------
+    bins : DataFrame
+        Table `bins`, shape (n, columns).
+    has_aging : bool
+        Whether the config's condition has `aging_days`.
+    conditions : DataFrame, optional
+        Conditions of the campaign that these are a part of, as `Rows` holds them: a model of it then fits both.
+    """
+    table = bins.reset_index(drop=True)
+    base_run = nesting_run(table)
+    keys = pd.DataFrame(
+        {
+            "specimen": pd.factorize(table["specimen_id"], sort=True)[0],
+            "run": pd.factorize(base_run, sort=True)[0],
+            "file": pd.factorize(records(table), sort=True)[0],
+            "stroke": table["stroke"].to_numpy(),
+        }
+    )
+    order = np.lexsort([keys[name].to_numpy() for name in ("stroke", "file", "run", "specimen")])
+    table = table.iloc[order].reset_index(drop=True)
+    keys = keys.iloc[order]
+    stroke = pd.factorize(keys["file"] * (int(keys["stroke"].max()) + 1) + keys["stroke"])[0]
+    groups = Groups.of(
+        {
+            "stroke": stroke,
+            "file": keys["file"].to_numpy(),
+            "run": keys["run"].to_numpy(),
+            "specimen": keys["specimen"].to_numpy(),
+        }
+    )
+    has_load = "load_N" in table and bool(table["load_N"].notna().all())
+    if has_load and POWER not in table and np.ptp(table["load_N"]) > 1e-3 * table["load_N"].abs().max():
+        table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
+    days = table["aging_days"].to_numpy(dtype=float) if has_aging else np.zeros(len(table))
+    condition, names = pd.factorize(table["condition"], sort=True)
+    if conditions is None:
+        first = table.drop_duplicates("condition").set_index("condition").loc[names]
+        conditions = first[["series", "rubber"]].reset_index()
+        conditions["aging_days"] = first["aging_days"].to_numpy(dtype=float) if has_aging else 0.0
+    else:
+        condition = pd.Index(conditions["condition"]).get_indexer(names)[condition]
+    files = groups.codes["file"]
+    per_file = np.bincount(files)[files]
+    pace = table["speed_bin_mm_s"] if "speed_bin_mm_s" in table else table["speed_mm_s"]
+    return Rows(
+        table=table,
+        order=order,
+        groups=groups,
+        force=table["force_N"].to_numpy(dtype=float),
+        speed=table["speed_mm_s"].to_numpy(dtype=float),
+        pace=pace.to_numpy(dtype=float),
+        load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(len(table)),
+        days=days,
+        condition=condition,
+        conditions=conditions,
+        has_load=has_load,
+        has_aging=has_aging,
+        weight=1.0 / per_file / (files.max() + 1),
+        filled=fill_missing(table, groups),
+    )
+
+
+def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
+    """Return the campaign's own numeric channels that a few files lack, each with its missing values filled in.
+
+    A missing value is that of its stroke, file, run or specimen, the first of them that has any (the mean, where they
+    differ), else the mean of all files. So a channel stays constant wherever it was, and files without a value say
+    next to nothing of a slope along it. Channels that too many files lack are not in it.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Rows of `bins`, sorted.
+    groups : Groups
+        Of these rows.
+    """
+    found, files = {}, groups.starts["file"].size
+    for name in open_columns(table):
+        if not pd.api.types.is_numeric_dtype(table[name]):
+            continue
+        column = pd.Series(table[name].to_numpy(dtype=float, na_value=np.nan))
+        per_file = column.groupby(groups.codes["file"]).mean()
+        if not column.isna().any() or per_file.notna().sum() < LEAST_KNOWN * files:
+            continue
+        values = column
+        for level in LEVELS:
+            known = column.groupby(groups.codes[level])
+            low, high = known.transform("min"), known.transform("max")
+            values = values.fillna(low.where(low == high, known.transform("mean")))
+        found[name] = values.fillna(per_file.mean()).to_numpy()
+    return found
+
+
+def sliding_power(load: np.ndarray | pd.Series, speed: np.ndarray | pd.Series) -> np.ndarray | pd.Series:
+    """Return the derived channel `POWER` from the load and the signed speed, of their shape."""
+    return load * np.abs(speed)
+
+
+def thin(bins: pd.DataFrame, most: int) -> pd.DataFrame:
+    """Return `bins` with neighbouring bins of a stroke merged until at most about `most` rows are left."""
+    merged = int(np.ceil(len(bins) / most))
+    return bins if merged <= 1 else merge(bins, merged)
+
+
+def merge(bins: pd.DataFrame, together: int | np.ndarray) -> pd.DataFrame:
+    """Return `bins` with so many neighbouring bins of a stroke in one row.
+
+    Means over all their samples: for shapes that are smooth over a few bins nothing is lost, and the cost no longer
+    grows with how finely the strokes were cut. A ripple needs the bins as they are.
+
+    Parameters
+    ----------
+    bins : DataFrame, shape (n, ...)
+        Table `bins`.
+    together : int or ndarray of int, shape (n,)
+        How many bins make a row; the same throughout a stroke.
+    """
+    place = bins.groupby(["file", "stroke"], sort=False).cumcount() // together
+    keys = [bins["file"], bins["stroke"], place.rename("place")]
+    numeric = [c for c in bins.columns if pd.api.types.is_float_dtype(bins[c])]
+    first = [c for c in bins.columns if c not in numeric and c not in ("file", "stroke", "n")]
+    grouped = bins.groupby(keys, sort=False)
+    samples = bins[numeric].notna().mul(bins["n"], axis=0).groupby(keys, sort=False).sum()
+    means = bins[numeric].mul(bins["n"], axis=0).groupby(keys, sort=False).sum() / samples  # 0 / 0: not known
+    table = pd.concat([means, grouped[first].first(), grouped["n"].sum()], axis=1)
+    return table.reset_index(level="place", drop=True).reset_index()[list(bins.columns)]
+
+
+def records(table: pd.DataFrame) -> pd.Series:
+    """Return each row's record, named by its first file.
+
+    A file is a record, unless the files of one repeat of a run each hold other strokes (column `stroke` of runs.csv):
+    these are one record that was split.
+    """
+    strokes = table.drop_duplicates(["file", "stroke"])
+    repeat = [strokes["specimen_id"], _unsigned(strokes["run_id"]), strokes["repeat"]]
+    again = pd.concat([*repeat, strokes["stroke"]], axis=1).duplicated(keep=False)
+    file = strokes["file"].astype(str)
+    first = file.groupby(repeat, dropna=False, sort=False).transform("first")
+    whole = again.groupby(repeat, dropna=False, sort=False).transform("any")
+    return table["file"].astype(str).map(dict(zip(file, file.where(whole, first), strict=True)))
+
+
+def nesting_run(table: pd.DataFrame) -> pd.Series:
+    """Return each row's run, without the sign that a record with strokes both ways adds to it."""
+    both_ways = table.groupby(records(table))["run_id"].transform("nunique") > 1
+    return table["run_id"].where(~both_ways, _unsigned(table["run_id"]))
+
+
+def _unsigned(run: pd.Series) -> pd.Series:
+    return run.str.replace(r"[+-]$", "", regex=True)
+
+
+def open_columns(table: pd.DataFrame) -> list[str]:
+    """Return the channels that the campaign added to `bins`."""
+    fixed = set(BINS.names())
+    return [name for name in table.columns if name not in fixed]
+
+
+def point_rows(
+    table: pd.DataFrame, condition: np.ndarray, conditions: pd.DataFrame, *, has_load: bool, has_aging: bool
+) -> Rows:
+    """Return points to predict at as `Rows`, each its own group.
+
+    Parameters
+    ----------
+    table : DataFrame, shape (n, ...)
+        `speed_mm_s` and every channel the model reads.
+    condition : ndarray, shape (n,)
+        Number of each point's condition in `conditions`.
+    conditions : DataFrame
+        condition, series, rubber and aging_days.
+    has_load, has_aging : bool
+        As in the rows the model was fitted to.
+    """
+    n = len(table)
+    every = np.arange(n)
+    days = conditions["aging_days"].to_numpy(dtype=float)[condition] if has_aging else np.zeros(n)
+    return Rows(
+        table=table,
+        order=every,
+        groups=Groups.of({level: every for level in LEVELS}),
+        force=np.zeros(n),
+        speed=table["speed_mm_s"].to_numpy(dtype=float),
+        pace=table["speed_mm_s"].to_numpy(dtype=float),
+        load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(n),
+        days=days,
+        condition=np.asarray(condition),
+        conditions=conditions,
+        has_load=has_load,
+        has_aging=has_aging,
+        weight=np.full(n, 1.0 / max(n, 1)),
+    )

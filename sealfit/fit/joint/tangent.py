@@ -1,0 +1,264 @@
+r"""The tangent of the joint model, held by what each specimen's rows depend on.
+
+A series has numbers of its own and shares a few with the others, so a row has as many derivatives as one series has
+numbers, however many series there are. Rows of a specimen share a *block*: the columns that any of them depends on.
+Whitening mixes rows of a specimen alone and stays within the block; normal matrices are sums over blocks; and columns
+of one block only are made orthonormal in it, before those that blocks share (a bordered block diagonal: Golub and
+Pereyra 1973, doi:10.1137/0710036, take linear numbers out in the same way). Cost and memory are linear in the rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from sealfit.fit.joint.rows import Groups
+
+WORTHWHILE = 0.5  # share of all columns beyond which a block is no smaller than the whole
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which column stands where in each block, and the block of each row."""
+
+    size: int  # columns, p
+    index: np.ndarray  # (blocks, k) column at each place; p where the place is empty
+    block: np.ndarray  # (n,)
+
+    @cached_property
+    def rows(self) -> list[slice | np.ndarray]:
+        """Rows of each block; a slice where they follow one another."""
+        if len(self.index) == 1:
+            return [slice(None)]
+        order = np.argsort(self.block, kind="stable")
+        parts = np.split(order, np.cumsum(np.bincount(self.block, minlength=len(self.index)))[:-1])
+        return [
+            slice(part[0], part[-1] + 1) if part.size and part[-1] - part[0] == part.size - 1 else part
+            for part in parts
+        ]
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Place of each column in each block, shape (blocks, p); -1 where a block does not have it."""
+        found = np.full((len(self.index), self.size + 1), -1)
+        np.put_along_axis(found, self.index, np.arange(self.index.shape[1])[None, :], axis=1)
+        return found[:, :-1]
+
+    def of(self, rows: np.ndarray) -> Layout:
+        """Return the layout of chosen rows."""
+        return Layout(self.size, self.index, self.block[rows])
+
+    def gram(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return the product of two sets of columns on the rows, shape (n, k) each -> (p, p)."""
+        if self.whole:
+            return first.T @ second
+        parts = np.stack([first[rows].T @ second[rows] for rows in self.rows])
+        wide = self.size + 1
+        total = np.bincount(self.pairs, parts.ravel(), minlength=wide * wide).reshape(wide, wide)
+        return total[:-1, :-1]
+
+    @cached_property
+    def pairs(self) -> np.ndarray:
+        """Where each entry of the blocks' Gram matrices stands in the whole one and its margin, (blocks * k * k,)."""
+        return (self.index[:, :, None] * (self.size + 1) + self.index[:, None, :]).ravel()
+
+    @cached_property
+    def whole(self) -> bool:
+        """Whether there is one block, of every column in order."""
+        return len(self.index) == 1 and np.array_equal(self.index[0], np.arange(self.size))
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """Derivatives of rows, shape (n, p), by blocks: `values`, shape (n, k), 0 where a place is empty."""
+
+    layout: Layout
+    values: np.ndarray
+
+    @classmethod
+    def dense(cls, columns: np.ndarray) -> Tangent:
+        """Return columns, shape (n, p), as one block."""
+        n, p = columns.shape
+        return cls(Layout(p, np.arange(p)[None, :], np.zeros(n, dtype=int)), columns)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.values.shape[0], self.layout.size
+
+    def toarray(self) -> np.ndarray:
+        """Return all columns, shape (n, p)."""
+        found = np.zeros((self.values.shape[0], self.layout.size + 1))
+        np.put_along_axis(found, self.layout.index[self.layout.block], self.values, axis=1)
+        return found[:, :-1]
+
+    def holding(self, values: np.ndarray) -> Tangent:
+        """Return other values, shape (n, k), of the same layout."""
+        return Tangent(self.layout, values)
+
+    def beside(self, columns: np.ndarray) -> Tangent:
+        """Return the tangent with more columns, shape (n,) or (n, m), in every block."""
+        values = np.column_stack([self.values, columns])
+        first, size = self.layout.size, self.layout.size + values.shape[1] - self.values.shape[1]
+        index = np.where(self.layout.index == first, size, self.layout.index)
+        index = np.column_stack([index, np.tile(np.arange(first, size), (len(index), 1))])
+        return Tangent(Layout(size, index, self.layout.block), values)
+
+    def gram(self) -> np.ndarray:
+        """Return T' T, shape (p, p)."""
+        return self.layout.gram(self.values, self.values)
+
+    def against(self, columns: np.ndarray) -> np.ndarray:
+        """Return T' C of columns on the rows, shape (n,) or (n, m) -> (p,) or (p, m)."""
+        total = np.zeros((self.layout.size + 1, *columns.shape[1:]))
+        for index, rows in zip(self.layout.index, self.layout.rows, strict=True):
+            total[index] += self.values[rows].T @ columns[rows]
+        return total[:-1]
+
+    def __matmul__(self, numbers: np.ndarray) -> np.ndarray:
+        """Return T x of numbers, shape (p,) or (p, m) -> (n,) or (n, m)."""
+        padded = np.concatenate([numbers, np.zeros((1, *numbers.shape[1:]))])
+        found = np.empty((self.values.shape[0], *numbers.shape[1:]))
+        for index, rows in zip(self.layout.index, self.layout.rows, strict=True):
+            found[rows] = self.values[rows] @ padded[index]
+        return found
+
+    def freed(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns on the rows, shape (n,) or (n, m), less what these, orthonormal, hold of them."""
+        return columns - self @ self.against(columns)
+
+    def squares(self, matrix: np.ndarray) -> np.ndarray:
+        """Return t' M t of each row t, for a matrix of shape (p, p) -> (n,)."""
+        padded, found = np.pad(matrix, (0, 1)), np.empty(self.values.shape[0])
+        for index, rows in zip(self.layout.index, self.layout.rows, strict=True):
+            found[rows] = np.einsum("ij,ij->i", self.values[rows] @ padded[np.ix_(index, index)], self.values[rows])
+        return found
+
+    def norms(self) -> np.ndarray:
+        """Return the length of each column, shape (p,)."""
+        squares = np.zeros(self.layout.size + 1)
+        for index, rows in zip(self.layout.index, self.layout.rows, strict=True):
+            squares[index] += np.einsum("ij,ij->j", self.values[rows], self.values[rows])
+        return np.sqrt(squares[:-1])
+
+    def scaled(self, factor: np.ndarray) -> Tangent:
+        """Return each column times a factor, shape (p,)."""
+        return self.holding(self.values * np.append(factor, 0.0)[self.layout.index][self.layout.block])
+
+    def sums(self, groups: Groups, level: str, factor: np.ndarray | None = None) -> Tangent:
+        """Return the sum over each group, within a specimen, of the rows times a factor, shape (n,)."""
+        values = self.values if factor is None else self.values * factor[:, None]
+        return Tangent(self.layout.of(groups.starts[level]), groups.sums(values, level))
+
+    def means(self, groups: Groups, level: str) -> Tangent:
+        """Return the mean over each group, within a specimen."""
+        return Tangent(self.layout.of(groups.starts[level]), groups.means(self.values, level))
+
+    def columns(self, mask: np.ndarray) -> Tangent:
+        """Return the columns where `mask`, shape (p,), is true."""
+        size, number = int(mask.sum()), np.append(np.cumsum(mask) - 1, 0)
+        index = np.where(np.append(mask, False)[self.layout.index], number[self.layout.index], size)
+        used = (index < size).any(axis=0)
+        values = np.where((index < size)[self.layout.block], self.values, 0.0)
+        return Tangent(Layout(size, index[:, used], self.layout.block), values[:, used])
+
+    def orthonormal(
+        self, tolerance: float, freed: Callable[[np.ndarray], np.ndarray] = lambda columns: columns
+    ) -> Tangent:
+        """Return an orthonormal basis of the columns' span, of shape (n, rank), columns first made of length 1.
+
+        Parameters
+        ----------
+        tolerance : float
+            Share of the largest singular value below which one is taken for zero.
+        freed : callable, optional
+            Takes something out of columns, (n, m) -> (n, m), specimen by specimen, once they are of length 1.
+        """
+        unit = self.scaled(1 / np.maximum(self.norms(), 1e-300))
+        unit = unit.holding(freed(unit.values))
+        layout = self.layout
+        shared = (layout.places >= 0).sum(axis=0) > 1
+        border = np.column_stack([unit._column(k) for k in np.flatnonzero(shared)]) if shared.any() else None
+        most = 1.0 if border is None else max(1.0, float(np.linalg.norm(border, 2)))  # one column has length 1
+        parts = []
+        for index, rows in zip(layout.index, layout.rows, strict=True):
+            own = unit.values[rows][:, np.append(~shared, False)[index]]
+            left, size, _ = np.linalg.svd(own, full_matrices=False)
+            most = max(most, float(size.max(initial=0.0)))
+            parts.append((left, size))
+        parts = [left[:, size > tolerance * most] for left, size in parts]
+        counts = np.array([part.shape[1] for part in parts])
+        first = np.cumsum(counts) - counts
+        places = np.arange(counts.max(initial=0))
+        values = np.zeros((unit.values.shape[0], places.size))
+        for part, rows in zip(parts, layout.rows, strict=True):
+            values[rows, : part.shape[1]] = part
+        size = int(counts.sum())
+        index = np.where(places < counts[:, None], first[:, None] + places, size)
+        own = Tangent(Layout(size, index, layout.block), values)
+        if border is None:
+            return own
+        border = own.freed(own.freed(border))  # twice: the first leaves what rounding has left
+        left, spread, _ = np.linalg.svd(border, full_matrices=False)
+        return own.beside(left[:, spread > tolerance * most])
+
+    def _column(self, number: int) -> np.ndarray:
+        """Return one column, shape (n,)."""
+        place = self.layout.places[self.layout.block, number]
+        return np.where(place >= 0, np.take_along_axis(self.values, np.maximum(place, 0)[:, None], axis=1)[:, 0], 0.0)
+
+
+class OwnColumns:
+    """A column for each specimen, on rows of its own: taking them out needs no matrix.
+
+    Parameters
+    ----------
+    code : ndarray, shape (n,)
+        Specimen of each row.
+    load : ndarray, shape (n,)
+        What its column holds there; one that holds nothing is none.
+    """
+
+    def __init__(self, code: np.ndarray, load: np.ndarray) -> None:
+        square = np.bincount(code, load**2)
+        self.count = int((square > 0).sum())
+        self.unit = load / np.sqrt(np.where(square > 0, square, 1.0))[code]
+        self.code, self.summing = code, csr_array((self.unit, (code, np.arange(code.size))))
+
+    def freed(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns, shape (n,) or (n, m), less what the specimens' own hold of them."""
+        return columns - (self.unit * (self.summing @ columns)[self.code].T).T
+
+
+def blocks_of(sets: Sequence[frozenset[int]], size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return blocks that hold sets of columns, and the block of each set; one for all where that is no dearer.
+
+    Parameters
+    ----------
+    sets : sequence of frozenset
+        Columns that must stand together.
+    size : int
+        Number of columns.
+
+    Returns
+    -------
+    tuple of ndarray
+        Column at each place, shape (blocks, k), `size` where it is empty; and number of the block, shape (sets,).
+    """
+    kept: list[frozenset[int]] = []
+    home: dict[frozenset[int], int] = {}
+    for one in sorted(set(sets), key=len, reverse=True):
+        home[one] = next((k for k, block in enumerate(kept) if one <= block), len(kept))
+        if home[one] == len(kept):
+            kept.append(one)
+    most = max(map(len, kept), default=0)
+    if len(kept) < 2 or most > WORTHWHILE * size:
+        return np.arange(size)[None, :], np.zeros(len(sets), dtype=int)
+    index = np.full((len(kept), most), size)
+    for k, block in enumerate(kept):
+        index[k, : len(block)] = sorted(block)
+    return index, np.array([home[one] for one in sets])

@@ -1,0 +1,432 @@
+"""What is random in a residual: noise, and the variance of strokes, files, runs and specimens by REML."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
+from scipy.sparse import csr_array
+
+from sealfit.fit.joint.declared import declare
+from sealfit.fit.joint.rows import LEVELS, Groups, Rows
+from sealfit.fit.joint.tangent import Tangent
+from sealfit.fit.joint.whitening import Component, Scatter
+from sealfit.ingest.scatter import two_nonnegative
+
+# ---------------------------------------------------------------- reml
+# The size of scatter at several nested levels, by restricted maximum likelihood (REML), with its exact gradient.
+#
+# With B = [1, F] the loadings of offset and gain, :math:`K_l` their variances at level l, and V_l the covariance up to
+# that level, Woodbury's identity gives for each group
+#
+# .. math:: B^T V_l^{-1} B = Q - Q M Q, \quad M = K^{1/2} (1 + K^{1/2} Q K^{1/2})^{-1} K^{1/2},
+#           \quad Q = \sum_\mathrm{inside} B^T V_{l-1}^{-1} B
+#
+# so that nothing larger than 2 x 2 is inverted: from the finest level up for the likelihood, and down again for the
+# traces in its gradient.
+#
+# Searle, Casella & McCulloch 1992, *Variance Components*, doi:10.1002/9780470316856, chapter 6.
+
+REVIVED = 0.03  # share at which a component starts though it was nothing before: from zero it could not come back
+MOST_GAIN = 0.5  # no rig's gain scatters more: a model near zero with gains of any size would fit every force
+LEAST = 1e-5  # share of all scatter below which a component is nothing
+MOST_SHARE = 30.0  # of the residual, of which the model has taken much where it has nearly as many numbers
+KINDS = ("offset", "gain")
+
+
+def reml(
+    residual: np.ndarray,
+    jacobian: Tangent,
+    variance: np.ndarray,
+    force: np.ndarray,
+    groups: Groups,
+    kinds: Sequence[tuple[str, str]],
+    start: Sequence[float] | None = None,
+) -> tuple[Component, ...]:
+    """Return the variance components of group means by restricted maximum likelihood.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (m,)
+        Mean residual of each finest group, at the fitted model.
+    jacobian : Tangent, shape (m, p)
+        Mean tangent of the model; the degrees of freedom it takes are accounted for.
+    variance : ndarray, shape (m,)
+        Variance of each mean from the rows' own noise.
+    force : ndarray, shape (m,)
+        Mean force of the model, signed.
+    groups : Groups
+        Groups of the m means.
+    kinds : sequence of (level, kind)
+        Components sought, finest level first.
+    start : sequence of float, optional
+        Variances to start from.
+    """
+    if not kinds:
+        return ()
+    scale_force = max(float(np.sqrt(np.mean(force**2))), 1e-12)
+    total = max(float(np.var(residual)), float(np.mean(variance)), 1e-20)
+    unit = np.array([total / (scale_force**2 if kind == "gain" else 1.0) for _, kind in kinds])
+    basis = jacobian.orthonormal(1e-9)
+    variance = np.maximum(variance, LEAST * total)  # less is nothing beside the scatter, and rounding would be more
+    likelihood = RestrictedLikelihood(residual, basis, variance, force, groups, kinds)
+
+    def objective(sd: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = likelihood(unit * sd**2)
+        return value, 2.0 * gradient * unit * sd
+
+    most = [MOST_GAIN**2 / u if kind == "gain" else np.inf for u, (_, kind) in zip(unit, kinds, strict=True)]
+    high = np.sqrt(np.clip(most, LEAST, MOST_SHARE))
+    first = np.full(len(kinds), 0.2) if start is None else np.maximum(np.asarray(start) / unit, REVIVED)
+    # Over standard deviations: a component that is nothing is a minimum at 0 there, over logarithms an endless slope.
+    best = minimize(
+        objective,
+        np.minimum(np.sqrt(first), 0.6 * high),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(0.0, most) for most in high],
+        options={"maxiter": 200, "ftol": 1e-10},  # far below what rounding in the residual should move
+    )
+    share = best.x**2
+    variances = np.where(share > LEAST, unit * share, 0.0)
+    return tuple(Component(level, kind, float(v)) for (level, kind), v in zip(kinds, variances, strict=True))
+
+
+class RestrictedLikelihood:
+    """Half the restricted deviance of group means, and its gradient, as functions of the variances.
+
+    Parameters
+    ----------
+    residual, variance, force : ndarray, shape (m,)
+        As for `reml`.
+    basis : Tangent, shape (m, p)
+        Orthonormal columns that span the model's tangent.
+    groups : Groups
+        Groups of the m means.
+    kinds : sequence of (level, kind)
+        Components, finest level first.
+    """
+
+    def __init__(
+        self,
+        residual: np.ndarray,
+        basis: Tangent,
+        variance: np.ndarray,
+        force: np.ndarray,
+        groups: Groups,
+        kinds: Sequence[tuple[str, str]],
+    ) -> None:
+        self.variance = variance
+        every = basis.beside(residual)
+        self.columns = every.values
+        self.loads = np.column_stack([np.ones_like(force), force])
+        self.places = [(level, KINDS.index(kind)) for level, kind in kinds]
+        self.finest = next(iter(groups.starts))
+        self.above = list(dict.fromkeys(level for level, _ in kinds if level != self.finest))
+        self.groups = {}  # level -> (what sums the finer groups in each group, group of each finer group)
+        self.layout = {self.finest: every.layout}
+        finer = groups.starts[self.finest]
+        for level in self.above:
+            own = np.searchsorted(finer, groups.starts[level])
+            summing = csr_array((np.ones(finer.size), np.arange(finer.size), np.r_[own, finer.size]))
+            self.groups[level] = (summing, groups.codes[level][finer])
+            finer = groups.starts[level]
+            self.layout[level] = every.layout.of(finer)
+
+    def __call__(self, variances: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the value and its derivative with respect to each variance, shape (kinds,)."""
+        size = {level: np.zeros(2) for level in (self.finest, *self.above)}
+        for (level, k), v in zip(self.places, variances, strict=True):
+            size[level][k] = v
+        own = self.variance + self.loads**2 @ size[self.finest]
+        loads, columns = self.loads / own[:, None], self.columns / own[:, None]
+        square = (loads[:, 0], loads[:, 1], loads[:, 1] * self.loads[:, 1])  # B' V^-1 B: 11, 12 and 22, each (groups,)
+        cross = (columns, columns * self.loads[:, 1:])  # B' V^-1 [X r], a row of each, (groups, p + 1)
+        gram = self.layout[self.finest].gram(self.columns, columns)
+        value = float(np.log(own).sum())
+        steps = [(square, cross)]
+        inner = []
+        for level in self.above:
+            summing, _ = self.groups[level]
+            q = tuple(summing @ part for part in square)
+            t = tuple(summing @ part for part in cross)
+            m, logdet = _shrinkage(q, size[level])
+            mt = _applied(m, t)
+            value += float(logdet.sum())
+            gram -= self.layout[level].gram(t[0], mt[0]) + self.layout[level].gram(t[1], mt[1])
+            mq = _product(m, q)
+            left = (1.0 - mq[0], -mq[1], -mq[2], 1.0 - mq[3])
+            inner.append((m, mt, left))
+            # q - q m q and t - q m t: what is left between the groups of this level
+            square = (q[0] * left[0] + q[1] * left[2], q[0] * left[1] + q[1] * left[3], q[1] * left[1] + q[2] * left[3])
+            cross = tuple(x - y for x, y in zip(t, _applied(q, mt), strict=True))
+            steps.append((square, cross))
+        chol = _root_of(gram[:-1, :-1])
+        half = solve_triangular(chol, gram[:-1, -1], lower=True)
+        value += 2.0 * float(np.log(np.diag(chol)).sum()) + float(gram[-1, -1] - half @ half)
+        # Columns that are orthonormal under V, and what is left of the residual: the gradient is in their loads.
+        turn = np.zeros_like(gram)
+        turn[:-1, :-1] = solve_triangular(chol, np.eye(half.size), lower=True).T
+        turn[:-1, -1], turn[-1, -1] = -turn[:-1, :-1] @ half, 1.0
+        turned = turn @ turn.T  # whose product with a Gram matrix is the sum of squares of the turned columns
+        slope = {}
+        n = y = None
+        for k in reversed(range(len(steps))):
+            square, cross = steps[k]
+            if k < len(self.above):
+                m, mt, left = inner[k]
+                if n is None:
+                    n, y = m, mt
+                else:
+                    code = self.groups[self.above[k + 1]][1]
+                    n = tuple(x + z for x, z in zip(m, _sandwich(left, tuple(x[code] for x in n)), strict=True))
+                    first, second = (x[code] for x in y)
+                    y = (
+                        mt[0] + left[0][:, None] * first + left[1][:, None] * second,
+                        mt[1] + left[2][:, None] * first + left[3][:, None] * second,
+                    )
+                code = self.groups[self.above[k]][1]
+                cross = tuple(x - z for x, z in zip(cross, _applied(square, tuple(x[code] for x in y)), strict=True))
+                taken = _sandwich((square[0], square[1], square[1], square[2]), tuple(x[code] for x in n))
+                square = tuple(x - z for x, z in zip(square, taken, strict=True))
+            level = self.above[k - 1] if k else self.finest
+            for kind in (kind for place, kind in self.places if place == level):
+                taken = np.vdot(self.layout[level].gram(cross[kind], cross[kind]), turned)
+                slope[level, kind] = float(square[2 * kind].sum()) - float(taken)
+        return 0.5 * value, 0.5 * np.array([slope[place] for place in self.places])
+
+
+def _root_of(gram: np.ndarray) -> np.ndarray:
+    """Return the lower Cholesky root of a Gram matrix; directions that only rounding holds are given a little size."""
+    ridge = 1e-12
+    while True:
+        try:
+            return np.linalg.cholesky(gram + ridge * np.eye(gram.shape[0]))
+        except np.linalg.LinAlgError:
+            largest = float(np.diag(gram).max())
+            if not np.isfinite(gram).all() or ridge > max(largest, 1.0):
+                raise
+            ridge = max(100 * ridge, 1e-12 * largest)
+
+
+Symmetric = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""2 x 2 matrices by their entries 11, 12 and 22, each (groups,): far quicker than products of stacks so small."""
+
+
+def _shrinkage(q: Symmetric, size: np.ndarray) -> tuple[Symmetric, np.ndarray]:
+    """Return (S^-1 + q)^-1 and log det (1 + S q), shape (groups,), for S the diagonal of `size`; S may hold zeros."""
+    a, b, c = 1.0 + size[0] * q[0], np.sqrt(size[0] * size[1]) * q[1], 1.0 + size[1] * q[2]
+    det = a * c - b * b
+    return (size[0] * c / det, -np.sqrt(size[0] * size[1]) * b / det, size[1] * a / det), np.log(det)
+
+
+def _applied(m: Symmetric, rows: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return m times two rows of columns, each (groups, columns)."""
+    off = m[1][:, None]
+    return m[0][:, None] * rows[0] + off * rows[1], off * rows[0] + m[2][:, None] * rows[1]
+
+
+def _product(m: Symmetric, q: Symmetric) -> tuple[np.ndarray, ...]:
+    """Return m q by its entries 11, 12, 21 and 22."""
+    return (
+        m[0] * q[0] + m[1] * q[1],
+        m[0] * q[1] + m[1] * q[2],
+        m[1] * q[0] + m[2] * q[1],
+        m[1] * q[1] + m[2] * q[2],
+    )
+
+
+def _sandwich(left: Sequence[np.ndarray], n: Symmetric) -> Symmetric:
+    """Return L n L' for L by its entries 11, 12, 21 and 22."""
+    a, b, c, d = left
+    first, second = a * n[0] + b * n[1], a * n[1] + b * n[2]
+    third, fourth = c * n[0] + d * n[1], c * n[1] + d * n[2]
+    return first * a + second * b, first * c + second * d, third * c + fourth * d
+
+
+def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
+    """Return an orthonormal basis of the columns' span, shape (m, rank)."""
+    left, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, size > tolerance * max(size.max(initial=0.0), 1e-300)]
+
+
+# ---------------------------------------------------------------- scatter
+# What is random in a residual: the rows' own noise, and the variance of strokes, files, runs and specimens.
+
+LEAST_NOISE = 1e-6  # of the force: below what any sensor resolves; keeps noise-free data from weights without end
+LEAST_FILES = 6  # from which files can be compared in shape
+
+
+def estimate_scatter(
+    rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: Tangent, start: Scatter | None = None
+) -> Scatter:
+    """Return row noise and variance components of the residual at a model, its degrees of freedom taken out.
+
+    Parameters
+    ----------
+    rows : Rows
+        The rows.
+    residual, friction : ndarray, shape (n,)
+        Measured minus model, and the model's friction, which noise and gains load on.
+    jacobian : Tangent, shape (n, p)
+        The model's.
+    start : Scatter, optional
+        An earlier estimate, to start from.
+    """
+    s0, g, inflation = row_noise(rows, residual, friction)
+    shape = shape_scatter(rows, residual, np.sqrt((s0**2 + (g * friction) ** 2) * inflation))
+    start = Scatter(s0, g, () if start is None else start.components, inflation, shape)
+    return estimate_components(rows, residual, friction, jacobian, start)
+
+
+def estimate_components(
+    rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: Tangent, scatter: Scatter
+) -> Scatter:
+    """Return a scatter with its components estimated anew and its row noise as it is.
+
+    Parameters
+    ----------
+    rows : Rows
+        The rows.
+    residual, friction : ndarray, shape (n,)
+        Measured minus model, and the model's friction.
+    jacobian : Tangent, shape (n, p)
+        The model's, whose degrees of freedom are taken out.
+    scatter : Scatter
+        Row noise, and where the components start.
+    """
+    groups, level = rows.groups, "stroke"
+    means = groups.means(np.column_stack([residual, friction]), level)
+    noise = groups.means(scatter.noise_sd(friction) ** 2, level)
+    count = np.diff(np.r_[groups.starts[level], residual.size])
+    kinds = usable_components(rows)
+    known = {(c.level, c.kind): c.variance for c in scatter.components}
+    components = reml(
+        means[:, 0],
+        jacobian.means(groups, level),
+        noise * scatter.alike / count,
+        means[:, 1],
+        groups.at(level),
+        kinds,
+        [known.get(kind, 0.0) for kind in kinds] if known else None,
+    )
+    return replace(scatter, components=tuple(replace(c, df=_df(rows, c)) for c in components))
+
+
+def usable_components(rows: Rows) -> list[tuple[str, str]]:
+    """Return the (level, kind) of random effects that these groups can tell apart, finest level first."""
+    counts = {level: rows.groups.starts[level].size for level in LEVELS}
+    used, finer = [], None
+    for level in LEVELS:
+        if finer is None:
+            if counts[level] > counts["file"] or level != "stroke":
+                used.append(level)
+                finer = level
+        elif counts[level] < counts[finer] and counts[level] > 2:
+            used.append(level)
+            finer = level
+    if used and used[-1] == "specimen" and not _specimens_free(rows):
+        used.pop()
+    both = rows.speed.min() < 0 < rows.speed.max() or np.ptp(np.abs(rows.force)) > 0.2 * np.abs(rows.force).max()
+    kinds = {level: ("offset", "gain") if both else ("offset",) for level in used}
+    if both and "specimen" in kinds:
+        kinds["specimen"] = ("gain",)  # a piece of rubber has a friction of its own, not a zero of the sensor
+    return [(level, kind) for level in used for kind in kinds[level]]
+
+
+def _specimens_free(rows: Rows) -> bool:
+    """Whether specimens scatter about something: replicate specimens of a condition, or a law across conditions."""
+    return rows.groups.starts["specimen"].size - declare(rows).numbers_of_mu >= 2
+
+
+def _df(rows: Rows, component: Component) -> float:
+    order = list(LEVELS)
+    counts = [rows.groups.starts[level].size for level in order]
+    at = order.index(component.level)
+    above = [counts[k] for k in range(at + 1, len(order)) if counts[k] < counts[at]]
+    return float(counts[at] - (above[0] if above else 1))
+
+
+def row_noise(rows: Rows, residual: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
+    """Return (s0, g, inflation): row noise sqrt(s0^2 + (gF)^2) inside strokes, and how correlation widens a mean.
+
+    What the strokes have in common at a bin is not noise and is taken out first.
+    """
+    groups = rows.groups
+    code, start = groups.codes["stroke"], groups.starts["stroke"]
+    count = np.diff(np.r_[start, residual.size])
+    inside = residual - groups.means(residual, "stroke")[code]
+    place = np.arange(residual.size) - start[code]
+    if start.size >= 8:
+        pattern_n = np.bincount(place)
+        sign = np.sign(rows.speed)
+        for part in (np.ones_like(sign), sign):
+            pattern = np.bincount(place, inside * part) / np.maximum(pattern_n, 1)
+            inside = inside - np.where(pattern_n >= 5, pattern, 0.0)[place] * part
+    size = np.abs(groups.means(force, "stroke"))
+    long = count >= 3
+    if not long.any():
+        return max(float(np.std(residual)), 1e-9), 0.0, 1.0
+    variance = np.add.reduceat(inside**2, start)[long] / (count[long] - 1)
+    floor = (LEAST_NOISE * float(np.sqrt(np.mean(force**2)))) ** 2 + 1e-300
+    square = size[long] ** 2
+    guess = np.full(long.sum(), float(np.mean(variance)) + floor)
+    for _ in range(4):
+        a, b = two_nonnegative(square, variance + floor, count[long] / guess**2)
+        guess = np.maximum(a + b * square, floor)
+    return float(np.sqrt(max(a, floor))), float(np.sqrt(b)), _inflation(inside, code, start, count)
+
+
+def _inflation(inside: np.ndarray, code: np.ndarray, start: np.ndarray, count: np.ndarray) -> float:
+    """Return 1 + 2 sum of autocorrelations over bins, cut at the first one that is not positive."""
+    scale = np.sqrt(np.maximum(np.add.reduceat(inside**2, start) / count, 1e-300))[code]
+    unit = inside / scale
+    total, inflation = max(float((unit**2).mean()), 1e-300), 1.0
+    for lag in range(1, max(2, int(count.min()) // 3)):
+        same = code[lag:] == code[:-lag]
+        rho = float((unit[lag:] * unit[:-lag])[same].mean()) / total
+        if rho < 0.05:
+            break
+        inflation += 2 * rho
+    return inflation
+
+
+def shape_scatter(rows: Rows, residual: np.ndarray, sd: np.ndarray) -> float:
+    """Return by what factor files differ in shape along their strokes more than the noise of their rows lets them.
+
+    Each pass's slope and bend along displacement are held against the mean of all passes of that direction: what they
+    have in common is no scatter. Without it hundreds of rows would outweigh the few files they come from.
+
+    Parameters
+    ----------
+    rows : Rows
+        The rows.
+    residual, sd : ndarray, shape (n,)
+        Measured minus model, and the rows' own noise.
+    """
+    groups = rows.groups
+    code, start = groups.codes["stroke"], groups.starts["stroke"]
+    if groups.starts["file"].size < LEAST_FILES:
+        return 1.0
+    place = rows.table["displacement_mm"].to_numpy(dtype=float)
+    place = place - groups.means(place, "stroke")[code]
+    place = np.sign(rows.speed) * place / np.maximum(np.maximum.reduceat(np.abs(place), start), 1e-300)[code]
+    inside = residual - groups.means(residual, "stroke")[code]
+    number = 2 * groups.codes["file"] + (rows.speed > 0)
+    size = np.abs(groups.means(rows.force, "stroke"))[code]
+    factors = []
+    for load in (np.ones_like(size), size / max(size.mean(), 1e-300)):  # an added force, or one that follows friction
+        found = []
+        for shape in (place, place**2 - groups.means(place**2, "stroke")[code]):
+            weight = np.bincount(number, (shape * load / sd) ** 2)
+            slope = np.bincount(number, shape * load * inside / sd**2) / np.maximum(weight, 1e-300)
+            for side in (0, 1):
+                w, b = weight[side::2], slope[side::2]
+                w, b = w[w > 0], b[w > 0]
+                if w.size >= LEAST_FILES:
+                    found.append((w * (b - w @ b / w.sum()) ** 2).sum() / (w.size - 1))
+        factors.append(np.mean(found) if found else 1.0)
+    return float(max(1.0, min(factors)))

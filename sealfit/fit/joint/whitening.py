@@ -1,0 +1,191 @@
+r"""Scatter at several nested levels, and the whitening that makes rows independent.
+
+A residual is noise of its row plus random offsets and gains of its stroke, file, run and specimen,
+
+.. math:: r_i = \epsilon_i + \sum_l (o_{l,g(i)} + k_{l,g(i)} F_i), \quad
+          \mathrm{Var}\, o_l = \sigma_{o,l}^2, \ \mathrm{Var}\, k_l = \sigma_{k,l}^2
+
+with F the model's friction: its force less what effects add to it, as rubber and load scale no ripple of the drive.
+Neighbouring rows are alike, and files differ in shape along their strokes: the row noise
+counts `alike` times in the mean of a stroke, and `shape` times more often about it.
+
+Within a stroke the components move only two numbers: its mean, and how much of F's own variation about its mean it
+holds (zero where F is constant). There a root of the inverse covariance is a chain of rank-one updates, as groups nest;
+all other patterns are only divided by their noise. That is exact, and linear in the number of rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from sealfit.fit.joint.rows import Groups
+from sealfit.fit.joint.tangent import Tangent
+
+FLAT = 1e-9  # of the mean: a force that varies less within a stroke does not vary
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """Variance of one kind of random effect at one level: an `offset` in force units, or a relative `gain`."""
+
+    level: str
+    kind: str
+    variance: float
+    df: float = np.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Scatter:
+    """Everything random: row noise sqrt(s0^2 + (gF)^2) and the components above it, finest level first."""
+
+    s0: float
+    g: float
+    components: tuple[Component, ...] = ()
+    alike: float = 1.0  # by which neighbours that resemble each other widen the variance of a mean
+    shape: float = 1.0  # by which files' own shapes widen the variance of a pattern along the stroke, beyond that
+
+    def knows(self, level: str) -> bool:
+        """Whether the variance of a level could be told from that of the others, be it zero."""
+        return any(part.level == level for part in self.components)
+
+    def noise_sd(self, friction: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of a row's own noise, shape of `friction`."""
+        return np.sqrt(self.s0**2 + (self.g * friction) ** 2)
+
+    def level_variance(self, level: str, force: np.ndarray) -> np.ndarray:
+        """Return the variance that one level adds to a row at `force`, shape of `force`."""
+        total = np.zeros_like(force, dtype=float)
+        for part in self.components:
+            if part.level == level:
+                total += part.variance * (force**2 if part.kind == "gain" else 1.0)
+        return total
+
+
+class Between:
+    """Whitening of a few numbers per group, whose own noise is independent, under the components above it.
+
+    Parameters
+    ----------
+    variance : ndarray, shape (m,)
+        Variance of each number's own noise.
+    loads : mapping
+        `offset` and `gain` -> how much a unit of it moves each number, shape (m,).
+    groups : Groups
+        Nested groups of the m numbers.
+    components : sequence of Component
+        Variance components, finest level first.
+
+    Attributes
+    ----------
+    logdet : float
+        log det of the covariance.
+    """
+
+    def __init__(
+        self, variance: np.ndarray, loads: Mapping[str, np.ndarray], groups: Groups, components: Sequence[Component]
+    ) -> None:
+        above = [
+            (groups.starts[part.level], groups.codes[part.level], np.sqrt(part.variance) * loads[part.kind])
+            for part in components
+            if part.variance > 0
+        ]
+        self.scale = 1 / np.sqrt(variance)
+        self.logdet = float(np.log(variance).sum())
+        self.steps: list[tuple] = []
+        left = np.column_stack([load for *_, load in above]) * self.scale[:, None] if above else None
+        for k, (start, code, _) in enumerate(above):
+            load = left[:, k].copy()
+            square = np.add.reduceat(load**2, start)
+            self.logdet += float(np.log1p(square).sum())
+            shrink = (1.0 - 1.0 / np.sqrt(1.0 + square)) / np.maximum(square, 1e-300)
+            # Sums over groups by a sparse product: ten times as fast as reduceat.
+            inner = csr_array((load * shrink[code], np.arange(load.size), np.r_[start, load.size]))
+            self.steps.append((inner, code, load))
+            left = self._step(left, *self.steps[-1])
+
+    def __call__(self, numbers: np.ndarray) -> np.ndarray:
+        """Return columns over the numbers, shape (m, k), in coordinates where they are independent, of variance 1."""
+        white = numbers * self.scale[:, None]
+        for step in self.steps:
+            white = self._step(white, *step)
+        return white
+
+    @staticmethod
+    def _step(columns: np.ndarray, inner: csr_array, code: np.ndarray, load: np.ndarray) -> np.ndarray:
+        return columns - load[:, None] * (inner @ columns)[code]
+
+
+class Whitening:
+    """A root of the inverse covariance of rows, made once and applied to many columns.
+
+    Parameters
+    ----------
+    scatter : Scatter
+        Row noise and components.
+    friction : ndarray, shape (n,)
+        The model's friction, signed: what noise and gains load on.
+    groups : Groups
+        Nested groups of the rows, strokes first.
+
+    Attributes
+    ----------
+    logdet : float
+        log det of the covariance.
+    """
+
+    def __init__(self, scatter: Scatter, friction: np.ndarray, groups: Groups) -> None:
+        finest = next(iter(groups.starts))
+        start, code = groups.starts[finest], groups.codes[finest]
+        n, m = friction.size, start.size
+        self.twice = np.repeat(start, 2)  # a row of the stroke that each of the two numbers is of
+        sd = scatter.noise_sd(friction) * np.sqrt(scatter.alike)
+        size = np.sqrt(np.bincount(code, sd**-2.0))
+        mean = 1 / (sd * size[code])  # unit vector along a stroke's mean, in units of the rows' noise
+        level = np.bincount(code, mean * friction / sd)
+        about = friction / sd - level[code] * mean
+        spread = np.sqrt(np.bincount(code, about**2))
+        flat = spread < FLAT * np.abs(level)
+        about = np.where(flat[code], 0.0, about / np.where(flat, 1.0, spread)[code])  # and along F about its mean
+        self.root = np.sqrt(scatter.shape)
+        self.unit = 1 / (sd * self.root)
+        self.back = csr_array(
+            (np.column_stack([mean, about]).ravel(), (2 * code[:, None] + [0, 1]).ravel(), 2 * np.arange(n + 1)),
+            shape=(n, 2 * m),
+        )
+        self.take = csr_array(self.back.T.multiply(1 / sd[None, :]))
+        self.between = Between(
+            np.tile([1.0, scatter.shape], m),
+            {
+                "offset": np.column_stack([size, np.zeros(m)]).ravel(),
+                "gain": np.column_stack([level, np.where(flat, 0.0, spread)]).ravel(),
+            },
+            groups.at(finest).repeated(2),
+            scatter.components,
+        )
+        self.logdet = self.between.logdet + float(2 * np.log(sd).sum() + (n - 2 * m) * np.log(scatter.shape))
+
+    def normal(self, tangent: Tangent, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return C' V^-1 C, shape (p, p), and C' V^-1 r of a tangent on the rows: no column is whitened.
+
+        `residual`, shape (n,), is white already.
+        """
+        scaled, numbers = tangent.values * self.unit[:, None], self.take @ tangent.values
+        between, kept = self.between(numbers), numbers / self.root
+        rows, strokes = tangent.layout, tangent.layout.of(self.twice)
+        square = rows.gram(scaled, scaled) + strokes.gram(between, between) - strokes.gram(kept, kept)
+        pull = Tangent(strokes, between - kept).against(residual @ self.back)
+        return square, tangent.holding(scaled).against(residual) + pull
+
+    def of(self, tangent: Tangent) -> Tangent:
+        """Return a tangent on the rows, whitened."""
+        return tangent.holding(self(tangent.values))
+
+    def __call__(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns on the rows, shape (n, k), in coordinates where rows are independent, of unit variance."""
+        white, numbers = columns * self.unit[:, None], self.take @ columns
+        white += self.back @ (self.between(numbers) - numbers / self.root)
+        return white

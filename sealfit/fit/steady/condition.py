@@ -1,0 +1,239 @@
+"""One condition's model: which of Eq. 14's numbers its speeds can hold, their fit, and what they determine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from sealfit.fit.least_squares import project
+from sealfit.fit.steady.stribeck import (
+    NAMES,
+    StribeckFit,
+    constrained_ends,
+    flat_p_value,
+    search_limits,
+    solve_stribeck,
+    stribeck_intervals,
+    tangent,
+)
+from sealfit.fit.steady.uncertainty import shifts_of, speed_levels
+from sealfit.physics import stribeck_force
+
+FULL, VISCOUS, CONSTANT = 4, 2, 1  # speed levels within one direction that each model needs
+SIGNIFICANT = 0.05
+COLUMNS = {4: NAMES, 2: ("mu_c", "sigma_2"), 1: ("mu_c",)}
+
+
+@dataclass
+class Condition:
+    """One condition on its way through the fit: its run means, and then its model and numbers."""
+
+    name: str
+    runs: pd.DataFrame
+    levels: dict[int, np.ndarray]
+    has_load: bool
+    left_out: int  # runs without load in a campaign with loads
+    model: int  # FULL, VISCOUS or CONSTANT
+    flat_p: float = np.nan
+    values: np.ndarray | None = None  # (p,) in the order of COLUMNS[model]
+    low: np.ndarray | None = None
+    high: np.ndarray | None = None
+    chi2: float = np.nan
+    grid: np.ndarray | None = None
+
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """|v|, N (1 without load), F sgn v and weight of each run, shape (n,)."""
+        load = self.runs["load"].to_numpy(float) if self.has_load else np.ones(len(self.runs))
+        return self.runs["speed"].to_numpy(float), load, self.runs["force"].to_numpy(float), self.runs["weight"].values
+
+    @property
+    def shifts(self) -> np.ndarray:
+        """Change of F sgn v of each run along the directions of the effects' uncertainty, shape (n, k)."""
+        return self.runs[shifts_of(self.runs)].to_numpy(float)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters of the model fitted."""
+        return COLUMNS[self.model]
+
+    @property
+    def df(self) -> int:
+        """Runs less parameters; a parameter at its limit still counts, which errs on the wide side."""
+        return max(len(self.runs) - len(self.names), 0)
+
+    def jacobian(self) -> np.ndarray:
+        """Derivative of F sgn v along the parameters, shape (n, p)."""
+        speed, load, _, _ = self.arrays
+        return tangent(speed, load, self.values) if self.model == FULL else self.columns()
+
+    def model_force(self) -> np.ndarray:
+        """F sgn v of the fitted model at every run, shape (n,)."""
+        speed, load, _, _ = self.arrays
+        if self.model != FULL:
+            return self.columns() @ self.values
+        mu_s, mu_c, v_s, sigma_2 = self.values
+        return stribeck_force(speed, load, mu_s=mu_s, mu_c=mu_c, v_s=v_s, sigma_2=sigma_2)
+
+    def offset(self) -> float:
+        """Half the difference between the directions' residuals where it is clear (4 standard errors), else 0.
+
+        It is no part of the declared model, but it widens the intervals and can hide a Stribeck curve: worth a word.
+        """
+        rest, way = self.runs["force"].to_numpy(float) - self.model_force(), self.runs["direction"].to_numpy()
+        one, other = rest[way > 0], rest[way < 0]
+        halves = self.runs["half"].dropna().to_numpy(float)
+        if min(len(one), len(other)) >= 3:
+            half = (one.mean() - other.mean()) / 2
+            error = np.sqrt(one.var(ddof=1) / len(one) + other.var(ddof=1) / len(other)) / 2
+        elif len(halves) >= 3:
+            half, error = halves.mean(), halves.std(ddof=1) / np.sqrt(len(halves))
+        else:
+            return 0.0
+        return float(half) if abs(half) > 4 * error else 0.0
+
+    def columns(self) -> np.ndarray:
+        """Columns of the model without Stribeck curve, shape (n, p)."""
+        speed, load, _, _ = self.arrays
+        return np.stack([load, speed], axis=1) if self.model == VISCOUS else load[:, None]
+
+
+def make_condition(name: str, runs: pd.DataFrame) -> Condition:
+    """Return a condition with the richest model its speed levels can hold; `runs` as `run_means`, with `weight`."""
+    loaded = runs["load"].notna().to_numpy()
+    has_load = bool(loaded.any())
+    kept = runs[loaded] if has_load and not loaded.all() else runs
+    levels = speed_levels(kept)
+    most = max(len(values) for values in levels.values())
+    model = FULL if most >= FULL else VISCOUS if most >= VISCOUS else CONSTANT
+    return Condition(str(name), kept.reset_index(drop=True), levels, has_load, len(runs) - len(kept), model)
+
+
+def stacked(conditions: list[Condition]) -> tuple[np.ndarray, ...]:
+    """Arrays of several conditions padded to one length; padding has weight 0."""
+    longest = max(len(c.runs) for c in conditions)
+    filled = [np.ones((len(conditions), longest)) for _ in range(3)] + [np.zeros((len(conditions), longest))]
+    for k, condition in enumerate(conditions):
+        for target, values in zip(filled, condition.arrays, strict=True):
+            target[k, : len(values)] = values
+    return tuple(filled)
+
+
+def solve(conditions: list[Condition]) -> None:
+    """Fit every condition's model, those with a Stribeck curve all at once."""
+    full = [c for c in conditions if c.model == FULL]
+    if full:
+        fit = solve_stribeck(*stacked(full))
+        for condition, values, rss, grid in zip(full, fit.values(), fit.rss, fit.grid, strict=True):
+            condition.values, condition.chi2, condition.grid = values, float(rss), grid
+    for condition in conditions:
+        if condition.model != FULL:
+            _solve_linear(condition)
+
+
+def _solve_linear(condition: Condition) -> None:
+    _, _, force, weight = condition.arrays
+    root = np.sqrt(weight)
+    held = [True] * len(condition.names)
+    condition.values, chi2 = project(condition.columns() * root[:, None], force * root, held)
+    condition.chi2 = float(chi2)
+
+
+def drop_flat_curve(condition: Condition, unit: float, df: float) -> None:
+    """Fall back to mu_c and sigma_2 where mu_s = mu_c is not rejected."""
+    speed, load, _, weight = condition.arrays
+    full, chi2 = condition.values, condition.chi2
+    condition.model = VISCOUS
+    _solve_linear(condition)
+    if np.isfinite(unit) and unit > 0:
+        condition.flat_p = flat_p_value(
+            speed, load, weight, condition.grid, (condition.chi2 - chi2) / unit, df, viscous=condition.values[1] > 0
+        )
+    if not condition.flat_p >= SIGNIFICANT:
+        condition.model, condition.values, condition.chi2 = FULL, full, chi2
+
+
+def bound(conditions: list[Condition], rise: np.ndarray) -> None:
+    """Set the ends of the intervals; `rise` is how much chi-square may grow, shape (conditions,)."""
+    full = [k for k, c in enumerate(conditions) if c.model == FULL and np.isfinite(rise[k])]
+    if full:
+        arrays = stacked([conditions[k] for k in full])
+        values, chi2 = (np.array([getattr(conditions[k], name) for k in full]) for name in ("values", "chi2"))
+        fit = StribeckFit(*values.T, chi2, search_limits(arrays[0], arrays[3]))
+        lows, highs = stribeck_intervals(*arrays, fit, rise[full])
+        for k, low, high in zip(full, lows, highs, strict=True):
+            conditions[k].low, conditions[k].high = low, high
+    for condition, allowed in zip(conditions, rise, strict=True):
+        if condition.model != FULL and np.isfinite(allowed):
+            _, _, force, weight = condition.arrays
+            root = np.sqrt(weight)
+            low, high = constrained_ends(
+                (condition.columns() * root[:, None])[None, None],
+                (force * root)[None, None],
+                np.array([condition.chi2 + allowed]),
+                [True] * len(condition.names),
+            )
+            condition.low, condition.high = low[0, 0], high[0, 0]
+
+
+def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
+    """Return, per parameter, whether these data determine it and, in words, why not or what is worth a remark."""
+    most = max(len(values) for values in condition.levels.values())
+    verdict = dict.fromkeys(NAMES, (True, ""))
+    if condition.model == CONSTANT:
+        lone = "one speed only in each direction: the sliding coefficient at that speed is all these runs hold."
+        verdict |= {name: (False, lone) for name in ("mu_s", "v_s", "sigma_2")}
+        verdict["mu_c"] = (True, "the sliding coefficient at the one speed tested, sigma_2 v included.")
+    elif condition.model == VISCOUS and most < FULL:
+        few = f"{most} speeds in one direction: the Stribeck curve needs four, two of them below about 2 v_s."
+        verdict |= {name: (False, few) for name in ("mu_s", "v_s")}
+        verdict["mu_c"] = (True, "the sliding coefficient over these speeds, without Stribeck curve.")
+    elif condition.model == VISCOUS:
+        flat = f"mu_s = mu_c is not rejected (p = {condition.flat_p:.2g}): no Stribeck curve is seen"
+        verdict |= {"mu_s": (False, f"{flat}, mu_s is mu_c."), "v_s": (False, f"{flat}, so v_s has no meaning.")}
+        verdict["mu_c"] = (True, "of the fit without Stribeck curve; mu_s = mu_c is not rejected.")
+        if condition.offset():
+            hidden = (
+                "The offset between the two directions counts as scatter here and may hide a curve; see close-loop."
+            )
+            verdict |= {
+                name: (ok, f"{why} {hidden}".strip()) for name, (ok, why) in verdict.items() if name != "sigma_2"
+            }
+    elif condition.low is None:
+        unknown = "as many parameters as runs and no repeats: nothing shows how far to trust it."
+        verdict |= {name: (False, unknown) for name in NAMES}
+    else:
+        verdict |= _judge_curve(condition)
+    if condition.low is None and condition.model != FULL:
+        verdict = {n: (ok, why or "no repeats and no spare run: no interval.") for n, (ok, why) in verdict.items()}
+    if "sigma_2" in condition.names and condition.values[condition.names.index("sigma_2")] == 0.0:
+        verdict["sigma_2"] = (verdict["sigma_2"][0], "at its physical limit 0: friction does not rise with speed here.")
+    for name in ("mu_s", "mu_c"):
+        if name in condition.names and condition.values[condition.names.index(name)] == 0.0:
+            verdict[name] = (False, "at its physical limit 0: these runs show no friction that it could be.")
+    against = int((condition.runs["force"] < 0).sum())
+    if against:
+        told = f"{against} runs have a force along the motion: check the sign of force or displacement."
+        verdict["mu_c"] = (verdict["mu_c"][0], f"{verdict['mu_c'][1]} {told}".strip())
+    return verdict
+
+
+def _judge_curve(condition: Condition) -> dict[str, tuple[bool, str]]:
+    mu_s, mu_c, v_s, _ = condition.values
+    low, high = condition.low, condition.high
+    below = max(int((values < 2 * v_s).sum()) for values in condition.levels.values())
+    verdict = {"mu_s": (True, "mu_s < mu_c: friction rises from rest.") if mu_s < mu_c else (True, "")}
+    if low[2] == 0.0:
+        verdict["v_s"] = (False, f"any v_s up to {high[2]:.3g} fits: slower speeds are needed.")
+        verdict["mu_s"] = (False, "v_s may lie below the slowest speed, and mu_s then may be anything.")
+    elif np.isinf(high[2]):
+        verdict["v_s"] = (False, f"any v_s from {low[2]:.3g} up fits: faster speeds are needed.")
+    elif below < 2:
+        few = "no speed lies" if below == 0 else "one speed lies"
+        verdict["v_s"] = (False, f"{few} below 2 v_s = {2 * v_s:.3g} in one direction: two are needed.")
+    if low[1] == 0.0:
+        verdict["mu_c"] = (False, "no speed is fast enough to see mu_c without mu_s: it may be zero.")
+    return verdict

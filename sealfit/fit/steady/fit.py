@@ -1,0 +1,290 @@
+"""Steady distributed LuGre (Eq. 14) per condition, with what the campaign's speeds can and cannot tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pandas as pd
+from scipy.special import stdtrit
+
+from sealfit.config import Config
+from sealfit.engine.run_map import run_map
+from sealfit.fit.joint.rows import both_ways_together
+from sealfit.fit.steady.condition import FULL, Condition, bound, drop_flat_curve, judge, make_condition, solve
+from sealfit.fit.steady.stribeck import NAMES, linearised
+from sealfit.fit.steady.uncertainty import (
+    UnitVariance,
+    likelier,
+    proportional_weights,
+    run_means,
+    run_weights,
+    unit_variance,
+)
+from sealfit.ingest.categorical import condition_columns
+from sealfit.ingest.scatter import Scatter, repeat_scatter
+from sealfit.tables import STEADY_FIT
+from sealfit.units import Units
+
+SIGNIFICANT = 0.05
+TOGETHER = 250  # conditions whose intervals one process finds at once,
+MANY = 3000  # where there are so many: fewer are done before a process has started
+FORCES = {"mu_s": "F_s", "mu_c": "F_c"}  # names without load
+
+
+def fit_conditions(steady: pd.DataFrame, config: Config, *, workers: int = 1) -> pd.DataFrame:
+    r"""Fit Eq. 14 to every condition and say what its speeds determine.
+
+    .. math:: F\,\mathrm{sgn}\,v = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}] + \sigma_2 |v|
+
+    Both directions together, on run means weighted by the pooled scatter of repeats. mu_s, mu_c and sigma_2 are not
+    negative; mu_s < mu_c is allowed and remarked. Without load the forces F_s and F_c are fitted, in the force's unit.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`; rows with `used` false are left out.
+    config : Config
+        Names the condition columns, the units and the sensor's accuracy.
+    workers : int
+        Processes for the intervals of many conditions.
+
+    Returns
+    -------
+    DataFrame
+        Table `steady_fit` plus the condition columns. `quantity` is "steady" (one row per parameter), "statistics",
+        "covariance" (`parameter` "mu_s,mu_c": type A, for the aging fit), "sensor_shift" (change of the parameter if
+        the sensor reads the size of every force one standard uncertainty too high; `u_sys` is its size) or, where
+        effects were taken out of the forces, "effect_shift" (`parameter` "mu_s:1": change along each direction of the
+        effects' uncertainty; it is in the covariance and the intervals, and common to all conditions).
+
+    Raises
+    ------
+    FitError
+        If nothing is left to fit.
+
+    Notes
+    -----
+    Intervals are profile-likelihood intervals throughout, with Student's t. `u_sys` takes the sensor's accuracy as one
+    unknown error of the force's size, the same for all samples, so nothing averages it down. A zero offset of the
+    sensor has opposite signs in the two directions and does at most the same; it is what the loop looks for.
+    """
+    conditions, scatter, variance = solve_conditions(steady)
+    keys = condition_keys(steady, config)
+    blocks = [slice(start, start + TOGETHER) for start in range(0, len(conditions), TOGETHER)]
+    asked = [(conditions[block], variance.of(block)) for block in blocks]
+    workers = workers if len(conditions) >= MANY else 1
+    found = run_map(partial(_told, scatter=scatter, config=config), asked, workers=workers, together=1)
+    table = pd.concat(found, ignore_index=True).merge(keys, on="condition", how="left", validate="many_to_one")
+    fixed = STEADY_FIT.names()
+    return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
+
+
+def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, UnitVariance]:
+    """Return every condition with its model solved, the scatter of repeats, and how far their variances are widened.
+
+    Curves that are not told from flat ones are dropped; there are no intervals yet.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`; rows with `used` false are left out.
+
+    Raises
+    ------
+    FitError
+        If nothing is left to fit.
+    """
+    runs = run_means(steady)
+    scatter = repeat_scatter(both_ways_together(steady[steady["used"].to_numpy(bool)]))
+    conditions = _solved(runs.assign(weight=run_weights(runs, scatter)))
+    if not scatter.df > 0:
+        conditions = _likelier_weighted(conditions)
+    first = _unit_variance(conditions, scatter)
+    for condition, value, df in zip(conditions, first.value, first.df, strict=True):
+        if condition.model == FULL:
+            drop_flat_curve(condition, value, df)
+    return conditions, scatter, _unit_variance(conditions, scatter)
+
+
+def _solved(runs: pd.DataFrame) -> list[Condition]:
+    conditions = [make_condition(name, rows) for name, rows in runs.groupby("condition", sort=True)]
+    solve(conditions)
+    return conditions
+
+
+def _likelier_weighted(even: list[Condition]) -> list[Condition]:
+    """Return the conditions with even weights or with those of a scatter in proportion to friction, the likelier.
+
+    Without repeats only the shape of the scatter can be guessed, and the residuals say which they bear out.
+    """
+    sizes = np.cumsum([len(c.runs) for c in even])[:-1]
+    weight = proportional_weights(np.concatenate([c.model_force() for c in even]))
+    other = [replace(c, runs=c.runs.assign(weight=w)) for c, w in zip(even, np.split(weight, sizes), strict=True)]
+    solve(other)
+    chi2 = [sum(c.chi2 for c in conditions) for conditions in (even, other)]
+    chosen = likelier(chi2, [np.ones(weight.size), weight], sum(c.df for c in even))
+    return (even, other)[chosen]
+
+
+def _unit_variance(conditions: list[Condition], scatter: Scatter) -> UnitVariance:
+    return unit_variance([c.chi2 for c in conditions], [c.df for c in conditions], scatter.df)
+
+
+def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
+    """One row per condition: series, rubber and the condition columns; null where unaged rubber has several."""
+    names = [c for c in dict.fromkeys(["series", "rubber", *condition_columns(config)]) if c in steady.columns]
+    grouped = steady[steady["condition"].notna()].groupby("condition", sort=True)
+    first, several = grouped[names].first(), grouped[names].nunique() > 1
+    return first.mask(several).reset_index()
+
+
+# ---------------------------------------------------------------- what the table says
+def _told(given: tuple[list[Condition], UnitVariance], scatter: Scatter, config: Config) -> pd.DataFrame:
+    """Return the rows of some conditions, their intervals found."""
+    conditions, variance = given
+    bound(conditions, variance.rise())
+    return pd.DataFrame(
+        [
+            {"condition": c.name, **row}
+            for k, c in enumerate(conditions)
+            for row in _rows(c, k, variance, scatter, config)
+        ]
+    )
+
+
+def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter, config: Config) -> Iterator[dict]:
+    unit_of = parameter_units(config.units, condition.has_load)
+    _, _, force, weight = condition.arrays
+    covariance, shift = linearised(condition.jacobian(), weight, condition.values, condition.names)
+    _, effects = linearised(condition.jacobian(), weight, condition.values, condition.names, condition.shifts)
+    covariance = covariance * variance.value[k] + effects @ effects.T
+    shift = np.where(np.abs(shift) > 1e-12 * np.abs(condition.values), shift * config.sensor.u, 0.0)  # else rounding
+    judged = judge(condition)
+    spelled = {name: name if condition.has_load else FORCES.get(name, name) for name in NAMES}
+    for name in NAMES:
+        identified, reason = judged[name]
+        row = {"quantity": "steady", "parameter": spelled[name], "unit": unit_of[name]}
+        row |= {"identified": identified, "reason": reason}
+        if name in condition.names:
+            j = condition.names.index(name)
+            low, high = (None, None) if condition.low is None else (condition.low[j], condition.high[j])
+            open_below = name == "v_s" and low == 0.0
+            if effects.any() and low is not None:
+                reach = stdtrit(variance.df[k], 0.975) * float(np.sqrt((effects[j] ** 2).sum()))
+                low, high = _widened(condition.values[j], low, high, reach)
+            stuck = name in ("mu_s", "mu_c") and condition.values[j] == 0.0  # at its limit: not known with error zero
+            se = None if stuck else _finite(np.sqrt(covariance[j, j]))
+            row |= {"value": condition.values[j], "se": se, "u_sys": abs(shift[j])}
+            row |= {"lo95": None if open_below else _finite(low), "hi95": _finite(high)}
+        yield table_row(**row)
+    residual = force - condition.model_force()
+    yield from _statistics(condition, k, variance, scatter, residual, config.units.unit("force"))
+    if np.isfinite(variance.value[k]):
+        for i, one in enumerate(condition.names):
+            for j, other in enumerate(condition.names[: i + 1]):
+                yield table_row(
+                    quantity="covariance",
+                    parameter=f"{spelled[other]},{spelled[one]}",
+                    value=_finite(covariance[i, j]),
+                    unit=_product(unit_of[other], unit_of[one]),
+                    identified=judged[one][0] and judged[other][0],
+                )
+    for j, name in enumerate(condition.names):
+        yield table_row(
+            quantity="sensor_shift",
+            parameter=spelled[name],
+            value=shift[j],
+            unit=unit_of[name],
+            identified=judged[name][0],
+        )
+        for number, moved in enumerate(effects[j], start=1):
+            yield table_row(
+                quantity="effect_shift",
+                parameter=f"{spelled[name]}:{number}",
+                value=moved,
+                unit=unit_of[name],
+                identified=judged[name][0],
+            )
+
+
+def _widened(value: float, low: float, high: float, reach: float) -> tuple[float, float]:
+    """Return an interval's ends, a half-width added in quadrature to each side; these numbers are not negative."""
+    return max(value - float(np.hypot(value - low, reach)), 0.0), value + float(np.hypot(high - value, reach))
+
+
+def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterator[dict]:
+    repeated = scatter.df > 0
+    no_repeats = "" if repeated else "no run was repeated: there is no pure error to compare with."
+    ratio = condition.chi2 / condition.df if condition.df else None
+    lack = no_repeats
+    if repeated and condition.df == 0:
+        lack = "as many parameters as runs: the fit cannot disagree with them."
+    elif repeated and variance.p[k] < SIGNIFICANT:
+        lack = (
+            "lack of fit: the runs disagree with the model by more than their repeats scatter (set-up scatter between "
+            f"runs, or something the model lacks); intervals are widened {np.sqrt(variance.value[k]):.2g} times."
+        )
+    offset = condition.offset()
+    if offset:
+        lack = f"{lack} The two directions differ: offset of {offset:.3g} {force_unit}, in no declared model.".strip()
+    if condition.left_out:
+        lack = f"{lack} {condition.left_out} runs without load were left out of the fit.".strip()
+    for name, value, unit, reason in (
+        ("chi2", condition.chi2 if repeated else None, "", no_repeats),
+        ("df", condition.df, "", ""),
+        ("reduced_chi2", ratio if repeated else None, "", no_repeats),
+        ("lack_of_fit_F", variance.f[k], "", no_repeats),
+        ("lack_of_fit_p", variance.p[k], "", lack),
+        (
+            "birge_ratio",
+            np.sqrt(variance.value[k]) if repeated else None,
+            "",
+            no_repeats or ("own" if variance.own[k] else "pooled"),
+        ),
+        ("error_df", variance.df[k], "", "degrees of freedom of the intervals' Student t"),
+        ("flat_p", condition.flat_p, "", "chance of this much Stribeck curve where mu_s = mu_c"),
+        ("rmse_N", np.sqrt(np.mean(residual**2)), force_unit, ""),
+        ("n_runs", len(condition.runs), "", ""),
+        ("n_files", condition.runs["files"].sum(), "", ""),
+        ("n_speeds", max(len(values) for values in condition.levels.values()), "", "levels within one direction"),
+    ):
+        yield table_row(
+            quantity="statistics", parameter=name, value=_finite(value), unit=unit, identified=True, reason=reason
+        )
+
+
+def parameter_units(units: Units, has_load: bool) -> dict[str, str]:
+    """Return the true unit of mu_s, mu_c (or F_s, F_c), v_s and sigma_2 under the config's units."""
+    force, speed, load = units.unit("force"), units.unit("speed"), units.unit("load")
+    mu = force if not has_load else "" if force == load else f"{force}/{load}"
+    sigma_2 = f"{force} s/{speed.removesuffix('/s')}" if speed.endswith("/s") else f"{force}/{speed}"
+    return {"mu_s": mu, "mu_c": mu, "v_s": speed, "sigma_2": sigma_2}
+
+
+def _product(one: str, other: str) -> str:
+    if one == other:
+        return f"({one})^2" if one else ""
+    return " ".join(f"({unit})" for unit in (one, other) if unit)
+
+
+def _finite(value) -> float | None:
+    return float(value) if value is not None and np.isfinite(value) else None
+
+
+def table_row(
+    *, quantity, parameter, value=None, se=None, lo95=None, hi95=None, u_sys=None, unit, identified, reason=""
+) -> dict:
+    """Return one row of a fit table; None, and an end that is open, become null."""
+    numbers = {"value": value, "se": se, "lo95": lo95, "hi95": hi95, "u_sys": u_sys}
+    return {
+        "model": "before",
+        "quantity": quantity,
+        "parameter": parameter,
+        **{name: np.nan if _finite(number) is None else float(number) for name, number in numbers.items()},
+        "unit": unit,
+        "identified": bool(identified),
+        "reason": reason,
+    }

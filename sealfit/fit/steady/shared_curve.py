@@ -1,0 +1,225 @@
+r"""mu_s and mu_c of all conditions from the forces, one v_s and one sigma_2 for all days of a series.
+
+The declared model (Eq. 14 with Eq. 15) holds v_s and sigma_2 of a series through its days, and only mu_s and mu_c age.
+Given v_s the force is linear in all else,
+
+.. math:: F\,\mathrm{sgn}\,v = N [\mu_c^{(i)} + (\mu_s^{(i)} - \mu_c^{(i)}) e^{-(v/v_s)^2}] + \sigma_2 |v|,
+
+so mu_s and mu_c of the conditions i, with their covariance, hold all that the forces say of any law of aging: a law
+fitted to them by generalised least squares is fitted to the forces. What the days share makes the values surer than
+free fits do, and determines conditions that have too few speeds for a fit of their own. Where the days of a series do
+not agree on v_s and sigma_2 (F test), its conditions keep their free fits; so do days that disagree with the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.linalg import block_diag
+from scipy.optimize import minimize_scalar
+from scipy.special import fdtrc
+
+from sealfit.fit.aging.series import PAIRS, steady_covariance, values_of
+from sealfit.fit.joint.declared import series_of_curve
+from sealfit.fit.least_squares import covariance_of, even_grid
+from sealfit.fit.steady.condition import FULL, Condition, stacked
+from sealfit.fit.steady.fit import FORCES, solve_conditions
+from sealfit.fit.steady.stribeck import search_limits
+from sealfit.fit.steady.uncertainty import UnitVariance, shifts_of
+from sealfit.tables import STEADY_FIT
+
+SHARED_P = 0.01  # below, the days of a series do not share v_s and sigma_2
+PER_DECADE = 30  # points of the search along v_s: of all days of a series together no minimum is narrow
+DETERMINED = 0.3  # standard error over value: above, the forces do not tell it
+RANK = 1e-8  # of the columns of a condition: with one speed mu_s and mu_c are one number
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Values of mu_s and mu_c (F_s and F_c) and the covariance of their measurement.
+
+    Attributes
+    ----------
+    table : DataFrame
+        `condition`, `quantity` and `value`, and the condition's columns of `steady_fit`.
+    covariance : ndarray, shape (n, n)
+        Of the values.
+    """
+
+    table: pd.DataFrame
+    covariance: np.ndarray
+
+
+def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
+    """Return what the forces say of mu_s and mu_c at every aged condition and the unaged rubber.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`; rows with `used` false are left out.
+    steady_fit : DataFrame
+        Table `steady_fit` with `aging_days`: the free fits, of which only what is identified is used.
+
+    Raises
+    ------
+    FitError
+        If nothing is left to fit.
+    """
+    rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["aging_days"].notna()]
+    of_parameters = [name for name in STEADY_FIT.names() if name not in ("condition", "series", "rubber")]
+    about = rows.drop(columns=of_parameters, errors="ignore").drop_duplicates("condition")
+    known = rows[rows["identified"].to_numpy(bool) & rows["value"].notna()]
+    curved = set(known.loc[known["parameter"] == "v_s", "condition"])
+    free = known[known["parameter"].isin([name for pair in PAIRS for name in pair])]
+    free = free.assign(quantity=free["parameter"])[["condition", "quantity", "value"]]
+    conditions, _, variance = solve_conditions(steady)
+    place = {c.name: k for k, c in enumerate(conditions)}
+    series = series_of_curve(about.reset_index(drop=True), aging=True)
+    known_covariances, known_shifts = values_of(steady_fit, "covariance"), values_of(steady_fit, "effect_shift")
+    count = len(shifts_of(steady))
+    tables, covariances, shifts = [], [], []
+    for names in (about["condition"].to_numpy(object)[series == s] for s in dict.fromkeys(series)):
+        places = [place[name] for name in names]
+        found = _shared([conditions[k] for k in places], variance, variance.value[places], curved)
+        covered = set()
+        if found is not None:
+            tables.append(found[0])
+            covariances.append(found[1])
+            shifts.append(found[2])
+            covered = found[3]
+        own = free[free["condition"].isin(set(names) - covered)]
+        tables.append(own)
+        keys = list(zip(own["condition"], own["quantity"], strict=True))
+        shift = np.array([[known_shifts.get((c, f"{q}:{k + 1}"), 0.0) for k in range(count)] for c, q in keys])
+        shift = shift.reshape(len(own), count)
+        shifts.append(shift)
+        same = own["condition"].to_numpy()[:, None] == own["condition"].to_numpy()[None, :]
+        covariances.append(steady_covariance(own, known_covariances) - same * (shift @ shift.T))  # it comes in below
+    table = pd.concat(tables, ignore_index=True) if tables else free
+    together = np.concatenate(shifts) if shifts else np.zeros((0, count))
+    covariance = block_diag(*covariances) + together @ together.T  # the effects are those of all conditions
+    return Levels(table.merge(about, on="condition", how="left", validate="many_to_one"), covariance)
+
+
+def _shared(
+    own: Sequence[Condition], variance: UnitVariance, widened: np.ndarray, curved: set[str]
+) -> tuple[pd.DataFrame, np.ndarray, np.ndarray, set[str]] | None:
+    """Return the values of a series, their covariance, how they move along the directions of the effects' uncertainty,
+    shape (values, k), and the conditions that it speaks for; None for no shared curve.
+
+    `widened`, shape (conditions,), is each condition's factor on the stated variances.
+    """
+    is_full = np.array([c.model == FULL for c in own])
+    full = [c for c in own if c.model == FULL]
+    df = _usual_df(variance)
+    if is_full.sum() < 2 or not curved & {c.name for c in own} or len({c.has_load for c in own}) > 1:
+        return None
+    if not np.isfinite(widened).all() or not np.isfinite(df):
+        return None
+    curve = _Curve(full, widened[is_full])
+    free = sum(c.chi2 / w for c, w in zip(full, widened[is_full], strict=True))
+    if _worse(curve.rss - free, curve.df - sum(c.df for c in full), df):
+        return None
+    if len(full) < len(own):  # days with too few speeds for a fit of their own, if they lie on it too
+        every = _Curve(own, widened)
+        if not _worse(every.rss - curve.rss, every.df - curve.df, df):
+            curve = every
+    covariance, _ = covariance_of(curve.tangent())
+    names = list(curve.names())
+    value, variances = curve.levels.ravel(), np.diag(covariance)[: len(names)]
+    keep = np.isfinite(variances) & (variances > 0) & (value > 0) & (variances < (DETERMINED * value) ** 2)
+    table = pd.DataFrame(names, columns=["condition", "quantity"]).assign(value=value)
+    places = np.flatnonzero(keep)
+    sure = np.where(np.isfinite(covariance), covariance, 0.0)
+    shift = sure[places] @ curve.tangent().T @ curve.shifts()
+    known = {c.name for c in curve.own}
+    return table[keep].reset_index(drop=True), covariance[np.ix_(places, places)], shift, known
+
+
+def _worse(rise: float, more: int, df: float) -> bool:
+    """Return whether a sum of squares rises by more than its degrees of freedom explain."""
+    return more > 0 and bool(fdtrc(more, df, rise / more) < SHARED_P)
+
+
+def _usual_df(variance: UnitVariance) -> float:
+    """Return the degrees of freedom of conditions that are not worse than the others."""
+    usual = variance.df[np.isfinite(variance.value) & ~variance.own]
+    return float(usual[0]) if usual.size else np.nan
+
+
+class _Curve:
+    """Eq. 14 with one v_s and one sigma_2 on several conditions, at the least sum of squares."""
+
+    def __init__(self, own: Sequence[Condition], widened: np.ndarray) -> None:
+        self.own = own
+        self.speed, self.load, self.force, weight = stacked(own)
+        self.root = np.sqrt(weight / widened[:, None])
+        grid = even_grid(*search_limits(self.speed.reshape(1, -1), weight.reshape(1, -1)), PER_DECADE)[0]
+        rss = self._along(grid)
+        best = int(np.argmin(rss))
+        ends = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
+        found = minimize_scalar(lambda u: self._solve(u)[0], bounds=ends, method="bounded", options={"xatol": 1e-9})
+        self.log_v_s = float(found.x) if found.fun <= rss[best] else float(grid[best])
+        self.rss, self.levels, self.sigma_2, rank = self._solve(self.log_v_s)
+        self.df = int((weight > 0).sum()) - rank - 2
+
+    def _columns(self, log_v_s: float) -> np.ndarray:
+        """Return the weighted columns of mu_s and mu_c, shape (conditions, runs, 2)."""
+        decay = np.exp(-((self.speed / np.exp(log_v_s)) ** 2))
+        return np.stack([decay, 1 - decay], axis=-1) * (self.load * self.root)[..., None]
+
+    def _along(self, log_v_s: np.ndarray) -> np.ndarray:
+        """Return the sums of squares, shape (g,), at many v_s, shape (g,): as `_solve`, by Gram and Schmidt."""
+        columns = np.moveaxis(self._columns(log_v_s[:, None, None]), -1, 0)  # (2, g, conditions, runs)
+        size = np.linalg.norm(columns, axis=-1, keepdims=True)
+        longer = size[0] >= size[1]
+        first, other = np.where(longer, columns, columns[::-1]) / np.maximum(size.max(axis=0), 1e-300)
+        other = other - (other * first).sum(axis=-1, keepdims=True) * first
+        beyond = np.linalg.norm(other, axis=-1, keepdims=True)
+        second = np.divide(other, beyond, out=np.zeros(other.shape), where=beyond > RANK)
+        left = []
+        for rest in (self.force * self.root, self.speed * self.root):  # F and |v|
+            for column in (first, second):
+                rest = rest - (rest * column).sum(axis=-1, keepdims=True) * column
+            left.append(rest)
+        force, speed = left
+        own, cross, size = (
+            (one * other).sum(axis=(1, 2)) for one, other in ((force, force), (force, speed), (speed, speed))
+        )
+        return own - np.divide(np.maximum(cross, 0.0) ** 2, size, out=np.zeros(size.shape), where=size > 0)
+
+    def _solve(self, log_v_s: float) -> tuple[float, np.ndarray, float, int]:
+        """Return the sum of squares, mu_s and mu_c, shape (conditions, 2), sigma_2, and the rank of the levels."""
+        columns = self._columns(log_v_s)
+        inverse = np.linalg.pinv(columns, rcond=RANK)
+        both = np.stack([self.force * self.root, self.speed * self.root], axis=-1)  # F and |v|
+        fitted = inverse @ both
+        rest = both - columns @ fitted
+        size = float((rest[..., 1] ** 2).sum())
+        sigma_2 = max(float((rest[..., 0] * rest[..., 1]).sum()) / size, 0.0) if size > 0 else 0.0
+        left = rest[..., 0] - sigma_2 * rest[..., 1]
+        rank = round(float(np.einsum("knp,kpn->", columns, inverse)))
+        return float((left**2).sum()), fitted[..., 0] - sigma_2 * fitted[..., 1], sigma_2, rank
+
+    def names(self) -> Iterator[tuple[str, str]]:
+        """Yield condition and quantity of every level, in the order of the tangent's columns."""
+        for condition in self.own:
+            for name in ("mu_s", "mu_c"):
+                yield condition.name, name if condition.has_load else FORCES[name]
+
+    def tangent(self) -> np.ndarray:
+        """Return the weighted derivatives along the levels, ln v_s and sigma_2 where it is not 0, shape (runs, p)."""
+        columns = self._columns(self.log_v_s)
+        square = (self.speed / np.exp(self.log_v_s)) ** 2
+        bend = np.diff(self.levels[:, ::-1], axis=1) * self.load * np.exp(-square) * 2 * square * self.root
+        shared = [bend.ravel()] + ([(self.speed * self.root).ravel()] if self.sigma_2 > 0 else [])
+        there = (self.root > 0).ravel()
+        return np.column_stack([block_diag(*columns), *shared])[there]
+
+    def shifts(self) -> np.ndarray:
+        """Return the weighted changes of the forces along the directions of the effects' uncertainty, (runs, k)."""
+        weighted = [c.shifts * root[: len(c.runs), None] for c, root in zip(self.own, self.root, strict=True)]
+        return np.concatenate(weighted)

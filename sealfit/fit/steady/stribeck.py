@@ -1,0 +1,332 @@
+"""Eq. 14 fitted to many conditions at once, with exact intervals of coefficients that must not be negative."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.special import stdtr
+
+from sealfit.fit.least_squares import covariance_of, even_grid, global_optimum, profile, solve_kept
+
+# ---------------------------------------------------------------- interval
+# Exact intervals of coefficients that must not be negative, from the sum of squares alone.
+
+FREE = 1e-12  # share of a column's variance that is its own, below which its coefficient is not bounded at all
+
+
+def constrained_ends(columns, y, limit, nonnegative):
+    """Ends of {c_j : the best sum of squares with c_j fixed, the others not negative, is at most `limit`}.
+
+    With c_j fixed, every set of zeros among the others gives a parabola in c_j. The constrained optimum at an end lies
+    on one of them, so the ends are the outermost crossings at which the others come out feasible: exact, no iteration.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (problems, g, n, p)
+        Weighted columns.
+    y : ndarray, shape (problems, g, n)
+        Weighted measured values.
+    limit : ndarray, shape (problems,)
+        Largest sum of squares allowed.
+    nonnegative : sequence of bool, length p
+        Which coefficients must not be negative.
+
+    Returns
+    -------
+    low, high : ndarray, shape (problems, g, p)
+        NaN where no c_j reaches the limit; inf where c_j is not bounded.
+    """
+    nonnegative = np.asarray(nonnegative, bool)
+    p = columns.shape[-1]
+    norm = np.sqrt(np.einsum("...np,...np->...p", columns, columns))
+    safe = np.where(norm > 0, norm, 1.0)
+    scaled = columns / safe[..., None, :]
+    # costs are counted from the unconstrained optimum: no digits are lost to |y|^2
+    gram = np.swapaxes(scaled, -1, -2) @ scaled
+    everything = np.ones((*gram.shape[:-2], p), bool)
+    moment = (np.swapaxes(scaled, -1, -2) @ y[..., None])[..., 0]
+    centre = solve_kept(gram, moment, everything)
+    rest = y - (scaled @ centre[..., None])[..., 0]
+    centre = centre + solve_kept(gram, (np.swapaxes(scaled, -1, -2) @ rest[..., None])[..., 0], everything)
+    rest = y - (scaled @ centre[..., None])[..., 0]
+    floor = np.einsum("...n,...n->...", rest, rest)
+    spare = limit[:, None] - floor  # what c may cost: (c - centre)' gram (c - centre) <= spare
+    low, high = np.full(moment.shape, np.nan), np.full(moment.shape, np.nan)
+    for j in range(p):
+        others = [k for k in range(p) if k != j and nonnegative[k]]
+        for zeros in product((False, True), repeat=len(others)):
+            keep = np.ones(p, bool)
+            keep[[k for k, zero in zip(others, zeros, strict=True) if zero]] = False
+            low_here, high_here = _ends(gram, centre, spare, j, keep, nonnegative)
+            low[..., j], high[..., j] = np.fmin(low[..., j], low_here), np.fmax(high[..., j], high_here)
+    if nonnegative.any():
+        low[..., nonnegative] = np.maximum(low[..., nonnegative], 0.0)
+        high[..., nonnegative] = np.where(high[..., nonnegative] < 0, np.nan, high[..., nonnegative])
+        low = np.where(np.isnan(high), np.nan, low)
+    return low / safe, np.where(norm > 0, high / safe, np.inf)
+
+
+def _ends(gram, centre, spare, j, keep, nonnegative):
+    """Crossings of one parabola: c_k = 0 for k not in `keep`, c_j = t, the rest of `keep` at its best."""
+    rest = keep.copy()
+    rest[j] = False
+    mask = np.broadcast_to(rest, centre.shape)
+    off = ~keep
+    # cost(t) in d = c - centre: d_k = -centre_k off, d_j = t - centre_j; rest minimised. Linear-quadratic in d_j.
+    fixed = np.where(off, -centre, 0.0)
+    pull = (gram @ fixed[..., None])[..., 0]
+    by_fixed = solve_kept(gram, pull, mask)  # -d_rest at d_j = 0
+    by_j = solve_kept(gram, gram[..., :, j], mask)  # -d_rest per unit of d_j
+    own = gram[..., j, j] - np.einsum("...k,...k->...", by_j, gram[..., :, j] * rest)
+    cross = pull[..., j] - np.einsum("...k,...k->...", by_fixed, gram[..., :, j] * rest)
+    base = np.einsum("...k,...k->...", fixed, pull) - np.einsum("...k,...k->...", by_fixed, pull * rest)
+    bounded = own > FREE
+    safe = np.where(bounded, own, 1.0)
+    least = -cross / safe
+    spread = (spare - base + np.where(bounded, cross**2 / safe, 0.0)) / safe
+    possible = spread >= 0
+    half = np.sqrt(np.maximum(spread, 0.0))
+    ends = []
+    for sign in (-1, 1):
+        d_j = least + sign * half
+        d_rest = -by_fixed - by_j * d_j[..., None]
+        c_rest = centre + d_rest
+        feasible = ~np.any((c_rest < -1e-12 * np.abs(centre).max(axis=-1, keepdims=True)) & rest & nonnegative, axis=-1)
+        value = np.where(possible & bounded & feasible, centre[..., j] + d_j, np.nan)
+        if sign > 0:  # not bounded: only if moving up for ever breaks nobody's sign
+            open_ = ~bounded & (spare - base >= 0) & ~np.any((by_j > 1e-9) & rest & nonnegative, axis=-1)
+            value = np.where(open_, np.inf, value)
+        ends.append(value)
+    return ends
+
+
+# ---------------------------------------------------------------- stribeck
+# Eq. 14 fitted to many conditions at once: F sgn(v) = N mu_s E + N mu_c (1 - E) + sigma_2 |v|, E = exp(-(v/v_s)^2).
+#
+# Written so, the three coefficients of the columns are the parameters themselves, and "not negative" holds for each.
+# All three are held at or above zero: friction takes energy out at every speed. mu_s < mu_c is allowed. Without load, N
+# = 1 and the coefficients are the forces F_s and F_c.
+
+SLOWEST, FASTEST = 1 / 5, 20.0  # v_s is sought from a fifth of the slowest speed to twenty times the fastest:
+# below, E is 1e-11 at every speed and nothing changes any more; above, 1 - E is 0.0025 and follows v^2 throughout
+PER_DECADE = 240  # 1 % from one v_s to the next: with four or five speeds a minimum can be that narrow
+HALVINGS = 40  # of one grid cell: ln v_s to 1e-13
+FINE = 61  # points inside the interval of v_s along which the intervals of the others are taken
+NAMES = ("mu_s", "mu_c", "v_s", "sigma_2")
+PHYSICAL = (True, True, True)
+
+
+@dataclass(frozen=True)
+class StribeckFit:
+    """Parameters of every problem, each shape (problems,)."""
+
+    mu_s: np.ndarray
+    mu_c: np.ndarray
+    v_s: np.ndarray
+    sigma_2: np.ndarray
+    rss: np.ndarray
+    limits: tuple[np.ndarray, np.ndarray]  # (problems,) each: lowest and highest ln v_s searched
+
+    @property
+    def grid(self) -> np.ndarray:
+        """ln v_s over all that was searched, shape (problems, g)."""
+        return even_grid(*self.limits, PER_DECADE)
+
+    def values(self) -> np.ndarray:
+        """Return mu_s, mu_c, v_s, sigma_2 as columns, shape (problems, 4)."""
+        return np.stack([self.mu_s, self.mu_c, self.v_s, self.sigma_2], axis=1)
+
+
+def stribeck_basis(speed, load):
+    """Return the columns of Eq. 14 along ln v_s, as `profile` calls them.
+
+    Parameters
+    ----------
+    speed, load : ndarray, shape (problems, n)
+        |v| and N; anything finite where the weight is 0.
+    """
+
+    def basis(u, rows):
+        v, n = speed[rows][:, None, :], load[rows][:, None, :]
+        decay = np.exp(-((v * np.exp(-u)[..., None]) ** 2))
+        return np.stack([n * decay, n * (1 - decay), np.broadcast_to(v, decay.shape)], axis=-1)
+
+    return basis
+
+
+def search_limits(speed, weight) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest ln v_s to be searched, shape (problems,); speed, weight (problems, n)."""
+    used = weight > 0
+    slowest = np.min(speed, axis=1, where=used, initial=np.inf)
+    fastest = np.max(speed, axis=1, where=used, initial=0.0)
+    return np.log(slowest * SLOWEST), np.log(fastest * FASTEST)
+
+
+def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> StribeckFit:
+    """Global weighted least-squares fit of Eq. 14 to many conditions.
+
+    Parameters
+    ----------
+    speed, load, force, weight : ndarray, shape (problems, n)
+        |v| > 0 in mm/s, N, F sgn(v) in N, 1/variance (0 for padding).
+    nonnegative : three bool
+        Whether mu_s, mu_c and sigma_2 are held at or above zero.
+
+    Raises
+    ------
+    FitError
+        If a value is not finite.
+
+    Examples
+    --------
+    >>> v = np.geomspace(0.5, 100, 9)[None, :]
+    >>> force = 50 * (0.3 + 0.1 * np.exp(-((v / 6.0) ** 2))) + 0.02 * v
+    >>> fit = solve_stribeck(v, np.full_like(v, 50.0), force, np.ones_like(v))
+    >>> [round(float(value[0]), 8) for value in (fit.mu_s, fit.mu_c, fit.v_s, fit.sigma_2)]
+    [0.4, 0.3, 6.0, 0.02]
+    """
+    speed, load, force, weight = np.broadcast_arrays(*(np.asarray(x, float) for x in (speed, load, force, weight)))
+    limits = search_limits(speed, weight)
+    found = global_optimum(stribeck_basis(speed, load), force, weight, even_grid(*limits, PER_DECADE), nonnegative)
+    mu_s, mu_c, sigma_2 = found.coefficients.T
+    return StribeckFit(mu_s, mu_c, np.exp(found.u), sigma_2, found.rss, limits)
+
+
+# ---------------------------------------------------------------- intervals
+def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise, *, nonnegative=PHYSICAL):
+    """Ends of the profile-likelihood intervals of mu_s, mu_c, v_s, sigma_2.
+
+    For v_s: where the best sum of squares exceeds the optimum's by no more than `rise`. For the others: the union, over
+    those v_s, of the exact interval at that v_s with the other coefficients held at or above zero. No curvature is
+    used anywhere, so a lopsided or open interval comes out as it is.
+
+    Parameters
+    ----------
+    speed, load, force, weight
+        As `solve_stribeck`.
+    fit : StribeckFit
+        Its result.
+    rise : ndarray, shape (problems,)
+        t^2 times the variance of unit weight.
+
+    Returns
+    -------
+    low, high : ndarray, shape (problems, 4)
+        v_s: 0 or inf where the interval reaches a limit of the search.
+    """
+    basis = stribeck_basis(speed, load)
+    limit = fit.rss + rise
+    u_best = np.log(fit.v_s)
+    rss, _ = profile(basis, force, weight, fit.grid, nonnegative)
+    inside = rss <= limit[:, None]
+    (u_low, open_low), (u_high, open_high) = (
+        _crossing(basis, force, weight, nonnegative, fit.grid, u_best, inside, limit, sign) for sign in (-1, 1)
+    )
+    fine = u_low[:, None] + (u_high - u_low)[:, None] * np.linspace(0, 1, FINE)
+    fine = np.concatenate([fine, u_best[:, None]], axis=1)
+    low, high = conditional_ends(basis, force, weight, fine, limit, nonnegative)
+    estimate = np.stack([fit.mu_s, fit.mu_c, fit.sigma_2], axis=1)
+    low, high = np.fmin(low, estimate), np.fmax(high, estimate)
+    v_low, v_high = np.where(open_low, 0.0, np.exp(u_low)), np.where(open_high, np.inf, np.exp(u_high))
+    return (
+        np.stack([low[:, 0], low[:, 1], v_low, low[:, 2]], axis=1),
+        np.stack([high[:, 0], high[:, 1], v_high, high[:, 2]], axis=1),
+    )
+
+
+def _crossing(basis, force, weight, nonnegative, grid, u_best, inside, limit, sign):
+    """Outermost u below (sign -1) or above (+1) the optimum within the limit, and whether the search saw no end."""
+    along = sign * grid
+    near = np.maximum(np.max(np.where(inside, along, -np.inf), axis=1), sign * u_best)
+    far = np.min(np.where(along > near[:, None], along, np.inf), axis=1)
+    open_ = ~np.isfinite(far)
+    far = np.where(open_, near, far)
+    for _ in range(HALVINGS):
+        middle = (near + far) / 2
+        value, _ = profile(basis, force, weight, sign * middle[:, None], nonnegative)
+        ok = value[:, 0] <= limit
+        near, far = np.where(ok, middle, near), np.where(ok, far, middle)
+    return sign * near, open_
+
+
+def conditional_ends(basis, force, weight, u, limit, nonnegative):
+    """Union over u of the constrained intervals of the coefficients, shape (problems, p) each."""
+    rows = np.arange(len(u))
+    root = np.sqrt(weight)[:, None, :]
+    columns = basis(u, rows)
+    low, high = constrained_ends(
+        columns * root[..., None], np.broadcast_to((force[:, None, :] * root), columns.shape[:-1]), limit, nonnegative
+    )
+    with np.errstate(all="ignore"):
+        return np.fmin.reduce(low, axis=1), np.fmax.reduce(high, axis=1)
+
+
+# ---------------------------------------------------------------- one condition
+def tangent(speed, load, values) -> np.ndarray:
+    """Derivative of F sgn(v) along mu_s, mu_c, v_s, sigma_2 at `values`, shape (n, 4)."""
+    mu_s, mu_c, v_s, _ = values
+    square = (speed / v_s) ** 2
+    decay = np.exp(-square)
+    return np.stack([load * decay, load * (1 - decay), load * (mu_s - mu_c) * decay * 2 * square / v_s, speed], axis=1)
+
+
+def linearised(jacobian, weight, values, names, moved=None):
+    """Covariance at unit variance, shape (p, p), and the change of the parameters when the forces move.
+
+    Without `moved`, shape (n, k), every force is 1 larger and the change has shape (p,), else (p, k).
+
+    A coefficient at its limit 0 is held there: zero variance, no change.
+    """
+    free = np.array([name == "v_s" or value > 0 for name, value in zip(names, values, strict=True)])
+    root = np.sqrt(weight)
+    covariance, _ = covariance_of(jacobian * root[:, None], free)
+    known = np.where(np.isfinite(covariance), covariance, 0.0)
+    return covariance, known @ (jacobian.T @ (weight if moved is None else weight[:, None] * moved))
+
+
+def flat_p_value(speed, load, weight, grid, statistic, df, *, viscous: bool = True) -> float:
+    r"""Chance of so large a gain from mu_s != mu_c where in truth the two are equal, v_s being free to gain most.
+
+    Under mu_s = mu_c no v_s exists, so the gain is a maximum over v_s, not one chi-square. The unit vector that the
+    Stribeck column leaves after mu and sigma_2 are projected out runs along a curve of length kappa on the sphere as
+    v_s moves; a tube around it has
+
+    .. math:: p = \frac{\kappa}{\pi} (1 + c^2/\nu)^{-\nu/2} + P(|t_\nu| > c)
+
+    Parameters
+    ----------
+    speed, load, weight : ndarray, shape (n,)
+        One condition.
+    grid : ndarray, shape (g,)
+        ln v_s that was searched.
+    statistic : float
+        c^2: fall of the sum of squares over the variance of unit weight.
+    df : float
+        Degrees of freedom of that variance; inf where it is known.
+    viscous : bool
+        Whether sigma_2 is free in the model without Stribeck.
+
+    Notes
+    -----
+    Hotelling 1939, Am. J. Math. 61, 440-460; Davies 1987, Biometrika 74(1), 33-43, doi:10.1093/biomet/74.1.33;
+    with estimated variance: Knowles and Siegmund 1989, Int. Stat. Rev. 57(3), 205-220, doi:10.2307/1403794.
+    """
+    root = np.sqrt(weight)
+    base = np.stack([load, speed] if viscous else [load], axis=1) * root[:, None]
+    q, r = np.linalg.qr(base / np.linalg.norm(base, axis=0))
+    q = q[:, np.abs(np.diag(r)) > 1e-10]
+    curve = np.exp(-((speed * np.exp(-grid)[:, None]) ** 2)) * load * root
+    size = np.linalg.norm(curve, axis=1)
+    left = curve - (curve @ q) @ q.T
+    length = np.linalg.norm(left, axis=1)
+    clear = length > 1e-7 * np.maximum(size, 1e-300)  # less is rounding, and its direction means nothing
+    clear &= size > 1e-280
+    unit = left[clear] / length[clear][:, None]
+    chord = np.linalg.norm(np.diff(unit, axis=0), axis=1)
+    kappa = float(np.sum(2 * np.arcsin(np.minimum(chord / 2, 1.0))))
+    c2 = max(float(statistic), 0.0)
+    tail = np.exp(-c2 / 2) if not np.isfinite(df) else (1 + c2 / df) ** (-df / 2)
+    alone = 2 * stdtr(df, -np.sqrt(c2))
+    return float(min(1.0, kappa / np.pi * tail + alone))

@@ -1,0 +1,220 @@
+"""What the fits weigh with: run means, their variance from pooled repeats, and how set-up scatter widens it.
+
+The unit of evidence is the run. Strokes of a file are averaged first, then the files (repeats) of a run; the scatter of
+repeats, pooled over the campaign, gives each run mean its variance. Where run means disagree with the model by more
+than that, because the rig was set up anew for each run or because the model lacks something, the intervals are widened
+by the Birge ratio, the root of the reduced chi-square.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from scipy.special import fdtrc, stdtrit
+
+from sealfit.errors import FitError
+from sealfit.fit.joint.rows import BOTH, SAME_SPEED, both_ways_together
+from sealfit.ingest.scatter import Scatter
+
+POOLING_P = 0.25  # Bancroft's level for "is there set-up scatter at all": at 5 % it would too often be missed
+WORSE_P = 0.01  # a condition that disagrees more than the others at this level is widened by its own ratio
+SMALLEST_SD = 1e-9  # of the largest force: repeats that agree to the last digit do not make a run infinitely certain
+SMALLEST_SHARE = 0.05  # of the largest force: a scatter in proportion to the force does not vanish with it
+SHIFT = "effects_u"  # columns of `steady_after`: directions in which the effects taken out are uncertain
+NEEDED = ("condition", "series", "rubber", "run_id", "file", "direction", "speed_mm_s", "load_N", "force_N", "used")
+
+
+def run_means(steady: pd.DataFrame) -> pd.DataFrame:
+    """Return one row per condition, run and direction: mean of its files, each the mean of its strokes.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`; rows with `used` false are left out. The two ways of a file are taken together.
+
+    Returns
+    -------
+    DataFrame
+        `condition`, `run_id`, `direction`, `speed` (|v|), `set` (commanded |v|, NaN where unknown), `load` (NaN where
+        unknown), `force` (F sgn v), `half` (half of the difference between the two ways, where a row stands for both)
+        and `files`, sorted by the first three; and the columns of `SHIFT`.
+
+    Raises
+    ------
+    FitError
+        If a column is missing, no row is used, or a run stands still.
+    """
+    missing = [name for name in NEEDED if name not in steady.columns]
+    if missing:
+        raise FitError(f"table steady lacks {', '.join(missing)}.", fix="Run sealfit ingest again.")
+    rows = steady[steady["used"].to_numpy(bool) & steady["condition"].notna().to_numpy()]
+    if rows.empty:
+        raise FitError("no steady window is left to fit.", fix="Look in table quality why each was left out.")
+    rows = both_ways_together(rows)
+    commanded = rows["speed_set_mm_s"] if "speed_set_mm_s" in rows.columns else pd.Series(np.nan, rows.index)
+    numbers = pd.DataFrame(
+        {
+            "condition": rows["condition"].astype(object),
+            "run_id": rows["run_id"].astype(object),
+            "direction": rows["direction"].astype(int),
+            "file": rows["file"].astype(object),
+            "speed": rows["speed_mm_s"].astype(float).abs(),
+            "set": commanded.astype(float).abs(),
+            "load": rows["load_N"].astype(float),
+            "force": rows["force_N"].astype(float) * rows["direction"].astype(int).replace(BOTH, 1),
+            "half": rows["half_N"],
+            **{name: rows[name].astype(float) for name in shifts_of(rows)},
+        }
+    )
+    keys = ["condition", "run_id", "direction"]
+    per_file = numbers.groupby([*keys, "file"], sort=True).mean()
+    grouped = per_file.groupby(level=keys, sort=True)
+    runs = grouped.mean().assign(files=grouped.size()).reset_index()
+    bad = ~(runs["speed"] > 0) | ~np.isfinite(runs["force"])
+    if bad.any():
+        first = runs[bad].iloc[0]
+        raise FitError(
+            f"run {first['run_id']} has speed {first['speed']:g} and force {first['force']:g} in its steady window.",
+            fix="Leave it out of the campaign, or look at its steady window.",
+        )
+    return runs
+
+
+def shifts_of(table: pd.DataFrame) -> list[str]:
+    """Return the columns along which the effects that were taken out are uncertain; none before the loop."""
+    return [name for name in table.columns if str(name).startswith(SHIFT)]
+
+
+def run_weights(runs: pd.DataFrame, scatter: Scatter) -> np.ndarray:
+    """Return 1/variance of each run mean, shape (n,), from the pooled scatter of repeats; without repeats 1."""
+    if not scatter.df > 0:
+        return np.ones(len(runs))
+    force = runs["force"].abs().to_numpy(float)
+    floor = SMALLEST_SD * float(force.max()) or 1.0
+    return runs["files"].to_numpy(float) / np.maximum(scatter.sd_N(force), floor) ** 2
+
+
+def proportional_weights(fitted_N: np.ndarray) -> np.ndarray:
+    """Return 1/variance of run means whose scatter is in proportion to the friction, shape (n,), up to a factor.
+
+    Parameters
+    ----------
+    fitted_N : ndarray, shape (n,)
+        Friction of every run by a fit with even weights. A run's own force will not do: its error would
+        set its weight, and where an offset leaves the force of one direction near zero, that run would decide alone.
+    """
+    size = np.abs(fitted_N)
+    return 1.0 / np.maximum(size, SMALLEST_SHARE * size.max(initial=0.0) or 1.0) ** 2
+
+
+def likelier(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float) -> int:
+    """Return which weights the residuals bear out: least n ln(chi2/df) - sum ln w, twice the negative log likelihood.
+
+    Parameters
+    ----------
+    chi2 : sequence of float
+        Weighted sum of squares of the whole campaign under each choice.
+    weights : sequence of ndarray, shape (n,)
+        The choices.
+    df : float
+        Degrees of freedom of chi2.
+    """
+    if not df > 0:
+        return 0
+    with np.errstate(divide="ignore"):
+        return int(np.argmin([len(w) * np.log(c / df) - np.log(w).sum() for c, w in zip(chi2, weights, strict=True)]))
+
+
+@dataclass(frozen=True)
+class UnitVariance:
+    """Factor on the stated variances, per condition, with what it rests on; NaN where nothing can be said."""
+
+    value: np.ndarray  # (conditions,), Birge ratio squared
+    df: np.ndarray  # (conditions,), of the Student t of the intervals
+    f: np.ndarray  # (conditions,), lack of fit against pure error; NaN without repeats
+    p: np.ndarray
+    pooled: float  # reduced chi-square of all conditions together
+    pooled_p: float
+    own: np.ndarray  # (conditions,) bool: widened by its own ratio, being worse than the others
+
+    def of(self, some: slice) -> UnitVariance:
+        """Return what is said of some of the conditions."""
+        own = {name: getattr(self, name)[some] for name in ("value", "df", "f", "p", "own")}
+        return replace(self, **own)
+
+    def rise(self) -> np.ndarray:
+        """Return by how much chi-square may exceed its minimum inside a 95 % interval, shape (conditions,)."""
+        with np.errstate(invalid="ignore"):
+            return stdtrit(self.df, 0.975) ** 2 * self.value
+
+
+def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
+    """Return how far the variances stated by the weights must be widened.
+
+    With repeats (`pure_df` > 0): chi-square over its degrees of freedom, pooled over the conditions, is tested against
+    pure error. At `POOLING_P` or below there is scatter between runs: the pooled ratio is the factor, on the pooled
+    degrees of freedom, and never below 1. Else the factor is 1 on `pure_df`. A condition that is worse than the pooled
+    ratio at `WORSE_P` gets its own. Without repeats the weights are relative and the pooled ratio is the variance.
+
+    Parameters
+    ----------
+    chi2, df : ndarray, shape (conditions,)
+        Weighted sum of squares and degrees of freedom of every condition.
+    pure_df : float
+        Degrees of freedom of the repeats' scatter; 0 without repeats.
+
+    Notes
+    -----
+    Birge 1932, Phys. Rev. 40, 207; Bancroft 1944, Ann. Math. Statist. 15(2), 190-204, doi:10.1214/aoms/1177731284.
+    """
+    chi2, df = np.asarray(chi2, float), np.asarray(df, float)
+    total, total_df = float(chi2.sum()), float(df.sum())
+    ratio = np.divide(chi2, df, out=np.full(chi2.shape, np.nan), where=df > 0)
+    pooled = total / total_df if total_df > 0 else np.nan
+    repeated = pure_df > 0
+    pooled_p = float(fdtrc(total_df, pure_df, pooled)) if repeated and total_df > 0 else np.nan
+    if not repeated:
+        base, base_df = pooled, total_df
+    elif pooled_p <= POOLING_P:
+        base, base_df = max(pooled, 1.0), total_df
+    else:
+        base, base_df = 1.0, pure_df
+    with np.errstate(invalid="ignore", divide="ignore"):
+        worse = (ratio > base) & (fdtrc(df, base_df, ratio / base) < WORSE_P) & (df < total_df)
+        p = fdtrc(df, pure_df, ratio) if repeated else np.full(chi2.shape, np.nan)
+    return UnitVariance(
+        value=np.where(worse, ratio, base),
+        df=np.where(worse, df, base_df if base_df > 0 else np.nan),
+        f=ratio if repeated else np.full(chi2.shape, np.nan),
+        p=p,
+        pooled=pooled,
+        pooled_p=pooled_p,
+        own=worse,
+    )
+
+
+def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
+    """Return the distinct speed levels of one condition, rising, per direction: {+1: (k,), -1: (m,)}.
+
+    Commanded speeds where every run of the direction has one, else measured speeds grouped within 25 %. Directions are
+    kept apart: a direction offset between a slow way out and a fast way back would be taken for a Stribeck curve.
+    """
+    ways, commanded, measured = (runs[name].to_numpy() for name in ("direction", "set", "speed"))
+    levels = {}
+    for direction in (1, -1):
+        own = (ways == direction) | (ways == BOTH)
+        if not own.any():
+            continue
+        speeds = commanded[own].astype(float)
+        if np.all(np.isfinite(speeds)) and np.all(speeds > 0):
+            codes = [float(f"{speed:.6g}") for speed in np.unique(speeds)]
+        else:
+            codes, start = [], -np.inf
+            for value in np.sort(measured[own].astype(float)):
+                start = value if value > SAME_SPEED * start or start < 0 else start
+                codes.append(start)
+        levels[direction] = np.unique(codes)
+    return levels

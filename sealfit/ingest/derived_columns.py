@@ -1,0 +1,330 @@
+"""What cells of runs.csv say, and what it leaves out: conditions, runs, repeats, specimens, their order."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from datetime import UTC, datetime
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from sealfit.config import Config
+from sealfit.errors import Fault
+from sealfit.ingest.categorical import Coded, Columns, add_keys, condition_columns, nothing
+from sealfit.ingest.file_names import TEXT_COLUMNS
+from sealfit.ingest.files import as_number
+from sealfit.ingest.listing import Entries, Entry
+
+# ---------------------------------------------------------------- run values
+# Cells of runs.csv and of file names to values: which columns are numbers, which are labels, and what cannot be.
+
+NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
+COUNTS = {"repeat": "repeats", "stroke": "strokes"}  # whole numbers
+_MOSTLY = 0.8  # a column with this share of numbers is one of numbers, and the rest of its cells are slips
+
+
+def to_values(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
+    """Return the columns as numbers or as labels, and faults of cells that are neither.
+
+    A column of numbers is one whose name says so, one of the config's condition columns or a channel where more than
+    four fifths of the cells are numbers, and any where all are.
+    """
+    faults: list[Fault] = []
+    made: Columns = {}
+    for name, cells in columns.items():
+        made[name], found = _column(name, cells, entries, config)
+        faults += found
+    return made, faults
+
+
+def _column(name: str, cells: Coded, entries: Entries, config: Config) -> tuple[Coded, list[Fault]]:
+    labels = cells.map(lambda cell: cell if isinstance(cell, str) else f"{cell:g}")
+    if name in TEXT_COLUMNS:
+        return labels, []
+    number = [cell if isinstance(cell, float) else as_number(cell) for cell in cells.values]
+    bad = [value is None or not math.isfinite(value) for value in number]
+    wrong = np.flatnonzero(np.array([*bad, False], bool)[cells.codes])
+    count = int(cells.known.sum())
+    known = name in NUMBERS or name in COUNTS
+    if len(wrong) and not known and len(wrong) >= (1 - _MOSTLY) * count:
+        return labels, []
+    if len(wrong) and not known and name not in config.condition:
+        i = int(wrong[0])
+        reason = f"{len(wrong)} of {count} cells are no numbers; the column is kept as labels."
+        fix = "Empty the cell, or put a number there."
+        place = {"severity": "warning", "action": "kept", "value": labels[i], "fix": fix}
+        return labels, [entries[i].fault("not_a_number", reason, name, **place)]
+    fix = "Put a number there."
+    faults = [
+        entries[i].fault("not_a_number", "is not a number.", name, value=labels[i], fix=fix) for i in wrong.tolist()
+    ]
+    # nan: not missing, but wrong
+    values = Coded(cells.codes, [math.nan if value is None else value for value in number])
+    if name not in COUNTS:
+        return values, faults
+    fix = f"Number the {COUNTS[name]} 1, 2, 3."
+    faults += [
+        entries[i].fault("not_a_number", "is no whole number.", name, value=values[i], fix=fix)
+        for i in np.flatnonzero(values.where(lambda value: math.isfinite(value) and value != int(value))).tolist()
+    ]
+    return values.map(lambda value: int(value) if math.isfinite(value) else -1), faults
+
+
+def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
+    """Return faults of values that cannot be: negative days, a load that does not press, a speed of zero."""
+    rules = (
+        ("aging_days", lambda value: value < 0, "is below 0 days.", "Days count from 0, unaged."),
+        (
+            "load_N",
+            lambda value: value <= 0,
+            "does not press.",
+            "The normal load is above 0; leave it empty if unknown.",
+        ),
+        ("speed_mm_s", lambda value: value == 0, "is no speed to slide at.", "Leave it empty if it is unknown."),
+    )
+    found = [
+        (i, entries[i].fault("out_of_range", reason, name, value=columns[name][i], fix=fix))
+        for name, wrong, reason, fix in rules
+        if name in columns
+        for i in np.flatnonzero(columns[name].where(wrong)).tolist()
+    ]
+    return [fault for _, fault in sorted(found, key=lambda one: one[0])]
+
+
+# ---------------------------------------------------------------- derive
+# What runs.csv leaves out: conditions in words, runs, repeats, specimens, the order of the campaign.
+#
+# Everything here works on what is already known of each file, and reads none.
+
+SETTING = 0.005  # commanded speeds and loads closer than this share are one setting; a plate or a step is more
+SAME_SPEED = 0.05  # measured speeds closer than this share are one commanded speed; rigs repeat within a few percent
+
+
+def condition_keys(columns: Columns, files: int, config: Config) -> Coded:
+    """Return the condition of each of so many files in words, as `conditions.add_keys` spells it.
+
+    Examples
+    --------
+    >>> sixty, eighty, four = (Coded.of([value]) for value in (60.0, 80.0, 4.0))
+    >>> campaign = {"temperature_C": sixty, "compression_ratio_pct": eighty, "aging_days": four}
+    >>> condition_keys(campaign, 1, Config()).values
+    ['temperature_C=60, compression_ratio_pct=80, aging_days=4']
+    >>> condition_keys({"aging_days": Coded.of([0.0])}, 1, Config()).values
+    ['unaged']
+    """
+    names = condition_columns(config)
+    own = [columns.get(name, nothing(files)) for name in names]
+    group = np.zeros(files, np.int64)
+    for column in own:
+        group = pd.factorize(group * (len(column.values) + 1) + column.codes)[0]
+    first = _first(group)
+    one = np.unique(first)  # a file of each condition
+    cells = [Coded(column.codes[one], column.values).cells() for column in own]
+    table = pd.DataFrame({name: pd.Series(column, dtype=object) for name, column in zip(names, cells, strict=True)})
+    words = Coded.of(add_keys(table, config)["condition"].tolist())
+    return Coded(words.codes[np.searchsorted(one, first)], words.values)
+
+
+def _text(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def as_set(columns: Columns) -> Columns:
+    """Return the columns with commanded speeds and loads that differ by rounding only taken as one setting.
+
+    Values within `SETTING` of the smallest of them become the one that most files have. A controller's readback, or a
+    change of units, leaves such differences, and runs must not fall apart over them.
+    """
+    return columns | {name: _one_setting(columns[name]) for name in ("speed_mm_s", "load_N") if name in columns}
+
+
+def _one_setting(column: Coded) -> Coded:
+    values = column.values
+    count = np.bincount(column.codes[column.known], minlength=len(values))
+    order = sorted(
+        (k for k in range(len(values)) if math.isfinite(values[k])), key=lambda k: (abs(values[k]), values[k])
+    )
+    groups: list[list[int]] = []
+    for sign in (1.0, -1.0):
+        start = None
+        for k in (k for k in order if math.copysign(1.0, values[k]) == sign):
+            if start is None or abs(values[k]) > abs(values[start]) * (1 + SETTING):
+                start = k
+                groups.append([])
+            groups[-1].append(k)
+    usual = {values[k]: values[max(group, key=lambda k: count[k])] for group in groups for k in group}
+    return column.map(lambda value: usual.get(value, value))
+
+
+def add_order(entries: Entries, columns: Columns) -> tuple[Columns, list[Fault]]:
+    """Return the columns with `run_order` and `elapsed_h` where files say when they were started; faults of bad times.
+
+    Equal times share the order of the first of them. A time without a zone is taken as UTC, so that one campaign
+    with and without zones keeps one order.
+    """
+    if "started_at" not in columns:
+        return columns, []
+    started = columns["started_at"]
+    texts = [str(value).strip() for value in started.values]
+    times = [_time(text) for text in texts]
+    fix = "Write it as 2024-03-01T09:30:00."
+    bad = np.array([*(time is None for time in times), False], bool)[started.codes]
+    faults = [
+        entries[i].fault("not_a_time", "is no ISO 8601 time.", "started_at", value=texts[started.codes[i]], fix=fix)
+        for i in np.flatnonzero(bad).tolist()
+    ]
+    if any(time.tzinfo for time in times if time is not None):
+        zoned = [time if time is None or time.tzinfo else time.replace(tzinfo=UTC) for time in times]
+        times = [None if time is None else time.astimezone(UTC).replace(tzinfo=None) for time in zoned]
+    moment = pa.array([*times, None], pa.timestamp("us")).to_numpy(zero_copy_only=False)[started.codes]
+    known = ~np.isnat(moment)
+    if not known.any():
+        return columns, faults
+    different, of, count = np.unique(moment[known], return_inverse=True, return_counts=True)
+    codes = np.full(len(entries), -1, np.int32)
+    codes[known] = of
+    place = 1.0 + np.cumsum(count) - count
+    hours = (different - different[0]).astype(np.int64) / 1e6 / 3600
+    return {**columns, "run_order": Coded(codes, place.tolist()), "elapsed_h": Coded(codes, hours.tolist())}, faults
+
+
+def _time(text: str) -> datetime | None:
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError:
+        return None
+
+
+def add_specimens(columns: Columns, conditions: Coded) -> Columns:
+    """Return the columns with `specimen_id`: one per condition where none is named."""
+    if "specimen_id" not in columns:
+        return {"specimen_id": conditions, **columns}
+    return {**columns, "specimen_id": columns["specimen_id"].over(conditions)}
+
+
+def add_runs(columns: Columns, conditions: Coded, measured: Sequence[float], unit: str) -> tuple[Columns, list[Fault]]:
+    """Return the columns with a `run_id` for every file, and what is to be said of it.
+
+    Where none is given there is one per condition, commanded speed and (named) specimen.
+
+    Parameters
+    ----------
+    columns : dict of str to Coded
+        What is known of the files; `speed_mm_s` is signed where a sign was given.
+    conditions : Coded
+        Condition of each file in words.
+    measured : sequence of float
+        Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run.
+    unit : str
+        Unit of the speeds.
+    """
+    none = nothing(len(conditions.codes))
+    given = columns.get("run_id", none)
+    if given.known.all():
+        return columns, []
+    run_ids: dict[int, str] = {}
+    groups = defaultdict(list)
+    specimens, speeds = columns.get("specimen_id", none), columns.get("speed_mm_s", none)
+    for i in np.flatnonzero(~given.known).tolist():
+        words = [conditions[i]]
+        if specimens[i] is not None:
+            words.append(str(specimens[i]))
+        if speeds[i] is not None:
+            run_ids[i] = ", ".join([*words, f"{speeds[i]:g} {unit}"])
+        else:
+            groups[", ".join(words)].append(i)
+    for words, members in groups.items():
+        members.sort(key=lambda i: measured[i])
+        cluster: list[int] = []
+        for place, i in enumerate(members):
+            cluster.append(i)
+            after = members[place + 1] if place + 1 < len(members) else None
+            if after is None or not measured[after] <= measured[i] * (1 + SAME_SPEED):
+                middle = measured[cluster[len(cluster) // 2]]
+                name = words if math.isnan(middle) else f"{words}, about {middle:.3g} {unit}"
+                run_ids.update(dict.fromkeys(cluster, name))
+                cluster = []
+    added = {**columns, "run_id": given.put(run_ids)}
+    if not groups:
+        return added, []
+    reason = "neither run_id nor a commanded speed is given; files of one condition share a run within 5 % of speed."
+    said = Fault("run_id_derived", reason, severity="info", action="kept", fix="Give run_id or speed_mm_s.")
+    return added, [said]
+
+
+def add_repeats(columns: Columns) -> Columns:
+    """Return the columns with a `repeat`: where missing by `started_at` if the whole run has it, else by file order.
+
+    Files that hold different strokes of a run, as their column `stroke` says, are numbered stroke by stroke.
+    """
+    run = columns["run_id"]
+    none = nothing(len(run.codes))
+    given, hours, stroke = (columns.get(name, none) for name in ("repeat", "elapsed_h", "stroke"))
+    if given.known.all():
+        return columns
+    runs = defaultdict(list)
+    for i, code in enumerate(zip(run.codes.tolist(), stroke.codes.tolist(), strict=True)):
+        runs[code].append(i)
+    numbers: dict[int, int] = {}
+    for members in runs.values():
+        if all(hours[i] is not None for i in members):
+            members.sort(key=lambda i: (hours[i], i))
+        used = {given[i] for i in members if given[i] is not None}
+        free = (number for number in range(1, len(members) + len(used) + 1) if number not in used)
+        numbers.update({i: next(free) for i in members if given[i] is None})
+    return {**columns, "repeat": given.put(numbers)}
+
+
+def disagreements(entries: Entries, columns: Columns, conditions: Coded) -> list[Fault]:
+    """Return faults of runs: a repeat that stands twice, or differs from its run in condition, speed or load."""
+    none = nothing(len(entries))
+    run, repeat, specimen = (columns[name] for name in ("run_id", "repeat", "specimen_id"))
+    stroke = columns.get("stroke", none)
+    told = {"speed_mm_s": columns.get("speed_mm_s", none), "load_N": columns.get("load_N", none)}
+    told["condition"] = conditions
+    first = _first(run.codes)
+    same_repeat = _first(run.codes.astype(np.int64) * (len(repeat.values) + 1) + repeat.codes)
+    same_repeat = _first(same_repeat * (len(stroke.values) + 1) + stroke.codes)
+    odd = same_repeat != np.arange(len(entries))
+    for column in (*told.values(), specimen):
+        odd |= column.codes != column.codes[first]
+    faults = []
+    for i in np.flatnonzero(odd).tolist():
+        entry, j, other = entries[i], int(first[i]), int(same_repeat[i])
+        if other != i:
+            reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
+            fix = "Give every file of a run its own repeat number, or each stroke of a repeat its number."
+            faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], fix=fix))
+        for name, column in told.items():
+            mine, theirs = column[i], column[j]
+            if mine != theirs and not _same(mine, theirs):
+                there = "none" if theirs is None else _text(theirs)
+                reason = f"differs from the other repeats of run '{run[i]}', {_place(entries[j])}: {there}."
+                fix = "One run is one condition, speed and load: give it another run_id, or correct the cell."
+                value = "none" if mine is None else mine
+                faults.append(entry.fault("run_disagrees", reason, name, value=value, fix=fix))
+        if specimen[i] != specimen[j] and _same(told["speed_mm_s"][i], told["speed_mm_s"][j]):
+            reason = f"run '{run[i]}' has repeats on several specimens; their scatter counts as that of repeats."
+            place = {"severity": "warning", "action": "kept", "fix": "Give each specimen a run_id of its own."}
+            faults.append(entry.fault("run_specimens", reason, "specimen_id", value=specimen[i], **place))
+    return faults
+
+
+def _first(groups: np.ndarray) -> np.ndarray:
+    """Return for every file the first one of its group, shape (files,)."""
+    of = pd.factorize(groups)[0]  # numbered as they appear
+    first = np.flatnonzero(np.diff(np.maximum.accumulate(of), prepend=-1))
+    return first[of]
+
+
+def _place(entry: Entry) -> str:
+    return f"line {entry.line}" if entry.line is not None else entry.file
+
+
+def _same(a: float | str | None, b: float | str | None) -> bool:
+    if isinstance(a, int | float) and isinstance(b, int | float):
+        return math.isclose(a, b, rel_tol=1e-9)
+    return a == b

@@ -1,0 +1,150 @@
+"""What is known of a trace file before it is read, and what its name says."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sealfit.config import Files
+from sealfit.errors import ConfigError
+from sealfit.ingest.categorical import Coded, Columns
+from sealfit.ingest.expression import evaluate, parse
+from sealfit.ingest.files import as_number
+
+# ---------------------------------------------------------------- refs
+# What is known of a trace file before it is read.
+
+
+@dataclass(frozen=True, slots=True)
+class TraceRef:
+    """One trace file and everything that runs.csv, its name, its header or its constant columns say of the whole file.
+
+    `file` is relative to the campaign folder, with forward slashes. `channels` always holds `run_id`, `repeat`,
+    `specimen_id` and the condition columns (day 0 may lack those other than the days), and where they are known
+    `speed_set_mm_s` (magnitude), `load_N`, `started_at` (ISO 8601), `run_order`, `elapsed_h` and the campaign's own
+    channels. What is not known is not there.
+    """
+
+    file: str
+    channels: Mapping[str, float | str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Listing(Sequence[TraceRef]):
+    """The trace files of a campaign, or some of them, in order; column by column, as they are many.
+
+    `columns` hold the channels; `conditions` the condition of each file in words.
+    """
+
+    files: list[str]
+    columns: Columns
+    conditions: Coded
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, i: int) -> TraceRef:
+        known = ((name, column[i]) for name, column in self.columns.items())
+        return TraceRef(self.files[i], {name: value for name, value in known if value is not None})
+
+    def __iter__(self) -> Iterator[TraceRef]:
+        cells = (column.cells() for column in self.columns.values())
+        for file, *values in zip(self.files, *cells, strict=True):
+            known = zip(self.columns, values, strict=True)
+            yield TraceRef(file, {name: value for name, value in known if value is not None})
+
+    def words(self) -> dict[str, np.ndarray]:
+        """Return every column in words, shape (files,)."""
+        return {name: column.words() for name, column in self.columns.items()}
+
+    def take(self, files: np.ndarray) -> Listing:
+        """Return some of the files, by their numbers, with the columns in which any of them has a value."""
+        taken = {name: column.take(files) for name, column in self.columns.items()}
+        filled = {name: column for name, column in taken.items() if column.values}
+        return Listing([self.files[i] for i in files.tolist()], filled, self.conditions.take(files))
+
+
+# ---------------------------------------------------------------- names
+# What the name of a trace file says: named parts of a pattern, value maps, templates and computed columns.
+
+TEXT_COLUMNS = ("run_id", "specimen_id", "started_at")  # "007" is a name here, not the number 7
+_FIELD = re.compile(r"\{([^{}]*)\}")
+
+
+@dataclass(frozen=True, slots=True)
+class NameParts:
+    """What a name says; `matched` is False where the pattern does not match it. Helpers begin with `_`."""
+
+    matched: bool
+    values: Mapping[str, float | str]
+
+    @property
+    def channels(self) -> dict[str, float | str]:
+        """The values that are channels: all but the helpers."""
+        return {name: value for name, value in self.values.items() if not name.startswith("_")}
+
+
+SAYS_NOTHING = NameParts(True, {})
+
+
+def names_speak(settings: Files) -> bool:
+    """Whether names of files say anything under the config's `files`."""
+    return bool(settings.name_pattern is not None or settings.compute or settings.columns)
+
+
+def name_parts(file: str, settings: Files) -> NameParts:
+    """Return what the relative path `file` says under the config's `files`.
+
+    Every named group of `name_pattern` is a part; a part with a value map takes the mapped value where the map has
+    one; numbers become numbers; `compute` and the templates of `columns` then add columns. Empty parts say nothing.
+
+    Raises
+    ------
+    ConfigError
+        If a template or an expression reads a part that the pattern does not have.
+
+    Examples
+    --------
+    >>> rig = Files(name_pattern=r"(?P<_sign>n?)(?P<_rpm>\\d+)\\.csv", values={"_sign": {"": 1, "n": -1}},
+    ...             compute={"speed_mm_s": "_sign * _rpm"}, columns={"run_id": "{_rpm} rpm"})
+    >>> name_parts("n120.csv", rig).channels
+    {'speed_mm_s': -120.0, 'run_id': '120 rpm'}
+    """
+    if not names_speak(settings):
+        return SAYS_NOTHING
+    texts: dict[str, str] = {}
+    values: dict[str, float | str] = {}
+    if settings.name_pattern is not None:
+        match = re.fullmatch(settings.name_pattern, file)
+        if match is None:
+            return NameParts(False, {})
+        for name, text in match.groupdict(default="").items():
+            mapped = settings.values.get(name, {}).get(text)
+            if mapped is None:
+                texts[name] = text
+                values[name] = text if name in TEXT_COLUMNS else _value(text)
+            else:
+                texts[name] = f"{mapped:g}" if isinstance(mapped, int | float) else mapped
+                values[name] = float(mapped) if isinstance(mapped, int | float) else mapped
+    for name, expression in settings.compute.items():
+        values[name] = float(evaluate(parse(expression), values))
+        texts[name] = f"{values[name]:g}"
+    for name, template in settings.columns.items():
+        texts[name] = _FIELD.sub(lambda found: _part(found.group(1), texts, template), template)  # noqa: B023
+        values[name] = texts[name] if name in TEXT_COLUMNS else _value(texts[name])
+    return NameParts(True, {name: value for name, value in values.items() if value != "" or name.startswith("_")})
+
+
+def _value(text: str) -> float | str:
+    number = as_number(text)
+    return text if number is None else number
+
+
+def _part(name: str, texts: Mapping[str, str], template: str) -> str:
+    if name not in texts:
+        known = ", ".join(texts) or "none"
+        raise ConfigError(f"template {template!r} reads a part '{name}' that the name has not.", fix=f"Parts: {known}.")
+    return texts[name]

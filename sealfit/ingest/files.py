@@ -1,0 +1,331 @@
+"""Files of a campaign as bytes, never one outside it, and their bytes as clean UTF-8 text."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import os
+import re
+import stat
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from sealfit.config import TraceFormat
+from sealfit.errors import BadFile, Fault
+from sealfit.store.manifest import Fingerprint, fingerprint, fingerprint_of
+
+# ---------------------------------------------------------------- folder
+# Files of a campaign folder as bytes: never one outside it, each opened once for its text and its fingerprint.
+
+_BLANK = b"\xef\xbb\xbf\xff\xfe \t\r\n\0"
+_PACKED = {
+    b"PK\x03\x04": "a zip archive or .xlsx workbook",
+    b"\x1f\x8b": "gzip",
+    b"\xd0\xcf\x11\xe0": "an .xls workbook",
+}
+
+
+class Folder:
+    """A campaign folder; where its subfolders lie, links followed, is looked up once for all of their files."""
+
+    def __init__(self, campaign: Path):
+        self.campaign = campaign
+        self._safe: dict[str, bool] = {}  # subfolder, and whether it lies inside
+
+    def inside(self, file: str) -> str | None:
+        """Return the path of `file` if it lies inside the campaign folder, links followed; otherwise None."""
+        folder, _, name = file.rpartition("/")
+        path = os.path.join(self.campaign, file)
+        odd = name in ("", ".", "..") or file.startswith("/") or any(mark in file for mark in "\0\\:")
+        if odd or not self._safe_folder(folder):
+            return path if inside(self.campaign, file) is not None else None
+        try:
+            linked = stat.S_ISLNK(os.lstat(path).st_mode)
+        except OSError:  # not there: said by who opens it
+            return path
+        return path if not linked or inside(self.campaign, file) is not None else None
+
+    def _safe_folder(self, folder: str) -> bool:
+        if folder not in self._safe:
+            self._safe[folder] = not folder or inside(self.campaign, folder) is not None
+        return self._safe[folder]
+
+    def read(self, file: str) -> tuple[bytes, Fingerprint]:
+        """Return the file's bytes, and the fingerprint of these very bytes.
+
+        Raises
+        ------
+        BadFile
+            As `read_bytes`.
+        """
+        raw, status = _read(self.inside(file), file)
+        return raw, fingerprint_of(raw, status)
+
+    def fingerprint(self, file: str) -> Fingerprint:
+        """Return the fingerprint of a file that could not be read as a trace."""
+        return fingerprint(self.campaign / file)
+
+
+def inside(campaign: Path, file: str) -> Path | None:
+    """Return the path of `file` if it lies inside the campaign folder, links followed; otherwise None."""
+    pure = PurePosixPath(file)
+    if pure.is_absolute() or re.match(r"[A-Za-z]:[\\/]|\\\\", file) or "\0" in file:
+        return None
+    path = campaign / pure
+    try:
+        resolved, root = path.resolve(), campaign.resolve()
+    except (OSError, RuntimeError):  # a loop of links
+        return None
+    return path if resolved != root and resolved.is_relative_to(root) else None
+
+
+def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
+    """Return the file's bytes, or with `head` its first ones.
+
+    Raises
+    ------
+    BadFile
+        If it is missing, outside the campaign, no file, not readable, empty, or packed.
+    """
+    return _read(Folder(campaign).inside(file), file, HEAD_BYTES if head else None)[0]
+
+
+def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, os.stat_result]:
+    if path is None:
+        raise _bad_path(
+            file, "path_outside", "lies outside the campaign folder.", "Copy it into the folder of runs.csv."
+        )
+    try:
+        # A pipe would be waited for forever, unless it is opened without waiting.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    except OSError as error:
+        raise _not_opened(path, file, error) from None
+    try:
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode):
+            raise _bad_path(file, "unreadable_file", "is no file.", "Check the path.")
+        raw = os.read(handle, status.st_size + 1 if size is None else size)
+        # Short where it is the whole file; a network's file system, or a file above 2 GB, may give it piece by piece.
+        while size is None and len(raw) != status.st_size and (more := os.read(handle, 1 << 24)):
+            raw += more
+    except OSError as error:
+        raise _bad_path(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.") from error
+    finally:
+        os.close(handle)
+    if not raw[:64].strip(_BLANK) and not raw.strip(_BLANK):
+        raise _bad_path(file, "empty_file", "is empty.", "Export it again, or take it out of runs.csv.")
+    for magic, what in _PACKED.items():
+        if raw.startswith(magic):
+            raise _bad_path(file, "binary_file", f"is {what}, not text.", "Export the trace as CSV.")
+    return raw, status
+
+
+def _not_opened(path: str, file: str, error: OSError) -> BadFile:
+    if isinstance(error, FileNotFoundError):
+        return _bad_path(file, "missing_file", "does not exist.", _similar(Path(path)))
+    if os.path.exists(path) and not os.path.isfile(path):  # a folder, where folders cannot be opened
+        return _bad_path(file, "unreadable_file", "is no file.", "Check the path.")
+    return _bad_path(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.")
+
+
+def _bad_path(file: str, check: str, reason: str, fix: str) -> BadFile:
+    return BadFile(Fault(check, reason, file=file, action="file left out", fix=fix))
+
+
+def _similar(path: Path) -> str:
+    """Return a fix for a missing file: the same name in other case or place, if there is one."""
+    try:
+        for other in path.parent.iterdir():
+            if other.name.lower() == path.name.lower():
+                return f"There is '{other.name}': the case of letters matters."
+    except OSError:
+        return f"There is no folder '{path.parent.name}' either; paths are relative to the folder of runs.csv."
+    return "Paths are relative to the folder of runs.csv."
+
+
+# ---------------------------------------------------------------- text
+# Bytes of a file to clean UTF-8 text, and where its header ends: encodings, byte-order marks, line ends, names.
+
+HEAD_BYTES = 65_536  # a header longer than this is no header
+_BOMS = (  # UTF-32 first: its mark begins with that of UTF-16
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
+_ASCII = ("auto", "utf-8", "utf8", "utf_8", "latin-1")  # encodings that are ASCII where the text is
+_CONTROL = bytes(set(range(32)) - {9, 10, 12, 13}) + b"\x7f"
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where a trace file's data begin and what its columns are called.
+
+    `header` are the lines before the data, without line ends; `names` is empty where columns go by position;
+    `start` is the offset of the first data byte and `first_line` its 1-based line number.
+    """
+
+    header: tuple[str, ...]
+    names: tuple[str, ...]
+    names_line: int | None
+    start: int
+    first_line: int
+
+
+def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> bytes:
+    """Return the text as UTF-8 bytes without byte-order mark, lines ended by a single line feed.
+
+    `auto` looks for a byte-order mark, then for the zero bytes of UTF-16, then tries UTF-8, then takes Latin-1.
+
+    Raises
+    ------
+    BadFile
+        If the bytes are not text in that encoding.
+    """
+    if _is_plain(raw) and encoding.lower() in _ASCII:
+        return raw
+    if encoding == "auto":
+        encoding = next((name for mark, name in _BOMS if raw.startswith(mark)), None) or _guess(raw)
+    elif encoding.lower().replace("_", "-") in ("utf-8", "utf8"):
+        encoding = "utf-8-sig"
+    if not raw.isascii() or encoding not in ("utf-8", "utf-8-sig", "latin-1"):
+        try:
+            decoder = codecs.getincrementaldecoder(encoding)()
+            text = decoder.decode(raw, final=not head)  # a head may end in the middle of a character
+        except UnicodeDecodeError as error:
+            if encoding == "utf-8":  # guessed
+                text = raw.decode("latin-1")
+            else:
+                line = raw[: error.start].count(b"\n") + 1
+                reason = f"is not {encoding}: byte {error.start} cannot be read."
+                raise _bad(file, "wrong_encoding", reason, 'Set encoding = "auto".', line) from error
+        raw = text.encode("utf-8", "replace").removeprefix(codecs.BOM_UTF8)
+    if raw.translate(None, _CONTROL) != raw:
+        place = next(i for i, byte in enumerate(raw) if byte in _CONTROL)
+        line = raw[:place].count(b"\n") + 1
+        reason = f"is not text: byte {raw[place]:#04x} stands in it."
+        raise _bad(file, "binary_file", reason, "Export the trace as text (CSV).", line)
+    if b"\r" in raw:
+        raw = raw.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    return raw
+
+
+def _is_plain(raw: bytes) -> bool:
+    """Return whether the bytes are letters, figures and marks of ASCII between line feeds, and nothing else."""
+    codes = np.frombuffer(raw, np.uint8)
+    return bool(codes.max(initial=0) < 127) and np.count_nonzero(codes < 32) == np.count_nonzero(codes == 10)
+
+
+def find_layout(text: bytes, settings: TraceFormat, file: str) -> Layout:
+    """Return where the data of a trace file begin.
+
+    Raises
+    ------
+    BadFile
+        If no line matches `header_ends_at`, or the header is longer than the file.
+    """
+    lines = text[:HEAD_BYTES].decode("utf-8", "ignore").split("\n")
+    count = _header_lines(lines, settings, file)
+    start = 0
+    for _ in range(count):
+        end = text.find(b"\n", start)
+        if end < 0:
+            start = len(text)
+            break
+        start = end + 1
+    header = tuple(lines[:count])
+    if settings.names == "none":
+        return Layout(header, (), None, start, count + 1)
+    back = settings.names_line or (2 if settings.units_row else 1)
+    if back > count:
+        reason = f"has a header of {count} lines, and its names should stand {back} lines before the data."
+        raise _bad(file, "header_not_found", reason, "Check header_lines and names_line in the rig config.")
+    names = tuple(name.strip() for name in split_line(without_strays(header[-back], settings), settings.delimiter))
+    return Layout(header, names, count - back + 1, start, count + 1)
+
+
+def split_line(line: str, delimiter: str) -> list[str]:
+    """Return the cells of one line; a quoted cell may hold the delimiter."""
+    if delimiter == "whitespace":
+        return line.split()
+    mark = "\t" if delimiter == "tab" else delimiter
+    if '"' not in line:
+        return line.split(mark)
+    try:
+        return next(csv.reader([line], delimiter=mark), [])
+    except csv.Error:
+        return line.split(mark)
+
+
+def header_fields(header: tuple[str, ...], settings: TraceFormat) -> dict[str, float | str]:
+    """Return the channels that the config reads from header lines: the first match of each, numbers as numbers."""
+    found: dict[str, float | str] = {}
+    for name, pattern in settings.header_fields.items():
+        for line in header:
+            if match := re.search(pattern, line):
+                value = (match.group(1) if match.re.groups else match.group()) or ""
+                number = as_number(value, settings.decimal)
+                found[name] = value.strip() if number is None else number
+                break
+    return found
+
+
+def as_number(cell: str, decimal: str = ".") -> float | None:
+    """Return the number in a cell (nan and inf included), or None if it holds none.
+
+    Examples
+    --------
+    >>> as_number(" 1,5 ", ","), as_number("1,5"), as_number("1_000"), as_number("-2e-3")
+    (1.5, None, None, -0.002)
+    """
+    text = cell.strip()
+    if decimal == ",":
+        if "." in text:
+            return None
+        text = text.replace(",", ".")
+    if "_" in text:  # Python reads 1_000 as a number; a rig never writes it
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _bad(file: str, check: str, reason: str, fix: str, line: int | None = None) -> BadFile:
+    return BadFile(Fault(check, reason, file=file, line=line, action="file left out", fix=fix))
+
+
+def _guess(raw: bytes) -> str:
+    """Return "utf-16-le" or "-be" where every other byte is zero, as in UTF-16 of Latin letters; else "utf-8"."""
+    sample = raw[:4096]
+    half = len(sample) // 2
+    if half > 1 and sample[1::2].count(0) > 0.8 * half and sample[::2].count(0) < 0.1 * half:
+        return "utf-16-le"
+    if half > 1 and sample[::2].count(0) > 0.8 * half and sample[1::2].count(0) < 0.1 * half:
+        return "utf-16-be"
+    return "utf-8"
+
+
+def without_strays(line: str, settings: TraceFormat) -> str:
+    """Return a line without the separators that it ends in, where the config says that these are stray."""
+    if not settings.trailing_separator:
+        return line
+    return line.rstrip(",; \t" + (settings.delimiter if len(settings.delimiter) == 1 else ""))
+
+
+def _header_lines(lines: list[str], settings: TraceFormat, file: str) -> int:
+    if settings.header_ends_at is not None:
+        for number, line in enumerate(lines, start=1):
+            if re.search(settings.header_ends_at, line):
+                return number
+        reason = f"no line matches header_ends_at = {settings.header_ends_at!r}."
+        raise _bad(file, "header_not_found", reason, "Check header_ends_at in the rig config against the file.")
+    if settings.header_lines is not None:
+        return settings.header_lines
+    if settings.names == "none":
+        return 0
+    blank = next((i for i, line in enumerate(lines) if line.strip()), 0)  # blank lines may stand before the names
+    return blank + 1 + settings.units_row

@@ -1,0 +1,301 @@
+"""Parts of a campaign, of whole runs each: what one process reads at once, and the tables it gives."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from sealfit.config import Config
+from sealfit.errors import Fault
+from sealfit.ingest.averages import bin_table, mean_traces
+from sealfit.ingest.categorical import condition_columns, keys_of
+from sealfit.ingest.file_names import Listing
+from sealfit.ingest.files import as_number
+from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_files
+from sealfit.store.manifest import Fingerprint
+from sealfit.store.parquet import as_dictionary, to_arrow
+from sealfit.tables import BINS, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
+
+# ---------------------------------------------------------------- shaped
+# A frame brought into the columns and types of its schema.
+
+INNER = ("several", "left", "equal", "extreme", "run", "sliding", "row", "by_itself")  # serve the ingest only
+STEADY_ONLY = tuple(
+    {column.name for column in STEADY.columns}
+    - {column.name for column in RUNS.columns}
+    - {column.name for column in BINS.columns}
+)
+
+
+def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.DataFrame:
+    """Return the schema's columns in order and with their types, then the open ones but `drop` and `INNER`."""
+    fixed = {}
+    for column in schema.columns:
+        values = (
+            table[column.name] if column.name in table.columns else pd.Series(None, index=table.index, dtype=object)
+        )
+        if column.dtype == FLOAT:
+            fixed[column.name] = pd.to_numeric(values, errors="coerce").astype(float)
+        elif column.dtype == INT:
+            fixed[column.name] = values.astype(np.int64)
+        elif column.dtype == TEXT:
+            fixed[column.name] = values.astype("str")
+        else:
+            fixed[column.name] = values.astype(bool)
+    taken = {*fixed, *INNER, *(name for name in drop if name not in fixed)}
+    return pd.DataFrame({**fixed, **{name: table[name] for name in table.columns if name not in taken}})
+
+
+# ---------------------------------------------------------------- parts
+# A campaign cut into parts of whole runs: what is read at once, by one process, and stored in one file a table.
+#
+# Where a cut lies depends on the runs beside it alone (content-defined chunking), so files that are added to a campaign
+# change the part they belong to and, at most, its neighbours; everything else stays as it is on the disk.
+
+PART_FILES = 256  # a part of so many files is stored in one file a table: few enough files, and little to read for one
+PART_BYTES = 4_000_000  # condition; of trace files, whichever comes first: a part's samples take some ten times that
+LEAST, MOST = 0.25, 2.0  # smallest and largest part, in parts as wanted; a run is never cut
+
+
+def plan_parts(conditions: Sequence[str], runs: Sequence[str], sizes: Sequence[int]) -> list[list[int]]:
+    """Return the files of each part, by their numbers, rising within a part; every file is in one part.
+
+    Conditions stay together unless one is larger than a part; runs always. A part holds conditions that are neighbours
+    in the order of their names, so the least and the largest name, which Parquet keeps, tell a reader what to skip.
+
+    Parameters
+    ----------
+    conditions, runs : sequence of str, length n
+        Condition and run of every file.
+    sizes : sequence of int, length n
+        Sizes of the files in bytes.
+
+    Examples
+    --------
+    >>> plan_parts(["a", "b", "a"], ["1", "2", "1"], [10, 10, 10])
+    [[0, 1, 2]]
+    """
+    whole: dict[str, dict[str, list[int]]] = {}
+    for i, (condition, run) in enumerate(zip(conditions, runs, strict=True)):
+        whole.setdefault(condition, {}).setdefault(run, []).append(i)
+    parts: list[list[int]] = [[]]
+    filled = 0.0
+    for condition, of_run in sorted(whole.items()):
+        weights = {run: _weight(files, sizes) for run, files in of_run.items()}
+        total = sum(weights.values())
+        if filled >= LEAST and filled + total > MOST:
+            parts.append([])
+            filled = 0.0
+        for run, files in of_run.items():
+            if total > 1.0 and filled >= LEAST and (filled + weights[run] > MOST or _cut(run, weights[run])):
+                parts.append([])
+                filled = 0.0
+            parts[-1] += files
+            filled += weights[run]
+        if filled >= LEAST and _cut(condition, total):
+            parts.append([])
+            filled = 0.0
+    return [sorted(part) for part in parts if part]
+
+
+def _weight(files: Sequence[int], sizes: Sequence[int]) -> float:
+    """Return how much of a part these files fill."""
+    return max(len(files) / PART_FILES, sum(sizes[i] for i in files) / PART_BYTES)
+
+
+def _cut(name: str, weight: float) -> bool:
+    """Whether a part ends at `name`: by its hash, as often as makes parts of the wanted size."""
+    number = int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
+    return number < weight * 2.0**64
+
+
+# ---------------------------------------------------------------- part
+# One part of a campaign: its files read, their strokes in one table, and the tables that grow with the samples.
+
+SAMPLED = ("traces", "traces_mean", "bins")  # tables that are made, and stored, part by part
+
+Stroke = tuple[str, int]  # file, and number of the stroke in it
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Files to read together: whole runs.
+
+    `unused` are strokes that a comparison with other parts has ruled out; `columns`, per table, those that it is to
+    have, and their types, since other parts have them.
+    """
+
+    refs: Listing
+    unused: frozenset[Stroke] = frozenset()
+    columns: Mapping[str, Mapping[str, str]] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FileFound:
+    """What is kept of a file once its samples are in the tables."""
+
+    file: str
+    mark: Fingerprint
+    rows: int
+    strokes: int
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one part gives.
+
+    `strokes` has a row per stroke with everything that is known of it, the keys included, and `used` by what the file
+    itself shows; `tables` are those of `SAMPLED` that have rows, without the strokes that are not used or were asked
+    to be left out; their words are dictionaries.
+    """
+
+    files: tuple[FileFound, ...]
+    faults: tuple[Fault, ...]
+    strokes: pa.Table
+    tables: dict[str, pa.Table]
+
+
+def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
+    """Return the strokes and the tables of one part.
+
+    Parameters
+    ----------
+    asked : Asked
+        Which files.
+    campaign : Path
+        Campaign folder.
+    config : Config
+        The rig.
+    """
+    files = read_files(asked.refs, campaign, config)
+    strokes = stroke_columns(files, config)
+    known = pa.table({name: _array(values) for name, values in strokes.items()})
+    found = tuple(FileFound(made.file, made.mark, made.rows, len(made.strokes)) for made in files)
+    faults = tuple(fault for made in files for fault in made.faults)
+    if not known.num_rows:
+        return Part(found, faults, known, {})
+    each = zip(strokes["used"], strokes["file"], strokes["stroke"], strict=True)
+    strokes["used"] = [used and (file, stroke) not in asked.unused for used, file, stroke in each]
+    samples = sample_columns(files, strokes)
+    tables = {"traces": _traces(samples, strokes, config)}
+    if samples["sliding"].any():
+        tables["traces_mean"] = _mean_traces(samples, strokes, config)
+    if samples["steady"].any():
+        tables["bins"] = _bins(samples, strokes, config)
+    return Part(found, faults, known, tables)
+
+
+def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, list]:
+    """Return everything that is known of every stroke, the keys included; run_id with its direction.
+
+    A run with strokes both ways is two: `<run_id>+` and `<run_id>-`.
+    """
+    rows = [row for made in files for row in made.strokes]
+    names = dict.fromkeys(name for row in rows for name in row)
+    columns = {name: [row.get(name) for row in rows] for name in names}
+    for name in condition_columns(config):
+        columns.setdefault(name, [math.nan] * len(rows))  # every file is unaged, and none says the rest
+    columns |= keys_of(columns, len(rows), config)
+    return columns | _two_runs(columns) if rows else {"used": []}
+
+
+def _two_runs(strokes: Mapping[str, list]) -> dict[str, list[str]]:
+    """Return `run_id` with its direction where needed, and `run`, as it was."""
+    names = [str(name) for name in strokes["run_id"]]
+    ways = defaultdict(set)
+    for run, file, way, used in zip(names, strokes["file"], strokes["direction"], strokes["used"], strict=True):
+        ways[run, file].add(way)
+        if used:
+            ways[run, None].add(way)
+    both = {run for (run, _), found in ways.items() if len(found) > 1}
+    signed = (f"{run}{'+' if way > 0 else '-'}" for run, way in zip(names, strokes["direction"], strict=True))
+    return {"run_id": [new if run in both else run for run, new in zip(names, signed, strict=True)], "run": names}
+
+
+def _array(values: Sequence[object]) -> pa.Array:
+    """Return the values as Arrow has them; where they are words and numbers together, as words."""
+    try:
+        return pa.array(values, from_pandas=True)
+    except (pa.ArrowInvalid, pa.ArrowTypeError):
+        return pa.array([value if value is None else str(value) for value in values], TEXT)
+
+
+def sample_columns(files: Sequence[FileStrokes], strokes: Mapping[str, list]) -> dict[str, np.ndarray]:
+    """Return all samples, with `row` (place in `strokes`); `steady` and `sliding` are false throughout a stroke that is
+    not used."""
+    parts = [made for made in files if made.samples is not None]
+    names = list(dict.fromkeys(name for made in parts for name in made.samples))
+    length = [len(made.samples["time_s"]) for made in parts]
+    columns = {name: _stacked([made.samples.get(name) for made in parts], length) for name in names}
+    first = np.concatenate(([0], np.cumsum([len(made.strokes) for made in parts])[:-1]))
+    first = first - [made.strokes[0]["stroke"] for made in parts]
+    columns["row"] = np.repeat(first, length) + columns["stroke"]
+    used = np.array(strokes["used"], bool)
+    if not used.all():
+        for name in ("steady", "sliding"):
+            columns[name] = columns[name] & used[columns["row"]]
+    return columns
+
+
+def _stacked(parts: list[np.ndarray | None], length: list[int]) -> np.ndarray:
+    """Return the parts in one array; null where a file lacks the channel."""
+    kinds = {part.dtype.kind for part in parts if part is not None}
+    if kinds <= set("fiub"):
+        return np.concatenate([np.full(n, np.nan) if p is None else p for p, n in zip(parts, length, strict=True)])
+    return np.concatenate([np.full(n, None, object) if p is None else p for p, n in zip(parts, length, strict=True)])
+
+
+def _traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
+    """Return table `traces`."""
+    measured = {name: values for name, values in samples.items() if name not in ("row", "sliding", ALONG)}
+    words = {name: as_dictionary(_array(strokes[name]), samples["row"]) for name in ("file", "condition")}
+    return to_arrow({**measured, **words}, TRACES, config.units)
+
+
+def _mean_traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
+    """Return table `traces_mean`, of the sliding of the strokes that are used."""
+    rows = np.flatnonzero(samples["sliding"])
+    names = ("row", "displacement_mm", "force_N", "steady")
+    made = mean_traces({name: samples[name][rows] for name in names}, strokes)
+    row = made.pop("row")
+    words = {name: as_dictionary(_array(strokes[name]), row) for name in ("run_id", "condition")}
+    return to_arrow({**made, "direction": np.array(strokes["direction"])[row], **words}, TRACES_MEAN, config.units)
+
+
+def _bins(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
+    """Return table `bins`: means of what was measured along the trace, and what is known of the whole stroke."""
+    rows = np.flatnonzero(samples["steady"])
+    measured = {name: values[rows] for name, values in samples.items() if name not in ("stroke", "steady", "sliding")}
+    measured["force_N"] = measured["force_N"] - measured["presliding_N"]
+    made = bin_table(measured, strokes, config.bins)
+    binned, place = np.unique(made.pop("row"), return_inverse=True)
+    known = {name: [values[i] for i in binned.tolist()] for name, values in strokes.items()}
+    if "load_N" in made and "load_N" in known:  # where some files measure it and others declare it
+        declared = np.array(known["load_N"], float)[place]
+        made["load_N"] = np.where(np.isnan(made["load_N"]), declared, made["load_N"])
+    kinds = {column.name: column.dtype for column in BINS.columns}
+    left_out = {*INNER, *STEADY_ONLY, "used", *kinds}
+    columns = {name: _typed(known.get(name, [None] * len(binned)), kind) for name, kind in kinds.items()}
+    columns |= {name: _array(values) for name, values in known.items() if name not in left_out}
+    spread = {name: _spread(values, place) for name, values in columns.items() if name not in made}
+    return to_arrow(spread | made, BINS, config.units)
+
+
+def _typed(values: Sequence[object], kind: pa.DataType) -> pa.Array:
+    """Return the values in the type of their column; null where a word stands for a number."""
+    if kind == FLOAT:
+        values = [as_number(value) if isinstance(value, str) else value for value in values]
+    return _array(values).cast(kind)
+
+
+def _spread(values: pa.Array, row: np.ndarray) -> pa.Array:
+    """Return the value of every row, words as dictionaries."""
+    return as_dictionary(values, row) if values.type == TEXT else values.take(pa.array(row))

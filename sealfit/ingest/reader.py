@@ -1,0 +1,246 @@
+"""One trace file to one clean table: read, computed, filtered, checked; every fault named with its place and fix."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sealfit.config import Config, TraceFormat
+from sealfit.errors import BadFile, ConfigError, Fault
+from sealfit.ingest.cells import Cells, Rows, clean, read_cells
+from sealfit.ingest.columns import RESERVED, SLOTS, Form, beside, channel_columns, form_of, required
+from sealfit.ingest.expression import evaluate, parse
+from sealfit.ingest.file_names import TraceRef, name_parts
+from sealfit.ingest.files import Layout, as_utf8, header_fields, read_bytes
+from sealfit.ingest.segments import Pieces
+from sealfit.ingest.trace_checks import speed_faults
+
+MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One trace as it was measured, in our columns and units.
+
+    `columns` holds time_s, displacement_mm and force_N (and load_N, where it was measured) as float64 and any further
+    channel as float64 or text, each of shape (n,); bad rows are left out. `line` is the 1-based line in the file of
+    every row, `rows_read` the number of data rows in the file, and `faults` what was found in it.
+    """
+
+    ref: TraceRef
+    columns: Mapping[str, np.ndarray]
+    line: np.ndarray
+    rows_read: int
+    faults: tuple[Fault, ...]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """The columns as a table."""
+        return pd.DataFrame(self.columns)
+
+
+def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
+    """Return one trace, with bad rows left out and named.
+
+    Parameters
+    ----------
+    campaign : Path
+        Campaign folder; `ref.file` is relative to it and never outside it.
+    ref : TraceRef
+        The file and what runs.csv and its name say.
+    config : Config
+        How the file is written.
+
+    Raises
+    ------
+    BadFile
+        If the file must be left out: missing, empty, binary, a column missing, too many bad rows, a speed that
+        contradicts the commanded one. It carries every fault found, the deciding one last.
+    """
+    (found,) = read_traces([(ref, read_bytes(campaign, ref.file))], config)
+    if isinstance(found, BadFile):
+        raise found
+    return found
+
+
+def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list[Trace | BadFile]:
+    """Return a trace for each of several files, or why it must be left out; files written alike are read in one go.
+
+    Parameters
+    ----------
+    files : sequence of (TraceRef, bytes)
+        What is known of each file, and its bytes; some dozens of them, as all are held at once.
+    config : Config
+        How the files are written.
+    """
+    found: list[Trace | BadFile | None] = [None] * len(files)
+    alike: dict[int, list[tuple[int, bytes]]] = {}
+    forms: list[Form] = []
+    for place, (ref, raw) in enumerate(files):
+        try:
+            text = as_utf8(raw, config.trace.encoding, ref.file)
+            number = next((i for i, form in enumerate(forms) if form.fits(text)), None)
+            if number is None:
+                number = len(forms)
+                forms.append(form_of(text, config.trace, ref.file))
+            alike.setdefault(number, []).append((place, forms[number].body(text)))
+        except BadFile as error:
+            found[place] = error
+    for number, members in alike.items():
+        form, names = forms[number], [files[place][0].file for place, _ in members]
+        made = read_cells([body for _, body in members], names, form.layout, config.trace, form.numeric)
+        for (place, _), cells in zip(members, made, strict=True):
+            try:
+                found[place] = _trace(cells, form, files[place][0], config)
+            except BadFile as error:
+                found[place] = error
+    return _at_their_speed(found, config)
+
+
+def _at_their_speed(found: Sequence[Trace | BadFile], config: Config) -> list[Trace | BadFile]:
+    """Return the traces with what is to be said of their speed; those that contradict it grossly are left out."""
+    traces = [trace for trace in found if isinstance(trace, Trace)]
+    if not traces:
+        return list(found)
+    time_s, displacement = (np.concatenate([t.columns[name] for t in traces]) for name in ("time_s", "displacement_mm"))
+    pieces = Pieces([len(trace.line) for trace in traces])
+    faults = iter(speed_faults(time_s, displacement, pieces, [trace.ref for trace in traces], config))
+    made: list[Trace | BadFile] = []
+    for trace in found:
+        fault = next(faults) if isinstance(trace, Trace) else None
+        if fault is None:
+            made.append(trace)
+        elif fault.action == "file left out":
+            made.append(BadFile(*trace.faults, fault))
+        else:
+            made.append(replace(trace, faults=(*trace.faults, fault)))
+    return made
+
+
+def _trace(cells: Cells, form: Form, ref: TraceRef, config: Config) -> Trace:
+    """Return the trace that the cells of a file make; raises as `read_trace`."""
+    settings, file, layout = config.trace, ref.file, form.layout
+    rows = Rows({name: cells.columns[i] for i, name in form.ours.items() if i in cells.columns}, cells.line)
+    known: Mapping[str, object] = {}
+    if settings.compute or settings.keep is not None:
+        known = {**ref.channels, **name_parts(file, config.files).values, **header_fields(layout.header, settings)}
+    faults = list(cells.faults)
+    good = ~cells.bad
+    first = settings.drop_first_rows
+    counted = max(len(good) - first, 1)
+    columns, dropped, found = channel_columns(rows.columns, SLOTS, good, rows.line, config, file)
+    faults += found
+    good &= ~dropped
+    bad = len(good[first:]) - int(np.count_nonzero(good[first:]))
+    good[:first] = False
+    rows, wrong, found = _derive(Rows(columns, rows.line).where(good), known, settings, layout, file)
+    faults += found
+    bad += wrong
+    faults += _too_many(bad, counted, faults, config, file)
+    if settings.keep is not None:
+        rows = rows.where(_kept(rows, known, settings, file))
+    if len(rows.line) < MIN_ROWS:
+        reason = f"{len(rows.line)} of {len(good)} data rows are left; a trace needs {MIN_ROWS}."
+        raise BadFile(*faults, _bad_file("no_rows", reason, file, "Check drop_first_rows, keep and the export."))
+    return Trace(ref, _named_beside(rows, ref, settings), rows.line, len(good), tuple(faults))
+
+
+def _derive(
+    rows: Rows, known: Mapping[str, object], settings: TraceFormat, layout: Layout, file: str
+) -> tuple[Rows, int, list[Fault]]:
+    """Return the rows with computed columns and integrated displacement, the number of bad ones, and the faults."""
+    speed = settings.integrate_displacement
+    compute = {name: parse(text) for name, text in settings.compute.items()}
+    later = _after_integral(compute) if speed else []
+    rows = _computed(rows, {n: e for n, e in compute.items() if n not in later}, known, settings, file)
+    if speed:
+        # The integral needs its time and speed clean first: one bad row would shift every displacement after it.
+        if speed not in rows.columns or "time_s" not in rows.columns:
+            missing = speed if speed not in rows.columns else "time_s"
+            raise BadFile(_missing(missing, layout, file))
+        rows, bad, faults = clean(rows, ["time_s", speed, "force_N"], file)
+        rows = Rows({**rows.columns, "displacement_mm": _integral(rows, speed, settings)}, rows.line)
+        rows = _computed(rows, {name: compute[name] for name in later}, known, settings, file)
+        required(rows.columns, layout, file)
+        return rows, bad, faults
+    required(rows.columns, layout, file)
+    rows, bad, faults = clean(rows, [name for name in SLOTS if name in rows.columns], file)
+    return rows, bad, faults
+
+
+def _missing(name: str, layout: Layout, file: str) -> Fault:
+    fix = "Name it under [trace.columns], or compute it under [trace.compute]."
+    return replace(
+        _bad_file("missing_column", "there is no such column.", file, fix), column=name, line=layout.names_line
+    )
+
+
+def _after_integral(compute: Mapping[str, object]) -> list[str]:
+    """Return the computed columns that need the displacement, directly or through another one."""
+    later: list[str] = []
+    for name, expression in compute.items():
+        if expression.names & {"displacement_mm", *later}:
+            later.append(name)
+    return later
+
+
+def _computed(rows: Rows, compute: Mapping, known: Mapping[str, object], settings: TraceFormat, file: str) -> Rows:
+    columns = dict(rows.columns)
+    for name, expression in compute.items():
+        value = _evaluate(expression, {**known, **settings.constants, **columns}, file)
+        columns[name] = np.broadcast_to(value, rows.line.shape).astype(float)
+    return Rows(columns, rows.line)
+
+
+def _evaluate(expression, values: Mapping[str, object], file: str) -> np.ndarray:
+    try:
+        return evaluate(expression, values)
+    except ConfigError as error:
+        raise BadFile(replace(_bad_file("expression", error.message, file, error.fix), column=error.column)) from error
+
+
+def _kept(rows: Rows, known: Mapping[str, object], settings: TraceFormat, file: str) -> np.ndarray:
+    values = {**known, **settings.constants, **rows.columns}
+    return np.broadcast_to(_evaluate(parse(settings.keep, condition=True), values, file), rows.line.shape)
+
+
+def _integral(rows: Rows, speed: str, settings: TraceFormat) -> np.ndarray:
+    """Return the displacement, trapezoid rule over time, 0 at the first row; a speed per minute is divided by 60."""
+    time_s, v = rows.columns["time_s"], rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
+    return np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(time_s))]) if len(v) else v
+
+
+def _too_many(bad: int, counted: int, faults: list[Fault], config: Config, file: str) -> list[Fault]:
+    """Raise `BadFile` if more rows are bad than the config allows."""
+    if bad <= config.quality.max_bad_rows * counted:
+        return []
+    fixes = Counter(fault.fix for fault in faults if fault.action == "row left out" and fault.fix)
+    fix = fixes.most_common(1)[0][0] if fixes else ""
+    reason = f"{bad} of {counted} rows are bad, more than {100 * config.quality.max_bad_rows:g} %."
+    raise BadFile(*faults, replace(_bad_file("too_many_bad_rows", reason, file, fix), value=float(bad)))
+
+
+def _named_beside(rows: Rows, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:
+    """Return slots first, then channels, without helper columns.
+
+    A channel that `ref` has too is left out where it is constant (`ref` says it); one that varies is another quantity
+    than the one set for the whole file, and is renamed, `temperature_file_C` beside `temperature_C`; so is one whose
+    name a table of ours makes itself.
+    """
+    columns = {name: rows.columns[name] for name in SLOTS if name in rows.columns}
+    for name, values in rows.columns.items():
+        if name in SLOTS or name in settings.drop_columns:
+            continue
+        if name in ref.channels and (values == values[0]).all():
+            continue
+        columns[beside(name, RESERVED.union(columns, ref.channels))] = values
+    return columns
+
+
+def _bad_file(check: str, reason: str, file: str, fix: str) -> Fault:
+    return Fault(check, reason, file=file, action="file left out", fix=fix)

@@ -1,0 +1,351 @@
+"""What only a comparison of strokes shows: a wrong sign, a dead sensor, a repeat that disagrees with its run."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sealfit.config import Config
+from sealfit.errors import Fault
+from sealfit.ingest.quality import FINE
+from sealfit.ingest.scatter import Layout, ScatterFit, fit_scatter, repeat_means
+
+# ---------------------------------------------------------------- outlying
+# Repeats that lie outside: those that disagree with their runs beyond the scatter pooled over all runs.
+
+MAX_OUTLIERS = 0.1  # share of repeats that the search takes out at most: beyond that the bulk is not known
+TOGETHER = 0.002  # taken out at once at most, as a share of the degrees of freedom: one at a time up to 1,000
+SQUARES = 0.02  # and of the squares, so that the scatter changes by a percent a round
+NEAR = 10.0  # a p within this factor of the level is found again one by one before it decides
+ALONE = 1e-9  # a residual that keeps less of its variance is that of a run's only repeat
+
+
+class _Judged(NamedTuple):
+    rows: np.ndarray  # one repeat, or the two of a run
+    t: float
+    p: float  # adjusted over the campaign
+    tests: int
+    mean_N: float  # of the run without it; of the run, if both are out
+
+
+def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
+    """Return the repeats that disagree with their runs beyond the pooled scatter.
+
+    Parameters
+    ----------
+    means : DataFrame
+        As `scatter.repeat_means` returns it.
+    level : float
+        Chance that any repeat at all is flagged in a campaign without outliers.
+
+    Returns
+    -------
+    DataFrame
+        Rows of `means` with `run_mean_N` (the run's mean without it), `t`, `p` (adjusted over the campaign) and
+        `alone` (true where two repeats disagree and which of them is wrong cannot be known: both are returned).
+
+    Notes
+    -----
+    The generalized extreme studentized deviate procedure (Rosner 1983, Technometrics 25(2), 165-172,
+    doi:10.1080/00401706.1983.10487848), on residuals within runs: the most extreme repeat is taken out, scatter and
+    pattern are estimated without it, and so on; the outliers are those up to the last one that exceeds its limit. So
+    neither does an outlier widen the scale it is judged by, nor do two hide each other. The limit is Sidak's for
+    the repeats left, on Student's t with the pooled degrees of freedom.
+
+    In large campaigns the most extreme repeats of several runs are taken out at once, so that the work grows with the
+    number of repeats and not with its square; each is then judged by a scatter between those with and without them,
+    and where that leaves the last outlier in doubt, by the scatter that one by one would have given.
+    """
+    layout = Layout.of(means)
+    force = means["force_N"].to_numpy(float)
+    tiny = 1e-6 * float(np.max(np.abs(force), initial=0.0)) + 1e-300  # repeats that agree to the last digit
+    found: list[_Judged] = []
+    left, over = max(1, int(MAX_OUTLIERS * len(means))), False
+    kept = np.ones(len(means), bool)
+    fit = fit_scatter(layout, force, kept)
+    while left > 0 and not over:
+        tests = int((kept & (fit.share > ALONE)).sum())
+        if fit.scatter.df < 4 or not tests:
+            break
+        most = min(left, int(TOGETHER * fit.scatter.df))
+        taken, kept, apart = _take_out(layout, force, fit, kept, _furthest(layout, fit, kept, most))
+        if apart.scatter.df < 3:
+            break
+        for judged in _judge(fit, apart, taken, tests, level, tiny):
+            found.append(judged)
+            over = judged.p >= level and abs(judged.t) < 3.0  # nothing further out remains
+            if over:
+                break
+        left, fit = left - len(taken), apart
+    outliers = _outliers(layout, force, found, level, tiny)
+    rows = np.concatenate([np.array([], int), *(one.rows for one in outliers)])
+    count = np.array([len(one.rows) for one in outliers], int)
+    per_row = {"run_mean_N": [one.mean_N for one in outliers], "t": [one.t for one in outliers],
+               "p": [one.p for one in outliers]}  # fmt: skip
+    told = {name: np.repeat(np.array(values, float), count) for name, values in per_row.items()}
+    return means.iloc[rows].assign(**told, alone=np.repeat(count == 2, count))
+
+
+def _furthest(layout: Layout, fit: ScatterFit, kept: np.ndarray, most: int) -> list[np.ndarray]:
+    """Return the rows to take out next, the most extreme first, one of a run: alone, or with the only other repeat."""
+    size = np.where(kept & (fit.share > ALONE), np.abs(fit.t), -1.0)
+    order = np.argsort(-size, kind="stable")[: int((size >= 0.0).sum())]
+    first = np.flatnonzero(~pd.Index(layout.run[order]).duplicated())
+    few = int(np.searchsorted(np.cumsum(size[order[first]] ** 2), SQUARES * fit.scatter.df))
+    first = first[: max(1, min(most, few))]
+    count = np.bincount(layout.run[kept], minlength=layout.runs)
+    return [
+        np.flatnonzero(kept & (layout.run == layout.run[row])) if count[layout.run[row]] == 2 else np.array([row])
+        for row in order[first]
+    ]
+
+
+def _take_out(
+    layout: Layout, force_N: np.ndarray, fit: ScatterFit, kept: np.ndarray, furthest: list[np.ndarray]
+) -> tuple[list[np.ndarray], np.ndarray, ScatterFit]:
+    """Return what is taken out, which rows are kept then, and the fit to these.
+
+    Without the furthest of its run another repeat may lie further out than some of the rest: these then wait, so that
+    the most extreme goes first.
+    """
+    without = _less(kept, furthest)
+    apart = fit_scatter(layout, force_N, without)
+    touched = without & (apart.share > ALONE) & np.isin(layout.run, layout.run[np.concatenate(furthest)])
+    sd = fit.scatter.sd_N(apart.mean[touched]) * np.sqrt(apart.share[touched])
+    next_out = np.max(np.abs(apart.residual[touched]) / np.maximum(sd, 1e-300), initial=0.0)
+    taken = [rows for rows in furthest if np.abs(fit.t[rows]).max() >= next_out] or furthest[:1]
+    if len(taken) < len(furthest):
+        without = _less(kept, taken)
+        apart = fit_scatter(layout, force_N, without)
+    return taken, without, apart
+
+
+def _less(kept: np.ndarray, taken: list[np.ndarray]) -> np.ndarray:
+    without = kept.copy()
+    for rows in taken:
+        without[rows] = False
+    return without
+
+
+def _judge(
+    fit: ScatterFit, apart: ScatterFit, taken: list[np.ndarray], tests: int, level: float, tiny: float
+) -> list[_Judged]:
+    """Return t and p of each that was taken out, by the scatter without it and without those before it.
+
+    Between the scatters with and without all of them, variances go by the share of the squares that is out, degrees of
+    freedom by the number.
+    """
+    worst = np.array([rows[np.argmax(np.abs(fit.t[rows]))] for rows in taken])
+    square = np.nan_to_num(fit.t[worst] ** 2, posinf=1.0)
+    number = np.arange(1, len(taken) + 1) / len(taken)
+    gone = np.cumsum(square) / square.sum() if square.any() else number
+    force = fit.mean[worst]
+    sd = np.sqrt((1.0 - gone) * fit.scatter.sd_N(force) ** 2 + gone * apart.scatter.sd_N(force) ** 2)
+    t = fit.residual[worst] / (np.maximum(sd, tiny) * np.sqrt(fit.share[worst]))
+    df = [(1.0 - n) * fit.df_at(f) + n * apart.df_at(f) for n, f in zip(number.tolist(), force.tolist(), strict=True)]
+    p_one = _two_sided_p(t, df, beyond_doubt=NEAR * level / tests)
+    judged = []
+    for k, rows in enumerate(taken):
+        p = -np.expm1((tests - (len(rows) - 1)) * np.log1p(-min(p_one[k], 1.0 - 1e-16)))
+        mean = apart.mean[worst[k]] if len(rows) == 1 else force[k]
+        judged.append(_Judged(rows, float(t[k]), float(p), tests, float(mean)))
+        tests -= len(rows)
+    return judged
+
+
+def _two_sided_p(t: np.ndarray, df: list[float], *, beyond_doubt: float) -> np.ndarray:
+    """Return the chance of Student's t so far out; the normal distribution's, which is less, if all of those are larger
+    than what is beyond doubt: then nothing lies outside, and scipy, which takes long to load, is not wanted."""
+    least = np.array([math.erfc(size / math.sqrt(2.0)) for size in np.abs(t).tolist()])
+    if np.all(least > 2.0 * beyond_doubt):  # twice, as many tests together are a little less likely than their sum
+        return least
+    from scipy.special import stdtr
+
+    return 2.0 * stdtr(df, -np.abs(t))
+
+
+def _outliers(layout: Layout, force_N: np.ndarray, found: list[_Judged], level: float, tiny: float) -> list[_Judged]:
+    """Return those up to the last one that exceeds its limit."""
+    for last in range(len(found), 0, -1):
+        one = found[last - 1]
+        if level / NEAR < one.p < level * NEAR:
+            kept = _less(np.ones(len(force_N), bool), [other.rows for other in found[: last - 1]])
+            with_it, without = (fit_scatter(layout, force_N, rows) for rows in (kept, _less(kept, [one.rows])))
+            one = _judge(with_it, without, [one.rows], one.tests, level, tiny)[0]
+        if one.p < level:
+            return [*found[: last - 1], one]
+    return []
+
+
+# ---------------------------------------------------------------- peers
+# What only a comparison of strokes shows: a force of the wrong sign, a dead sensor, a repeat that lies outside.
+
+AGAINST = -0.5  # share of its peers' force by which a force against its motion is of the wrong sign, not an offset
+
+
+def reversed_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
+    """Return which strokes to keep, shape (n,), and findings on force signs that contradict the motion.
+
+    Friction opposes the motion, so force times direction is positive. Where one stroke of a run has it negative
+    against its peers (the other strokes of its run, else those of the same direction), it is left out: a sensor or a
+    sign was turned round. Where most strokes of a direction have it negative, an offset or the sign convention is the
+    cause: said once per file, and kept.
+
+    Parameters
+    ----------
+    strokes : DataFrame
+        One row per stroke: file, stroke, several (more strokes in the file), run, direction, force_N, used.
+    """
+    keep = np.ones(len(strokes), bool)
+    force = (strokes["force_N"] * strokes["direction"]).to_numpy(float)
+    used = strokes["used"].to_numpy(bool) & np.isfinite(force)
+    against = used & (force < 0.0)
+    if not against.any():
+        return keep, []
+    found = []
+    group = strokes.groupby(["direction", "run"], sort=False).ngroup().to_numpy()
+    runs, ways = _Leaving(force, used, group), _Leaving(force, used, strokes["direction"].to_numpy() > 0)
+    for i in np.flatnonzero(against):
+        usual = runs.median(i) if runs.others(i) >= 2 else ways.median(i)
+        wrong = usual > 0.0 and force[i] < AGAINST * usual
+        keep[i] = not wrong
+        found.append(_against(strokes.iloc[i], force[i], bool(wrong)))
+    return keep, found
+
+
+class _Leaving:
+    """Medians of the used values of a group, one of them left out."""
+
+    def __init__(self, values: np.ndarray, used: np.ndarray, group: np.ndarray):
+        order = np.lexsort((values, group))
+        self.values, self.group = values, group
+        order = order[used[order]]
+        self.sorted, of = values[order], group[order]
+        names, first, count = np.unique(of, return_index=True, return_counts=True)
+        self.span = {
+            name: (a, a + n) for name, a, n in zip(names.tolist(), first.tolist(), count.tolist(), strict=True)
+        }
+
+    def others(self, i: int) -> int:
+        """Return how many others are in the group of the used row `i`."""
+        first, last = self.span[self.group[i]]
+        return last - first - 1
+
+    def median(self, i: int) -> float:
+        """Return the median of the others in the group of the used row `i`; nan without any."""
+        first, last = self.span[self.group[i]]
+        own = first + int(np.searchsorted(self.sorted[first:last], self.values[i]))
+        n = last - first - 1
+        if n == 0:
+            return float("nan")
+        middle = [first + (n - 1) // 2, first + n // 2]
+        return float(np.mean([self.sorted[k + (k >= own)] for k in middle]))
+
+
+def _against(row: pd.Series, force_N: float, wrong: bool) -> Fault:
+    fix = (
+        "Look for a turned sensor or a turned sign in this file."
+        if wrong
+        else "If the rig counts force the other way round, change its sign in the config: compute.force_N."
+    )
+    return Fault(
+        "reversed",
+        "the mean force has the direction of the motion"
+        + (
+            ", unlike in the other strokes."
+            if wrong
+            else ": an offset larger than the friction, or the sign convention."
+        ),
+        file=row["file"],
+        stroke=int(row["stroke"]) if row["several"] else None,
+        column="force_N",
+        value=float(force_N),
+        severity="error" if wrong else "warning",
+        action="stroke left out" if wrong else "kept",
+        fix=fix,
+    )
+
+
+def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
+    """Return which strokes to keep, shape (n,), and findings on forces that never change in the steady window.
+
+    Where the other strokes show noise larger than the sensor's steps, the sensor is dead, or at the end of its range if
+    the value is the largest of the stroke. Where they do not, it is coarse (or without noise), and they are kept.
+
+    Parameters
+    ----------
+    strokes : DataFrame
+        One row per stroke: file, stroke, several, equal (share of samples equal to the one before), extreme (whether
+        the window's largest force is the stroke's), force_N, used.
+    """
+    used = strokes["used"].to_numpy(bool)
+    constant = used & (strokes["equal"].to_numpy(float) >= 1.0)
+    keep = np.ones(len(strokes), bool)
+    if not constant.any():
+        return keep, []
+    others = strokes["equal"].to_numpy(float)[used & ~constant]
+    dead = bool(len(others) and np.median(others) < FINE)
+    return (~constant if dead else keep), [_constant(row, dead) for _, row in strokes[constant].iterrows()]
+
+
+def _constant(row: pd.Series, dead: bool) -> Fault:
+    check, reason = "coarse", "and other strokes show no noise either: its steps are larger than the noise."
+    fix = "Use a finer range if the sensor has one."
+    if dead:
+        check, reason = "stuck", "unlike in other strokes."
+        fix = "Check the cable and the logger, and measure again."
+    if dead and row["extreme"]:
+        check = "saturated"
+        fix = f"The sensor may be at the end of its range: use a larger one. {fix}"
+    return Fault(
+        check,
+        f"the force is {row['force_N']:g} all along the steady window, {reason}",
+        file=row["file"],
+        stroke=int(row["stroke"]) if row["several"] else None,
+        column="force_N",
+        value=float(row["force_N"]),
+        severity="error" if dead else "info",
+        action="stroke left out" if dead else "kept",
+        fix=fix,
+    )
+
+
+def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, list[Fault]]:
+    """Return `steady` with `outlier` and `used`, and a finding per repeat that disagrees with its run.
+
+    Flagged always, left out of the fits only where the config says `quality.drop_outliers`; and never where only two
+    repeats disagree, since which of them is wrong cannot be known.
+    """
+    flagged = outlying_repeats(repeat_means(steady), config.quality.outlier_p)
+    outlier, dropped, found = np.zeros(len(steady), bool), np.zeros(len(steady), bool), []
+    near = np.flatnonzero(steady["file"].isin(flagged["file"]))
+    places = steady.iloc[near].groupby(["file", "run_id"], sort=False).indices
+    for row in flagged.itertuples(index=False):
+        rows = near[places[row.file, row.run_id]]
+        out = config.quality.drop_outliers and not row.alone
+        outlier[rows] = True
+        dropped[rows] |= out
+        found.append(
+            Fault(
+                "outlier",
+                _disagreement(row, config.units.unit("force")),
+                file=row.file,
+                column="force_N",
+                value=float(row.force_N),
+                severity="warning",
+                action="file left out" if out else "kept",
+                fix="Look into the notes of that test; quality.drop_outliers in the config leaves such repeats out.",
+            )
+        )
+    return steady.assign(outlier=outlier, used=steady["used"].to_numpy(bool) & ~dropped), found
+
+
+def _disagreement(row, unit: str) -> str:
+    others = "its only other repeat gives" if row.alone else "the other repeats of its run give"
+    return (
+        f"repeat {row.repeat} of run {row.run_id} is {row.force_N:.4g} {unit}; {others} {row.run_mean_N:.4g} {unit}, "
+        f"their common pattern removed: {abs(row.t):.1f} SDs of the scatter pooled over runs (p = {row.p:.1g})."
+    )

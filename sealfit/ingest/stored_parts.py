@@ -1,0 +1,217 @@
+"""Parts of a campaign on the disk: written by whoever reads them, and taken as they are while nothing has changed.
+
+A part's files are named by what it was made from, so a process that does the work a second time (its first answer was
+lost) writes the same names, and a part that is as it was keeps its files. Beside its tables a part has a file of its
+strokes and findings: with it, the whole campaign can be judged anew without reading the samples.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from sealfit import __version__
+from sealfit.config import Config
+from sealfit.errors import Fault
+from sealfit.ingest.partitions import SAMPLED, Asked, read_part
+from sealfit.store import parquet
+from sealfit.store.manifest import Fingerprint
+from sealfit.store.staged_writes import PARQUET, disk, file_size, sync
+
+PARTS = "parts"  # folder of OUT with the strokes of each part
+ARROW = ".arrow"
+FORMAT = 4  # of a part's files; those of another one are made again
+_ABOUT = b"part"
+
+Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each column, as Arrow spells it
+
+
+@dataclass(frozen=True)
+class Made:
+    """One part as the campaign needs it.
+
+    Of its files, in the order in which they were asked for, `rows` are the rows that were read, and `found` the
+    strokes; `marks` are the fingerprints of those that were read now. `strokes` is None where they are left on the disk
+    (`stored_strokes`), and once they are let go. `unused` and `wanted` are what was asked for (`part.Asked`); `columns`
+    are those of its tables; the tables themselves are in `tables`, or on the disk in `stored`: files by their names
+    below OUT, with their sizes in bytes.
+    """
+
+    marks: Mapping[str, Fingerprint]
+    rows: Sequence[int]
+    found: Sequence[int]
+    faults: tuple[Fault, ...]
+    strokes: pa.Table | None
+    unused: frozenset
+    wanted: Columns | None
+    columns: Columns
+    tables: Mapping[str, pa.Table]
+    stored: Mapping[str, int]
+
+
+def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None) -> Made:
+    """Read a part and store it below `folder`, or keep its tables in memory where there is none.
+
+    Raises
+    ------
+    OutError
+        If the disk is full or refuses.
+    """
+    part = read_part(asked, campaign, config)
+    marks = {found.file: found.mark for found in part.files}
+    rows, count = [found.rows for found in part.files], [found.strokes for found in part.files]
+    tables = part.tables
+    if folder is None:
+        return Made(marks, rows, count, part.faults, part.strokes, asked.unused, asked.columns, {}, tables, {})
+    columns = {name: {f.name: str(f.type) for f in parquet.spelled_out(table.schema)} for name, table in tables.items()}
+    if asked.columns is not None:
+        tables = {
+            name: parquet.with_columns(table, asked.columns[name], config.units) for name, table in tables.items()
+        }
+    hashes = [found.mark.sha256 for found in part.files]
+    name = _file_name(part_key(asked.refs.files, asked.refs.words(), hashes, seen_by_parts(config)), asked)
+    with disk(folder.parent), _whole_files(folder) as write:
+        stored = {
+            (file := f"{of}{PARQUET}/{name}"): write(file, table, parquet.write_arrow) for of, table in tables.items()
+        }
+        about = {
+            "unused": sorted(asked.unused),
+            "wanted": asked.columns,
+            "columns": columns,
+            "rows": rows,
+            "found": count,
+            "faults": [fault.as_dict() for fault in part.faults],
+            "stored": stored,
+        }
+        metadata = {**(part.strokes.schema.metadata or {}), _ABOUT: json.dumps(about)}
+        file = f"{PARTS}/{Path(name).with_suffix(ARROW)}"
+        stored[file] = write(file, part.strokes.replace_schema_metadata(metadata), parquet.write_ipc)
+    # Its strokes are not sent: whoever asked finds them on the disk, and need not hold them while other parts are read.
+    return Made(marks, rows, count, part.faults, None, asked.unused, asked.columns, columns, {}, stored)
+
+
+def stored_strokes(part: Made, folder: Path) -> pa.Table:
+    """Return the strokes of a part that was made in `folder`."""
+    return parquet.read_ipc(folder / next(name for name in part.stored if name.startswith(f"{PARTS}/")))
+
+
+def seen_by_parts(config: Config) -> str:
+    """Return in words what every part is made by, whatever its files: the version of the program and the rig."""
+    return json.dumps([__version__, FORMAT, config.model_dump(mode="json")])
+
+
+def part_key(
+    files: Sequence[str], known: Mapping[str, np.ndarray], hashes: Sequence[str | None], seen: str
+) -> str | None:
+    """Return a hash of what a part is made from, or None where a file's content is not known.
+
+    Parameters
+    ----------
+    files : sequence of str, length n
+        Its files.
+    known : dict of str to ndarray, each of shape (n,)
+        What is known of them, in words: the columns in which any of them has a value.
+    hashes : sequence of str or None, length n
+        Of their content.
+    seen : str
+        What `seen_by_parts` says.
+    """
+    if None in hashes:
+        return None
+    cells = chain.from_iterable(words.tolist() for words in known.values())
+    told = [seen, json.dumps(list(known)), *files, *hashes, *cells]
+    # Words may hold any mark, so that their lengths are told too.
+    lengths = np.fromiter(map(len, told), np.int64, len(told))
+    return hashlib.sha256(lengths.tobytes() + "".join(told).encode("utf-8", "surrogatepass")).hexdigest()[:20]
+
+
+def _file_name(key: str | None, asked: Asked) -> str:
+    variant = hashlib.sha256(json.dumps([sorted(asked.unused), asked.columns], sort_keys=True).encode()).hexdigest()
+    return f"{key or uuid.uuid4().hex[:20]}-{variant[:8]}{PARQUET}"
+
+
+def known_parts(out: Path, files: Mapping[str, int]) -> dict[str, Path]:
+    """Return the stored parts that are whole, by their keys.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of results.
+    files : dict of str to int
+        Files that the last ingest left there, and their sizes in bytes.
+    """
+    whole = {Path(name).stem: out / name for name in files if name.startswith(f"{PARTS}/")}
+    for name, size in files.items():
+        if "/" in name and file_size(f"{out}/{name}") != size:
+            whole.pop(Path(name).stem, None)
+    return {name.split("-", 1)[0]: path for name, path in whole.items()}
+
+
+def load_part(path: Path) -> Made:
+    """Return a part that was stored before, without its tables."""
+    strokes = parquet.read_ipc(path)
+    about = json.loads(strokes.schema.metadata[_ABOUT])
+    unused = frozenset((file, stroke) for file, stroke in about["unused"])
+    stored = {**about["stored"], f"{PARTS}/{path.name}": path.stat().st_size}
+    faults = tuple(Fault(**fault) for fault in about["faults"])
+    given = ({}, about["rows"], about["found"], faults, strokes, unused, about["wanted"])
+    return Made(*given, about["columns"], {}, stored)
+
+
+def common_columns(parts: Sequence[Made]) -> Columns:
+    """Return the columns of each table over all parts; numbers beside words are words.
+
+    Tables of one folder must agree: a reader takes the columns of the first file for those of all.
+    """
+    common: dict[str, dict[str, str]] = {name: {} for name in SAMPLED}
+    for columns in (part.columns for part in parts):
+        for table, types in columns.items():
+            for name, kind in types.items():
+                known = common[table].setdefault(name, kind)
+                if known != kind:
+                    common[table][name] = "string" if "string" in (known, kind) else "double"
+    return common
+
+
+def agrees(part: Made, columns: Columns) -> bool:
+    """Whether the stored tables of a part have these columns, in this order."""
+    has = {table: (part.wanted or part.columns)[table] for table in part.columns}
+    return all(list(types.items()) == list(columns[table].items()) for table, types in has.items())
+
+
+@contextlib.contextmanager
+def _whole_files(folder: Path) -> Iterator[Callable[[str, pa.Table, Callable], int]]:
+    """Give a function that writes a table to a file below `folder` and returns its size.
+
+    All are on the disk and in their places when the block ends, each whole or not there at all; two processes that
+    write the same do not disturb each other.
+    """
+    drafts: dict[Path, Path] = {}
+
+    def write(file: str, table: pa.Table, how: Callable[[pa.Table, Path], None]) -> int:
+        path = folder / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        drafts[path] = draft = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+        how(table, draft)
+        return draft.stat().st_size
+
+    try:
+        yield write
+        with ThreadPoolExecutor() as pool:  # several files reach the disk in hardly more time than one
+            list(pool.map(sync, drafts.values()))
+        for path, draft in drafts.items():
+            os.replace(draft, path)
+    finally:
+        for draft in drafts.values():
+            draft.unlink(missing_ok=True)

@@ -1,0 +1,394 @@
+"""Checks of a trace: single samples that cannot be right, and a speed that is not the commanded one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from sealfit.config import Config, Quality
+from sealfit.errors import ConfigError, Fault
+from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.segments import Pieces, median, quantile, running_median
+from sealfit.ingest.strokes import Stroke, displacement_noises_mm
+from sealfit.units import Units
+
+# ---------------------------------------------------------------- spikes
+# Single samples that cannot be right: a displacement that jumps away and back, a force far off its neighbours.
+
+NEIGHBOURS = 5  # a median over five samples is blind to one or two wrong ones, and exact on any slope
+# A spike stands apart, four times as far off as 95 % of the samples (of noise: 7.8 SDs); else it is one of many bursts.
+APART, USUAL = 4.0, 0.95
+STEPS = 5.0  # a spike of displacement is off by more than so many of the usual steps: see `displacement_spikes`
+FIX = "Correct the cell if the true value is known."
+
+
+def displacement_suspects(
+    displacement_mm: np.ndarray, traces: Pieces, noise_mm: np.ndarray, settings: Quality
+) -> np.ndarray:
+    """Return which traces may hold a spike of displacement, shape (traces,): of the others none is found."""
+    off = np.abs(displacement_mm - running_median(displacement_mm, traces, NEIGHBOURS, "mirror"))
+    farthest = traces.max(off)
+    # Where more than half of the steps are as large as a share of the farthest, so is their median.
+    large = np.abs(traces.steps(displacement_mm)) >= traces.spread(farthest * ((1.0 + 1e-9) / STEPS))
+    return (
+        (traces.size >= 4 * NEIGHBOURS)
+        & (farthest > settings.spike_sigma * noise_mm)
+        & (2 * traces.sum(large) < traces.size + 1)
+    )
+
+
+def force_suspects(force_N: np.ndarray, steady: np.ndarray, traces: Pieces, settings: Quality) -> np.ndarray:
+    """Return which traces may hold a spike of force, shape (traces,): of the others none is found."""
+    off = np.abs(force_N - running_median(force_N, traces, NEIGHBOURS, "mirror"))
+    # Where more than half of the usual samples are off by a share of the farthest, so is their median.
+    noisy = off >= traces.spread(traces.max(off) * ((1.0 + 1e-9) / (1.4826 * settings.spike_sigma)))
+    usual = traces.sum(steady)
+    usual, noisy = np.where(usual > 0, (usual, traces.sum(noisy & steady)), (traces.size, traces.sum(noisy)))
+    may = (traces.size >= 4 * NEIGHBOURS) & (2 * noisy < usual + 2)
+    if not may.any():
+        return may
+    limit = np.full(len(traces), np.inf)
+    for i in np.flatnonzero(may).tolist():
+        own = off[traces.slices[i]]
+        inside = own[steady[traces.slices[i]]]
+        limit[i] = settings.spike_sigma * (1.4826 * median(inside if len(inside) else own))
+    far = off > traces.spread(limit)
+    return traces.sum(far & (steady | _beyond(force_N, far, traces))) > 0
+
+
+def _beyond(force_N: np.ndarray, suspects: np.ndarray, traces: Pieces) -> np.ndarray:
+    """Return which samples reach beyond their trace without its suspects by half of its range, shape (n,)."""
+    rest = np.where(suspects, 0.0, force_N)  # at rest the force may be zero
+    low, high = np.minimum(traces.min(rest), 0.0), np.maximum(traces.max(rest), 0.0)
+    reach = np.maximum(traces.spread(low) - force_N, force_N - traces.spread(high))
+    return reach > traces.spread(0.5 * (high - low))
+
+
+def displacement_spikes(
+    file: str, displacement_mm: np.ndarray, line: np.ndarray, settings: Quality
+) -> tuple[np.ndarray, list[Fault]]:
+    """Return which rows to keep, shape (n,): not those whose displacement jumps away and back; a finding for each.
+
+    More than `max_bad_rows` of them are the nature of the signal, and all are kept.
+    """
+    keep = np.ones(len(displacement_mm), bool)
+    if len(displacement_mm) < 4 * NEIGHBOURS:
+        return keep, []
+    one = Pieces([len(displacement_mm)])
+    off = displacement_mm - running_median(displacement_mm, one, NEIGHBOURS, "mirror")
+    # At a turn the median lags by one step of the fastest samples around, never by more than a few of the usual ones.
+    step = median(np.abs(np.diff(displacement_mm)))
+    (noise,) = displacement_noises_mm(displacement_mm, one)
+    least = max(STEPS * step, APART * quantile(np.abs(off), USUAL), 1e-9 * float(np.ptp(displacement_mm)))
+    spikes = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, least))
+    if len(spikes) > settings.max_bad_rows * len(off):
+        return keep, []
+    keep[spikes] = False
+    return keep, [_spike(file, None, "displacement_mm", displacement_mm[i], off[i], line[i]) for i in spikes]
+
+
+def force_spikes(
+    file: str, force_N: np.ndarray, strokes: Sequence[Stroke], line: np.ndarray, settings: Quality
+) -> tuple[np.ndarray, list[Fault]]:
+    """Return which rows to keep, shape (n,): not single samples of force far off their neighbours; a finding for each.
+
+    "Far" is `spike_sigma` robust standard deviations of what the samples of the steady windows are off the median of
+    their neighbours, and apart from the bulk of these. Outside the windows, where a break-away peak may be as sharp,
+    a spike must also reach beyond the rest of the trace by half of its range. More than `max_bad_rows` spikes are the
+    nature of the signal: said, and kept.
+    """
+    keep = np.ones(len(force_N), bool)
+    if len(force_N) < 4 * NEIGHBOURS:
+        return keep, []
+    one, steady = Pieces([len(force_N)]), np.zeros(len(force_N), bool)
+    off = force_N - running_median(force_N, one, NEIGHBOURS, "mirror")
+    for stroke in strokes:
+        steady[stroke.rows] = True
+    usual = off[steady] if steady.any() else off
+    least = max(0.5 * resolution(force_N), 1e-9 * median(np.abs(force_N)), 1e-300)
+    noise = max(1.4826 * median(np.abs(usual)), least)
+    apart = APART * quantile(np.abs(usual), USUAL)
+    suspects = np.abs(off) > max(settings.spike_sigma * noise, apart)
+    if not suspects.any():
+        return keep, []
+    spikes = np.flatnonzero(suspects & (steady | _beyond(force_N, suspects, one)))
+    if len(spikes) > settings.max_bad_rows * len(force_N):
+        reason = f"{len(spikes)} samples jump away from their neighbours: too many to be single wrong samples."
+        fix = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
+        value = float(len(spikes))
+        return keep, [
+            Fault("spikes", reason, file, None, None, "force_N", value, severity="warning", action="kept", fix=fix)
+        ]
+    keep[spikes] = False
+    starts = np.array([stroke.start for stroke in strokes])
+    several = len(strokes) > 1
+    found = []
+    for i in spikes:
+        number = int(np.searchsorted(starts, i, side="right")) if several else None
+        found.append(_spike(file, number, "force_N", force_N[i], off[i], line[i]))
+    return keep, found
+
+
+def resolution(values: np.ndarray) -> float:
+    """Return the smallest step between different values: the sensor's resolution if coarse, else next to nothing."""
+    different = np.unique(values)
+    return float(np.diff(different).min()) if len(different) > 1 else 0.0
+
+
+def _spike(file: str, stroke: int | None, column: str, value: float, off: float, line: int) -> Fault:
+    return Fault(
+        "spike",
+        f"a single sample, {abs(off):.4g} off its neighbours.",
+        file=file,
+        stroke=stroke,
+        line=int(line),
+        column=column,
+        value=float(value),
+        severity="warning",
+        action="row left out",
+        fix=FIX,
+    )
+
+
+# ---------------------------------------------------------------- speed unit
+# From the slope of displacement over time to the unit that the campaign's speed is stated in.
+
+LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "µm": 1e-6, "um": 1e-6, "μm": 1e-6, "in": 25.4e-3}
+ANGLE = {"turn": 2 * math.pi, "rev": 2 * math.pi, "rad": 1.0, "deg": math.pi / 180, "°": math.pi / 180}
+TIME = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+SHORT = {"rpm": ("turn", "min"), "rps": ("turn", "s")}
+
+
+def speed_factor(units: Units) -> float:
+    """Return what turns displacement unit per time unit into the speed's unit: 60 for turn, s and rpm; 1 for mm, s
+    and mm/s.
+
+    Raises
+    ------
+    ConfigError
+        If the units do not fit together (turn and mm/s), or are not known and not spelled "<displacement>/<time>".
+
+    Examples
+    --------
+    >>> speed_factor(Units({"displacement": ("angle", "turn"), "speed": ("speed", "rpm")}))
+    60.0
+    """
+    displacement, time, speed = (units.unit(slot) for slot in ("displacement", "time", "speed"))
+    way, _, per = speed.partition("/") if speed not in SHORT else (SHORT[speed][0], "/", SHORT[speed][1])
+    if (way, per) == (displacement, time):
+        return 1.0
+    for sizes in (LENGTH, ANGLE):
+        if {way, displacement} <= sizes.keys() and {per, time} <= TIME.keys():
+            return (sizes[displacement] / sizes[way]) * (TIME[per] / TIME[time])
+    raise ConfigError(
+        f"displacement in {displacement!r} over time in {time!r} does not give a speed in {speed!r}.",
+        column="quantities",
+        fix=f"Declare the speed's unit as '{displacement}/{time}', or units known here: "
+        f"{', '.join([*LENGTH, *ANGLE, *TIME, *SHORT])}.",
+    )
+
+
+# ---------------------------------------------------------------- speed check
+# Does the displacement move as fast as commanded? A factor that is wrong in a known way names the unit mixed up.
+
+BLOCKS = 100  # pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke
+FEWEST = 6  # pieces of which a noisy trace is cut at least: a rest at either end, and sliding between
+NOISE_OF_PATH = 0.1  # noise of a step between the means of two pieces, as a share of the step
+GROSS = 1.5  # beyond this factor the file contradicts itself and is left out; below, the commanded speed may be nominal
+
+
+def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
+    """Return the mean speed of a trace, rests included, and its plateau speed: see `measured_speeds`.
+
+    Examples
+    --------
+    >>> t = np.linspace(0.0, 10.0, 201)
+    >>> mean, plateau = measured_speed(t, np.where(t < 5, 3 * t, 15.0))  # slides at 3 mm/s, then rests
+    >>> round(mean, 6), round(plateau, 6)
+    (1.5, 3.0)
+    """
+    mean, plateau = measured_speeds(time_s, displacement_mm, Pieces([len(time_s)]))
+    return float(mean[0]), float(plateau[0])
+
+
+def measured_speeds(time_s: np.ndarray, displacement_mm: np.ndarray, traces: Pieces) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean speed of every trace, rests included, and its plateau speed; magnitudes, nan if there is none.
+
+    Parameters
+    ----------
+    time_s, displacement_mm : ndarray, shape (n,)
+        Rising time and displacement of traces, one after the other, in any unit; the speeds are in their quotient.
+    traces : Pieces
+        Where each of them lies.
+
+    Notes
+    -----
+    A trace is cut into 100 pieces, or 50 per stroke. The mean is that of all pieces; the plateau is the median of
+    those faster than half their 90th percentile, so rests, turns and ramps do not count. In stick-slip the speed that
+    was set is the mean, in a stroke with rests it is the plateau; elsewhere the two agree.
+    """
+    pieces = np.full(len(traces), BLOCKS)
+    for i in np.flatnonzero(~_slides_once(displacement_mm, traces)).tolist():
+        pieces[i] *= max(1, _strokes(displacement_mm[traces.slices[i]]) // 2)
+    cuts = np.minimum(traces.size, pieces + 1)
+    mean, plateau = np.full(len(traces), np.nan), np.full(len(traces), np.nan)
+    for count in np.unique(cuts[cuts > 1]).tolist():
+        alike = np.flatnonzero(cuts == count)
+        at = np.linspace(0, traces.size[alike] - 1, count, axis=1).astype(np.int64) + traces.start[alike, None]
+        mean[alike], plateau[alike] = _of_cuts(time_s[at], displacement_mm[at])
+    return mean, plateau
+
+
+def _of_cuts(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and plateau of traces of which so many rows are given, shape (traces, rows)."""
+    with np.errstate(all="ignore"):  # beyond 1e308 there is no speed: nan or inf, and no check
+        path, time = np.abs(np.diff(displacement_mm)), np.diff(time_s)
+        speeds = np.sort(path / time)
+        usual = np.quantile(speeds, 0.9, axis=1)
+        slow = (speeds <= 0.5 * usual[:, None]).sum(axis=1)
+        fast = speeds.shape[1] - slow
+        # The middle of those that are faster, which stand at the end.
+        ends = np.minimum(slow + np.array([(fast - 1) // 2, fast // 2]), speeds.shape[1] - 1)
+        low, high = np.take_along_axis(speeds, ends.T, axis=1).T
+        return path.sum(axis=1) / time.sum(axis=1), np.where(fast > 0, (low + high) / 2.0, np.nan)
+
+
+def _slides_once(displacement_mm: np.ndarray, traces: Pieces) -> np.ndarray:
+    """Return which traces surely hold less than four strokes, shape (traces,).
+
+    A stroke, as `_strokes` counts it, covers half of what lies between the 1st and the 99th percentile. Where a
+    hundredth of the samples lies in the tenth at either end, that is 0.4 of the range.
+    """
+    low, high = traces.min(displacement_mm), traces.max(displacement_mm)
+    tenth, few = 0.1 * (high - low), 0.01 * (traces.size - 1) + 1.0
+    below = traces.sum(displacement_mm <= traces.spread(low + tenth))
+    above = traces.sum(displacement_mm >= traces.spread(high - tenth))
+    path = traces.sum(np.abs(traces.steps(displacement_mm)))
+    return (below >= few + 1.0) & (above >= few + 1.0) & (path < 4.0 * 0.4 * (high - low))
+
+
+def _strokes(displacement_mm: np.ndarray) -> int:
+    """Return how often the trace goes from its lowest quarter to its highest or back: roughly, its strokes."""
+    low, high = quantile(displacement_mm, 0.01), quantile(displacement_mm, 0.99)
+    ends = displacement_mm[
+        (displacement_mm < low + 0.25 * (high - low)) | (displacement_mm > high - 0.25 * (high - low))
+    ]
+    return int(np.count_nonzero(np.diff(ends > 0.5 * (low + high))))
+
+
+def speed_faults(
+    time_s: np.ndarray, displacement_mm: np.ndarray, traces: Pieces, refs: Sequence[TraceRef], config: Config
+) -> list[Fault | None]:
+    """Return, for every trace, a fault if time and displacement disagree with the commanded speed.
+
+    None if they agree or no speed is commanded. They agree if the commanded speed lies between the measured mean and
+    the plateau, or misses them by no more than `quality.speed_disagreement`. Up to a factor of 1.5 the file is kept
+    with a warning: every table holds the measured speed. Beyond, the file is left out, and the fix names the mix-up
+    that fits the factor. Arguments as in `measured_speeds`.
+    """
+    commanded = [_commanded(ref) for ref in refs]
+    if not any(commanded):
+        return [None] * len(refs)
+    factor = speed_factor(config.units)
+    speeds = (factor * speed for speed in measured_speeds(time_s, displacement_mm, traces))
+    faults: list[Fault | None] = []
+    for ref, speed, mean, plateau, own in zip(
+        refs, commanded, *(s.tolist() for s in speeds), traces.slices, strict=True
+    ):
+        fault = None
+        if speed and 0 < plateau < math.inf and mean < math.inf:  # else nothing moves: said where strokes are sought
+            fault = _disagreement(ref, speed, mean, plateau, time_s[own], displacement_mm[own], config)
+        faults.append(fault)
+    return faults
+
+
+def _commanded(ref: TraceRef) -> float | None:
+    speed = ref.channels.get("speed_set_mm_s")
+    return speed if isinstance(speed, int | float) and speed > 0 else None
+
+
+def _disagreement(
+    ref: TraceRef,
+    commanded: float,
+    mean: float,
+    plateau: float,
+    time_s: np.ndarray,
+    displacement: np.ndarray,
+    config: Config,
+) -> Fault | None:
+    tolerance = config.quality.speed_disagreement
+    measured = _nearest(commanded, mean, plateau)
+    if abs(measured / commanded - 1) <= tolerance:
+        return None
+    of_means = speed_factor(config.units) * np.array(_speeds_of_means(time_s, displacement))
+    if np.isfinite(of_means).all():
+        measured = _nearest(commanded, *of_means.tolist())
+    ratio = measured / commanded
+    if abs(ratio - 1) <= tolerance:
+        return None
+    unit = config.units.unit("speed")
+    reason = f"displacement over time gives {measured:.4g} {unit}, commanded are {commanded:.4g} {unit}."
+    gross = not 1 / GROSS <= ratio <= GROSS
+    fix = (
+        _mix_up(ratio, time_s, displacement, tolerance) if gross else "Check the commanded speed, or slip in the drive."
+    )
+    return Fault(
+        "speed_disagreement",
+        reason,
+        file=ref.file,
+        column="displacement_mm",
+        value=measured,
+        severity="error" if gross else "warning",
+        action="file left out" if gross else "kept",
+        fix=fix,
+    )
+
+
+def _nearest(commanded: float, mean: float, plateau: float) -> float:
+    """Return what lies between the mean and the plateau speed and nearest to the commanded one."""
+    return min(max(commanded, min(mean, plateau)), max(mean, plateau))
+
+
+def _speeds_of_means(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
+    """Return mean and plateau speed of one trace from the means of pieces, as few as its noise asks for; else nan.
+
+    The mean of a piece of m samples has a noise of sd / sqrt(m), and two make a step; the path of `count` steps is
+    longer by noise that must stay small beside the travel.
+    """
+    n, travel = len(time_s), float(np.ptp(displacement_mm))
+    noise = float(displacement_noises_mm(displacement_mm, Pieces([n]))[0])
+    if noise <= 0.0 or n < 2 * FEWEST:
+        return math.nan, math.nan
+    count = int((NOISE_OF_PATH * travel / noise * math.sqrt(n / 2.0)) ** (2.0 / 3.0))
+    if not FEWEST <= count < BLOCKS:
+        return math.nan, math.nan
+    cut = np.linspace(0, n, count + 1).astype(np.int64)
+    means = [np.add.reduceat(values, cut[:-1]) / np.diff(cut) for values in (time_s, displacement_mm)]
+    mean, plateau = _of_cuts(*(values[None, :] for values in means))
+    return float(mean[0]), float(plateau[0])
+
+
+def _mix_up(ratio: float, time_s: np.ndarray, displacement: np.ndarray, tolerance: float) -> str:
+    """Return the likely fix for a measured speed that is `ratio` times the commanded one."""
+    step, travel = float(np.median(np.diff(time_s))), float(np.ptp(displacement))
+    time_in_ms = 'Is the time in ms? Set compute.time_s = "time_ms / 1000" in the rig config.'
+    metres = "Is the displacement in m? Compute displacement_mm from it, times 1000."
+    known = (
+        # Both are a factor of 1000: rigs sample faster than once a second and travel farther than 1 mm.
+        (1e-3, time_in_ms if step >= 0.5 or travel >= 1.0 else metres),
+        (1e3, "Is the displacement in µm, or the commanded speed in m/s?"),
+        (1e-6, "Is the time in µs, or in ms with the displacement in m?"),
+        (0.1, "Is the displacement in cm?"),
+        (10.0, "Is the commanded speed in cm/s?"),
+        (1 / 25.4, "Is the displacement in inches?"),
+        (60.0, "Is the time in minutes?"),
+        (1 / 60.0, "Is the commanded speed per minute, not per second?"),
+        (3600.0, "Is the time in hours?"),
+        (1000.0 / 60.0, "Is the commanded speed in m/min?"),
+    )
+    factor, fix = min(known, key=lambda row: abs(math.log(ratio / row[0])))
+    if abs(math.log(ratio / factor)) <= math.log1p(tolerance):
+        return fix
+    return "Check the commanded speed, the decimal mark, and the units of time and displacement."

@@ -1,0 +1,209 @@
+"""Laws of aging: Eq. 15, in the form that data determine and in the one that is printed, and its rivals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sealfit.errors import ParameterError
+
+# ---------------------------------------------------------------- aging
+# The aging law (Eq. 15), in the form that data determine and in the form that is printed.
+
+
+def _checked(days, b):
+    days, b = np.asarray(days, float), np.asarray(b, float)
+    if not np.all(b > 0):
+        raise ParameterError(f"b = {np.min(b):g} d: the aging law needs b > 0.", fix="Give b > 0.")
+    if np.any(days < 0):
+        raise ParameterError(f"aging_days = {np.min(days):g}: aging time cannot be negative.")
+    return days, b
+
+
+def aging_law(days, *, mu_0, a, b):
+    r"""Coefficient (or force) after aging, in the unit of `mu_0`.
+
+    .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b)
+
+    This is Eq. 15 with c = -a ln b, the only c for which mu(0) = mu_0. Eq. 15 itself has one parameter too many: with
+    mu_0 fitted as well, only mu_0 - c is determined.
+
+    Parameters
+    ----------
+    days : float or ndarray, shape (n,)
+        Aging time t in days, from 0.
+    mu_0, a, b : float or ndarray
+        Value of the unaged rubber; loss per e-fold of time, same unit; time after which the loss sets in, in days.
+
+    Raises
+    ------
+    ParameterError
+        If any `b` is not positive or any time is negative.
+
+    Notes
+    -----
+    Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102, Eq. 15.
+
+    Examples
+    --------
+    >>> round(float(aging_law(4.0, mu_0=0.93566, a=0.04448, b=0.0804)), 4)
+    0.761
+    """
+    days, b = _checked(days, b)
+    return np.asarray(mu_0, float) - np.asarray(a, float) * np.log1p(days / b)
+
+
+def aging_constant(a, b):
+    """The c of Eq. 15 that belongs to the identifiable law, c = -a ln b, in the unit of `a`.
+
+    Raises
+    ------
+    ParameterError
+        If any `b` (in days) is not positive.
+
+    Examples
+    --------
+    >>> round(float(aging_constant(0.04448, 0.0804)), 4)
+    0.1121
+    """
+    _, b = _checked(0.0, b)
+    return -np.asarray(a, float) * np.log(b)
+
+
+def aging_law_as_printed(days, *, mu_0, a, b, c):
+    r"""Coefficient after aging as Eq. 15 is printed, with its four parameters.
+
+    .. math:: \mu(t) = \mu_0 - a \ln(t + b) - c
+
+    Parameters and errors as `aging_law`; `c` has the unit of `mu_0`.
+
+    Examples
+    --------
+    >>> round(float(aging_law_as_printed(16.0, mu_0=0.93513, a=0.04448, b=0.0804, c=0.11159)), 4)
+    0.7
+    """
+    days, b = _checked(days, b)
+    return np.asarray(mu_0, float) - np.asarray(a, float) * np.log(days + b) - np.asarray(c, float)
+
+
+# ---------------------------------------------------------------- losses
+# Shapes that the loss of friction by aging may have over time: Eq. 15 and its rivals.
+#
+# All are :math:`\mu(t) = \mu_0 - a\, \varphi(t)` with :math:`\varphi(0) = 0`:
+#
+# - ``log``, Eq. 15: :math:`\ln(1 + t/b)`. Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102.
+# - ``stretched``: :math:`1 - e^{-(t/\tau)^\beta}`, a floor of :math:`\mu_0 - a` that is approached as relaxation in a
+#   glassy or cross-linked network is. Kohlrausch 1854, Ann. Phys. 167, 56-82, doi:10.1002/andp.18541670103.
+# - ``power``: :math:`t^n` with t in days; n = 1/2 where diffusion sets the pace. Findley, Lai & Onaran 1976, Creep and
+#   Relaxation of Nonlinear Viscoelastic Materials, chapter 2.
+# - ``induction``: :math:`\ln(1 + \max(t - t_i, 0)/b)`, nothing before the stabiliser is used up. For induction periods
+#   of elastomers: Celina 2013, Polym. Degrad. Stab. 98(12), 2419-2429, doi:10.1016/j.polymdegradstab.2013.06.024.
+
+
+@dataclass(frozen=True)
+class Loss:
+    """One shape of the loss over time.
+
+    Attributes
+    ----------
+    name : str
+        As above.
+    form : str
+        Equation in plain text.
+    parameters : tuple of str
+        Its own numbers, all positive: times in days, exponents.
+    units : tuple of str
+        Of these.
+    value : callable
+        (days, own numbers) -> phi, broadcast.
+    time : callable
+        (phi, own numbers) -> days until the loss is phi; inf where it is never reached.
+    slopes : callable
+        (days, own numbers) -> derivative of phi along ln t, and along the logarithm of each own number; broadcast.
+    """
+
+    name: str
+    form: str
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    value: Callable
+    time: Callable
+    slopes: Callable
+
+
+def _log(days, b):
+    return np.log1p(np.asarray(days, float) / b)
+
+
+def _log_time(phi, b):
+    return b * np.expm1(phi)
+
+
+def _log_slopes(days, b):
+    share = np.asarray(days, float) / (b + days)
+    return share, -share
+
+
+def _stretched(days, tau, beta):
+    return -np.expm1(-((np.asarray(days, float) / tau) ** beta))
+
+
+def _stretched_time(phi, tau, beta):
+    phi = np.asarray(phi, float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(phi < 1, tau * (-np.log1p(-np.minimum(phi, 1.0))) ** (1 / beta), np.inf)
+
+
+def _stretched_slopes(days, tau, beta):
+    ratio = np.asarray(days, float) / tau
+    power = ratio**beta
+    bend = beta * power * np.exp(-power)
+    return bend, -bend, bend * np.log(np.where(ratio > 0, ratio, 1.0))
+
+
+def _power(days, n):
+    return np.asarray(days, float) ** n
+
+
+def _power_time(phi, n):
+    return np.asarray(phi, float) ** (1 / n)
+
+
+def _power_slopes(days, n):
+    days = np.asarray(days, float)
+    bend = n * days**n
+    return bend, bend * np.log(np.where(days > 0, days, 1.0))
+
+
+def _induction(days, b, t_i):
+    return np.log1p(np.maximum(np.asarray(days, float) - t_i, 0.0) / b)
+
+
+def _induction_time(phi, b, t_i):
+    return t_i + b * np.expm1(phi)
+
+
+def _induction_slopes(days, b, t_i):
+    late = np.maximum(np.asarray(days, float) - t_i, 0.0)
+    per_day = (late > 0) / (b + late)
+    return days * per_day, -late * per_day, -t_i * per_day
+
+
+LOSSES = {
+    loss.name: loss
+    for loss in (
+        Loss("log", "mu_0 - a ln(1 + t/b)", ("b",), ("d",), _log, _log_time, _log_slopes),
+        Loss(
+            "stretched", "mu_0 - a (1 - exp(-(t/tau)^beta))", ("tau", "beta"), ("d", ""),
+            _stretched, _stretched_time, _stretched_slopes,
+        ),
+        Loss("power", "mu_0 - a t^n", ("n",), ("",), _power, _power_time, _power_slopes),
+        Loss(
+            "induction", "mu_0 - a ln(1 + max(t - t_i, 0)/b)", ("b", "t_i"), ("d", "d"),
+            _induction, _induction_time, _induction_slopes,
+        ),
+    )
+}  # fmt: skip
+"""Every shape by name."""

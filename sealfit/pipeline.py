@@ -1,0 +1,278 @@
+"""One function per command: read tables from OUT, call the pure functions, write what they return."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sealfit.engine.run_map import on_cluster
+from sealfit.errors import CampaignError, Fault
+from sealfit.progress import Silent, timed
+from sealfit.store.manifest import STEPS, ConfigCopy, fingerprint, glob_names
+from sealfit.store.out_folder import Store
+from sealfit.store.paths import RUNS, campaign_folder, existing_out, own_effects_folder
+from sealfit.store.staged_writes import Staged
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
+CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
+AFTER = (
+    "steady_after", "steady_fit_after", "aging_fit_after", "aging_curves_after", "aging_laws_after",
+    "master_curve_after", "dynamic_fit_after", "dynamic_curves_after",
+)  # fmt: skip
+FITTED = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
+UNREPORTED = ("traces", "bins", "steady_after")  # of many rows, and nothing in the report needs them
+TRACE = ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"]
+REPORTED = {  # of tables with a row per bin, what the report looks at
+    f"residuals_{stage}": ["condition", "run_id", "file", "residual_N", "heldout_residual_N"]
+    for stage in ("before", "after")
+}
+FAULTY = ("warning", "error")  # severities that count as a fault
+
+Counted = tuple[int, str]
+"""How many rows a step worked on, and what they are."""
+
+Work = Callable[[Store, Staged, int, Silent], Counted]
+
+
+def run(
+    campaign: Path,
+    out: Path,
+    config: Path | None = None,
+    *,
+    steps: tuple[str, ...] = STEPS,
+    workers: int = 1,
+    scheduler: str | None = None,
+    force: bool = False,
+    strict: bool = False,
+    effects_folder: Path | None = None,
+    progress: Silent | None = None,
+) -> dict:
+    """Do every step of `steps` that is not current, in order, and return the summary of all of them.
+
+    Parameters
+    ----------
+    campaign, out : Path
+        The campaign's folder and the folder of results.
+    config : Path or None
+        A rig config, or None for the default.
+    workers : int
+        Processes of this computer that read trace files, fit and repeat the search.
+    scheduler : str or None
+        Address or scheduler file of a Dask cluster to do that instead; it has to see both folders.
+    force : bool
+        Do current steps too.
+    strict : bool
+        Stop at any fault of the campaign, after the first step.
+    effects_folder : Path or None
+        Folder of the user's own effects, which is run; it comes before the one that the config names.
+
+    Raises
+    ------
+    SealfitError
+        CampaignError, ConfigError, OutError, FitError: whatever the user has to fix.
+    """
+    progress = progress or Silent()
+    source = ConfigCopy.at(config)
+    checked = source.parse()
+    own = own_effects_folder(effects_folder, source, out, campaign)  # before OUT is made
+    folder = campaign_folder(campaign, checked)
+    with Store.writing(out, folder, source, own) as store, on_cluster(scheduler, folder, out):
+        return _do_steps(store, steps, workers=workers, force=force, strict=strict, progress=progress)
+
+
+def ingest(campaign: Path, out: Path, config: Path | None = None, **options) -> dict:
+    """Read the campaign into OUT and return the summary; arguments as `run`."""
+    return run(campaign, out, config, steps=("ingest",), **options)
+
+
+def single(
+    step: str,
+    out: Path,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    force: bool = False,
+    effects_folder: Path | None = None,
+    progress: Silent | None = None,
+) -> dict:
+    """Do one step after the first in an OUT whose earlier steps are current, and return its summary.
+
+    Raises
+    ------
+    StaleError
+        If a step before it is missing or stale; it names the command to run.
+    RequestError
+        If close-loop needs the user's own effects and no `effects_folder` is given.
+    """
+    with Store.writing(existing_out(out), effects=effects_folder) as store, on_cluster(scheduler, out):
+        store.require(STEPS[STEPS.index(step) - 1])
+        return _do_steps(store, (step,), workers=workers, force=force, strict=False, progress=progress or Silent())
+
+
+def _do_steps(
+    store: Store, steps: tuple[str, ...], *, workers: int, force: bool, strict: bool, progress: Silent
+) -> dict:
+    from sealfit.report import summary
+
+    for warning in store.warnings:
+        progress.warn(warning)
+    store.anew = force
+    done = []
+    for step in steps:
+        why = store.why_stale(step)
+        if why or force:
+            if why and step in store.state.steps:
+                progress.say(why)
+            with timed(step) as part, store.step(step) as staged:
+                part.rows, part.of = _WORK[step](store, staged, workers, progress)
+            done.append(step)
+        else:
+            progress.say(f"{step}: current, not redone")
+        if step == "ingest" and strict:
+            _refuse_faults(store.read("quality"))
+    with timed("summary"):
+        found = summary.of_steps(store, steps)
+    return {"out": str(store.out), "done": done, **found}
+
+
+def _refuse_faults(quality: pd.DataFrame) -> None:
+    faults = faults_of(quality)
+    if faults:
+        raise CampaignError(faults)
+
+
+def faults_of(quality: pd.DataFrame) -> list[Fault]:
+    """Return the faults that a quality table holds; rows of severity "info" are none."""
+    rows = quality[quality["severity"].isin(FAULTY)].astype(object)
+    rows = rows.where(rows.notna(), None)
+    whole = {name: rows[name].map(lambda n: None if n is None else int(n)) for name in ("stroke", "line")}
+    return [Fault(**row) for row in rows.assign(**whole).to_dict("records")]
+
+
+# ---------------------------------------------------------------- the work of each step; how many rows of what it saw
+def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+    with timed("loading libraries"):
+        from sealfit.ingest.campaign import Place, ingest_campaign
+
+    campaign, config = store.state.campaign, store.seen_config("ingest")
+    runs_before = fingerprint(campaign / RUNS)  # as it was when the reading began
+    place = Place(staged.folder(), store.parts(), store.marks)
+    with progress.counting("reading trace files") as on_file:
+        ingested = ingest_campaign(campaign, config, workers=workers, on_file=on_file, place=place)
+    progress.faults(ingested.faults)
+    with timed("writing tables"):
+        for name, table in ingested.tables.items():
+            staged.table(name, table)
+    staged.adopt(ingested.stored)
+    marks = ingested.marks
+    named = {fault.file for fault in ingested.faults if fault.file} | set(glob_names(campaign, config.files))
+    # Missing or unreadable: if that changes, the campaign has changed.
+    marks |= {name: fingerprint(campaign / name) for name in sorted(named - marks.keys())}
+    staged.inputs = marks | {RUNS: runs_before}
+    return int(ingested.tables["inputs"]["rows"].sum()), "samples"
+
+
+def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+    from sealfit.fit.steady.fit import fit_conditions
+
+    steady = store.read("steady")
+    progress.say(f"fitting {steady['condition'].nunique()} conditions")
+    staged.table("steady_fit", fit_conditions(steady, store.seen_config("fit-steady"), workers=workers))
+    return len(steady), "strokes"
+
+
+def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+    from sealfit.fit.aging.all_series import joint_laws
+    from sealfit.fit.aging.series import aging_curves, fit_series
+
+    config = store.seen_config("fit-aging")
+    if config.aging:
+        progress.say("fitting the aging law")
+    else:
+        progress.say("no aging_days in the condition: there is no aging law to fit")
+    steady_fit = store.read("steady_fit")
+    fitted = fit_series(steady_fit, config)
+    laws, curve = joint_laws(store.read("steady"), steady_fit, config, workers=workers)
+    staged.table("aging_laws", laws)
+    staged.table("master_curve", curve)
+    staged.table("aging_fit", fitted)
+    staged.table("aging_curves", aging_curves(fitted))
+    return int(steady_fit["condition"].nunique()), "conditions"
+
+
+def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+    from sealfit.fit.dynamic.fit import fit_dynamic
+
+    progress.say("fitting the pre-sliding part")
+    tables, config = (store.read("steady"), store.read("steady_fit")), store.seen_config("fit-dynamic")
+    found = fit_dynamic(store.traces(), *tables, config, workers=workers)
+    staged.table("dynamic_fit", found.fit)
+    staged.table("dynamic_curves", found.curves)
+    return len(tables[0]), "strokes"
+
+
+def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+    from sealfit.closure.after import after_fits
+    from sealfit.closure.loop import close_loop
+
+    store.require_effects()
+    config = store.seen_config("close-loop")
+    closure = close_loop(store.read("bins"), store.traces(), config, workers=workers, on_progress=progress.say)
+    if closure.tables["effects"].size:
+        progress.say("the fits with the effects taken out")
+    after = after_fits(closure.after, store.read("steady"), store.traces(), config, workers=workers)
+    with timed("writing tables"):
+        for name, table in {**closure.tables, **after}.items():
+            staged.table(name, table)
+    started = store.read("runs", ["started_at"])["started_at"].dropna()
+    staged.json("model", {**closure.model, "first_started_at": min(started) if len(started) else None})
+    staged.json("closure", closure.document)
+    return len(closure.tables["residuals_before"]), "bins"
+
+
+def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+    from sealfit.report.page import build_report
+
+    progress.say("drawing the report")
+    with timed("reading tables"):
+        tables = _reported(store, (*INGESTED, *FITTED, *CLOSED, *AFTER))
+    with timed("page"):
+        about = store.read_json("closure"), store.provenance(), store.seen_config("report")
+        report = build_report(tables, *about)
+    with timed("writing plots", rows=len(report.figures), of="plots"):
+        for name, figure in report.figures.items():
+            staged.figure(name, figure)
+    staged.text("report.html", report.html)
+    return sum(len(table) for table in tables.values()), "rows of tables"
+
+
+def _reported(store: Store, names: tuple[str, ...]) -> dict[str, pd.DataFrame]:
+    """Return of these tables what the report draws."""
+    read = [name for name in names if name not in (*UNREPORTED, "traces_mean")]
+    tables = {name: store.read(name, REPORTED.get(name)) for name in read}
+    return {**tables, "traces_mean": _example_traces(store, tables["runs"])} if "traces_mean" in names else tables
+
+
+def _example_traces(store: Store, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the averaged traces that the report draws; the table has hundreds of rows for each of all runs."""
+    from sealfit.report.figures.aging import example_runs
+
+    names = ["run_id", "condition"]
+    places = store.read("traces_mean", names, coded=names).drop_duplicates("run_id").astype(object)
+    chosen = example_runs(places, runs)["run_id"].tolist()
+    traces = store.read("traces_mean", TRACE, runs=chosen)
+    return traces.sort_values("run_id", key=lambda names: names.map(chosen.index), kind="stable")
+
+
+_WORK: dict[str, Work] = {
+    "ingest": _ingest,
+    "fit-steady": _fit_steady,
+    "fit-aging": _fit_aging,
+    "fit-dynamic": _fit_dynamic,
+    "close-loop": _close_loop,
+    "report": _report,
+}

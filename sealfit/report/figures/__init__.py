@@ -1,0 +1,36 @@
+"""All plots of a report, from its tables; each subject is drawn in a file of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pandas as pd
+
+from sealfit.config import Config
+from sealfit.report.figures.aging import aging, master_curve, traces_mean
+from sealfit.report.figures.residual import before_after, effect_shapes, residual_channels, variance_levels
+from sealfit.report.figures.speed import force_speed, starts
+from sealfit.report.style import Plot
+
+
+def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> dict[str, Plot]:
+    """Return every plot that these tables give, by name; one without data is not there.
+
+    Parameters
+    ----------
+    tables : mapping of str to DataFrame
+        The report's tables, all of them present, some perhaps empty.
+    closure : mapping or None
+        closure.json, or None where the loop was not run.
+    config : Config
+        Gives the labels their true units.
+    """
+    plots = (
+        before_after(tables, closure, config),
+        effect_shapes(tables, closure, config),
+        variance_levels(tables, config),
+        residual_channels(tables, config),
+        force_speed(tables, config),
+        *(make(tables, config) for make in (aging, master_curve, starts, traces_mean)),
+    )
+    return {plot.name: plot for plot in plots if plot is not None}

@@ -1,0 +1,350 @@
+"""Aging curves, the master curve, and a few averaged traces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter
+
+from sealfit.config import Config
+from sealfit.report.excerpts import MOST_KEYS, MOST_PANELS, rms, spread, telling
+from sealfit.report.notation import (
+    ConditionNames,
+    count,
+    given,
+    is_unaged,
+    joined,
+    number,
+    plain,
+    short,
+    symbol_math,
+    symbol_plain,
+)
+from sealfit.report.style import (
+    AFTER,
+    BLACK,
+    CYCLE,
+    FLOOR,
+    QUIET,
+    SKY,
+    Key,
+    Panel,
+    Plot,
+    evenly,
+    natural,
+    padded,
+    round_ticks,
+    shades,
+)
+from sealfit.units import Units
+
+# ---------------------------------------------------------------- figures curves
+# Aging curves, and a few averaged traces.
+
+TRACE_BUCKETS = 350  # of each, the lowest and the highest sample are drawn: what the eye can see of a trace
+MOST_TRACES = 6
+
+
+# ---------------------------------------------------------------- aging
+def draw_aging(
+    ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Units, before: pd.DataFrame | None = None
+) -> None:
+    """Draw what aging does to the coefficients of one series: the law with its band, and each condition's fit.
+
+    Parameters
+    ----------
+    ax : Axes
+        Drawn on; the caller owns the figure.
+    points : DataFrame
+        Columns quantity, aging_days, value, lo95, hi95: the fits per condition.
+    curves : DataFrame
+        Rows of table `aging_curves`.
+    units : Units
+        Give the labels their true units.
+    before : DataFrame, optional
+        Rows of the same table without the loop's effects.
+    """
+    quantities = list(dict.fromkeys([*curves["quantity"], *points["quantity"]]))
+    for k, quantity in enumerate(quantities):
+        colour, marker = CYCLE[k % len(CYCLE)], "os^Dv"[k % 5]
+        curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
+        ax.fill_between(curve["aging_days"], curve["lo95"], curve["hi95"], color=colour, alpha=0.18, linewidth=0)
+        ax.plot(curve["aging_days"], curve["value"], color=colour)
+        if before is not None:
+            earlier = before[before["quantity"] == quantity].sort_values("aging_days")
+            ax.plot(earlier["aging_days"], earlier["value"], color=colour, linestyle=":", linewidth=1.1)
+        here = points[points["quantity"] == quantity]
+        spread = np.nan_to_num(np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float))
+        ax.errorbar(
+            here["aging_days"], here["value"], np.abs(spread), color=colour, fmt=marker, elinewidth=0.8, capsize=1.5
+        )
+    ax.xaxis.set_major_locator(round_ticks(integer=True))
+    ax.set_xlabel(plain(units.label("aging_days")))
+    ax.set_ylabel(
+        "friction coefficient" if "mu_s" in quantities or "mu_c" in quantities else plain(units.label("force_N"))
+    )
+
+
+def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+    """Return the aging curves, a panel per series, or None if this campaign does not age rubber."""
+    curves = tables["aging_curves"]
+    if curves.empty or not config.aging:
+        return None
+    names = ConditionNames.of(config)
+    quantities = list(dict.fromkeys(curves["quantity"]))
+    points = aging_points(tables["steady_fit"], quantities, names)
+    series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural((names(s), None)))
+    misfit = _law_misfits(points, curves) if len(series) > MOST_PANELS else {}
+    series, note = telling(
+        series,
+        [misfit.get(s, np.nan) for s in series],
+        [names.number(s, "temperature_C") for s in series],
+        "series",
+    )
+    if note:
+        note += " All stand in steady_fit.parquet and aging_curves.parquet."
+    rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
+    before = tables.get("aging_curves_before", curves.iloc[:0])
+    shown = pd.concat([curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"]]).dropna()
+    span = padded(shown.quantile(0.002), shown.quantile(0.998))
+    right = max(curves["aging_days"].max(), points["aging_days"].max() if len(points) else 0.0)
+    unaged = points["series"].map(is_unaged).astype(bool)
+    panels = []
+    for name in series:
+        curve, earlier = curves[curves["series"] == name], before[before["series"] == name]
+        here = points[(points["series"] == name) | (unaged & (points["rubber"] == rubber.get(name)))]
+
+        def draw(ax: Axes, here=here, curve=curve, earlier=earlier) -> None:
+            draw_aging(ax, here, curve, config.units, earlier)
+            ax.set_ylim(*span)
+            ax.set_xlim(-0.03 * right, 1.03 * right)
+
+        first = float(curve["value"].iloc[0])
+        alt = f"Aging, {names(name)}: {joined([symbol_plain(q) for q in quantities])} over {number(right)} d; "
+        alt += f"{symbol_plain(quantities[0])} starts at {number(first)}."
+        panels.append(Panel(short(names(name)), alt, draw))
+    legend = [Key(q, CYCLE[k % len(CYCLE)], symbol=True) for k, q in enumerate(quantities)]
+    legend += [Key("fit per condition, 95 %", FLOOR, "point"), Key("aging law, 95 % band", FLOOR, "band")]
+    if len(before):
+        legend.append(Key("before, without the effects", FLOOR, "dotted"))
+    return Plot("aging", "Aging", tuple(panels), tuple(legend), note)
+
+
+def _law_misfits(points: pd.DataFrame, curves: pd.DataFrame) -> dict[str, float]:
+    """Return how far the conditions of every series lie from its law, as an rms of all coefficients."""
+    laws = {place: curve.sort_values("aging_days") for place, curve in curves.groupby(["series", "quantity"])}
+    gaps: dict[str, list[float]] = {}
+    for (name, quantity), own in points.groupby(["series", "quantity"]):
+        if (law := laws.get((name, quantity))) is not None:
+            expected = np.interp(own["aging_days"].astype(float), law["aging_days"], law["value"].astype(float))
+            gaps.setdefault(name, []).extend((own["value"].astype(float) - expected).tolist())
+    return {name: rms(values) for name, values in gaps.items()}
+
+
+def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str], names: ConditionNames) -> pd.DataFrame:
+    """Return the identified coefficients of every condition with the days they belong to."""
+    rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["identified"].astype(bool)]
+    rows = rows[rows["parameter"].isin(list(quantities))]
+    of = {c: 0.0 if is_unaged(c) else names.number(c, "aging_days") for c in rows["condition"].unique()}
+    days = rows["condition"].map(of).astype(float)
+    columns = ["series", "rubber", "value", "lo95", "hi95"]
+    return rows[columns].assign(quantity=rows["parameter"], aging_days=days)
+
+
+# ---------------------------------------------------------------- averaged traces
+def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
+    """Draw one run's mean force along its displacement with its standard error; the steady window is shaded.
+
+    Parameters
+    ----------
+    ax : Axes
+        Drawn on; the caller owns the figure.
+    trace : DataFrame
+        Rows of table `traces_mean` of this run; the force is drawn in the direction of motion.
+    units : Units
+        Give the labels their true units.
+    """
+    thin = envelope(along_motion(trace))
+    error = thin["force_se_N"].fillna(0)
+    ax.fill_between(
+        thin["displacement_mm"], thin["force_N"] - error, thin["force_N"] + error, color=AFTER, alpha=0.25, linewidth=0
+    )
+    whole = thin["n"] == thin["n"].max()  # where a repeat begins later, its own start pulls the mean
+    ax.plot(thin["displacement_mm"], thin["force_N"], color=SKY, linewidth=0.8)
+    ax.plot(thin["displacement_mm"], thin["force_N"].where(whole), color=AFTER, linewidth=0.9)
+    trace = trace.sort_values("displacement_mm")
+    steady = trace["steady"].astype(bool)
+    ax.fill_between(
+        trace["displacement_mm"], 0, 1, where=steady, transform=ax.get_xaxis_transform(), color=QUIET, alpha=0.12,
+        linewidth=0, zorder=0,
+    )  # fmt: skip
+    ax.set_xlabel(plain(units.label("displacement_mm")))
+    ax.set_ylabel(plain(units.label("force_N")))
+
+
+def along_motion(traces: pd.DataFrame) -> pd.DataFrame:
+    """Return traces with the force counted in the direction of motion: a force that opposes it is positive."""
+    return traces.assign(force_N=traces["force_N"] * traces["direction"])
+
+
+def envelope(trace: pd.DataFrame, buckets: int = TRACE_BUCKETS) -> pd.DataFrame:
+    """Return a trace thinned to the lowest and highest force of each bucket, so that ripples keep their height."""
+    trace = trace[trace["force_N"].notna()].sort_values("displacement_mm")
+    if len(trace) <= 2 * buckets:
+        return trace
+    bucket = (np.arange(len(trace)) * buckets) // len(trace)
+    force = trace["force_N"].reset_index(drop=True)
+    ends = force.groupby(bucket).agg(["idxmin", "idxmax"]).to_numpy().ravel()
+    return trace.iloc[np.unique(np.concatenate([ends, [0, len(trace) - 1]]))]
+
+
+def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+    """Return a few averaged traces, spread over conditions and speeds, or None if there are none."""
+    traces = tables["traces_mean"]
+    chosen = example_runs(traces, tables["runs"])
+    if chosen.empty:
+        return None
+    names, units = ConditionNames.of(config), config.units
+    shown = along_motion(traces[traces["run_id"].isin(chosen["run_id"])])["force_N"].dropna()
+    span = padded(shown.min(), shown.max())
+    panels = []
+    for run in chosen.itertuples():
+        trace = traces[traces["run_id"] == run.run_id]
+        speed = f", {given(run.speed)} {units.unit('speed')}" if np.isfinite(run.speed) else ""
+        repeats = int(trace["n"].max())
+        title = f"{names(run.condition)}{speed}"
+
+        def draw(ax: Axes, trace=trace) -> None:
+            draw_trace(ax, trace, units)
+            ax.set_ylim(*span)
+
+        alt = f"Mean trace of {title}, {count(repeats, 'stroke')} averaged: {units.quantity('force')} from "
+        alt += f"{number(trace['force_N'].min())} to {number(trace['force_N'].max())} {units.unit('force')}."
+        panels.append(Panel(short(title, 40), alt, draw))
+    counts = traces[traces["run_id"].isin(chosen["run_id"])].groupby("run_id")["n"]
+    fewer = bool((counts.min() < counts.max()).any())
+    legend = (
+        Key("mean of all repeats", AFTER),
+        *([Key("of fewer repeats", SKY)] if fewer else []),
+        Key("± standard error", AFTER, "band"),
+        Key("steady window", QUIET, "band"),
+    )
+    return Plot("traces_mean", "Averaged traces", tuple(panels), legend)
+
+
+def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return up to six runs: conditions spread evenly, and along them the speeds from slow to fast.
+
+    Parameters
+    ----------
+    traces : DataFrame
+        Columns run_id and condition of table `traces_mean`, one row or more of a run.
+    runs : DataFrame
+        Table `runs`, for the speeds.
+
+    Returns
+    -------
+    DataFrame
+        Columns run_id, condition and speed; of six runs or fewer all of them, in their order.
+    """
+    if traces.empty:
+        return pd.DataFrame(columns=["run_id", "condition", "speed"])
+    speed = runs["speed_set_mm_s"].fillna(runs["speed_mm_s"].abs()).astype(float)
+    speed = speed.groupby(runs["run_id"]).mean()
+    known = traces.drop_duplicates("run_id")[["run_id", "condition"]]
+    known = known.assign(speed=known["run_id"].map(speed).astype(float))
+    if len(known) <= MOST_TRACES:
+        return known
+    groups = [g.sort_values("speed") for _, g in known.groupby("condition", sort=False)]
+    n = min(MOST_TRACES, len(known))
+    picked = []
+    for k, place in enumerate(evenly(len(groups), n)):
+        group = groups[place]
+        left = group[~group["run_id"].isin([row["run_id"] for row in picked])]
+        if len(left):
+            picked.append(left.iloc[evenly(len(left), n)[k]])
+    return pd.DataFrame(picked)
+
+
+# ---------------------------------------------------------------- figures laws
+# The master curve: every condition's value over its aging time, scaled by the rate at its temperature.
+
+MARKERS = "os^Dv<>"
+SCALED = "scaled aging time"
+
+
+def draw_master_curve(
+    ax: Axes, rows: pd.DataFrame, colours: Mapping[float, str], units: Units, before: pd.DataFrame | None = None
+) -> None:
+    """Draw one quantity's values over scaled aging time, and the law with its 95 % band.
+
+    Parameters
+    ----------
+    ax : Axes
+        Drawn on; the caller owns the figure.
+    rows : DataFrame
+        Rows of table `master_curve`.
+    colours : mapping
+        Of each aging temperature.
+    units : Units
+        Give the labels their true units.
+    before : DataFrame, optional
+        Rows of the same table without the loop's effects: their law is drawn.
+    """
+    values, law = rows[rows["kind"] == "value"], rows[rows["kind"] == "law"].sort_values("scaled_days")
+    aged = values[values["scaled_days"] > 0]
+    ax.set_xscale("symlog", linthresh=float(aged["scaled_days"].min()), linscale=0.7)
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.fill_between(law["scaled_days"], law["lo95"], law["hi95"], color=FLOOR, alpha=0.2, linewidth=0)
+    ax.plot(law["scaled_days"], law["value"], color=FLOOR)
+    if before is not None:
+        earlier = before[before["kind"] == "law"].sort_values("scaled_days")
+        ax.plot(earlier["scaled_days"], earlier["value"], color=FLOOR, linestyle=":")
+    fresh = values[values["scaled_days"] == 0]
+    ax.plot(fresh["scaled_days"], fresh["value"], linestyle="", marker="o", color=BLACK, clip_on=False)
+    percents = np.sort(aged["compression_ratio_pct"].dropna().unique())
+    for (celsius, percent), own in aged.groupby(["temperature_C", "compression_ratio_pct"], dropna=False):
+        marker = MARKERS[int(np.searchsorted(percents, percent)) % len(MARKERS)] if np.isfinite(percent) else "o"
+        ax.plot(
+            own["scaled_days"],
+            own["value"],
+            linestyle="",
+            marker=marker,
+            markersize=4,
+            color=colours.get(celsius, BLACK),
+        )
+    quantity = str(rows["quantity"].iloc[0])
+    ax.set_xlabel(f"{SCALED} ({plain(units.of('aging_days'))})")
+    ax.set_ylabel(symbol_math(quantity))
+
+
+def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+    """Return the master curves, a panel per rubber and quantity, or None where there is no joint law."""
+    table = tables["master_curve"]
+    if table.empty:
+        return None
+    celsius = np.sort(table["temperature_C"].dropna().unique())
+    colours = dict(zip(celsius.tolist(), shades(len(celsius)), strict=True))
+    several = table["rubber"].nunique() > 1
+    panels, groups = [], list(table.groupby(["rubber", "quantity"], sort=False))
+    before = tables.get("master_curve_before", table.iloc[:0])
+    for (rubber, quantity), rows in spread(groups, MOST_PANELS):
+        earlier = before[(before["rubber"] == rubber) & (before["quantity"] == quantity)]
+        shown = pd.concat([rows["value"], earlier.loc[earlier["kind"] == "law", "value"]])
+        span = padded(shown.min(), shown.max())
+
+        def draw(ax: Axes, rows=rows, span=span, earlier=earlier) -> None:
+            draw_master_curve(ax, rows, colours, config.units, earlier)
+            ax.set_ylim(*span)
+
+        title = f"{rubber}, {symbol_plain(quantity)}" if several else symbol_plain(quantity)
+        alt = f"Master curve of {title}: from {number(rows['value'].max())} to {number(rows['value'].min())}."
+        panels.append(Panel(title, alt, draw))
+    legend = [Key(f"{given(t)} °C", colour, "point") for t, colour in spread(list(colours.items()), MOST_KEYS)]
+    legend += [Key("unaged", BLACK, "point"), Key("law, 95 % band", FLOOR, "band")]
+    legend += [Key("before, without the effects", FLOOR, "dotted")] if len(before) else []
+    note = "" if len(groups) == len(panels) else f"{len(panels)} of {len(groups)}; all stand in master_curve.parquet."
+    return Plot("master_curve", "Master curve", tuple(panels), tuple(legend), note)

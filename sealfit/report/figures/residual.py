@@ -1,0 +1,376 @@
+"""Errors before and after, the residual along every channel, and what the effects look like."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from sealfit.config import Config
+from sealfit.report.excerpts import MOST_MARKS
+from sealfit.report.figures.speed import LOG_SPAN as SPEED_SPAN
+from sealfit.report.notation import (
+    channel_label,
+    channel_words,
+    effect_label,
+    known,
+    number,
+    p_value,
+    plain,
+    short,
+    symbol_math,
+    symbol_plain,
+    together,
+)
+from sealfit.report.style import (
+    AFTER,
+    BEFORE,
+    FLOOR,
+    QUIET,
+    Key,
+    Panel,
+    Plot,
+    capital,
+    category_ticks,
+    is_logarithmic,
+    log_axis,
+    value_ticks,
+)
+from sealfit.units import Units
+
+# ---------------------------------------------------------------- figures loop
+# Errors before and after, and the level at which the residual sits.
+
+LEVELS = ("specimen", "run", "file", "stroke", "sample")
+ERRORS = (("rmse_N", "all bins"), ("rmse_runs_N", "run means"), ("heldout_rmse_N", "held out"))
+
+
+# ---------------------------------------------------------------- before and after
+def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
+    """Draw each error as a step from before to after, with the noise floor as a line."""
+    rows = [(key, label) for key, label in ERRORS if known(closure["before"].get(key))]
+    values = [closure[stage].get(key) for key, _ in rows for stage in ("before", "after")]
+    texts = together(values)
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.85}
+    largest = max(value for value in values if known(value))
+    for k, (key, _) in enumerate(rows):
+        before, after = closure["before"][key], closure["after"].get(key)
+        y = len(rows) - 1 - k
+        if known(after) and after != before:
+            ax.plot([before, after], [y, y], color=QUIET, linewidth=1.2, zorder=1)
+            ax.plot(after, y, "o", color=AFTER, markersize=6.5, zorder=3)
+            ax.annotate(
+                texts[2 * k + 1], (after, y), (0, 7), textcoords="offset points", ha="center", color=AFTER, bbox=box
+            )
+        ax.plot(before, y, "o", color=BEFORE, markersize=6.5, zorder=2)
+        ax.annotate(texts[2 * k], (before, y), (0, 7), textcoords="offset points", ha="center", color=BEFORE, bbox=box)
+    floor = closure.get("noise_floor_N")
+    if known(floor):
+        ax.axvline(floor, color=FLOOR, linestyle="--", linewidth=1.0, zorder=0)
+        largest = max(largest, floor)
+    ax.set_yticks(range(len(rows)), [label for _, label in reversed(rows)])
+    ax.set_ylim(-0.6, len(rows) - 0.35)
+    ax.set_xlim(0.0, 1.13 * largest)
+    ax.grid(axis="y", visible=False)
+    ax.set_xlabel(f"rms error ({plain(units.unit('force'))})")
+
+
+def draw_histogram(ax: Axes, before: np.ndarray, after: np.ndarray, units: Units, held_out: bool) -> None:
+    """Draw how the errors of the run means are spread, before and after, in the same classes."""
+    both = np.concatenate([before, after])
+    edge = float(np.max(np.abs(both))) or 1.0
+    edges = np.linspace(-edge, edge, 2 * int(np.clip(np.sqrt(len(before)), 4, 15)) + 2)
+    ax.hist(before, edges, histtype="stepfilled", color=BEFORE, alpha=0.25)
+    ax.hist(before, edges, histtype="step", color=BEFORE, linewidth=1.2)
+    if not np.array_equal(before, after):
+        ax.hist(after, edges, histtype="step", color=AFTER, linewidth=1.7)
+    ax.axvline(0.0, color=QUIET, linewidth=0.8, zorder=0)
+    ax.yaxis.get_major_locator().set_params(integer=True)
+    kind = "held-out error" if held_out else "error"
+    ax.set_xlabel(f"{kind} of the run mean ({plain(units.unit('force'))})")
+    ax.set_ylabel("runs")
+
+
+def run_means(residuals: pd.DataFrame, column: str) -> pd.Series:
+    """Return the mean of `column` over every run, each file weighing the same."""
+    files = residuals.groupby(["run_id", "file"], sort=True)[column].mean()
+    return files.groupby(level="run_id", sort=True).mean().dropna()
+
+
+def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> Plot | None:
+    """Return the errors before and after with the noise floor, or None if the loop was not run."""
+    if closure is None or not any(known(closure["before"].get(key)) for key, _ in ERRORS):
+        return None
+    unit = config.units.unit("force")
+    pairs = [
+        f"{label} {number(closure['before'].get(key))} before, {number(closure['after'].get(key))} {unit} after"
+        for key, label in ERRORS
+    ]
+    floor = closure.get("noise_floor_N")
+    alt = f"Rms errors: {'; '.join(pairs)}; noise floor {f'{number(floor)} {unit}' if known(floor) else 'unknown'}."
+    panels = [Panel("Errors and the noise floor", alt, lambda ax: draw_errors(ax, closure, config.units), left=0.86)]
+    before, after = tables["residuals_before"], tables["residuals_after"]
+    if len(before) and len(after):
+        held = before["heldout_residual_N"].notna().any() and after["heldout_residual_N"].notna().any()
+        column = "heldout_residual_N" if held else "residual_N"
+        a, b = run_means(before, column).to_numpy(), run_means(after, column).to_numpy()
+        if len(a) >= 4 and len(b) >= 4:
+            alt = f"Errors of {len(a)} run means: standard deviation {number(float(np.std(a)))} before, "
+            alt += f"{number(float(np.std(b)))} {unit} after."
+            panels.append(
+                Panel("Errors of the run means", alt, lambda ax: draw_histogram(ax, a, b, config.units, bool(held)))
+            )
+    same = closure["before"] == closure["after"]
+    legend = (
+        [Key("declared model", BEFORE, "bar")] if same else [Key("before", BEFORE, "bar"), Key("after", AFTER, "bar")]
+    )
+    if known(floor):
+        legend.append(Key("noise floor", FLOOR, "dashed"))
+    return Plot("before_after", "Errors before and after", tuple(panels), tuple(legend))
+
+
+# ---------------------------------------------------------------- residual by level
+def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
+    """Draw the variance of the residual at every level, before and after; beside each bar its standard deviation."""
+    whole = levels[levels["channel"].isna()]
+    names = [name for name in LEVELS if name in set(whole["level"])]
+    names += [name for name in dict.fromkeys(whole["level"]) if name not in LEVELS]
+    bars = [(stage, name) for name in names for stage in ("before", "after")]
+    sd = {(row.stage, row.level): row.sd_N for row in whole.itertuples()}
+    found = [sd.get(bar) for bar in bars]
+    texts = dict(zip(bars, together(found), strict=True))
+    largest = max([value**2 for value in found if known(value)], default=1.0) or 1.0
+    single = not any(stage == "after" for stage in whole["stage"])
+    for k, name in enumerate(reversed(names)):
+        for stage, colour, shift in (("before", BEFORE, 0.19), ("after", AFTER, -0.19)):
+            value = sd.get((stage, name))
+            if not known(value):
+                continue
+            y = k if single else k + shift
+            ax.barh(y, value**2, 0.34, color=colour, linewidth=0)
+            ax.annotate(texts[stage, name], (value**2, y), (4, 0), textcoords="offset points", va="center", size=7.5)
+    unit = plain(units.unit("force"))
+    ax.set_yticks(range(len(names)), list(reversed(names)))
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    ax.set_xlim(0.0, 1.2 * largest)
+    ax.grid(axis="y", visible=False)
+    ax.set_xlabel(f"variance (({unit})²)" if " " in unit else f"variance ({unit}²)")
+
+
+def variance_levels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+    """Return the residual's variance by level, or None if the loop was not run."""
+    levels = tables["levels"]
+    whole = levels[levels["channel"].isna() & levels["sd_N"].notna()]
+    if whole.empty:
+        return None
+    unit = config.units.unit("force")
+    parts = [f"{row.level} {row.stage} {number(row.sd_N)} {unit}" for row in whole.itertuples()]
+    alt = f"Standard deviation of the residual by level: {', '.join(parts)}."
+    height = 0.82 + 0.42 * whole["level"].nunique()
+    title = f"Variance by level, and its root in {unit}"
+    panel = Panel(title, alt, lambda ax: draw_levels(ax, levels, config.units), height=max(height, 1.6), left=0.86)
+    legend = (Key("before", BEFORE, "bar"), Key("after", AFTER, "bar"))
+    return Plot("variance_levels", "Where the residual's variance sits", (panel,), legend)
+
+
+# ---------------------------------------------------------------- figures residual
+# The residual along every channel, and what the effects look like.
+
+MOST_CHANNELS = 18
+MANY_CATEGORIES = 24
+LOG_SPAN = 50.0
+Z95 = 1.959964
+
+
+# ---------------------------------------------------------------- residual by channel
+def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> None:
+    """Draw the mean residual along one channel before and after, with 95 % intervals from whole units.
+
+    Parameters
+    ----------
+    ax : Axes
+        Drawn on; the caller owns the figure.
+    rows : DataFrame
+        Rows of table `channels` of this channel.
+    channel : str
+        Its name.
+    units : Units
+        Give the labels their true units.
+    """
+    numeric = rows["x"].notna().all() and channel != "direction"
+    x = rows["x"].to_numpy(float) if numeric else np.arange(len(rows), dtype=float)
+    log = numeric and is_logarithmic(x, LOG_SPAN)
+    if numeric and channel in ("speed_mm_s", "speed_set_mm_s"):  # as force against speed is drawn
+        log = bool(x.min() > 0 and x.max() / x.min() > SPEED_SPAN)
+    # side by side, a little apart on the page, so that neither hides the other
+    apart = 0.008 * (np.ptp(np.log(x)) if log else np.ptp(x)) if numeric else 0.09
+    ax.axhline(0.0, color=QUIET, linewidth=0.8, zorder=1)
+    many = not numeric and len(rows) > MANY_CATEGORIES  # drawn finer, or they are one blot
+    for stage, colour, marker, shift in (("before", BEFORE, "o", -apart), ("after", AFTER, "s", apart)):
+        spread = Z95 * rows[f"{stage}_se_N"].fillna(0.0).to_numpy(float)
+        places, mean = x * np.exp(shift) if log else x + shift, rows[f"{stage}_N"]
+        ax.errorbar(
+            places,
+            mean,
+            spread,
+            color=colour,
+            marker=marker,
+            markersize=1.8 if many else 3.6,
+            markerfacecolor="white" if stage == "before" else colour,
+            markeredgewidth=0.6 if many else 0.9,
+            linestyle="-" if numeric else "",
+            linewidth=0.8,
+            elinewidth=0.4 if many else 0.9,
+            capsize=0.0 if many else 1.8,
+            zorder=2 if stage == "before" else 3,
+            rasterized=len(rows) > MOST_MARKS,
+        )
+    if log:
+        log_axis(ax)
+    elif numeric:
+        value_ticks(ax, x)
+    else:
+        category_ticks(ax, categories(rows, channel))
+    ax.set_xlabel(plain(short(channel_label(channel, units), 44)))
+    ax.set_ylabel(f"residual ({plain(units.unit('force'))})")
+
+
+def categories(rows: pd.DataFrame, channel: str) -> list[str]:
+    """Return the names of a category's rows; both directions in words."""
+    if channel == "direction":
+        return ["forward" if value > 0 else "backward" for value in rows["x"].fillna(rows["label"]).astype(float)]
+    return rows["label"].astype(str).tolist()
+
+
+def channel_order(channels: pd.DataFrame) -> list[str]:
+    """Return the channels, the one that orders the residual most before the others."""
+    z2 = (channels["before_N"] / channels["before_se_N"].replace(0.0, np.nan)) ** 2
+    strength = z2.groupby(channels["channel"], sort=False).mean().fillna(0.0)
+    return strength.sort_values(ascending=False, kind="stable").index.tolist()
+
+
+def residual_channels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+    """Return the residual along every channel, before and after, or None if the loop was not run."""
+    channels = tables["channels"]
+    if channels.empty:
+        return None
+    span = _span(channels)
+    tested = tables["levels"].dropna(subset=["channel", "p_value"])
+    p = tested.groupby(["stage", "channel"])["p_value"].min().to_dict()
+    panels = []
+    for name in channel_order(channels)[:MOST_CHANNELS]:
+        rows = channels[channels["channel"] == name]
+        rows = rows.sort_values("x") if rows["x"].notna().all() else rows
+
+        def draw(ax: Axes, rows=rows, name=name) -> None:
+            draw_channel(ax, rows, name, config.units)
+            ax.set_ylim(*span)
+
+        words = channel_words(name, config.units)
+        largest = [rows[f"{stage}_N"].abs().max() for stage in ("before", "after")]
+        alt = f"Mean residual along {words}: largest {number(largest[0])} before, {number(largest[1])} "
+        alt += f"{config.units.unit('force')} after"
+        found = p.get(("before", name))
+        alt += f"; p {p_value(found)} before." if found is not None else "."
+        panels.append(Panel(short(capital(words), 38), alt, draw))
+    legend = (Key("before", BEFORE, "open"), Key("after", AFTER, "point"))
+    return Plot("residual_channels", "Residual by channel", tuple(panels), legend)
+
+
+def _span(channels: pd.DataFrame) -> tuple[float, float]:
+    ends = [
+        channels[f"{s}_N"] + sign * Z95 * channels[f"{s}_se_N"].fillna(0)
+        for s in ("before", "after")
+        for sign in (-1, 1)
+    ]
+    values = pd.concat([*ends, pd.Series([0.0])]).dropna()
+    means = pd.concat([channels["before_N"], channels["after_N"]]).abs().max()
+    low, high = max(values.min(), -2.5 * means), min(values.max(), 2.5 * means)  # a wide bar does not flatten the rest
+    room = 0.07 * (high - low) or 1.0
+    return low - room, high + room
+
+
+# ---------------------------------------------------------------- shapes of effects
+def draw_shape(ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units) -> None:
+    """Draw an effect along one channel: its form with the 95 % band, and the free shape it was compared with.
+
+    Parameters
+    ----------
+    ax : Axes
+        Drawn on; the caller owns the figure.
+    rows : DataFrame
+        Rows of table `shapes` of this effect and channel.
+    effect : mapping
+        Its entry in closure.json.
+    units : Units
+        Give the labels their true units.
+    """
+    channel, scale = rows["channel"].iloc[0], shape_scale(effect)
+    numeric = rows["x"].notna().all() and channel != "direction"
+    if channel == "direction" and rows["x"].notna().all():
+        rows = rows[rows["x"].abs() == 1.0]  # there is nothing between forward and backward
+    value, lo, hi, free = (scale * rows[name].to_numpy(float) for name in ("value", "lo95", "hi95", "free"))
+    ax.axhline(0.0, color=QUIET, linewidth=0.8, zorder=1)
+    if numeric:
+        x = rows["x"].to_numpy(float)
+        ax.fill_between(x, lo, hi, color=AFTER, alpha=0.2, linewidth=0)
+        ax.plot(x, free, color=FLOOR, linestyle="--", linewidth=1.1)
+        ax.plot(x, value, color=AFTER)
+        ax.set_xlim(x.min(), x.max() if x.max() > x.min() else x.min() + 1)
+        if is_logarithmic(x, LOG_SPAN):
+            log_axis(ax)
+    else:
+        x = np.arange(len(rows))
+        spread = np.nan_to_num(np.abs(np.stack([value - lo, hi - value])))
+        ax.errorbar(x, value, spread, color=AFTER, fmt="o", elinewidth=1.4, capsize=2.0)
+        ax.plot(x, free, color=FLOOR, marker="_", linestyle="", markersize=12)
+        category_ticks(ax, categories(rows, channel))
+    ax.set_xlabel(plain(short(channel_label(channel, units), 44)))
+    ax.set_ylabel(shape_label(rows, effect, units, symbol_math))
+
+
+def shape_scale(effect: Mapping) -> float:
+    """Return 100 where a shape is a factor minus one, drawn in percent, else 1."""
+    return 100.0 if effect.get("operation") == "multiply" else 1.0
+
+
+def shape_label(rows: pd.DataFrame, effect: Mapping, units: Units, symbol: Callable[[str], str] = symbol_plain) -> str:
+    """Return what a shape's values are, with the unit: "added force (N)", "change of μ (%)"."""
+    target = effect.get("acts_on", "force")
+    force = plain(units.quantity("force"))
+    if effect.get("operation") == "multiply":
+        return f"change of {force if target == 'force' else symbol(target)} (%)"
+    unit = next((u for u in rows["unit"] if isinstance(u, str) and u), "")
+    tail = f" ({plain(unit)})" if unit else ""
+    return f"added {force}{tail}" if target == "force" else f"change of {symbol(target)}{tail}"
+
+
+def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> Plot | None:
+    """Return the shape of every effect, a panel for each channel it is drawn along, or None if there is none."""
+    shapes = tables["shapes"]
+    if closure is None or shapes.empty:
+        return None
+    panels = []
+    for (index, channel), rows in shapes.groupby(["effect", "channel"], sort=False):
+        if not 0 <= int(index) < len(closure["effects"]):
+            continue
+        effect = closure["effects"][int(index)]
+        rows = rows.sort_values("x") if rows["x"].notna().all() else rows
+
+        def draw(ax: Axes, rows=rows, effect=effect) -> None:
+            draw_shape(ax, rows, effect, config.units)
+
+        scale = shape_scale(effect)
+        words = effect_label(effect, config.units)
+        alt = f"Shape of {words} along {channel_words(channel, config.units)}: "
+        alt += f"{shape_label(rows, effect, config.units)} from {number(scale * rows['value'].min())} to "
+        alt += f"{number(scale * rows['value'].max())}."
+        panels.append(Panel(short(capital(words), 40), alt, draw, effect=int(index)))
+    if not panels:
+        return None
+    legend = [Key("effect, 95 % band", AFTER)]
+    if shapes["free"].notna().any():
+        legend.append(Key("free shape", FLOOR, "dashed"))
+    return Plot("effect_shapes", "Shapes of the effects", tuple(panels), tuple(legend))

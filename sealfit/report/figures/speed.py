@@ -1,0 +1,386 @@
+"""Force against speed, a panel per series; and how the force comes up at a few speeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from sealfit.config import Config
+from sealfit.report.excerpts import MOST_KEYS, MOST_MARKS, MOST_PANELS, condition_misfits, rms, spread, telling
+from sealfit.report.notation import ConditionNames, channel_words, count, given, is_unaged, number, plain, short
+from sealfit.report.style import (
+    BLACK,
+    CYCLE,
+    FLOOR,
+    HEIGHT,
+    Key,
+    Panel,
+    Plot,
+    capital,
+    evenly,
+    in_order,
+    is_number,
+    log_axis,
+    natural,
+    padded,
+    shades,
+)
+from sealfit.units import Units
+
+# ---------------------------------------------------------------- figures speed
+# Force against speed: a panel per series, every condition with its model, band and run means.
+
+MOST_CURVES = 24  # in one panel
+MOST_COLOURS = 10  # in one panel; with more, each condition has its own, or numbers are thinned
+TALL = 3.1  # inches, where one or two panels hold everything
+LOG_SPAN = 20.0  # speeds that span this factor are drawn on a logarithmic axis
+
+
+@dataclass(frozen=True)
+class Line:
+    """One condition in a panel of force against speed, all in the direction of motion (magnitudes).
+
+    `curves` holds, per direction and load, columns direction, speed, before, after, lo, hi; `points` speed, force, sd,
+    direction.
+    """
+
+    label: str
+    colour: str
+    curves: tuple[pd.DataFrame, ...] = ()
+    points: pd.DataFrame = field(default_factory=pd.DataFrame)
+
+
+def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool = False) -> None:
+    """Draw force against speed of several conditions: model with its band, declared model dotted, run means.
+
+    Parameters
+    ----------
+    ax : Axes
+        Drawn on; the caller owns the figure.
+    lines : sequence of Line
+        The conditions.
+    units : Units
+        Give the labels their true units.
+    log : bool
+        Whether the speed axis is logarithmic.
+    """
+    dense = sum(len(line.points) for line in lines) > MOST_MARKS
+    for line in lines:
+        for curve in line.curves:
+            ax.fill_between(curve["speed"], curve["lo"], curve["hi"], color=line.colour, alpha=0.2, linewidth=0)
+            if not curve["before"].equals(curve["after"]):
+                ax.plot(curve["speed"], curve["before"], color=line.colour, linestyle=":", linewidth=0.9, alpha=0.8)
+            backward = len(curve) and curve["direction"].iloc[0] < 0
+            ax.plot(curve["speed"], curve["after"], color=line.colour, linestyle="--" if backward else "-")
+        for direction, points in line.points.groupby("direction") if len(line.points) else ():
+            ax.errorbar(
+                points["speed"],
+                points["force"],
+                points["sd"].fillna(0.0),
+                color=line.colour,
+                fmt="o" if direction > 0 else "<",
+                markersize=3.4,
+                markerfacecolor=line.colour if direction > 0 else "white",
+                markeredgewidth=0.9,
+                elinewidth=0.8,
+                capsize=0.0 if dense else 1.5,
+                rasterized=dense,
+            )
+    if log:
+        log_axis(ax)
+    else:
+        ax.set_xlim(left=0.0)
+    ax.set_xlabel(plain(units.label("speed_mm_s")))
+    ax.set_ylabel(plain(units.label("force_N")))
+
+
+def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+    """Return force against speed for every condition, a panel per series, or None if nothing was measured."""
+    points, curves = run_points(tables["steady"], config), curve_lines(tables, config)
+    conditions = pd.unique(pd.concat([points["condition"], curves["condition"]], ignore_index=True))
+    if not len(conditions):
+        return None
+    names = ConditionNames.of(config)
+    last = "aging_days" if config.aging else config.condition[-1]
+    rubber = tables["steady"].drop_duplicates("condition").set_index("condition")["rubber"].to_dict()
+    unaged = [c for c in conditions if is_unaged(c)]
+    groups = _groups([c for c in conditions if not is_unaged(c)], names, last)
+    if not groups:
+        groups = {"": unaged}
+    groups, note = _telling(groups, len(conditions) - len(unaged), tables, names)
+    levels = in_order({names.parts(c).get(last, "") for group in groups.values() for c in group} - {""})
+    numeric = all(is_number(level) for level in levels)
+    colour = dict(zip(levels, shades(len(levels)) if numeric else _cycle(len(levels)), strict=True))
+    speeds = pd.concat([points["speed"], curves["speed"]])
+    speeds = speeds[speeds > 0].astype(float)
+    log = len(speeds) > 0 and speeds.max() / speeds.min() > LOG_SPAN
+    # one scale for all panels, so that conditions can be compared across them
+    shown = pd.concat([points["force"] + points["sd"].fillna(0), points["force"] - points["sd"].fillna(0)])
+    shown = pd.concat([shown, curves["after"], curves["before"]]).dropna()
+    span = padded(shown.min(), shown.max())
+    x_span = (speeds.min() / 1.2 if log else 0.0, speeds.max() * (1.2 if log else 1.06))
+    drawn = {*unaged, *(c for group in groups.values() for c in group)}
+    most = max(2, MOST_CURVES // max(len(group) for group in groups.values()))  # of a condition: directions and loads
+    own_curves = {
+        c: tuple(spread([part for _, part in own.groupby(["direction", "load"], dropna=False)], most))
+        for c, own in curves[curves["condition"].isin(drawn)].groupby("condition")
+    }
+    own_points = dict(list(points.groupby("condition", sort=False)))
+    panels = []
+    for title, group in groups.items():
+        shared = [c for c in unaged if c not in group and rubber.get(c) in {rubber.get(g) for g in group}]
+        lines = [
+            Line(
+                names(c),
+                BLACK if is_unaged(c) else colour[names.parts(c)[last]],
+                own_curves.get(c, ()),
+                own_points.get(c, points.iloc[:0]),
+            )
+            for c in [*shared, *group]
+        ]
+        panels.append(
+            Panel(
+                short(title),
+                _force_alt(title, lines, config),
+                _force_drawer(lines, config, log, span, x_span),
+                height=HEIGHT if len(groups) > 2 else TALL,
+            )
+        )
+    legend = [Key(short(names(c)), BLACK) for c in spread(unaged, MOST_KEYS)]
+    legend += [Key(short(_level_label(last, level, names)), colour[level]) for level in spread(levels, MOST_KEYS)]
+    both = points["direction"].nunique() > 1
+    legend.append(Key("run means, forward" if both else "run means", FLOOR, "point"))
+    if both:
+        legend.append(Key("run means, backward", FLOOR, "left"))
+    if len(curves):
+        legend.append(Key("model", FLOOR) if curves["lo"].notna().any() else Key("steady fit", FLOOR))
+        if curves["direction"].nunique() > 1:
+            legend.append(Key("model, backward", FLOOR, "dashed"))
+        if curves["lo"].notna().any():
+            legend.append(Key("95 % band", FLOOR, "band"))
+        if _differ(curves):
+            legend.append(Key("declared model", FLOOR, "dotted"))
+    quantity = config.units.quantity("force")
+    title = f"{capital(quantity)} against {config.units.quantity('speed')}"
+    return Plot("force_speed", title, tuple(panels), tuple(legend), note)
+
+
+def _force_drawer(lines, config: Config, log: bool, span, x_span) -> Callable[[Axes], None]:
+    def draw(ax: Axes) -> None:
+        ax.set_xlim(*x_span)
+        draw_force_speed(ax, lines, config.units, log=log)
+        ax.set_xlim(*x_span)
+        ax.set_ylim(*span)
+        if log:
+            log_axis(ax)
+
+    return draw
+
+
+def _force_alt(title: str, lines: Sequence[Line], config: Config) -> str:
+    forces = pd.concat([line.points["force"] for line in lines if len(line.points)] or [pd.Series(dtype=float)])
+    unit = config.units.unit("force")
+    text = f"{config.units.quantity('force')} against {config.units.quantity('speed')}{', ' + title if title else ''}: "
+    text += f"{count(len(lines), 'condition')}"
+    if len(forces):
+        text += f", run means from {number(forces.min())} to {number(forces.max())} {unit}"
+    return text + "."
+
+
+def run_points(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
+    """Return mean and scatter of every run: condition, direction, speed, force (in the direction of motion), sd, n."""
+    used = steady[steady["used"].astype(bool)]
+    if used.empty:
+        return pd.DataFrame(columns=["condition", "direction", "speed", "force", "sd", "n"]).astype({"force": float})
+    sign = used["direction"].astype(float)
+    rows = used.assign(speed=used["speed_mm_s"].abs(), force=used["force_N"] * sign)
+    files = rows.groupby(["condition", "run_id", "direction", "file"], sort=False)[["speed", "force"]].mean()
+    runs = files.groupby(level=["condition", "run_id", "direction"], sort=False)
+    found = runs["speed"].mean().to_frame()
+    found["force"], found["sd"], found["n"] = runs["force"].mean(), runs["force"].std(), runs["force"].size()
+    return found.reset_index()
+
+
+def curve_lines(tables: Mapping[str, pd.DataFrame], config: Config) -> pd.DataFrame:
+    """Return the loop's curves, or those of the steady fit where the loop was not run, by magnitude of the speed."""
+    curves = tables["curves"]
+    if curves.empty:
+        return _steady_curves(tables["steady_fit"], tables["steady"])
+    sign = np.sign(curves["speed_mm_s"]).replace(0.0, 1.0)
+    ends = np.sort(
+        np.stack([curves["force_after_lo95_N"] * sign, curves["force_after_hi95_N"] * sign]).astype(float), axis=0
+    )
+    return pd.DataFrame(
+        {
+            "condition": curves["condition"],
+            "direction": sign,
+            "load": curves["load_N"],
+            "speed": curves["speed_mm_s"].abs(),
+            "before": curves["force_before_N"] * sign,
+            "after": curves["force_after_N"] * sign,
+            "lo": ends[0],
+            "hi": ends[1],
+        }
+    ).sort_values(["condition", "direction", "speed"])
+
+
+def _steady_curves(fit: pd.DataFrame, steady: pd.DataFrame) -> pd.DataFrame:
+    from sealfit.physics.stribeck import stribeck_force
+
+    columns = ["condition", "direction", "load", "speed", "before", "after", "lo", "hi"]
+    found = []
+    for condition, rows in fit[fit["quantity"] == "steady"].groupby("condition", sort=False):
+        values = rows.set_index("parameter")["value"].to_dict()
+        here = steady[(steady["condition"] == condition) & steady["used"].astype(bool)]
+        load = here["load_N"].mean() if here["load_N"].notna().any() else np.nan
+        top = {"mu_s": values.get("mu_s", values.get("F_s")), "mu_c": values.get("mu_c", values.get("F_c"))}
+        top |= {"v_s": values.get("v_s"), "sigma_2": values.get("sigma_2")}
+        if here.empty or any(value is None or not np.isfinite(value) for value in top.values()) or top["v_s"] <= 0:
+            continue
+        speed = np.geomspace(max(here["speed_mm_s"].abs().min(), 1e-6) / 1.2, here["speed_mm_s"].abs().max() * 1.05, 80)
+        force = stribeck_force(speed, 1.0 if np.isnan(load) else load, **top)
+        found.append(pd.DataFrame({"condition": condition, "direction": 1.0, "load": load, "speed": speed,
+                                   "before": force, "after": force, "lo": np.nan, "hi": np.nan}))  # fmt: skip
+    return pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=columns).astype({"speed": float})
+
+
+def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict[str, list[str]]:
+    """Return {title: conditions} of the panels: conditions that differ in the last column only stand together."""
+    groups: dict[str, list[str]] = {}
+    for condition in conditions:
+        others = {name: value for name, value in names.parts(condition).items() if name != last}
+        title = names(", ".join(f"{name}={value}" for name, value in others.items())) if others else ""
+        groups.setdefault(title, []).append(condition)
+    groups = {
+        t: in_order(g, key=lambda c: names.parts(c).get(last, "")) for t, g in sorted(groups.items(), key=natural)
+    }
+    if all(len(group) <= MOST_COLOURS for group in groups.values()):
+        return groups
+    if len(conditions) > MOST_PANELS and all(is_number(names.parts(c).get(last, "")) for c in conditions):
+        return {title: spread(group, MOST_COLOURS) for title, group in groups.items()}  # numbers have an order
+    return {names(c): [c] for group in groups.values() for c in group}
+
+
+def _telling(
+    groups: dict[str, list[str]], aged: int, tables: Mapping[str, pd.DataFrame], names: ConditionNames
+) -> tuple[dict[str, list[str]], str]:
+    """Return the panels that are drawn, and in words which of how many, and of how many conditions, they are."""
+    misfit = condition_misfits(tables) if len(groups) > MOST_PANELS else {}
+    titles, note = telling(
+        list(groups),
+        [rms(misfit.get(c, np.nan) for c in group) for group in groups.values()],
+        [np.fmax.reduce([names.number(c, "temperature_C") for c in group]) for group in groups.values()],
+        "panels",
+    )
+    groups = {title: groups[title] for title in titles}
+    drawn = sum(len(group) for group in groups.values())
+    if drawn < aged:
+        note = f"{note} Of {count(aged, 'condition')} {drawn} are in them.".strip()
+    return groups, f"{note} All stand in steady.parquet and curves.parquet." if note else ""
+
+
+def _differ(curves: pd.DataFrame) -> bool:
+    gap = (curves["after"] - curves["before"]).abs().max()
+    return bool(gap > 1e-9 * max(curves["after"].abs().max(), 1e-300))
+
+
+def _cycle(n: int) -> list[str]:
+    return [CYCLE[k % len(CYCLE)] for k in range(n)]
+
+
+def _level_label(name: str, level: str, names: ConditionNames) -> str:
+    if name == "aging_days":
+        return f"{level} d"
+    return names(f"{name}={level}") if names.units.of(name) else f"{channel_words(name, names.units)} {level}"
+
+
+# ---------------------------------------------------------------- figures dynamic
+# How the force comes up: the mean start at a few speeds, and the dynamic model's.
+
+MOST_START_PANELS = 6
+MOST_SPEEDS = 3
+UP = 0.98  # share of the last force at which a start counts as over
+BEYOND = 1.5  # of that distance is shown
+
+
+def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], units: Units) -> None:
+    """Draw the mean starts of a condition over the distance slid, with their standard error, and the model's.
+
+    Parameters
+    ----------
+    ax : Axes
+        Drawn on; the caller owns the figure.
+    curves : DataFrame
+        Rows of table `dynamic_curves`.
+    colours : mapping
+        Of each commanded speed.
+    units : Units
+        Give the labels their true units.
+    """
+    for (speed, direction), curve in curves.groupby(["speed_set_mm_s", "direction"], dropna=False, sort=True):
+        curve = curve.sort_values("distance_mm")
+        colour = colours.get(speed, BLACK)
+        error = curve["force_se_N"].fillna(0.0)
+        ax.fill_between(
+            curve["distance_mm"], curve["force_N"] - error, curve["force_N"] + error, color=colour, alpha=0.2,
+            linewidth=0,
+        )  # fmt: skip
+        ax.plot(
+            curve["distance_mm"], curve["force_N"], linestyle="", marker="o" if direction > 0 else "<", markersize=2.6,
+            color=colour, markerfacecolor=colour if direction > 0 else "white", markeredgewidth=0.7,
+        )  # fmt: skip
+        ax.plot(curve["distance_mm"], curve["model_N"], color=colour, linestyle="-" if direction > 0 else "--")
+    ax.set_xlim(0.0, _reach(curves))
+    ax.set_xlabel(plain(units.label("distance_mm")))
+    ax.set_ylabel(plain(units.label("force_N")))
+
+
+def _reach(curves: pd.DataFrame) -> float:
+    """Return the distance to which starts are drawn: to where the slowest of them is over, and half of it beyond."""
+    ends = []
+    for _, curve in curves.groupby(["speed_set_mm_s", "direction"], dropna=False):
+        curve = curve.sort_values("distance_mm")
+        below = np.flatnonzero(curve["force_N"].to_numpy() < UP * curve["force_N"].iloc[-1])
+        ends.append(curve["distance_mm"].iloc[min(below[-1] + 1 if len(below) else 0, len(curve) - 1)])
+    return float(BEYOND * max(ends))
+
+
+def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+    """Return the mean starts of up to six conditions at up to three speeds each, or None if no trace shows one."""
+    curves = tables["dynamic_curves"]
+    if curves.empty:
+        return None
+    names, units = ConditionNames.of(config), config.units
+    ordered = sorted(curves["condition"].unique(), key=lambda c: (not is_unaged(c), natural((names(c), None))))
+    picked = [ordered[k] for k in evenly(len(ordered), min(len(ordered), MOST_START_PANELS))]
+    speeds = np.sort(curves["speed_set_mm_s"].dropna().unique())
+    speeds = speeds[evenly(len(speeds), min(len(speeds), MOST_SPEEDS))]
+    colours = dict(zip(speeds.tolist(), shades(len(speeds)), strict=True))
+    shown = curves[curves["condition"].isin(picked)]
+    shown = shown[shown["speed_set_mm_s"].isin(speeds) | shown["speed_set_mm_s"].isna()]
+    span = padded(min(0.0, shown["force_N"].min()), shown["force_N"].max())
+    panels = []
+    for condition in picked:
+        own = shown[shown["condition"] == condition]
+        if own.empty:
+            continue
+
+        def draw(ax: Axes, own=own) -> None:
+            draw_starts(ax, own, colours, units)
+            ax.set_ylim(*span)
+
+        alt = f"Starts of {names(condition)}: {units.quantity('force')} from {number(own['force_N'].min())} to "
+        alt += f"{number(own['force_N'].max())} {units.unit('force')} over {number(_reach(own))} "
+        alt += f"{units.unit('displacement')}."
+        panels.append(Panel(short(names(condition)), alt, draw))
+    legend = [Key(f"{given(speed)} {units.unit('speed')}", colour) for speed, colour in colours.items()]
+    legend.append(Key("mean of the starts", FLOOR, "point"))
+    if (shown["direction"] < 0).any():
+        legend.append(Key("backward", FLOOR, "left"))
+    if shown["model_N"].notna().any():
+        legend.append(Key("dynamic model", FLOOR, "line"))
+    return Plot("starts", "Starts", tuple(panels), tuple(legend))

@@ -1,0 +1,432 @@
+"""Numbers, symbols, channels and conditions as people read them, always with the true unit."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup, escape
+
+from sealfit.config import Config
+from sealfit.ingest.categorical import UNAGED
+from sealfit.units import Units
+
+# ---------------------------------------------------------------- numbers
+# Numbers as people read them: a value rounded to its uncertainty, a minus that is a minus, nothing invented.
+
+NOTHING = "–"
+THIN = "\u202f"  # narrow no-break space: between thousands, and around the cross of a power of ten
+_UP = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SMALL, LARGE = 1e-4, 1e6  # outside of these a power of ten is taken out
+
+
+def known(value: object) -> bool:
+    """Return whether `value` is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return `value` to `digits` significant digits; a dash if there is none.
+
+    Examples
+    --------
+    >>> number(0.61234), number(-12.3456), number(1752.4), number(0.0), number(None)
+    ('0.612', '−12.3', '1752', '0', '–')
+    >>> number(1.234e-5)
+    '1.23\u202f×\u202f10⁻⁵'
+    """
+    if isinstance(value, float) and math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    if not known(value):
+        return NOTHING
+    value = float(value)
+    if value == 0:
+        return "0"
+    power = _power(value)
+    value /= 10.0**power
+    return _fixed(value, max(decimals(value, digits), 0)) + _times_ten(power)
+
+
+def given(value: float | None, digits: int = 3) -> str:
+    """Return a number that somebody set, without the zeros that a measured one would need.
+
+    Examples
+    --------
+    >>> given(0.5), given(10.02), given(1752.0)
+    ('0.5', '10', '1752')
+    """
+    if not known(value):
+        return NOTHING
+    text = number(value, digits)
+    return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
+
+
+def decimals(size: float, digits: int = 2) -> int:
+    """Return how many decimals show `size` to `digits` significant digits; negative left of the point.
+
+    Examples
+    --------
+    >>> decimals(0.0123), decimals(0.0996), decimals(3.4), decimals(456.0)
+    (3, 2, 1, -1)
+    """
+    size = abs(float(size))
+    if size == 0 or not math.isfinite(size):
+        return 0
+    rounded = float(f"{size:.{digits - 1}e}")  # 0.0996 is 0.10: one decimal less than its own exponent says
+    return digits - 1 - math.floor(math.log10(rounded) + 1e-12)
+
+
+def measured(value: float | None, lo: float | None, hi: float | None, digits: int = 2) -> tuple[str, str]:
+    """Return a value and its interval, both rounded to `digits` significant digits of the interval's half-width.
+
+    With `digits` 1, a half-width that begins with 1 keeps two: one would round it by up to a third.
+
+    Examples
+    --------
+    >>> measured(0.83512, 0.8214, 0.8489)
+    ('0.835', '[0.821, 0.849]')
+    >>> measured(6.123, 5.513, 6.7012)
+    ('6.12', '[5.51, 6.70]')
+    >>> measured(4.02, 3.61, 4.48, digits=1), measured(4.02, 3.9, 4.14, digits=1)
+    (('4.0', '[3.6, 4.5]'), ('4.02', '[3.90, 4.14]'))
+    >>> measured(4.0, None, None), measured(4.0, None, 5.5)
+    (('4.00', '–'), ('4.00', 'up to 5.50'))
+    """
+    if not known(value):
+        return NOTHING, NOTHING
+    if not (known(lo) and known(hi)):
+        return number(value), f"from {number(lo)}" if known(lo) else f"up to {number(hi)}" if known(hi) else NOTHING
+    if hi == lo:
+        return number(value), f"[{number(lo)}, {number(hi)}]"
+    power = _power(max(abs(value), abs(lo), abs(hi)))
+    value, lo, hi = (x / 10.0**power for x in (value, lo, hi))
+    half = (hi - lo) / 2
+    if digits == 1 and f"{half:.1e}".startswith("1"):
+        digits = 2
+    places = min(decimals(half, digits), 9)
+    tail = _times_ten(power)
+    return _fixed(value, places) + tail, f"[{_fixed(lo, places)}, {_fixed(hi, places)}]" + tail
+
+
+def uncertain(value: float | None, u: float | None) -> str:
+    """Return a value rounded to two significant digits of its uncertainty.
+
+    Examples
+    --------
+    >>> uncertain(1.23456, 0.034), uncertain(1.23456, None)
+    ('1.235', '1.23')
+    """
+    if not known(value) or not known(u) or u <= 0:
+        return number(value)
+    power = _power(max(abs(value), abs(u)))
+    return _fixed(value / 10.0**power, min(decimals(u / 10.0**power), 9)) + _times_ten(power)
+
+
+def together(values: Sequence[float | None], digits: int = 2) -> list[str]:
+    """Return several numbers of one unit with the same decimals: the smallest shows `digits` significant ones.
+
+    Examples
+    --------
+    >>> together([1.4234, 0.3121, 0.2899, None])
+    ['1.42', '0.31', '0.29', '–']
+    """
+    sizes = [abs(value) for value in values if known(value) and value != 0]
+    if not sizes:
+        return [number(value) for value in values]
+    power = _power(max(sizes))
+    largest = decimals(max(sizes) / 10.0**power, 4)  # one tiny value does not give the others nine decimals
+    places = min(decimals(min(sizes) / 10.0**power, digits), largest)
+    return [_fixed(v / 10.0**power, places) + _times_ten(power) if known(v) else NOTHING for v in values]
+
+
+def p_value(p: float | None) -> str:
+    """Return a p-value with its sign: "= 0.012", "< 0.001".
+
+    Examples
+    --------
+    >>> p_value(0.0123), p_value(0.00012), p_value(0.0512), p_value(0.8), p_value(None)
+    ('= 0.012', '< 0.001', '= 0.051', '= 0.80', 'not available')
+    """
+    if not known(p):
+        return "not available"
+    if p < 0.001:
+        return "< 0.001"
+    if p > 0.99:
+        return "> 0.99"
+    return f"= {p:.{decimals(p, 2)}f}"
+
+
+def of_unit(text: str, unit: str) -> str:
+    """Return a number with its unit, which no line break parts.
+
+    Examples
+    --------
+    >>> of_unit("1.5", "mN m")
+    '1.5\xa0mN\xa0m'
+    >>> of_unit("1.5", "")
+    '1.5'
+    """
+    return f"{text} {unit}".strip().replace(" ", "\u00a0")
+
+
+def count(n: int, one: str, many: str | None = None) -> str:
+    """Return "1 file", "3 files".
+
+    Examples
+    --------
+    >>> count(1, "series", "series"), count(0, "file"), count(1752, "file")
+    ('1 series', '0 files', '1752 files')
+    """
+    return f"{_fixed(float(n), 0)} {one if n == 1 else many or one + 's'}"
+
+
+def _power(value: float) -> int:
+    size = abs(value)
+    return math.floor(math.log10(size)) if size and not SMALL <= size < LARGE else 0
+
+
+def power_of_ten(power: int) -> str:
+    """Return an exponent as it is written above the line.
+
+    Examples
+    --------
+    >>> power_of_ten(-12)
+    '⁻¹²'
+    """
+    return str(power).translate(_UP)
+
+
+def _times_ten(power: int) -> str:
+    return f"{THIN}×{THIN}10{power_of_ten(power)}" if power else ""
+
+
+def _fixed(value: float, places: int) -> str:
+    text = f"{round(value, places):,.{max(places, 0)}f}"
+    if float(text.replace(",", "")) == 0:
+        text = text.lstrip("-")  # no minus before a zero
+    whole, point, rest = text.replace("-", "−").partition(".")
+    if len(whole.lstrip("−")) <= 5:  # four digits are read without help
+        whole = whole.replace(",", "")
+    return whole.replace(",", THIN) + point + rest
+
+
+# ---------------------------------------------------------------- symbols
+# Symbols, channels and conditions as people read them: in HTML, in a plot, and always with the true unit.
+
+GREEK = {
+    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "zeta": "ζ", "eta": "η", "theta": "θ",
+    "kappa": "κ", "lambda": "λ", "mu": "μ", "nu": "ν", "xi": "ξ", "rho": "ρ", "sigma": "σ", "tau": "τ", "phi": "φ",
+    "chi": "χ", "psi": "ψ", "omega": "ω",
+}  # fmt: skip
+_SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])(?:_?([0-9]+)|_([A-Za-z0-9]{{1,4}}))?")
+_SLOTS = ("speed_set_mm_s", "displacement_from_mm", "displacement_to_mm", "displacement_mm", "distance_mm",
+          "speed_mm_s", "force_N", "load_N")  # fmt: skip
+_SLOT = re.compile(rf"\b(?:{'|'.join(_SLOTS)})\b")
+_STATISTICS = {"rmse_N": "rms error", "reduced_chi2": "χ² / df", "lack_of_fit_p": "lack of fit, p", "n_runs": "runs",
+               "n_files": "files", "n_speeds": "speeds", "n_days": "days tested", "last_day": "last day",
+               "rmse": "rms error", "max_error_pct": "largest error",
+               "specimen_sd_pct": "specimen scatter"}  # fmt: skip
+
+
+def symbol_html(name: str) -> Markup:
+    """Return a parameter's symbol as HTML: mu_s as an italic mu with an upright s below; other names as they are.
+
+    Examples
+    --------
+    >>> str(symbol_html("mu_s")), str(symbol_html("<b>"))
+    ('<i>μ</i><sub>s</sub>', '&lt;b&gt;')
+    """
+    base, sub = _split(name)
+    if base is None:
+        return escape(name)
+    return Markup("<i>{}</i><sub>{}</sub>").format(base, sub) if sub else Markup("<i>{}</i>").format(base)
+
+
+def symbol_plain(name: str) -> str:
+    """Return a parameter's symbol as plain text: "μ_s".
+
+    Examples
+    --------
+    >>> symbol_plain("sigma_2"), symbol_plain("rate")
+    ('σ_2', 'rate')
+    """
+    base, sub = _split(name)
+    return name if base is None else f"{base}_{sub}" if sub else base
+
+
+def symbol_math(name: str) -> str:
+    r"""Return a parameter's symbol for a plot, in matplotlib's mathtext.
+
+    Examples
+    --------
+    >>> symbol_math("mu_s"), symbol_math("cost$")
+    ('$\\mu_{\\mathrm{s}}$', 'cost\\$')
+    """
+    base, sub = _split(name)
+    if base is None:
+        return plain(name)
+    letter = next((f"\\{word}" for word, sign in GREEK.items() if sign == base), base)
+    return f"${letter}_{{\\mathrm{{{sub}}}}}$" if sub else f"${letter}$"
+
+
+def _split(name: str) -> tuple[str | None, str]:
+    found = _SYMBOL.fullmatch(str(name))
+    if found is None:
+        return None, ""
+    return GREEK.get(found[1], found[1]), found[2] or found[3] or ""
+
+
+def plain(text: object) -> str:
+    """Return text for a plot as it stands: a dollar sign in a column's name starts no formula."""
+    return str(text).replace("$", r"\$")
+
+
+def short(text: object, longest: int = 34) -> str:
+    """Return text cut to `longest` characters, with an ellipsis where it was cut."""
+    text = str(text)
+    return text if len(text) <= longest else text[: longest - 1].rstrip() + "…"
+
+
+def true_units(text: str, units: Units) -> str:
+    """Return a sentence with every slot's name put as its true quantity and unit.
+
+    Examples
+    --------
+    >>> true_units("force_N is stuck", Units({"force": ("torque", "mN m")}))
+    'torque (mN m) is stuck'
+    """
+    return _SLOT.sub(lambda found: channel_label(found[0], units), str(text))
+
+
+def channel_label(name: str, units: Units) -> str:
+    """Return a channel with its unit, e.g. "sliding distance (mm)"; a column of the campaign's own keeps its name.
+
+    Examples
+    --------
+    >>> channel_label("displacement_mm", Units({"displacement": ("angle", "turn")})), channel_label("batch", Units())
+    ('angle (turn)', 'batch')
+    """
+    quantity, unit = channel_words(name, units), units.of(name)
+    return f"{quantity} ({unit})" if unit else quantity
+
+
+def channel_words(name: str, units: Units) -> str:
+    """Return a channel's name in words, without its unit."""
+    special = {
+        "distance_mm": "sliding distance",
+        "displacement_from_mm": f"{units.quantity('displacement')} at the window's start",
+        "displacement_to_mm": f"{units.quantity('displacement')} at the window's end",
+        "speed_set_mm_s": f"commanded {units.quantity('speed').removeprefix('sliding ')}",
+        "specimen_id": "specimen",
+        "run_id": "run",
+    }
+    if name in special:
+        return special[name]
+    unit, label = units.of(name), units.label(name)
+    return label.removesuffix(f" ({unit})") if unit else label
+
+
+def split_channels(text: str | None, known: Collection[str]) -> list[str]:
+    """Return the channels whose names, joined by spaces, `text` is.
+
+    A column's own name may hold spaces, so the names that are known decide where to cut.
+
+    Examples
+    --------
+    >>> split_channels("direction oil temp", {"direction", "oil temp"})
+    ['direction', 'oil temp']
+    """
+    names, words = [], text.split(" ") if text else []
+    while words:
+        n = next((n for n in range(len(words), 0, -1) if " ".join(words[:n]) in known), 1)
+        names.append(" ".join(words[:n]))
+        words = words[n:]
+    return names
+
+
+def effect_label(effect: Mapping, units: Units) -> str:
+    """Return an effect's label in words, slots by their true quantity; how it acts is said elsewhere.
+
+    Examples
+    --------
+    >>> effect = {"label": "ripple along displacement_mm, added to force", "acts_on": "force"}
+    >>> effect_label(effect, Units())
+    'ripple along displacement'
+    """
+    label = re.sub(rf", (?:added to|factor on) {re.escape(str(effect.get('acts_on')))}$", "", str(effect["label"]))
+    return _SLOT.sub(lambda found: channel_words(found[0], units), label)
+
+
+def quantity_words(name: str) -> str:
+    """Return what a fit's statistic is called."""
+    return _STATISTICS.get(name, name.removesuffix("_N").replace("_", " "))
+
+
+@dataclass(frozen=True)
+class ConditionNames:
+    """How conditions and series are spelled: values with units, the order said once.
+
+    Examples
+    --------
+    >>> names = ConditionNames.of(Config())
+    >>> names("temperature_C=60, compression_ratio_pct=80, aging_days=4"), names("unaged"), names.key
+    ('60 °C · 80 % · 4 d', 'unaged', 'aging temperature · compression ratio · aging time')
+    """
+
+    columns: tuple[str, ...]
+    units: Units
+
+    @classmethod
+    def of(cls, config: Config) -> ConditionNames:
+        """Return the names for a config's condition and rubber columns."""
+        rubber = [name for name in config.rubber if name not in config.condition]
+        return cls((*config.condition, *rubber), config.units)
+
+    def __call__(self, text: object) -> str:
+        """Return a condition or series as the tables spell it, in short."""
+        parts = self.parts(text)
+        if not parts:
+            return str(text)
+        return " · ".join(self._value(name, value) for name, value in parts.items())
+
+    def parts(self, text: object) -> dict[str, str]:
+        """Return {column: value} of a condition as the tables spell it; empty if it is not spelled so (unaged)."""
+        marks = "|".join(re.escape(name) for name in sorted(self.columns, key=len, reverse=True))
+        pieces = re.split(rf"(?:^|, )({marks})=", str(text))
+        if pieces[0]:
+            return {}
+        return dict(zip(pieces[1::2], pieces[2::2], strict=True))
+
+    def number(self, text: object, column: str) -> float:
+        """Return a condition's value of a column as a number; NaN where it has none."""
+        try:
+            return float(self.parts(text).get(column, "nan"))
+        except ValueError:
+            return float("nan")
+
+    @property
+    def key(self) -> str:
+        """What the values stand for, in their order; "" for a single one, which needs no telling apart."""
+        if len(self.columns) < 2:
+            return ""
+        return " · ".join(channel_words(name, self.units) for name in self.columns)
+
+    def _value(self, name: str, value: str) -> str:
+        unit = self.units.of(name)
+        number = re.fullmatch(r"-?[0-9.]+(e[-+]?[0-9]+)?", value)
+        if unit:
+            return f"{value} {unit}" if number else value
+        return f"{channel_words(name, self.units)} {value}" if number else value
+
+
+def is_unaged(text: object) -> bool:
+    """Return whether a condition or series is that of unaged rubber."""
+    return str(text) == UNAGED or str(text).startswith(f"{UNAGED}, ")
+
+
+def joined(words: Sequence[str]) -> str:
+    """Return "a", "a and b", "a, b and c"."""
+    words = [str(word) for word in words]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else ""

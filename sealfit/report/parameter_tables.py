@@ -1,0 +1,340 @@
+"""The fitted parameters and laws of aging as tables to read, each value with its interval."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import pandas as pd
+from markupsafe import Markup
+
+from sealfit.config import Config
+from sealfit.report.excerpts import MOST_ROWS, spread
+from sealfit.report.notation import (
+    NOTHING,
+    ConditionNames,
+    count,
+    given,
+    is_unaged,
+    known,
+    measured,
+    number,
+    quantity_words,
+    symbol_html,
+    true_units,
+)
+from sealfit.report.style import natural
+
+# ---------------------------------------------------------------- law tables
+# The joint laws of aging as rows to read: what each says, and the evidence for it.
+
+MOST_LAWS = 4  # of each quantity
+
+
+def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> list[dict]:
+    """Return the likeliest laws of each quantity, and separate laws, as plain values for the page.
+
+    Parameters
+    ----------
+    aging_laws : DataFrame
+        Table `aging_laws`, perhaps empty.
+    before : DataFrame, optional
+        The same without the loop's effects: its likeliest law follows that of `aging_laws`.
+    """
+    found = []
+    earlier = {} if before is None else {row["key"]: row for row in law_rows(before) if row["chosen"]}
+    several = aging_laws["rubber"].nunique() > 1 if len(aging_laws) else False
+    for (rubber, quantity), own in aging_laws.groupby(["rubber", "quantity"], sort=False):
+        last = own["rank"].max()
+        for rank, law in own.groupby("rank", sort=True):
+            first = law.iloc[0]
+            if rank > MOST_LAWS and not (rank == last and first["law"] == "separate"):
+                continue
+            by = law.dropna(subset=["parameter"]).set_index("parameter")
+            found.append(
+                {
+                    "rubber": rubber if several else "",
+                    "quantity": symbol_html(quantity),
+                    "form": first["form"],
+                    "changes": f"the {first['way']}" if first["way"] else NOTHING,
+                    "criterion": number(first["criterion"]) if rank > 1 else "0",
+                    "energy": _with_interval(by, "E"),
+                    "kappa": _with_interval(by, "kappa"),
+                    "heldout_series": number(first["heldout_series"]) if known(first["heldout_series"]) else NOTHING,
+                    "heldout_last_day": number(first["heldout_last_day"])
+                    if known(first["heldout_last_day"])
+                    else NOTHING,
+                    "chosen": rank == 1,
+                    "before": False,
+                    "key": (rubber, quantity),
+                }
+            )
+            if rank == 1 and (rubber, quantity) in earlier:
+                found.append({**earlier[rubber, quantity], "criterion": NOTHING, "chosen": False, "before": True})
+    return found
+
+
+def _with_interval(by: pd.DataFrame, name: str) -> str:
+    """Return a parameter with its interval, or that these data do not determine it."""
+    if name not in by.index:
+        return NOTHING
+    row = by.loc[name]
+    if not row["identified"]:
+        return "not identified"
+    value, interval = measured(row["value"], row["lo95"], row["hi95"])
+    return f"{value} {interval}"
+
+
+# ---------------------------------------------------------------- parameters
+# The fitted parameters as tables to read: a row per condition or series, each parameter with interval and u_sys.
+
+STATISTICS = (
+    "rmse_N", "rmse", "max_error_pct", "specimen_sd_pct", "reduced_chi2", "lack_of_fit_p", "df",
+    "n_runs", "n_files", "n_speeds", "n_days", "last_day",
+)  # fmt: skip
+ENDS = ("value", "lo95", "hi95")
+MOST_BREAK_AWAYS = 600
+HIDDEN = ("covariance", "sensor_shift", "effect_shift")  # for programs; they stand in the Parquet tables
+
+Rows = dict[tuple[str, str], dict]  # of one condition or series, by parameter and unit
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One parameter of one row; `words` stands in its place where these data do not determine it."""
+
+    value: str = NOTHING
+    interval: str = NOTHING
+    u_sys: str = NOTHING
+    words: str = ""
+    before: str = NOTHING  # the value without the loop's effects
+
+
+@dataclass(frozen=True)
+class ParameterTable:
+    """A table ready to be written: heads of the key columns, (symbol, unit) of each parameter, rows, notes.
+
+    A row is its keys, its cells, and what there is to say about it: why a parameter is not identified, remarks.
+    """
+
+    title: str
+    heads: tuple[str, ...]
+    groups: tuple[tuple[Markup, str], ...]
+    rows: tuple[tuple[tuple[str | Markup, ...], tuple[Cell, ...], Markup], ...]
+    single: bool = False  # values only: statistics have neither interval nor u_sys
+    note: str = ""  # which of how many there are, where they are too many
+    compared: bool = False  # whether cells say what they were before
+
+    @property
+    def width(self) -> int:
+        """Number of columns of a parameter."""
+        return 1 if self.single else 4 if self.compared else 3
+
+
+def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
+    """Return the break-aways that stand above the sliding force, as plain values for the page, and how many there are.
+
+    Parameters
+    ----------
+    dynamic_fit : DataFrame
+        Table `dynamic_fit`, perhaps empty.
+    config : Config
+        Names the conditions and gives the true units.
+    """
+    names, found = ConditionNames.of(config), []
+    keys = ("condition", "speed_set_mm_s", "direction")
+    groups: dict[tuple, dict[str, dict]] = {}
+    for row in _records(dynamic_fit[dynamic_fit["quantity"] == "break_away"], *keys):
+        groups.setdefault(tuple(row[name] for name in keys), {})[row["parameter"]] = row
+    ratios = {place: by["F_ba/F"] for place, by in groups.items()}
+    above = [place for place, ratio in ratios.items() if ratio["identified"] and not ratio["reason"]]
+    for condition, speed, direction in spread(above, MOST_BREAK_AWAYS):
+        by, ratio = groups[condition, speed, direction], ratios[condition, speed, direction]
+        force, interval = measured(*(by["F_ba"][name] for name in ENDS))
+        percents = (None if ratio[name] is None else 100.0 * (ratio[name] - 1.0) for name in ENDS)
+        share, share_interval = measured(*percents)
+        found.append(
+            {
+                "condition": names(condition),
+                "speed": given(speed) if known(speed) else NOTHING,
+                "direction": "forward" if direction > 0 else "backward",
+                "force": force,
+                "force_interval": interval,
+                "share": share,
+                "share_interval": share_interval,
+            }
+        )
+    return found, len(above)
+
+
+def parameter_tables(
+    fit: pd.DataFrame, key: str, config: Config, before: pd.DataFrame | None = None
+) -> list[ParameterTable]:
+    """Return the tables of `steady_fit` (key "condition") or `aging_fit` (key "series").
+
+    Quantities with the same parameters share a table; units stand in the head, and where a parameter has another unit
+    than in the head's row it has a column of its own.
+
+    Parameters
+    ----------
+    fit : DataFrame
+        Table `steady_fit` or `aging_fit`, perhaps empty.
+    key : str
+        Column that tells the rows apart.
+    config : Config
+        Names the conditions and gives the true units.
+    before : DataFrame, optional
+        The same table without the loop's effects, for its values beside those of `fit`.
+    """
+    fit = fit[~fit["quantity"].isin(HIDDEN)]
+    if fit.empty:
+        return []
+    earlier = _values(before, key) if before is not None else None
+    names = ConditionNames.of(config)
+    of_quantity = {
+        quantity: tuple(dict.fromkeys(zip(rows["parameter"], rows["unit"].fillna(""), strict=True)))
+        for quantity, rows in fit.groupby("quantity", sort=False)
+    }
+    fit, note = _readable(fit, key, names)
+    tables = []
+    for parameters in dict.fromkeys(of_quantity.values()):
+        quantities = [quantity for quantity, own in of_quantity.items() if own == parameters]
+        rows = fit[fit["quantity"].isin(quantities)]
+        if quantities == ["statistics"]:
+            tables.append(_statistics(rows, key, names, config))
+        else:
+            tables.append(_table(rows, key, quantities, parameters, names, config, earlier))
+    return [replace(table, note=note) for table in tables]
+
+
+def _values(fit: pd.DataFrame, key: str) -> dict[tuple[str, str, str], dict]:
+    """Return the rows of a fit table by condition or series, quantity and parameter."""
+    return {(row[key], row["quantity"], row["parameter"]): row for row in _records(fit, key, "quantity")}
+
+
+def _readable(fit: pd.DataFrame, key: str, names: ConditionNames) -> tuple[pd.DataFrame, str]:
+    """Return the rows of as many conditions or series as one reads, and in words which they are."""
+    every = sorted(fit[key].unique(), key=lambda name: _place(name, names))
+    if len(every) <= MOST_ROWS:
+        return fit, ""
+    stored = "aging_fit" if key == "series" else "dynamic_fit" if "dynamic" in set(fit["quantity"]) else "steady_fit"
+    note = (
+        f"{MOST_ROWS} of {count(len(every), key, key if key == 'series' else None)}, spread evenly over all of them; "
+    )
+    return fit[fit[key].isin(spread(every, MOST_ROWS))], f"{note}the others stand in {stored}.parquet."
+
+
+def _table(
+    fit: pd.DataFrame,
+    key: str,
+    quantities: Sequence[str],
+    parameters: Sequence[tuple[str, str]],
+    names: ConditionNames,
+    config: Config,
+    earlier: Mapping[tuple[str, str, str], Mapping] | None,
+) -> ParameterTable:
+    several = len(quantities) > 1 or key == "series"
+    found = []
+    for (name, quantity), by in _rows_of(fit, key, "quantity", names):
+        cells = tuple(_cell(by.get(parameter)) for parameter in parameters)
+        if earlier is not None:
+            olds = [_before(earlier.get((name, quantity, parameter))) for parameter, _ in parameters]
+            cells = tuple(replace(cell, before=old) for cell, old in zip(cells, olds, strict=True))
+        keys = (names(name), symbol_html(quantity)) if several else (names(name),)
+        found.append((keys, cells, _note(by, config)))
+    heads = (_head(key), "of") if several else (_head(key),)
+    groups = tuple((symbol_html(p), u) for p, u in parameters)
+    title = _title(key, quantities, after=earlier is not None)
+    return ParameterTable(title, heads, groups, tuple(found), compared=earlier is not None)
+
+
+def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Config) -> ParameterTable:
+    split = fit["parameter"].str.rpartition(":")  # "mu_s:lack_of_fit_p" is about mu_s alone
+    fit = fit.assign(of=split[0], parameter=split[2])
+    several = fit["of"].ne("").any()
+    present = set(zip(fit["parameter"], fit["unit"].fillna(""), strict=True))
+    shown = [(name, unit) for name in STATISTICS for found, unit in sorted(present) if found == name]
+    shown = shown or sorted(present)
+    found = []
+    for (name, of), by in _rows_of(fit, key, "of", names):
+        cells = tuple(Cell(_statistic(by[p]) if p in by else NOTHING) for p in shown)
+        lack = {p: row for p, row in by.items() if p[0] == "lack_of_fit_p"}
+        keys = (names(name), symbol_html(of)) if several else (names(name),)
+        found.append((keys, cells, _note(lack, config, named=False)))
+    groups = tuple((Markup("{}").format(quantity_words(p)), u) for p, u in shown)
+    title = "How well the fits do" if key == "condition" else "How well the aging law does"
+    heads = (_head(key), "of") if several else (_head(key),)
+    return ParameterTable(title, heads, groups, tuple(found), single=True)
+
+
+def _rows_of(fit: pd.DataFrame, key: str, second: str, names: ConditionNames) -> list[tuple[tuple[str, str], Rows]]:
+    """Return ((key, second), rows by parameter and unit): unaged rubber first, then by temperature, ..., days."""
+    found: dict[tuple[str, str], Rows] = {}
+    for row in _records(fit, key, second):
+        found.setdefault((row[key], row[second]), {})[row["parameter"], row["unit"] or ""] = row
+    places = {name: _place(name, names) for name, _ in found}
+    return sorted(found.items(), key=lambda entry: places[entry[0][0]])
+
+
+def _place(name: str, names: ConditionNames) -> tuple[bool, list]:
+    """Return a sort key of a condition or series."""
+    return not is_unaged(name), natural((names(name), None))
+
+
+def _records(rows: pd.DataFrame, *keys: str) -> list[dict]:
+    """Return rows as dictionaries, None where nothing stands: a table of one dtype takes pandas one pass."""
+    plain = rows[[*keys, "parameter", "unit", "value", "lo95", "hi95", "u_sys", "identified", "reason"]].astype(object)
+    return plain.where(plain.notna(), None).to_dict("records")
+
+
+def _statistic(row: Mapping) -> str:
+    """Return a count as a count, a measure with its digits."""
+    whole = known(row["value"]) and float(row["value"]).is_integer() and abs(row["value"]) >= 1
+    return given(row["value"], 9) if whole else number(row["value"])
+
+
+def _cell(row: Mapping | None) -> Cell:
+    if row is None:
+        return Cell()
+    if not row["identified"]:
+        return Cell(words="not identified")
+    value, interval = measured(row["value"], row["lo95"], row["hi95"])
+    return Cell(value, interval, number(row["u_sys"], 2) if known(row["u_sys"]) else NOTHING)
+
+
+def _before(row: Mapping | None) -> str:
+    """Return a value without the loop's effects, in the digits of its own interval."""
+    if row is None or not row["identified"]:
+        return NOTHING
+    return measured(row["value"], row["lo95"], row["hi95"])[0]
+
+
+def _note(rows: Mapping[tuple[str, str], Mapping], config: Config, *, named: bool = True) -> Markup:
+    """Return what there is to say about a row, each thing once, with the parameters that it is about."""
+    about: dict[tuple[bool, str], list[str]] = {}
+    for (parameter, _), row in rows.items():
+        why = row["reason"] or ("" if row["identified"] else "these data do not determine it")
+        if why:
+            about.setdefault((bool(row["identified"]), str(why)), []).append(parameter)
+    said = []
+    for (identified, why), parameters in about.items():
+        lead = Markup(", ").join([symbol_html(p) for p in parameters]) if named else Markup("")
+        lead += Markup("" if identified else " not identified")
+        said.append(Markup("{}{}{}").format(lead, ": " if lead else "", true_units(why, config.units)))
+    return Markup("<br>").join(said)
+
+
+def _head(key: str) -> str:
+    return {"condition": "condition", "series": "series"}.get(key, key)
+
+
+def _title(key: str, quantities: Sequence[str], *, after: bool) -> str:
+    if quantities == ["dynamic"]:
+        return "Bristles, fitted to the starts of each condition"
+    if key == "condition":
+        return "Steady friction, fitted to each condition on its own"
+    return (
+        ("Aging law of each series, from the joint fit" if after else "Aging law, fitted to each series")
+        if set(quantities) <= {"mu_s", "mu_c", "F_s", "F_c"}
+        else ", ".join(quantities)
+    )

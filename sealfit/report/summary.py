@@ -1,0 +1,249 @@
+"""What a command ends with: the main figures as plain values, and clauses on the verdict that the report shares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from sealfit.units import Units
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from sealfit.effects.contract import Effect
+    from sealfit.store.out_folder import Store
+
+
+# ---------------------------------------------------------------- summary
+# What a command ends with: the main figures as plain values, for --json; `summary_lines` has the same in words.
+
+NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift", "effect_shift")  # `quantity` of rows about the fit itself
+
+OF_INGEST = {  # columns that its summary counts
+    "inputs": ["status"],
+    "runs": ["used", "run_id"],
+    "quality": ["action", "severity", "check", "column", "value", "reason"],
+    "steady": ["condition"],
+}
+EFFECT_KEYS = (
+    "id",
+    "label",
+    "form",
+    "acts_on",
+    "operation",
+    "channels",
+    "named",
+    "candidate",
+    "parameters",
+    "reference",
+)
+
+
+def of_steps(store: Store, steps: Iterable[str]) -> dict:
+    """Return the summaries of `steps`, all of them current."""
+    make = {
+        "ingest": lambda: of_ingest({name: store.read(name, columns) for name, columns in OF_INGEST.items()}),
+        "fit-steady": lambda: of_fit(store.read("steady_fit"), "condition"),
+        "fit-aging": lambda: of_fit(store.read("aging_fit"), "series"),
+        "fit-dynamic": lambda: of_dynamic(store.read("dynamic_fit")),
+        "close-loop": lambda: of_closure(store.read_json("closure"), store.config.units) | {"fits": of_after(store)},
+        "report": lambda: {"file": str(store.out / "report.html")},
+    }
+    return {step.replace("-", "_"): make[step]() for step in steps}
+
+
+def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
+    """Return how many files, runs and conditions there are, and how many faults."""
+    inputs, quality, steady = tables["inputs"], tables["quality"], tables["steady"]
+    runs = tables["runs"][tables["runs"]["used"].astype(bool)]
+    return {
+        "files": {
+            "used": int((inputs["status"] == "used").sum()),
+            "left_out": int((inputs["status"] == "left out").sum()),
+            "not_matched": int((inputs["status"] == "not matched").sum()),
+        },
+        "rows_left_out": int((quality["action"] == "row left out").sum()),
+        "strokes_left_out": int((quality["action"] == "stroke left out").sum()),
+        "faults": {severity: int((quality["severity"] == severity).sum()) for severity in ("error", "warning")},
+        "incomplete_columns": _incomplete(quality),
+        "runs": int(runs["run_id"].nunique()),
+        "conditions": int(steady["condition"].nunique()),
+    }
+
+
+def _incomplete(quality: pd.DataFrame) -> list[dict]:
+    """Return the columns that some files have no value of, and what that does."""
+    rows = quality[quality["check"] == "incomplete_column"]
+    return [
+        {"column": column, "files_without": int(float(value)), "reason": reason}
+        for column, value, reason in zip(rows["column"], rows["value"], rows["reason"], strict=True)
+    ]
+
+
+def of_fit(fit: pd.DataFrame, of: str) -> dict:
+    """Return the range of every parameter over the conditions or series of `fit` in which it is identified."""
+    rows = fit[~fit["quantity"].isin(NOT_PARAMETERS)]
+    ranges = []
+    for (quantity, parameter, unit), group in rows.groupby(["quantity", "parameter", "unit"], sort=False, dropna=False):
+        known = group.loc[group["identified"].astype(bool), "value"].dropna()
+        why = group.loc[~group["identified"].astype(bool), "reason"].dropna().mode()
+        ranges.append(
+            {
+                "quantity": quantity,
+                "parameter": parameter,
+                "unit": unit or "",
+                "min": float(known.min()) if len(known) else None,
+                "max": float(known.max()) if len(known) else None,
+                "identified": len(known),
+                "of": len(group),
+                "reason": str(why.iloc[0]) if len(why) else "",  # the commonest why not
+            }
+        )
+    return {of: int(fit[of].nunique()), "parameters": ranges}
+
+
+def of_dynamic(fit: pd.DataFrame) -> dict:
+    """Return the ranges of sigma_0 and sigma_1, and the largest break-away above the sliding force."""
+    ratios = fit[fit["parameter"] == "F_ba/F"]
+    broken = ratios[ratios["identified"].astype(bool) & (ratios["reason"] == "")]
+    most = broken.loc[broken["value"].idxmax()] if len(broken) else None
+    return {
+        **of_fit(fit[fit["quantity"] == "dynamic"], "condition"),
+        "break_aways": len(ratios),
+        "above_sliding": len(broken),
+        "largest_ratio": None if most is None else float(most["value"]),
+        "largest_at": None if most is None else str(most["condition"]),
+    }
+
+
+def of_closure(closure: Mapping, units: Units) -> dict:
+    """Return the verdict, the errors before and after, the effects and what is left."""
+    kept = (
+        "verdict", "fit_quality", "sensitivity", "refused", "units", "noise_floor_N", "before", "after",
+        "heldout_unit", "left", "next_runs",
+    )  # fmt: skip
+    effects = [{key: effect[key] for key in EFFECT_KEYS} for effect in closure["effects"]]
+    return {**{key: closure[key] for key in kept}, "sentence": verdict_sentence(closure, units), "effects": effects}
+
+
+def of_after(store: Store) -> dict:
+    """Return the summaries of the fits with the loop's effects taken out; empty where none was added."""
+    if all(effect["candidate"] for effect in store.read_json("closure")["effects"]):
+        return {}
+    return {
+        "fit_steady": of_fit(store.read("steady_fit_after"), "condition"),
+        "fit_aging": of_fit(store.read("aging_fit_after"), "series"),
+        "fit_dynamic": of_dynamic(store.read("dynamic_fit_after")),
+    }
+
+
+def verdict_sentence(closure: Mapping, units: Units) -> str:
+    """Return the verdict in one sentence."""
+    count = sum(not effect["candidate"] for effect in closure["effects"])
+    added = {0: "no effect was added", 1: "one effect was missing and is added"}.get(
+        count, f"{count} effects were missing and are added"
+    )
+    quality = quality_clause(closure)
+    if closure["verdict"] == "nothing_missing":
+        power = power_clause(closure, units)
+        return "; ".join(filter(None, ["nothing was found that the declared model misses", quality, power]))
+    if closure["verdict"] == "cannot_tell":
+        return f"{quality}, and these files cannot tell why: {untold_clause(closure, units)}"
+    if closure["verdict"] == "closed":
+        untold = untold_clause(closure, units)
+        beside = f"; these files cannot tell of {untold}" if untold else ""
+        return f"{added}; no significant structure is left; {quality}{beside}"
+    return f"{added}, and something is left that no model holds{_where(closure['left'], units)}; {quality}"
+
+
+def _where(left: Mapping, units: Units) -> str:
+    where = f", at the level of the {left['level']}" if left["level"] else ""
+    along = f", along {units.label(left['channel'])}" if left["channel"] else ""
+    return where + along + (f" (p = {left['p_value']:.2g})" if left["p_value"] is not None else "")
+
+
+def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
+    """Return the catalogue as plain values; parameters have their units for the likeliest way to act."""
+    from types import SimpleNamespace
+
+    from sealfit.closure.result import parameter_unit
+    from sealfit.effects.contract import CHANNEL
+
+    units = replace(units, channels={**units.channels, CHANNEL: "unit of x"})
+    listed = []
+    for effect in effects:
+        target, operation = effect.acts_on[0]
+        likeliest = SimpleNamespace(channels=effect.reads, acts_on=target, operation=operation)
+        listed.append(
+            {
+                "id": effect.id,
+                "label": effect.label.replace("{x}", "a channel x").replace("{z}", "a channel z"),
+                "form": effect.form,
+                "equation": effect.equation,
+                "reads": list(effect.reads),
+                "acts_on": [{"target": target, "operation": operation} for target, operation in effect.acts_on],
+                "physical": effect.physical,
+                "source": effect.source,
+                "parameters": [
+                    {"name": p.name, "unit": parameter_unit(p.unit, likeliest, units), "meaning": p.meaning}
+                    for p in effect.parameters
+                ],
+            }
+        )
+    return listed
+
+
+# ---------------------------------------------------------------- verdict
+# Clauses that the summary and the report share: fit quality beside the verdict, and what could have been seen.
+
+WITHIN = {
+    "trace": "along a stroke", "stroke": "from stroke to stroke", "repeat": "from repeat to repeat",
+    "run": "from run to run", "condition": "from specimen to specimen",
+}  # fmt: skip
+"""Words for the level at which a variable varies."""
+
+NAMED = 3
+"""Variables whose smallest effect a sentence gives."""
+
+
+def quality_clause(closure: Mapping) -> str:
+    """Return how the error compares with the scatter of repeats, in a clause."""
+    quality = closure.get("fit_quality") or {"state": "unknown"}
+    if quality["state"] == "unknown":
+        return "whether the error is only scatter is not known without repeats"
+    if quality["state"] == "within_scatter":
+        return "the error is within the scatter of repeats"
+    times, p_value = quality["ratio"], quality["p_value"]
+    return f"the error is {times:.2g} times the scatter of repeats (lack of fit p = {p_value:.1g})"
+
+
+def power_clause(closure: Mapping, units: Units) -> str:
+    """Return the smallest effects that the campaign would have found, in a clause; empty where nothing is known."""
+    known = [s for s in closure.get("sensitivity") or () if s["smallest_N"] is not None]
+    if not known:
+        return ""
+    largest = sorted(known, key=lambda s: -s["smallest_N"])[:NAMED]
+    texts = [f"{units.label(s['variable'])} {WITHIN[s['level']]} {s['smallest_pct']:.2g} %" for s in largest]
+    return f"the least sensitive variables would have shown an effect of {', '.join(texts)} of the force"
+
+
+def untold_clause(closure: Mapping, units: Units) -> str:
+    """Return which variables the campaign could not tell of, and what would do, in a clause; empty for none."""
+    texts = [
+        f"{effect['label']} (shown by too few specimens, or differently: test more)"
+        for effect in closure["effects"]
+        if effect["candidate"]
+    ]
+    texts += [
+        f"{item['label']} (p = {item['p_value']:.1g}, too weak to claim it: test more)"
+        for item in closure.get("refused") or ()
+        if item["weak"]
+    ][:NAMED]
+    for entry in [s for s in closure.get("sensitivity") or () if s["cannot_tell"]][:NAMED]:
+        name, smallest, files = entry["variable"], entry["smallest_pct"], entry["files_needed"]
+        size = "no effect" if smallest is None else f"no effect below {smallest:.2g} % of the force"
+        more = f"; about {files} files like these would show one of 1 %" if files and smallest is not None else ""
+        more = f"; at least {files} files are needed" if files and smallest is None else more
+        texts.append(f"{units.label(name)} ({size} could be seen{more})")
+    return ", ".join(texts)

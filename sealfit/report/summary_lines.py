@@ -1,0 +1,246 @@
+"""What a command ends with, in a few lines: the figures of `summary` as people read them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+# ---------------------------------------------------------------- summary lines
+# What a command ends with, in a few lines: the figures of `summary` as people read them.
+
+
+def lines(summary: Mapping) -> list[str]:
+    """Return the summary of one step or of all of them, a line for each thing worth knowing.
+
+    Where the loop added effects, the fits with these taken out come first, and those before beside them.
+    """
+    writers = {
+        "ingest": ingest_lines,
+        "fit_steady": lambda part: _fit_lines("steady fit", part),
+        "fit_aging": lambda part: _fit_lines("aging", part),
+        "fit_dynamic": dynamic_lines,
+        "close_loop": closure_lines,
+        "report": lambda part: [line("report", part["file"])],
+    }
+    after, found = summary.get("close_loop", {}).get("fits") or {}, []
+    for name, write in writers.items():
+        found += write(after[name]) if name in after else []
+        own = write(summary[name]) if name in summary else []
+        if name in after:
+            own = [line("  before", text[len(line("", "")) :]) for text in own if text not in found]
+        found += own
+    return found
+
+
+def ingest_lines(part: Mapping) -> list[str]:
+    """Return the lines of an ingest."""
+    files, faults = part["files"], part["faults"]
+    text = f"{files['used']} used, {files['left_out']} left out"
+    if files["not_matched"]:
+        text += f", {files['not_matched']} not matched by the file-name pattern"
+    found = [line("files", text)]
+    left_out = [_count(part[f"{what}s_left_out"], what) for what in ("stroke", "row") if part[f"{what}s_left_out"]]
+    if sum(faults.values()):
+        text = f"{_count(faults['error'], 'error')}, {_count(faults['warning'], 'warning')}"
+        more = f"; left out: {', '.join(left_out)}" if left_out else ""
+        found.append(line("faults", f"{text}{more} (table quality)"))
+    found += [line("column", f"{one['column']}: {one['reason']}") for one in part["incomplete_columns"]]
+    found.append(line("conditions", f"{part['conditions']} in {_count(part['runs'], 'run')}"))
+    return found
+
+
+def _fit_lines(title: str, part: Mapping) -> list[str]:
+    ranges = part["parameters"]
+    if not ranges:
+        return [line(title, "nothing to fit")]
+    quantities = list(dict.fromkeys(entry["quantity"] for entry in ranges))
+    found = []
+    for quantity in quantities:
+        texts = [_range(entry) for entry in ranges if entry["quantity"] == quantity]
+        name = "" if len(quantities) == 1 else f"{quantity}: "
+        found.append(line(title if not found else "", name + ", ".join(texts)))
+    lacking = [entry for entry in ranges if entry["identified"] < entry["of"]]
+    if lacking:
+        names = [f"{e['quantity']} {e['parameter']}" if len(quantities) > 1 else e["parameter"] for e in lacking]
+        texts = [
+            f"{name} in {entry['of'] - entry['identified']} of {entry['of']}" if entry["of"] > 1 else name
+            for name, entry in zip(names, lacking, strict=True)
+        ]
+        reason = next((entry["reason"] for entry in lacking if entry["reason"]), "")
+        found.append(line("", f"not identified: {', '.join(texts)}. {reason}".rstrip()))
+    return found
+
+
+def dynamic_lines(part: Mapping) -> list[str]:
+    """Return the lines of the dynamic fit."""
+    found = _fit_lines("pre-sliding", part)
+    if part["above_sliding"]:
+        more = f"{part['largest_ratio'] - 1:.1%} at most, {part['largest_at']}"
+        text = f"above the sliding force in {part['above_sliding']} of {part['break_aways']} cases of condition, speed "
+        text += f"and direction ({more})"
+        found.append(line("break-away", text))
+    return found
+
+
+def _range(entry: Mapping) -> str:
+    unit = f" {entry['unit']}" if entry["unit"] else ""
+    if entry["min"] is None:
+        return f"{entry['parameter']} not identified"
+    if entry["min"] == entry["max"]:
+        return f"{entry['parameter']} {entry['min']:.4g}{unit}"
+    return f"{entry['parameter']} {entry['min']:.4g} to {entry['max']:.4g}{unit}"
+
+
+def closure_lines(part: Mapping) -> list[str]:
+    """Return the lines of a closed loop."""
+    unit, before, after = part["units"]["force_N"], part["before"], part["after"]
+    found = [line("verdict", f"{part['verdict']}: {part['sentence']}")]
+    for effect in part["effects"]:
+        status = "candidate, not applied: " if effect["candidate"] else "+ "
+        known = [p for p in effect["parameters"] if p["value"] is not None or p["name"] != "phi"]
+        values = ", ".join(_value(p) for p in known) if effect["named"] else "no form does as well"
+        found.append(line("", f"{status}{effect['label']}: {values}"))
+        if not effect["candidate"]:
+            found.append(line("", f"  reference state of the coefficients: {effect['reference']}"))
+    rows = (("rmse", "rmse_N"), ("held out", "heldout_rmse_N"), ("run means", "rmse_runs_N"), ("largest", "max_abs_N"))
+    texts = [f"{name} {_number(before[key])} -> {_number(after[key])}" for name, key in rows]
+    found.append(line(f"error ({unit})", "; ".join(texts)))
+    if part["noise_floor_N"] is not None:
+        found.append(line("noise floor", f"{_number(part['noise_floor_N'])} {unit}"))
+    if part["left"]["channel"] is not None:
+        found.append(line("left", _left(part["left"], part["verdict"], unit)))
+    for run in part["next_runs"][:3]:
+        found.append(line("next runs", run["why"]))
+    return found
+
+
+def _left(left: Mapping, verdict: str, unit: str) -> str:
+    """Return what is left: how much above the floor, along which channels, and whether chance could have made it."""
+    above = f"rmse {_number(left['rmse_N'])} {unit} above the floor, " if left["rmse_N"] else ""
+    sure = "" if verdict == "unexplained" else ": no claim, a place to look"
+    return f"{above}along {left['channel']} (p {left['p_value']:.2g}){sure}"
+
+
+def _value(parameter: Mapping) -> str:
+    unit = f" {parameter['unit']}" if parameter["unit"] else ""
+    return f"{parameter['name']} {_number(parameter['value'])}{unit}"
+
+
+def _acts(effect: Mapping) -> str:
+    how = {"add": "added to", "multiply": "a factor on"}[effect["operation"]]
+    return f"{how} {'the force' if effect['acts_on'] == 'force' else effect['acts_on']}"
+
+
+def effects_lines(listed: Mapping) -> list[str]:
+    """Return the catalogue, an effect after the other."""
+    found = []
+    for effect in listed["effects"]:
+        mark = "  [in the model of this OUT]" if effect["id"] in (listed.get("added") or ()) else ""
+        found.append(f"{effect['id']}: {effect['label']}{mark}")
+        acts = ", ".join(_acts({**way, "acts_on": way["target"]}) for way in effect["acts_on"])
+        found.append(f"    {effect['form']}")
+        found.append(f"    {acts}")
+        for p in effect["parameters"]:
+            found.append(f"    {p['name']}{' [' + p['unit'] + ']' if p['unit'] else ''}: {p['meaning']}")
+    if listed.get("added", ()) is None:
+        found.append("The loop of this OUT is not closed, or stale: which effects it added is not known.")
+    if listed.get("note"):
+        found.append(f"note: {listed['note']}")
+    return found
+
+
+def predict_lines(part: Mapping) -> list[str]:
+    """Return the lines of a prediction."""
+    text = f"{part['answered']} of {_count(part['rows'], 'row')} answered, {part['extrapolated']} extrapolated"
+    refused = part["rows"] - part["answered"]
+    if refused:
+        text += f"; {_count(refused, 'row')} could not be, and the column note says why"
+    return [line("points", text), line("answers", part["output"])]
+
+
+def line(title: str, text: str) -> str:
+    """Return a line of a summary under its title."""
+    return f"{title:<11} {text}"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3g}"
+
+
+# ---------------------------------------------------------------- summary life
+# What `lifetime` ends with, in lines.
+
+
+def lifetime_lines(part: Mapping) -> list[str]:
+    """Return the lines of a lifetime, the rivals' answers below it."""
+    found = [line("model", text) for text in _model(part)]
+    found.append(line("law", f"{part['quantity']} = {part['form']}, {_change(part)}"))
+    found.append(line("life" if "days" in part else "use", _life(part)))
+    if part.get("ci95_resampled"):
+        found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
+    if part.get("ci95_over_laws") and part["rivals"] and part["days"]:
+        found.append(line("", f"95 % interval over all laws by their weight: {_days_between(part['ci95_over_laws'])}"))
+    if part.get("before"):
+        found.append(line("before", f"{_life(part['before'])}, without the effects"))
+    for rival in part["rivals"]:
+        found.append(line("rival", f"{rival['form']}, {_change(rival)}: {_life(rival)}"))
+    return found
+
+
+def _model(part: Mapping) -> list[str]:
+    """Return which model answers, and the state in which each of its effects is zero."""
+    if part["model"] == "before":
+        return ["before: declared model, without the effects of the loop"]
+    if not part["effects"]:
+        return ["after: no effect was added, so it is the declared model"]
+    return [f"after, {effect['reference']}: {effect['label']}" for effect in part["effects"]]
+
+
+def _change(part: Mapping) -> str:
+    names = [name for name in ("E", "kappa") if name in part["parameters"]]
+    if not names:
+        return "one temperature and compression"
+    driven = f"temperature and compression change the {part['way']}"
+    energy = f", E = {part['parameters']['E']:.3g} kJ/mol" if "E" in names else ""
+    return driven + energy
+
+
+def _life(part: Mapping) -> str:
+    if "days" not in part:
+        years, span = f"{part['years']:g} years", "from {:g} to {:g} degC".format(*part["sought_C"])
+        if part["always"] == "longer":
+            return f"it lasts longer than {years} at every temperature {span}"
+        if part["always"] == "shorter":
+            return f"at no temperature {span} does it last {years}"
+        low, high = part["tested_C"]
+        beyond = f" (extrapolated: tested from {low:g} to {high:g} degC)" if part["extrapolated"] else ""
+        return f"it lasts {years} at {part['temperature_C']:.1f} degC{_degrees(part['temperature_ci95'])}{beyond}"
+    if part["days"] is None:
+        return f"{part['threshold']:.4g} is not reached, not in 1e9 d"
+    if part["days"] == 0:
+        return f"unaged rubber is beyond {part['threshold']:.4g} already"
+    text = f"{part['days']:.3g} d to {part['threshold']:.4g}, 95 % {_days_between(part['ci95'])}"
+    if part["beyond_tests"] is not None and part["beyond_tests"] > 1:
+        text += f" (extrapolated: {part['beyond_tests']:.2g} times the longest test)"
+    if part["outside"]:
+        text += f" (extrapolated: {' and '.join(part['outside'])} outside what was tested)"
+    return text
+
+
+def _degrees(ends: list) -> str:
+    low, high = ends
+    if low is None and high is None:
+        return ", these tests set no limits to it"
+    if low is None or high is None:
+        return f", 95 % below {high:.1f} degC" if low is None else f", 95 % above {low:.1f} degC"
+    return f", 95 % {low:.1f} to {high:.1f} degC"
+
+
+def _days_between(ends: list) -> str:
+    low, high = ends
+    if low is None:
+        return "not in 1e9 d"
+    return f"{low:.3g} d or more" if high is None else f"{low:.3g} to {high:.3g} d"

@@ -1,0 +1,288 @@
+"""The declared model of a SPEC, Eq. 14 with Eq. 15, and its undeclared effects, bound to the catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from sealfit.effects import EFFECTS
+from sealfit.effects.contract import CHANNEL, Effect, Operation, Target
+from sealfit.effects.free import LEVELS, SMOOTH, smooth_effect
+from sealfit.errors import ConfigError, ParameterError
+from sealfit.simulation.base import Strict
+from sealfit.simulation.formula import evaluate_formula, parse_formula
+
+# ---------------------------------------------------------------- physics
+# The declared model of a SPEC: Eq. 14 with Eq. 15, one law for all series or one each.
+
+# The model's numbers before any effect; the endings _s and _c stand for mu_s and mu_c.
+QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
+
+
+class Law(Strict):
+    """Eq. 15 in its identifiable form, mu_0 - a ln(1 + t/b); forces in N where the design has no load."""
+
+    mu_0: float = Field(gt=0, description="unaged rubber")
+    a: float = Field(0.0, description="loss per e-fold of time")
+    b: float = Field(1.0, gt=0, description="days after which the loss sets in")
+
+
+class Growth(Strict):
+    """How `a` grows with temperature and compression where no series is declared by itself."""
+
+    reference_temperature_C: float = Field(60.0, description="temperature at which `a` is as declared")
+    doubling_C: float = Field(40.0, gt=0, description="degrees that double `a`; ten is van 't Hoff's rule for a rate")
+    reference_compression_pct: float = Field(80.0, description="compression ratio at which `a` is as declared")
+    per_pct: float = Field(0.005, description="relative growth of `a` per percent of height taken away")
+
+    def factor(self, temperature_C, compression_pct):
+        """Return the factor on `a`, broadcast over both arguments."""
+        thermal = 2.0 ** ((temperature_C - self.reference_temperature_C) / self.doubling_C)
+        return thermal * (1.0 + self.per_pct * (self.reference_compression_pct - compression_pct))
+
+
+class SeriesLaw(Strict):
+    """One series declared by itself; what is left out is as in `physics`. mu_0 belongs to the unaged rubber."""
+
+    temperature_C: float | None = None
+    compression_ratio_pct: float | None = None
+    a_s: float | None = None
+    b_s: float | None = Field(None, gt=0)
+    a_c: float | None = None
+    b_c: float | None = Field(None, gt=0)
+    v_s: float | None = Field(None, gt=0)
+    sigma_2: float | None = None
+
+
+class Physics(Strict):
+    """The declared model: Eq. 14 with Eq. 15. The defaults are the paper's numbers for 60 degC and 80 %."""
+
+    mu_s: Law = Law(mu_0=0.93513, a=0.04448, b=0.0804)
+    mu_c: Law = Law(mu_0=0.609, a=0.03307, b=0.1324)
+    v_s: float = Field(5.0, gt=0, description="mm/s")
+    sigma_2: float = Field(0.05, description="N s/mm")
+    sigma_0: float | None = Field(None, gt=0, description="N/mm; none: every rise is design.stiffness_mm long")
+    sigma_1: float = Field(0.0, ge=0, description="N s/mm; only with sigma_0")
+    growth: Growth | None = Field(None, description="none: one law for all series")
+    series: tuple[SeriesLaw, ...] = ()
+
+
+def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the declared model's numbers at given conditions, before any effect: `QUANTITIES`, each of shape (n,).
+
+    Parameters
+    ----------
+    physics : Physics
+        The SPEC's.
+    conditions : mapping of str to ndarray, shape (n,)
+        `temperature_C`, `compression_ratio_pct` and `aging_days`, those that the design has. Unaged rubber (day 0) has
+        v_s and sigma_2 of `physics` itself, whatever its temperature cell says.
+    """
+    n = len(next(iter(conditions.values()))) if conditions else 1
+    temperature = conditions.get("temperature_C")
+    compression = conditions.get("compression_ratio_pct")
+    days = conditions.get("aging_days", np.ones(n))
+    values = {
+        **{f"{name}_s": np.full(n, getattr(physics.mu_s, name)) for name in ("a", "b")},
+        **{f"{name}_c": np.full(n, getattr(physics.mu_c, name)) for name in ("a", "b")},
+        "mu_0s": np.full(n, physics.mu_s.mu_0),
+        "mu_0c": np.full(n, physics.mu_c.mu_0),
+        "v_s": np.full(n, physics.v_s),
+        "sigma_2": np.full(n, physics.sigma_2),
+    }
+    if physics.growth is not None:
+        growth = physics.growth
+        factor = growth.factor(
+            growth.reference_temperature_C if temperature is None else temperature,
+            growth.reference_compression_pct if compression is None else compression,
+        )
+        values["a_s"], values["a_c"] = values["a_s"] * factor, values["a_c"] * factor
+    for series in physics.series:
+        own = np.asarray(days) > 0
+        for wanted, found in ((series.temperature_C, temperature), (series.compression_ratio_pct, compression)):
+            if wanted is not None:
+                own = own & (found == wanted if found is not None else False)
+        for name in ("a_s", "b_s", "a_c", "b_c", "v_s", "sigma_2"):
+            value = getattr(series, name)
+            if value is not None:
+                values[name] = np.where(own, value, values[name])
+    return {name: values[name] for name in QUANTITIES}
+
+
+# ---------------------------------------------------------------- effects
+# The undeclared effects of a SPEC, bound to the catalogue and put to work on the declared model.
+
+EXPRESSION = "expression"
+
+
+class EffectEntry(Strict):
+    """One effect: of the catalogue, `smooth`, `levels` (one value per category), or a formula of channels."""
+
+    id: str
+    channels: tuple[str, ...] = Field((), description="in the order in which the effect reads them")
+    acts_on: Target | None = Field(None, description="default: the catalogue's likeliest; force for an expression")
+    operation: Operation | None = Field(None, description="default: the catalogue's likeliest; add for an expression")
+    parameters: dict[str, float] = Field(default_factory=dict)
+    reference: dict[str, float] = Field(default_factory=dict, description="where it is zero or one, e.g. load_N_ref")
+    knots: tuple[float, ...] = Field((), description="of a smooth shape")
+    formula: str | None = Field(None, description="of an expression")
+
+    @model_validator(mode="after")
+    def _whole(self) -> EffectEntry:
+        if (self.id == EXPRESSION) != (self.formula is not None):
+            raise ValueError("id = 'expression' and formula belong together")
+        if self.formula is not None:
+            try:
+                unknown = [
+                    n for n in parse_formula(self.formula).channels if n not in (*self.channels, *self.parameters)
+                ]
+            except ConfigError as error:
+                raise ValueError(str(error)) from None
+            if self.channels and unknown:
+                raise ValueError(f"formula reads {', '.join(unknown)}: list it in channels or parameters")
+        if self.id == LEVELS and (len(self.channels) != 1 or not self.parameters):
+            raise ValueError("levels needs one channel, and parameters = {category = value, ...}")
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class BoundEffect:
+    """An effect of a SPEC with everything decided: what it reads, what it acts on, and its shape."""
+
+    id: str
+    channels: tuple[str, ...]
+    acts_on: Target
+    operation: Operation
+    form: str
+    parameters: Mapping[str, float]
+    shape: Callable[[Mapping[str, np.ndarray]], np.ndarray]  # channels -> added force, factor minus one or change
+
+
+def resolve_effects(entries: Sequence[EffectEntry]) -> tuple[BoundEffect, ...]:
+    """Return the effects of a SPEC bound to the catalogue, in the SPEC's order.
+
+    Raises
+    ------
+    ConfigError
+        If an id, a parameter or the number of channels is not the catalogue's, or an effect cannot act on a target.
+    """
+    return tuple(_resolve(entry, f"effects.{number} ({entry.id})") for number, entry in enumerate(entries))
+
+
+def _resolve(entry: EffectEntry, place: str) -> BoundEffect:
+    if entry.formula is not None:
+        return _expression(entry)
+    if entry.id == LEVELS:
+        return _levels(entry)
+    effect = _catalogued(entry, place)
+    channels = _bound_channels(entry, effect, place)
+    _check_parameters(entry, effect, place)
+    _check_reference(entry, effect, place)
+    acts_on, operation = _target(entry, effect, place)
+    values, reference = dict(entry.parameters), {k: np.float64(v) for k, v in entry.reference.items()}
+
+    def shape(given: Mapping[str, np.ndarray]) -> np.ndarray:
+        arrays = np.broadcast_arrays(*(np.asarray(given[channel]) for channel in channels))
+        inputs = dict(zip(effect.reads, arrays, strict=True))
+        return np.asarray(effect.shape({**inputs, **reference}, **values), dtype=float)
+
+    return BoundEffect(entry.id, channels, acts_on, operation, effect.form, values, shape)
+
+
+def _catalogued(entry: EffectEntry, place: str) -> Effect:
+    if entry.id == SMOOTH:
+        try:
+            return smooth_effect(entry.knots, entry.reference.get("x_ref"))
+        except ParameterError as error:
+            raise ConfigError(f"{place}: {error}", fix="Give knots = [...].") from error
+    if entry.id not in EFFECTS:
+        known = ", ".join(sorted({*EFFECTS, SMOOTH, LEVELS, EXPRESSION}))
+        raise ConfigError(f"{place}: there is no such effect.", fix=f"Known: {known}.")
+    return EFFECTS[entry.id]
+
+
+def _check_reference(entry: EffectEntry, effect: Effect, place: str) -> None:
+    known = [f"{name}_ref" for name in effect.reads]
+    for name in entry.reference:
+        if name not in known:
+            raise ConfigError(f"{place}: has no reference '{name}'.", fix=f"It may have {', '.join(known)}.")
+
+
+def _bound_channels(entry: EffectEntry, effect: Effect, place: str) -> tuple[str, ...]:
+    if entry.channels:
+        if len(entry.channels) != len(effect.reads):
+            raise ConfigError(
+                f"{place}: reads {len(effect.reads)} channels, {len(entry.channels)} given.",
+                fix=f"Give channels for {', '.join(effect.reads)}, in this order.",
+            )
+        return entry.channels
+    if CHANNEL in effect.reads:
+        raise ConfigError(f"{place}: reads a channel of your choice.", fix='Add channels = ["<column>"].')
+    return effect.reads
+
+
+def _check_parameters(entry: EffectEntry, effect: Effect, place: str) -> None:
+    wanted = {p.name: p for p in effect.parameters}
+    for name in entry.parameters:
+        if name not in wanted:
+            raise ConfigError(f"{place}: has no parameter '{name}'.", fix=f"Its parameters: {', '.join(wanted)}.")
+    for name, parameter in wanted.items():
+        if name not in entry.parameters:
+            raise ConfigError(f"{place}: parameter '{name}' is missing.", fix=f"{name}: {parameter.meaning}.")
+        low, high = parameter.bounds
+        if not parameter.linear and not low <= entry.parameters[name] <= high:
+            raise ConfigError(
+                f"{place}: parameter '{name}' is {entry.parameters[name]:g}.", fix=f"Give {low:g} to {high:g}."
+            )
+
+
+def _target(entry: EffectEntry, effect: Effect, place: str) -> tuple[Target, Operation]:
+    pairs = [
+        (target, operation)
+        for target, operation in effect.acts_on
+        if entry.acts_on in (None, target) and entry.operation in (None, operation)
+    ]
+    if pairs:
+        return pairs[0]
+    known = ", ".join(f"{target} by {operation}" for target, operation in effect.acts_on)
+    wanted = " by ".join(part for part in (entry.acts_on, entry.operation) if part)
+    raise ConfigError(f"{place}: cannot act on {wanted}.", fix=f"It acts on {known}; write an expression for others.")
+
+
+def _expression(entry: EffectEntry) -> BoundEffect:
+    formula = parse_formula(str(entry.formula))
+    constants = {name: np.float64(value) for name, value in entry.parameters.items()}
+    channels = tuple(name for name in formula.channels if name not in constants)
+
+    def shape(given: Mapping[str, np.ndarray]) -> np.ndarray:
+        return evaluate_formula(formula, {**given, **constants})
+
+    target, operation = entry.acts_on or "force", entry.operation or "add"
+    return BoundEffect(entry.id, channels, target, operation, formula.text, dict(entry.parameters), shape)
+
+
+def _levels(entry: EffectEntry) -> BoundEffect:
+    (channel,) = entry.channels
+    labels = np.array(list(entry.parameters), dtype=str)
+    order = np.argsort(labels)
+    values = np.array(list(entry.parameters.values()))[order]
+    labels = labels[order]
+
+    def shape(given: Mapping[str, np.ndarray]) -> np.ndarray:
+        found = _as_label(np.asarray(given[channel]))
+        place = np.minimum(np.searchsorted(labels, found), labels.size - 1)
+        return np.where(labels[place] == found, values[place], 0.0)  # a category without a value has none
+
+    target, operation = entry.acts_on or "force", entry.operation or "add"
+    return BoundEffect(LEVELS, (channel,), target, operation, "value of the level", dict(entry.parameters), shape)
+
+
+def _as_label(values: np.ndarray) -> np.ndarray:
+    """Return categories as text; numbers as %g, so that repeat 2.0 is level "2"."""
+    if values.dtype.kind in "fiu":
+        found, codes = np.unique(values, return_inverse=True)
+        return np.array([f"{v:g}" for v in found], dtype=str)[codes].reshape(values.shape)
+    return values.astype(str)

@@ -1,0 +1,338 @@
+"""The OUT folder: every table written whole or not at all, and every step either current or known to be stale."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sealfit import __version__
+from sealfit.config import Config
+from sealfit.errors import ConfigError, OutError, StaleError
+from sealfit.store.lock import held, undisturbed
+from sealfit.store.manifest import (
+    STATE,
+    STEPS,
+    ConfigCopy,
+    Done,
+    Fingerprint,
+    Fingerprints,
+    State,
+    changes,
+    fingerprint,
+    provenance,
+    seen_config,
+    step_keys,
+    to_json,
+)
+from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
+from sealfit.store.staged_writes import PARQUET, Staged, disk, file_size, sync
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from sealfit.store.parquet import StoredTraces
+
+PROVENANCE = "provenance.json"
+
+
+class Store:
+    """One OUT folder with the campaign and the config it belongs to; `known` if it holds results already.
+
+    `effects` is the folder of the user's own effects that the command line names; the config has it, and no other.
+    """
+
+    def __init__(self, out: Path, state: State, *, known: bool, kept: State | None = None, effects: Path | None = None):
+        self.out, self.state = out, state
+        self._kept = kept  # the state as it stands in `out`
+        self.effects = effects
+        config = state.config.parse()
+        self._names_effects = config.loop.effects_folder is not None
+        own = {"effects_folder": None if effects is None else str(effects)}
+        self.config: Config = config.model_copy(update={"loop": config.loop.model_copy(update=own)})
+        self.warnings: list[str] = []
+        self._keys: dict[str, str] | None = None  # of every step for the campaign as it is now
+        self.anew = False  # whether what is stored already is to be made again
+        self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new, or not as the state has them
+        if state.campaign.is_dir():
+            self._changed = changes(state.campaign, state.inputs, self.config)
+        elif known:
+            self.warnings.append(
+                f"the campaign folder {state.campaign} is not there: whether it has changed cannot be told."
+            )
+        self.marks = state.inputs | self._changed  # the campaign's files as they are now
+
+    # ------------------------------------------------------------ opening
+    @classmethod
+    def open(cls, out: Path, effects: Path | None = None) -> Store:
+        """Return the results in `out`, for reading; `effects` is the folder that --effects-folder names.
+
+        Raises
+        ------
+        OutError
+            If `out` holds no results of sealfit.
+        ConfigError
+            If `effects` may not be run, as `own_effects_folder`.
+        """
+        state = State.read(out)
+        if state is None:
+            what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
+            raise OutError(what, file=out, fix=f"Make them with: sealfit run CAMPAIGN --out {shlex.quote(str(out))}")
+        effects = own_effects_folder(effects, None, out, state.campaign)
+        config = state.config.now()
+        hashes = effects_seen(effects, state.effects, state.config, config)
+        return cls(out, replace(state, config=config, effects=hashes), known=True, kept=state, effects=effects)
+
+    @classmethod
+    @contextlib.contextmanager
+    def writing(
+        cls,
+        out: Path,
+        campaign: Path | None = None,
+        source: ConfigCopy | None = None,
+        effects: Path | None = None,
+    ) -> Iterator[Store]:
+        """Hold `out` as its only writer and give the store; without `campaign`, one that holds results already.
+
+        `source` is the config that the command line names, `effects` the folder that --effects-folder names.
+
+        Raises
+        ------
+        OutError
+            If `out` is a file, a folder that sealfit did not make, the results of another campaign, in use by another
+            process, or cannot be written.
+        """
+        if campaign is None or source is None:
+            cls.open(out, effects)  # raises if there is nothing to go on from
+        with held(out):
+            if campaign is None or source is None:
+                store = cls.open(out, effects)
+            else:
+                folder = own_effects_folder(effects, source, out, campaign)
+                store = cls._of_campaign(out, campaign.resolve(), source, folder)
+            store._keep_what_moved()
+            yield store
+
+    @classmethod
+    def _of_campaign(cls, out: Path, campaign: Path, source: ConfigCopy, effects: Path | None) -> Store:
+        kept = State.read(out)
+        hashes = {} if effects is None else effect_hashes(effects)
+        if kept is None or (kept.campaign != campaign and not kept.steps):
+            return cls(out, State(campaign, source, effects=hashes), known=False, kept=kept, effects=effects)
+        store_inputs, moved = kept.inputs, kept.campaign != campaign
+        if moved:
+            store_inputs = Fingerprints.of({name: fingerprint(campaign / name) for name in kept.inputs})
+            if store_inputs.sha256 != kept.inputs.sha256:
+                raise OutError(
+                    f"belongs to the campaign {kept.campaign}, and {campaign} holds other data.",
+                    file=out,
+                    fix="Choose another --out.",
+                )
+        state = replace(kept, campaign=campaign, config=source, inputs=store_inputs, effects=hashes)
+        store = cls(out, state, known=True, kept=kept, effects=effects)
+        if moved:
+            store.warnings.append(
+                f"{out} was made from {kept.campaign}; {campaign} holds the same data and takes over."
+            )
+        return store
+
+    def _keep_what_moved(self) -> None:
+        """Keep the campaign's new place, new times of unchanged files and a config that says the same, if any."""
+        kept = self._kept
+        if kept is None:
+            return
+        known = self.state.inputs
+        same = {n: mark for n, mark in self._changed.items() if n in known and mark.sha256 == known[n].sha256}
+        if same:
+            self.state = replace(self.state, inputs=known | same)
+        source = self.state.config if _same_config(kept.config, self.state.config) else kept.config
+        tidy = replace(self.state, config=source, effects=kept.effects)
+        if tidy != kept:
+            staged = Staged(self.out, self.config.units, "state")
+            try:
+                staged.text(STATE, to_json(tidy.as_dict(), indent=None))
+                with disk(self.out):
+                    staged.move(STATE)
+            finally:
+                staged.clear()
+
+    @property
+    def kept_effects(self) -> dict[str, str | None]:
+        """Hashes of the user's own effects with which the results were made, by file name."""
+        return self._kept.effects if self._kept is not None else {}
+
+    # ------------------------------------------------------------ current or stale
+    def why_stale(self, step: str) -> str:
+        """Return in words why `step` has to be done, or "" if it is current."""
+        if self._keys is None:
+            self._keys = step_keys(self.marks, self.config, self.state.effects)
+        keys = self._keys
+        for name in STEPS[: STEPS.index(step) + 1]:
+            done = self.state.steps.get(name)
+            if done is None:
+                return f"{name} has not been done"
+            if done.key != keys[name]:
+                return f"{name} is stale: {self._what_changed(name, done)}"
+            for file, size in done.files.items():
+                if file_size(f"{self.out}/{file}") != size:
+                    return f"{name} is stale: its {file} is missing or was changed"
+        return ""
+
+    def _what_changed(self, step: str, done: Done) -> str:
+        if done.version != __version__:
+            return f"it was made by sealfit {done.version}, this is {__version__}"
+        known = self.state.inputs
+        changed = sorted(n for n, mark in self._changed.items() if n not in known or mark.sha256 != known[n].sha256)
+        if changed:
+            more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+            return f"inputs changed ({', '.join(changed[:3])}{more})"
+        own = what_differs(self.kept_effects, self.state.effects)
+        if own and step == "close-loop":
+            return own
+        return f"the config ({self.state.config.name}) changed"
+
+    def require(self, step: str) -> None:
+        """Raise StaleError, naming the command to run, unless `step` and all before it are current."""
+        for name in STEPS[: STEPS.index(step) + 1]:
+            why = self.why_stale(name)
+            if why:
+                raise StaleError(f"{why}.", file=self.out, fix=f"Run: {self.command(name)}")
+
+    def require_effects(self) -> None:
+        """Raise RequestError if the loop is to be closed with the user's own effects and no folder of them is given."""
+        if self.effects is None and (self._names_effects or self.state.effects):
+            raise needed("the loop is closed with", self.state.effects)
+
+    def command(self, step: str) -> str:
+        """Return the command line that does `step`."""
+        out = shlex.quote(str(self.out))
+        if step != "ingest":
+            own = self.effects or ("FOLDER" if self._names_effects or self.state.effects else None)
+            option = f" {OPTION} {shlex.quote(str(own))}" if own and step == "close-loop" else ""
+            return f"sealfit {step} {out}{option}"
+        config = f" --config {shlex.quote(str(self.state.config.path))}" if self.state.config.path else ""
+        return f"sealfit ingest {shlex.quote(str(self.state.campaign))} --out {out}{config}"
+
+    # ------------------------------------------------------------ reading
+    def read(self, table: str, columns: list[str] | None = None, **which: Sequence[str]) -> pd.DataFrame:
+        """Return a table, or those columns of it; `which` as `parquet.read`."""
+        from sealfit.store import parquet
+
+        return parquet.read(self._parts_of(table) or self.out / f"{table}{PARQUET}", columns, **which)
+
+    def _parts_of(self, table: str) -> list[Path]:
+        files = (file for done in self.state.steps.values() for file in done.files)
+        return [self.out / file for file in files if file.startswith(f"{table}{PARQUET}/")]
+
+    def traces(self) -> list[StoredTraces]:
+        """Return where table `traces` lies, in groups of whole conditions."""
+        from sealfit.ingest.stored_parts import ARROW, PARTS
+        from sealfit.store import parquet
+        from sealfit.store.parquet import by_conditions
+
+        conditions = {}
+        for path in self._parts_of("traces"):
+            strokes = parquet.read_ipc((self.out / PARTS / path.name).with_suffix(ARROW))
+            conditions[path] = strokes["condition"].drop_null().unique().to_pylist()
+        return by_conditions(conditions)
+
+    def read_json(self, name: str) -> dict:
+        """Return `<name>.json`."""
+        import json
+
+        return json.loads((self.out / f"{name}.json").read_text("utf-8"))
+
+    def seen_config(self, step: str) -> Config:
+        """Return the config as `step` may see it."""
+        return seen_config(step, self.config)
+
+    def provenance(self) -> dict:
+        """Return what the results were made from and with."""
+        return provenance(self.state)
+
+    # ------------------------------------------------------------ writing
+    @contextlib.contextmanager
+    def step(self, name: str) -> Iterator[Staged]:
+        """Give a place for the files of step `name`; they all take their places when the block ends without an error.
+
+        Parameters
+        ----------
+        name : str
+            One of `STEPS`.
+
+        Raises
+        ------
+        OutError
+            If the disk is full or refuses; OUT then holds what it held before.
+        """
+        began = time.monotonic()
+        staged = Staged(self.out, self.config.units, name)
+        try:
+            yield staged
+            self._commit(name, staged, time.monotonic() - began)
+        finally:
+            staged.clear()
+
+    def _commit(self, name: str, staged: Staged, seconds: float) -> None:
+        inputs = self.state.inputs if staged.inputs is None else staged.inputs
+        files = dict(staged.files)
+        done = Done(
+            step_keys(inputs, self.config, self.state.effects)[name],
+            __version__,
+            datetime.now(UTC).isoformat(timespec="seconds"),
+            round(seconds, 3),
+            files,
+        )
+        # Until every file is in its place the step counts as not done: a kill in between cannot pass a mixture of old
+        # and new tables as current. All is on the disk before the first move, so a full disk changes nothing in OUT.
+        earlier = {step: self.state.steps[step] for step in STEPS[: STEPS.index(name)] if step in self.state.steps}
+        known = inputs if earlier else Fingerprints()  # none are known of steps not done
+        begun = replace(self.state, inputs=known, steps=earlier)
+        ended = replace(begun, inputs=inputs, steps={**earlier, name: done})
+        staged.text("begun.json", to_json(begun.as_dict(), indent=None))
+        staged.text("ended.json", to_json(ended.as_dict(), indent=None))
+        staged.text(PROVENANCE, to_json(provenance(ended), indent=None))
+        old = self.state.steps[name].files if name in self.state.steps else {}
+        with undisturbed(), disk(self.out):  # moving files takes milliseconds, and half of it would be stale
+            staged.move("begun.json", STATE)
+            sync(self.out)
+            for file in files:
+                staged.move(file)
+            for file in self._left_over(old, files):
+                (self.out / file).unlink(missing_ok=True)
+            staged.move(PROVENANCE)
+            sync(self.out)
+            staged.move("ended.json", STATE)
+            sync(self.out)
+            self.state = ended
+        if staged.inputs is not None:
+            self.marks, self._changed, self._keys = inputs, {}, None
+
+    def _left_over(self, old: Mapping[str, int], files: Mapping[str, int]) -> set[str]:
+        """Return the files of an earlier time of the step that are not its any more.
+
+        In the folder of a table nothing else may lie, whoever left it there: readers take all of it.
+        """
+        folders = {file.split("/")[0] for file in files if "/" in file and not file.startswith("plots/")}
+        lying = {f"{folder}/{path.name}" for folder in folders for path in (self.out / folder).iterdir()}
+        return (old.keys() | lying) - files.keys()
+
+    # ------------------------------------------------------------ parts of a table
+    def parts(self) -> dict[str, Path]:
+        """Return the stored parts of the campaign that may be taken as they are, by their keys."""
+        from sealfit.ingest.stored_parts import known_parts
+
+        done = self.state.steps.get("ingest")
+        return known_parts(self.out, done.files) if done and not self.anew else {}
+
+
+def _same_config(kept: ConfigCopy, config: ConfigCopy) -> bool:
+    try:
+        return kept.parse() == config.parse()
+    except ConfigError:
+        return False

@@ -1,0 +1,283 @@
+"""Tables to Parquet and back with true units in the metadata, and the samples of strokes read part by part."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from sealfit import __version__
+from sealfit.ingest.segments import median
+from sealfit.store import parquet
+from sealfit.tables import TEXT, Column, Schema
+from sealfit.units import Units
+
+# ---------------------------------------------------------------- parquet
+# Tables to Parquet and back: the schema of `tables.py` applied, true units and meanings in the metadata.
+
+CHANNEL = "channel of the campaign"
+Columns = Mapping[str, pd.Series | np.ndarray | pa.Array]  # of equal length, or a frame
+
+
+def to_arrow(frame: pd.DataFrame | Columns, schema: Schema, units: Units) -> pa.Table:
+    """Return `frame` as a table of `schema`: its columns first, in order and type; then, if it is open, all others.
+
+    Each field's metadata holds `unit` (the true one) and `meaning`; the table's holds `sealfit` (version and table)
+    and `units` (true unit by column). NaN becomes null; words may come as dictionaries (`as_dictionary`).
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, doubled, of the wrong type, or not in a closed schema: a fault of the step, not of the
+        user's data.
+    """
+    names = [str(name) for name in frame]
+    if len(set(names)) != len(names):
+        raise ValueError(f"table {schema.name}: doubled columns {sorted({n for n in names if names.count(n) > 1})}")
+    missing = [name for name in schema.names() if name not in names]
+    others = [name for name in names if name not in set(schema.names())]
+    if missing or (others and not schema.open_):
+        raise ValueError(f"table {schema.name}: missing columns {missing}, columns that it does not know {others}")
+
+    arrays, fields = [], []
+    for column in (*schema.columns, *(Column(name, "", None, CHANNEL) for name in others)):
+        array = _array(frame[column.name], column, schema.name)
+        arrays.append(array)
+        fields.append(_field(column, array.type, units))
+    return _table(arrays, fields, json.dumps({"version": __version__, "table": schema.name}))
+
+
+def _table(arrays: list, fields: list[pa.Field], about: str | bytes) -> pa.Table:
+    units = {field.name: field.metadata[b"unit"].decode() for field in fields}
+    metadata = {"sealfit": about, "units": json.dumps(units, ensure_ascii=False)}
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=metadata))
+
+
+def with_columns(table: pa.Table, columns: Mapping[str, str], units: Units) -> pa.Table:
+    """Return a table of `to_arrow` with these columns, in this order: name and type, as Arrow spells it.
+
+    A column that it lacks is null throughout; numbers become words where words are asked for.
+    """
+    arrays, fields = [], []
+    for name, kind in columns.items():
+        wanted = pa.type_for_alias(kind)
+        at = table.schema.get_field_index(name)
+        if at < 0:
+            arrays.append(pa.nulls(table.num_rows, wanted))
+            fields.append(_field(Column(name, "", None, CHANNEL), wanted, units))
+            continue
+        values = table.column(at)
+        if wanted == TEXT and pa.types.is_dictionary(values.type):
+            wanted = values.type
+        elif wanted == TEXT and values.type != TEXT:
+            values = pa.array(values.to_pandas().map(str, na_action="ignore").astype(object), TEXT, from_pandas=True)
+        arrays.append(values.cast(wanted))
+        fields.append(table.schema.field(at).with_type(wanted))
+    return _table(arrays, fields, table.schema.metadata[b"sealfit"])
+
+
+def _field(column: Column, dtype: pa.DataType, units: Units) -> pa.Field:
+    about = {"unit": units.of(column.name) or column.unit, "meaning": column.meaning}
+    return pa.field(column.name, dtype, metadata=about)
+
+
+def write(frame: pd.DataFrame, schema: Schema, units: Units, path: Path) -> None:
+    """Write `frame` to `path`. Raises OSError if the disk refuses, ValueError as `to_arrow`."""
+    write_arrow(to_arrow(frame, schema, units), path)
+
+
+def as_dictionary(words: pa.Array, row: np.ndarray) -> pa.Array:
+    """Return the word of every row, of those in `words`, as a dictionary: no word is spelled out for every row."""
+    codes = words.cast(TEXT).dictionary_encode()
+    return pa.DictionaryArray.from_arrays(codes.indices.take(pa.array(row)), codes.dictionary)
+
+
+def spelled_out(schema: pa.Schema) -> pa.Schema:
+    """Return the schema of the same table without dictionaries, as it is read from the disk."""
+    return pa.schema(
+        [f.with_type(f.type.value_type) if pa.types.is_dictionary(f.type) else f for f in schema], schema.metadata
+    )
+
+
+def write_arrow(table: pa.Table, path: Path) -> None:
+    """Write a table as it is; whoever calls waits until it is on the disk. Raises OSError if the disk refuses."""
+    schema = spelled_out(table.schema)
+    measured = [field.name for field in schema if pa.types.is_floating(field.type)]  # have no dictionary
+    settings = {
+        "compression": "zstd",
+        "use_dictionary": [field.name for field in schema if field.name not in measured] or False,
+        # First bytes with first bytes, and so on: nothing to lose, and half the time to compress.
+        "use_byte_stream_split": measured or False,
+        # Whoever reads it is told of words, as they are in a table without dictionaries.
+        "store_schema": False,
+    }
+    about = {**(schema.metadata or {}), b"ARROW:schema": base64.b64encode(schema.serialize())}
+    # A file of Python's, so that a full disk is an OSError with its number.
+    with path.open("wb") as file, pq.ParquetWriter(file, table.schema, **settings) as writer:
+        writer.write_table(table)
+        writer.add_key_value_metadata(about)
+
+
+def write_ipc(table: pa.Table, path: Path) -> None:
+    """Write a table in Arrow's own format, which is read in no time; errors as `write_arrow`."""
+    with path.open("wb") as file, pa.ipc.new_file(file, table.schema) as writer:
+        writer.write_table(table)
+
+
+def read_ipc(path: Path) -> pa.Table:
+    """Return a table that `write_ipc` wrote; its columns stay on the disk until they are looked at."""
+    with pa.memory_map(str(path)) as file:
+        return pa.ipc.open_file(file).read_all()
+
+
+def read(
+    path: Path | Sequence[Path],
+    columns: list[str] | None = None,
+    coded: Sequence[str] = (),
+    runs: Sequence[str] | None = None,
+) -> pd.DataFrame:
+    """Return the table at `path`, a file or its parts in their order, or those columns of it, or the rows of some runs.
+
+    Columns of words in `coded` come as categories: no word is spelled out for every row. With `runs` one of the
+    columns is run_id.
+    """
+    paths = [path] if isinstance(path, Path) else path
+    parts = []
+    for one in paths:
+        with pq.ParquetFile(
+            one, read_dictionary=list(coded)
+        ) as file:  # a tenth of what read_table takes for a small file
+            part = file.read(columns=columns)
+        parts.append(part if runs is None else part.filter(pc.is_in(part["run_id"], pa.array(runs, TEXT))))
+    return pa.concat_tables(parts).to_pandas(self_destruct=True)
+
+
+def _array(values: pd.Series | np.ndarray | pa.Array, column: Column, table: str) -> pa.Array:
+    try:
+        array = _whole(values if isinstance(values, pa.Array) else _of_column(values, column))
+    except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError) as error:
+        raise ValueError(f"table {table}, column '{column.name}': {error}") from error
+    if pa.types.is_null(array.type):  # an optional channel without a single value
+        return array.cast(pa.float64())
+    if pa.types.is_large_string(array.type):
+        return array.cast(TEXT)
+    return array
+
+
+def _of_column(values: pd.Series | np.ndarray, column: Column) -> pa.Array | pa.ChunkedArray:
+    if column.dtype == TEXT and isinstance(values.dtype, pd.StringDtype):
+        return pa.array(values, from_pandas=True)
+    if column.dtype == TEXT or (column.dtype is None and _mixed(values)):
+        values = pd.Series(values).map(str, na_action="ignore").astype(object)
+        return pa.array(values, type=TEXT, from_pandas=True)
+    missing = values.dtype != float or np.isnan(values).any()  # that none is, is seen faster here
+    return pa.array(values, type=column.dtype, from_pandas=missing)
+
+
+def _whole(array: pa.Array | pa.ChunkedArray) -> pa.Array:
+    return array.combine_chunks() if isinstance(array, pa.ChunkedArray) else array
+
+
+def _mixed(values: pd.Series | np.ndarray) -> bool:
+    """Whether a channel holds categories, or numbers and words together: then all of it is words."""
+    if isinstance(values.dtype, pd.CategoricalDtype):
+        return True
+    return values.dtype == object and any(isinstance(value, str) for value in values)
+
+
+# ---------------------------------------------------------------- samples
+# Samples of traces as table `traces` holds them, those of a stroke one after the other.
+
+
+@dataclass(frozen=True)
+class StoredTraces:
+    """Where the traces of some conditions lie: all of theirs, and of no others."""
+
+    conditions: frozenset[str]
+    paths: tuple[Path, ...]
+
+    def read(self, columns: list[str] | None = None, coded: Sequence[str] = ()) -> pd.DataFrame:
+        """Return them, or those columns of table `traces`; words of `coded` as categories."""
+        return parquet.read(self.paths, columns, coded)
+
+
+def by_conditions(parts: Mapping[Path, Iterable[str]]) -> list[StoredTraces]:
+    """Return the parts of table `traces` in groups that share no condition.
+
+    Parameters
+    ----------
+    parts : mapping of Path to iterable of str
+        The conditions of each part.
+
+    Examples
+    --------
+    >>> groups = by_conditions({Path("1"): ["a", "b"], Path("2"): ["c"], Path("3"): ["b", "d"]})
+    >>> [sorted(group.conditions) for group in groups]
+    [['a', 'b', 'd'], ['c']]
+    """
+    groups: list[StoredTraces] = []
+    for path, conditions in parts.items():
+        joined = StoredTraces(frozenset(conditions), (path,))
+        for group in [group for group in groups if group.conditions & joined.conditions]:
+            groups.remove(group)
+            joined = StoredTraces(group.conditions | joined.conditions, (*group.paths, *joined.paths))
+        groups.append(joined)
+    return sorted(groups, key=lambda group: min(group.conditions, default=""))
+
+
+def a_part_at_a_time(traces: pd.DataFrame | Sequence[StoredTraces], columns: list[str]) -> Iterator[pd.DataFrame]:
+    """Yield table `traces`, or each part of where it lies: these columns of it, files as categories there."""
+    if isinstance(traces, pd.DataFrame):
+        yield traces[columns]
+        return
+    for path in (path for group in traces for path in group.paths):
+        yield parquet.read(path, columns, coded=["file"])
+
+
+def stroke_index(table: pd.DataFrame) -> pd.MultiIndex:
+    """Return the file and stroke of each row, for `strokes_of`."""
+    return pd.MultiIndex.from_frame(table[["file", "stroke"]])
+
+
+def strokes_of(traces: pd.DataFrame, strokes: pd.MultiIndex) -> tuple[np.ndarray, np.ndarray]:
+    """Return where each stroke's samples begin, the end of the last added, and which of `strokes` each is.
+
+    Parameters
+    ----------
+    traces : DataFrame
+        Rows of table `traces`.
+    strokes : MultiIndex
+        File and stroke of each.
+
+    Returns
+    -------
+    edges : ndarray of int, shape (n + 1,)
+        Samples edges[k] to edges[k + 1] are one stroke.
+    own : ndarray of int, shape (n,)
+        Its place in `strokes`; -1 where it is not among them.
+    """
+    file = traces["file"]
+    if isinstance(file.dtype, pd.CategoricalDtype):
+        file, names = file.cat.codes.to_numpy(), file.cat.categories
+    else:
+        file, names = pd.factorize(file)
+    stroke = traces["stroke"].to_numpy()
+    first = np.flatnonzero(np.r_[True, (file[1:] != file[:-1]) | (stroke[1:] != stroke[:-1])])
+    own = strokes.get_indexer(pd.MultiIndex.from_arrays([np.asarray(names, object)[file[first]], stroke[first]]))
+    return np.r_[first, file.size], own
+
+
+def noise_from_bends(bends: np.ndarray) -> float:
+    """Return the standard deviation of a sample from second differences of neighbours; 0 without any.
+
+    Their variance is six times a sample's; the median absolute deviation is blind to where the signal itself bends.
+    """
+    return 1.4826 * median(np.abs(bends - median(bends))) / np.sqrt(6.0) if bends.size else 0.0

@@ -1,0 +1,189 @@
+"""The folders and files that a command line names, the folder of own effects among them."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from difflib import get_close_matches
+from pathlib import Path
+
+from sealfit.config import Config
+from sealfit.errors import CampaignError, ConfigError, Fault, RequestError
+from sealfit.store.manifest import STATE, ConfigCopy, fingerprint
+
+# ---------------------------------------------------------------- places
+# The folders and files that a command line names: found, or refused with the likeliest one that is there.
+
+RUNS = "runs.csv"
+
+
+def campaign_folder(path: Path, config: Config) -> Path:
+    """Return `path` if it is a folder that can be a campaign.
+
+    Raises
+    ------
+    CampaignError
+        If there is no such folder, or no runs.csv in it where the config needs one; the fix names the likeliest.
+    """
+    if path.is_file():
+        fix = f"Give its folder: {_quoted(path.parent)}" if path.name == RUNS else f"Give the folder that holds {RUNS}."
+        raise CampaignError([Fault("campaign_folder", f"{path} is a file, not a campaign folder.", fix=fix)])
+    if not path.is_dir():
+        raise CampaignError([Fault("campaign_folder", f"there is no folder {path}.", fix=_did_you_mean(path))])
+    if config.files.glob is None and not (path / RUNS).is_file():
+        below = sorted(child.parent for child in path.glob(f"*/{RUNS}"))
+        fix = f"It lists the trace files; or set files.glob in a config (--config). Files here: {_some_files(path)}"
+        if below:
+            fix = "Did you mean " + " or ".join(_quoted(folder) for folder in below[:3]) + "?"
+        raise CampaignError([Fault("runs_csv", f"{path} has no {RUNS}.", file=RUNS, fix=fix)])
+    return path
+
+
+def existing_out(out: Path) -> Path:
+    """Return `out` if it is a folder.
+
+    Raises
+    ------
+    RequestError
+        If it is not; the fix names the likeliest folder of results, or the command that makes one.
+    """
+    if out.is_dir():
+        return out
+    fix = _did_you_mean(out, lambda folder: (folder / STATE).is_file())
+    raise RequestError(f"there is no folder {out}.", fix=fix or f"Make it: sealfit run CAMPAIGN --out {_quoted(out)}")
+
+
+def existing_file(path: Path, what: str) -> Path:
+    """Return `path` if it is a file; else raise RequestError, which calls it `what`."""
+    if path.is_file():
+        return path
+    if path.is_dir():
+        raise RequestError(f"{path} is a folder, not a {what}.", fix="Give the file itself.")
+    raise RequestError(f"there is no {what} {path}.", fix=_did_you_mean(path, Path.is_file))
+
+
+def _did_you_mean(path: Path, fits=Path.is_dir) -> str:
+    parent = path.absolute().parent
+    missing = None
+    while not parent.is_dir():
+        missing, parent = parent, parent.parent
+    wanted = (missing or path.absolute()).name
+    try:
+        there = sorted(
+            child.name for child in parent.iterdir() if not child.name.startswith(".") and (missing or fits(child))
+        )
+    except OSError:
+        return ""
+    likely = get_close_matches(wanted, there, n=1, cutoff=0.5)
+    if likely:
+        return f"Did you mean {_quoted(path.parent / likely[0] if missing is None else parent / likely[0])}?"
+    return ""
+
+
+def _some_files(folder: Path) -> str:
+    names = sorted(child.name + ("/" if child.is_dir() else "") for child in folder.iterdir())
+    if not names:
+        return "none."
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else ".")
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
+
+
+# ---------------------------------------------------------------- own effects
+# The folder of the user's own effects, as the command line names it: the one place from which Python is run.
+#
+# A campaign and a folder of results may come from somebody else. Nothing that lies in them, and no path that they keep,
+# leads to Python being run: the person who runs the command names the folder, by --effects-folder or in the config that
+# --config names. A folder of results keeps the hashes of the files, which tell whether they are the same.
+
+OPTION = "--effects-folder"
+KEY = "key 'loop.effects_folder'"
+
+
+def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Path) -> Path | None:
+    """Return the folder from which the user's own effects are read, without symbolic links; None if none is named.
+
+    Parameters
+    ----------
+    given : Path or None
+        What --effects-folder says; it comes before the config.
+    config : ConfigCopy or None
+        The config that the command line names, never one that a folder of results keeps.
+    *data : Path
+        The campaign and the folder of results.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such folder, if it or one of its files lies in `data`, or if a config that lies there names it.
+    """
+    folder, said = given, OPTION
+    if given is None and config is not None:
+        folder, said = config.effects_folder(), KEY
+    if folder is None:
+        return None
+    if said == KEY and (place := _place_of(config.path, data)):
+        raise ConfigError(
+            f"{KEY}: the config lies in {place}, so the folder that it names is not run.",
+            file=config.path,
+            fix=f"Name the folder by {OPTION}, or move the config.",
+        )
+    if not folder.is_dir():
+        raise ConfigError(f"{said}: there is no folder {folder}.", fix="Fix the path.")
+    for path in (folder, *sorted(folder.glob("*.py"))):
+        if place := _place_of(path, data):
+            raise ConfigError(
+                f"{said}: {path} lies in {place}, and Python is never run from there.",
+                fix="Read the files; if you trust them, move them to a folder of your own.",
+            )
+    return folder.resolve()
+
+
+def _place_of(path: Path, data: tuple[Path, ...]) -> Path | None:
+    """Return the one of the folders `data` in which a path lies, symbolic links followed; None if in none."""
+    return next((place for place in data if path.resolve().is_relative_to(place.resolve())), None)
+
+
+def effect_hashes(folder: Path) -> dict[str, str | None]:
+    """Return the SHA-256 of every Python file in the folder, by name."""
+    return {path.name: fingerprint(path).sha256 for path in sorted(folder.glob("*.py"))}
+
+
+def effects_seen(
+    given: Path | None, kept: Mapping[str, str | None], kept_config: ConfigCopy, config: ConfigCopy
+) -> dict[str, str | None]:
+    """Return the hashes of the user's own effects as they are now, as far as it can be told; nothing is run.
+
+    Parameters
+    ----------
+    given : Path or None
+        The folder that the command line names.
+    kept, kept_config
+        The hashes and the config that the folder of results keeps.
+    config : ConfigCopy
+        The same config as it stands now, read again if its file is still there.
+    """
+    if given is not None:
+        return effect_hashes(given)
+    named = config.effects_folder()
+    if named is None:  # they were given by the option, or the config has dropped them
+        return dict(kept) if kept_config.effects_folder() is None else {}
+    return effect_hashes(named) if config.path.is_file() and named.is_dir() else dict(kept)
+
+
+def what_differs(kept: Mapping[str, str | None], now: Mapping[str, str | None]) -> str:
+    """Return in words which files of the user's own effects differ; empty if none does."""
+    names = sorted(name for name in kept.keys() | now.keys() if kept.get(name) != now.get(name))
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return f"your own effects are not those it was made with ({', '.join(names[:3])}{more})" if names else ""
+
+
+def needed(what: str, names: Mapping[str, str | None] | list[str]) -> RequestError:
+    """Return the error of a command that needs the user's own effects and was given none."""
+    files = f" ({', '.join(sorted(names))})" if names else ""
+    return RequestError(
+        f"{what} your own effects{files}, and Python is run only from a folder that the command line names.",
+        fix=f"Add {OPTION} FOLDER.",
+    )

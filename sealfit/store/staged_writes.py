@@ -1,0 +1,117 @@
+"""Files written beside their final place, then moved there: nobody ever sees half a file in OUT."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+import stat
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sealfit.errors import OutError
+from sealfit.store.manifest import Fingerprints, to_json
+from sealfit.tables import SCHEMAS
+from sealfit.units import Units
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from sealfit.report.style import Drawn
+
+STAGING = ".staging-"
+PARQUET = ".parquet"
+
+
+class Staged:
+    """Files of one step, written beside their final place and moved there together when the step is complete."""
+
+    def __init__(self, out: Path, units: Units, step: str):
+        self._out, self._units = out, units
+        self._folder = out / f"{STAGING}{os.getpid()}-{step}"
+        self.files: dict[str, int] = {}
+        self.inputs: Fingerprints | None = None  # set by ingest: what it read
+
+    def table(self, name: str, frame: pd.DataFrame) -> None:
+        """Write table `name` of `tables.SCHEMAS`; ValueError if the frame does not have its columns and types."""
+        from sealfit.store import parquet
+
+        self._write(f"{name}{PARQUET}", lambda path: parquet.write(frame, SCHEMAS[name], self._units, path))
+
+    def json(self, name: str, document: Mapping) -> None:
+        """Write `document` as `<name>.json`; numbers that are not finite become null."""
+        self.text(f"{name}.json", to_json(document))
+
+    def text(self, name: str, text: str) -> None:
+        """Write a text file."""
+        self._write(name, lambda path: path.write_bytes(text.encode("utf-8")))
+
+    def figure(self, name: str, figure: Drawn) -> None:
+        """Write a drawn figure as `plots/<name>.png` and `.svg`."""
+        self._write(f"plots/{name}.png", lambda path: path.write_bytes(figure.png))
+        self.text(f"plots/{name}.svg", figure.svg)
+
+    def folder(self) -> Path:
+        """Return the folder in which other processes may write files of this step, told with `adopt`."""
+        with disk(self._out):
+            self._folder.mkdir(exist_ok=True)
+        return self._folder
+
+    def adopt(self, files: Mapping[str, int]) -> None:
+        """Take files, with their sizes, for this step's: some that others wrote into `folder`, and some in OUT."""
+        self.files |= files
+
+    def _write(self, name: str, write: Callable[[Path], object]) -> None:
+        path = self._folder / name
+        with disk(self._out):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(path)
+            sync(path)
+            self.files[name] = path.stat().st_size
+
+    def move(self, name: str, to: str | None = None) -> None:
+        """Move a staged file to its final place in one step of the file system; one that is in OUT already stays."""
+        if name in self.files and not os.path.exists(f"{self._folder}/{name}"):
+            return
+        target, source = self._out / (to or name), self._folder / name
+        if target.parent.is_file():  # a table that was one file
+            target.parent.unlink()
+        target.parent.mkdir(exist_ok=True)
+        os.replace(source, target)
+
+    def clear(self) -> None:
+        """Remove what is staged."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def disk(out: Path) -> Iterator[None]:
+    """Say in one line what the file system refused."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        fix = "Fix the rights of the folder, or choose another --out."
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            fix = "Free some space and run the command again; the results that were there are untouched."
+        raise OutError(f"cannot be written ({reason}).", file=out, fix=fix) from error
+
+
+def file_size(path: str) -> int | None:
+    """Return the size of a file in bytes; None where there is no file."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status.st_size if stat.S_ISREG(status.st_mode) else None
+
+
+def sync(path: Path) -> None:
+    """Wait until `path`, a file or a folder, is on the disk itself."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
