@@ -24,8 +24,8 @@ from sealfit.effects.free import LEVELS, levels_effect
 from sealfit.fit.joint.estimate import Fitted, fit
 from sealfit.fit.joint.model import Model, Term
 from sealfit.fit.joint.rows import Rows
+from sealfit.ingest.expression import evaluate, parse
 from sealfit.simulation import Spec
-from sealfit.simulation.formula import evaluate_formula, parse_formula
 from sealfit.simulation.motion import SteadyLaw, steady_law
 
 UNITS = ("stroke", "file", "run", "specimen")
@@ -103,12 +103,12 @@ def true_term(entry, channels: tuple[str, ...]) -> tuple[Term, dict[str, float]]
 
 def formula_effect(text: str, values: Mapping[str, float], target: tuple[str, str]) -> Effect:
     """Return a formula that is proportional to each of its parameters as an effect."""
-    formula = parse_formula(text)
-    reads = tuple(name for name in formula.channels if name not in values)
+    formula = parse(text)
+    reads = tuple(name for name in sorted(formula.names) if name not in values)
 
     def shape(inputs, **given) -> np.ndarray:
         numbers = {name: np.float64(value) for name, value in given.items()}
-        return evaluate_formula(formula, {**{name: inputs[name] for name in reads}, **numbers})
+        return evaluate(formula, {**{name: inputs[name] for name in reads}, **numbers})
 
     parameters = tuple(Parameter(n, "{y}", 0.0, AMPLITUDE, "size", linear=True) for n in values)
     return Effect("expression", text, text, text, reads, (target,), parameters, shape, "SPEC", ({}, {}, 0.0))

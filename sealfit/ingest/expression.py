@@ -1,30 +1,32 @@
-"""Safe expressions of a rig config: `(force_raw - pressure_bar * 1e5 * pi * (0.0257 / 2) ** 2)`.
+"""Safe expressions of rig configs and SPECs: `(force_raw - pressure_bar * 1e5 * pi * (0.0257 / 2) ** 2)`.
 
-A config is a text file that people pass around, so an expression is never run as Python: it is parsed into a tree,
-every node of the tree is checked against a short list, and only numbers and arrays are ever computed with.
+These are text files that people pass around, so an expression is never run as Python: it is parsed into a tree, every
+node of the tree is checked against a short list, and only numbers and arrays are ever computed with.
 """
 
 from __future__ import annotations
 
 import ast
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import numpy as np
 
 from sealfit.errors import ConfigError
 
-MAX_CHARACTERS = 1000  # nobody writes a longer one by hand; keeps the parser's memory bounded
-MAX_DEPTH = 60  # nesting; keeps the walk far below Python's recursion limit
+MAX_CHARACTERS = 1000
+"""Longest text of an expression: nobody writes a longer one by hand, and the parser's memory is bounded."""
 
-CONSTANTS = {"pi": np.pi}
+MAX_DEPTH = 60
+"""Deepest nesting: keeps the walk far below Python's recursion limit."""
+
 FUNCTIONS = {  # name: (function, fewest arguments, most arguments)
-    "abs": (np.abs, 1, 1),
-    "sqrt": (np.sqrt, 1, 1),
-    "min": (lambda *values: _fold(np.minimum, values), 2, 20),
-    "max": (lambda *values: _fold(np.maximum, values), 2, 20),
+    **{name: (getattr(np, name), 1, 1) for name in ("abs", "sqrt", "exp", "log", "sin", "cos", "tanh", "sign")},
+    "min": (lambda *values: reduce(np.minimum, values), 2, 20),
+    "max": (lambda *values: reduce(np.maximum, values), 2, 20),
+    "where": (np.where, 3, 3),
 }
 _BINARY = {
     ast.Add: np.add,
@@ -34,6 +36,7 @@ _BINARY = {
     ast.Pow: np.power,
 }
 _UNARY = {ast.USub: np.negative, ast.UAdd: np.positive}
+_JOIN = {ast.And: np.logical_and, ast.Or: np.logical_or}
 _COMPARE = {
     ast.Lt: np.less,
     ast.LtE: np.less_equal,
@@ -42,16 +45,21 @@ _COMPARE = {
     ast.Eq: np.equal,
     ast.NotEq: np.not_equal,
 }
-_ALLOWED = "Allowed are numbers, column names, + - * / **, parentheses, pi, abs, min, max, sqrt"
+_FIX = (
+    "Allowed are numbers, column names, pi, + - * / **, parentheses, comparisons, and, or, not, a category as in "
+    f"batch == 'B', and {', '.join(FUNCTIONS)}."
+)
+Values = Mapping[str, object]
+Computed = Callable[[Values], np.ndarray]
 
 
 @dataclass(frozen=True, slots=True)
 class Expression:
-    """A checked expression: its text, its tree, and the names (columns, parts, constants) it reads."""
+    """A checked expression: its text, the columns it reads, and what computes it."""
 
     text: str
-    tree: ast.expr
     names: frozenset[str]
+    compute: Computed
 
 
 @lru_cache(maxsize=256)
@@ -63,7 +71,7 @@ def parse(text: str, *, condition: bool = False) -> Expression:
     text : str
         For example `"-torque_pct * 9.84 / 100"`; with `condition`, `"load_N > 4.9 and time_s < 60"`.
     condition : bool
-        True for a row filter: comparisons joined by `and`, `or`, `not` are then required; otherwise they are refused.
+        Whether it must be a condition; a comparison in a number counts 1 where it holds and 0 where it does not.
 
     Raises
     ------
@@ -74,11 +82,8 @@ def parse(text: str, *, condition: bool = False) -> Expression:
     --------
     >>> sorted(parse("(a + 2) * pi").names)
     ['a']
-    >>> parse("open('x')")
-    Traceback (most recent call last):
-    ...
-    sealfit.errors.ConfigError: in "open('x')": function 'open' is not allowed. Allowed are numbers, column names, \
-+ - * / **, parentheses, pi, abs, min, max, sqrt.
+    >>> evaluate(parse("where(batch == 'B', 2, 1) * (x > 0)"), {"batch": ["A", "B"], "x": 1.0})
+    array([1., 2.])
     """
     if len(text) > MAX_CHARACTERS:
         raise ConfigError(f"an expression of {len(text)} characters.", fix=f"Keep it below {MAX_CHARACTERS}.")
@@ -88,13 +93,13 @@ def parse(text: str, *, condition: bool = False) -> Expression:
             tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = getattr(error, "msg", None) or "it is nested too deeply"
-        raise ConfigError(f"{text!r} is not an expression: {reason}.", fix=_fix(condition)) from error
-    names: set[str] = set()
-    (_check_condition if condition else _check_number)(tree, text, names, 0)
-    return Expression(text, tree, frozenset(names))
+        raise ConfigError(f"{text!r} is not an expression: {reason}.", fix=_FIX) from error
+    checked = _Checked(text)
+    compute = checked.truth(tree, 0) if condition else checked.number(tree, 0)
+    return Expression(text, frozenset(checked.names), compute)
 
 
-def evaluate(expression: Expression, values: Mapping[str, object]) -> np.ndarray:
+def evaluate(expression: Expression, values: Values) -> np.ndarray:
     """Return the expression's value: an array of shape (n,), or of shape () if only constants are read.
 
     Arithmetic is in double precision; what is undefined (0/0, the root of a negative number) gives NaN and what is too
@@ -103,7 +108,7 @@ def evaluate(expression: Expression, values: Mapping[str, object]) -> np.ndarray
     Raises
     ------
     ConfigError
-        If a name is not in `values`, or stands for text.
+        If a name is not in `values`, or stands for text where a number is wanted.
     """
     for name in sorted(expression.names):
         if name not in values:
@@ -111,139 +116,102 @@ def evaluate(expression: Expression, values: Mapping[str, object]) -> np.ndarray
             raise ConfigError(
                 f"in {expression.text!r}: there is no column '{name}'.", column=name, fix=f"Known: {known}."
             )
-        if np.asarray(values[name]).dtype.kind not in "fiub":
-            raise ConfigError(
-                f"in {expression.text!r}: '{name}' is text, not a number.", column=name, fix="Map it to numbers first."
-            )
     with np.errstate(all="ignore"):
-        return np.asarray(_value(expression.tree, values))
+        return np.asarray(expression.compute(values))
 
 
-def _fix(condition: bool) -> str:
-    return _ALLOWED + (", and comparisons joined by and, or, not." if condition else ".")
+class _Checked:
+    """Builds what computes an expression, node by node, and refuses what is not on the list."""
+
+    def __init__(self, text: str) -> None:
+        self.text, self.names = text, set()
+
+    def number(self, node: ast.expr, depth: int) -> Computed:
+        """Return what computes a number; a condition gives 1 or 0."""
+        if depth > MAX_DEPTH:
+            raise self.refusal(f"nesting deeper than {MAX_DEPTH}")
+        match node:
+            case ast.Constant(value=value) if isinstance(value, int | float) and not isinstance(value, bool):
+                return self.constant(value)
+            case ast.Name(id="pi"):
+                return self.constant(np.pi)
+            case ast.Name(id=name) if not name.startswith("__"):
+                self.names.add(name)
+                return lambda values: _as_number(values[name], name, self.text)
+            case ast.UnaryOp(op=op, operand=part) if type(op) in _UNARY:
+                inner = self.number(part, depth + 1)
+                return lambda values: _UNARY[type(op)](inner(values))
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
+                one, other = self.number(left, depth + 1), self.number(right, depth + 1)
+                return lambda values: _BINARY[type(op)](one(values), other(values))
+            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in FUNCTIONS:
+                return self.call(name, arguments, depth)
+            case ast.Compare() | ast.BoolOp() | ast.UnaryOp(op=ast.Not()):
+                inner = self.truth(node, depth + 1)
+                return lambda values: np.asarray(inner(values), dtype=float)
+        raise self.refusal(f"'{ast.unparse(node)}'")
+
+    def truth(self, node: ast.expr, depth: int) -> Computed:
+        """Return what computes a condition."""
+        if depth > MAX_DEPTH:
+            raise self.refusal(f"nesting deeper than {MAX_DEPTH}")
+        match node:
+            case ast.BoolOp(op=op, values=parts):
+                inner = [self.truth(part, depth + 1) for part in parts]
+                return lambda values: reduce(_JOIN[type(op)], [part(values) for part in inner])
+            case ast.UnaryOp(op=ast.Not(), operand=part):
+                only = self.truth(part, depth + 1)
+                return lambda values: np.logical_not(only(values))
+            case ast.Compare(
+                left=ast.Name(id=name),
+                ops=[ast.Eq() | ast.NotEq() as op],
+                comparators=[ast.Constant(value=str() as label)],
+            ) if not name.startswith("__"):
+                self.names.add(name)
+                return lambda values: _COMPARE[type(op)](np.asarray(values[name]).astype(str), label)
+            case ast.Compare(left=left, ops=ops, comparators=rights) if all(type(op) in _COMPARE for op in ops):
+                sides = [self.number(part, depth + 1) for part in (left, *rights)]
+                return lambda values: _compared(ops, [side(values) for side in sides])
+            case ast.Compare():
+                raise self.refusal(f"'{ast.unparse(node)}'")
+        self.number(node, depth + 1)  # refuses with its own words what is not even a number
+        raise ConfigError(
+            f"in \"{self.text}\": '{ast.unparse(node)}' compares nothing.", fix="Write for example load_N > 4.9."
+        )
+
+    def call(self, name: str, arguments: list[ast.expr], depth: int) -> Computed:
+        """Return what computes a call of a function."""
+        function, fewest, most = FUNCTIONS[name]
+        if not fewest <= len(arguments) <= most:
+            wanted = str(fewest) if fewest == most else f"{fewest} to {most}"
+            raise ConfigError(f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.')
+        inner = [self.number(part, depth + 1) for part in arguments]
+        return lambda values: function(*(part(values) for part in inner))
+
+    def constant(self, value: float) -> Computed:
+        """Return what gives a constant: never a Python int, so that 9**9**9 is infinity at once."""
+        try:
+            known = np.float64(value)
+        except OverflowError as error:
+            raise self.refusal("so large a number") from error
+        return lambda values: known
+
+    def refusal(self, piece: str) -> ConfigError:
+        """Return the error that names what is not allowed."""
+        return ConfigError(f'in "{self.text}": {piece} is not allowed.', fix=_FIX)
 
 
-def _refuse(text: str, piece: str, condition: bool = False) -> ConfigError:
-    return ConfigError(f'in "{text}": {piece} is not allowed.', fix=_fix(condition))
+def _as_number(value: object, name: str, text: str) -> np.ndarray:
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiub":
+        raise ConfigError(
+            f"in {text!r}: '{name}' is text, not a number.",
+            column=name,
+            fix=f"Map it to numbers first, or compare it: {name} == 'B'.",
+        )
+    return array.astype(float, copy=False)
 
 
-def _fold(function, values):
-    result = values[0]
-    for value in values[1:]:
-        result = function(result, value)
-    return result
-
-
-def _check_depth(text: str, depth: int) -> None:
-    if depth > MAX_DEPTH:
-        raise _refuse(text, f"nesting deeper than {MAX_DEPTH}")
-
-
-def _check_condition(node: ast.expr, text: str, names: set[str], depth: int) -> None:
-    _check_depth(text, depth)
-    match node:
-        case ast.BoolOp(values=parts):
-            for part in parts:
-                _check_condition(part, text, names, depth + 1)
-        case ast.UnaryOp(op=ast.Not(), operand=part):
-            _check_condition(part, text, names, depth + 1)
-        case ast.Compare(left=left, ops=ops, comparators=rights):
-            for op in ops:
-                if type(op) not in _COMPARE:
-                    raise _refuse(text, f"comparison '{_WORDS.get(type(op), type(op).__name__)}'", True)
-            for part in (left, *rights):
-                _check_number(part, text, names, depth + 1)
-        case _:
-            _check_number(node, text, names, depth + 1)  # refuses with its own words what is not even a number
-            raise ConfigError(
-                f"in \"{text}\": '{ast.unparse(node)}' compares nothing.", fix="Write for example load_N > 4.9."
-            )
-
-
-_WORDS = {ast.Is: "is", ast.IsNot: "is not", ast.In: "in", ast.NotIn: "not in"}
-_OPERATORS = {
-    ast.FloorDiv: "//",
-    ast.Mod: "%",
-    ast.MatMult: "@",
-    ast.BitAnd: "&",
-    ast.BitOr: "|",
-    ast.BitXor: "^",
-    ast.LShift: "<<",
-    ast.RShift: ">>",
-    ast.Invert: "~",
-    ast.Not: "not",
-}
-_PIECES = {
-    ast.Attribute: "a dot (attribute)",
-    ast.Subscript: "an index in brackets",
-    ast.Lambda: "lambda",
-    ast.IfExp: "if ... else",
-    ast.NamedExpr: "an assignment",
-    ast.BoolOp: "and/or outside a row filter",
-    ast.Compare: "a comparison outside a row filter",
-    ast.JoinedStr: "text",
-    ast.Starred: "a star",
-}
-
-
-def _check_number(node: ast.expr, text: str, names: set[str], depth: int) -> None:
-    _check_depth(text, depth)
-    match node:
-        case ast.Constant(value=value):
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise _refuse(text, f"the value {value!r}")
-            try:
-                float(value)
-            except OverflowError as error:
-                raise _refuse(text, "so large a number") from error
-        case ast.Name(id=name):
-            if name.startswith("__"):
-                raise _refuse(text, f"name '{name}'")
-            if name not in CONSTANTS:
-                names.add(name)
-        case ast.UnaryOp(op=op, operand=part):
-            if type(op) not in _UNARY:
-                raise _refuse(text, f"'{_OPERATORS.get(type(op), type(op).__name__)}'")
-            _check_number(part, text, names, depth + 1)
-        case ast.BinOp(left=left, op=op, right=right):
-            if type(op) not in _BINARY:
-                raise _refuse(text, f"'{_OPERATORS.get(type(op), type(op).__name__)}'")
-            _check_number(left, text, names, depth + 1)
-            _check_number(right, text, names, depth + 1)
-        case ast.Call(func=function, args=arguments, keywords=keywords):
-            if not isinstance(function, ast.Name) or function.id not in FUNCTIONS:
-                raise _refuse(text, f"function '{ast.unparse(function)}'")
-            if keywords:
-                raise _refuse(text, f"the named argument '{keywords[0].arg}'")
-            _, fewest, most = FUNCTIONS[function.id]
-            if not fewest <= len(arguments) <= most:
-                wanted = str(fewest) if fewest == most else f"{fewest} to {most}"
-                raise ConfigError(f'in "{text}": {function.id} takes {wanted} values, {len(arguments)} given.')
-            for part in arguments:
-                _check_number(part, text, names, depth + 1)
-        case _:
-            raise _refuse(text, _PIECES.get(type(node), f"'{ast.unparse(node)}' ({type(node).__name__})"))
-
-
-def _value(node: ast.expr, values: Mapping[str, object]):
-    match node:
-        case ast.Constant(value=value):
-            return np.float64(value)  # never a Python int: 9**9**9 is then infinity at once, not hours of digits
-        case ast.Name(id=name):
-            return np.float64(CONSTANTS[name]) if name in CONSTANTS else np.asarray(values[name], dtype=float)
-        case ast.UnaryOp(op=ast.Not(), operand=part):
-            return np.logical_not(_value(part, values))
-        case ast.UnaryOp(op=op, operand=part):
-            return _UNARY[type(op)](_value(part, values))
-        case ast.BinOp(left=left, op=op, right=right):
-            return _BINARY[type(op)](_value(left, values), _value(right, values))
-        case ast.Call(func=ast.Name(id=name), args=arguments):
-            return FUNCTIONS[name][0](*(_value(part, values) for part in arguments))
-        case ast.BoolOp(op=op, values=parts):
-            join = np.logical_and if isinstance(op, ast.And) else np.logical_or
-            return _fold(join, [_value(part, values) for part in parts])
-        case ast.Compare(left=left, ops=ops, comparators=rights):
-            sides = [_value(part, values) for part in (left, *rights)]
-            tests = [_COMPARE[type(op)](a, b) for op, a, b in zip(ops, sides, sides[1:], strict=False)]
-            return _fold(np.logical_and, tests)
-    raise ConfigError(f"'{type(node).__name__}' is not allowed.")  # unreachable after `parse`; refuse all the same
+def _compared(ops: list[ast.cmpop], sides: list[np.ndarray]) -> np.ndarray:
+    tests = [_COMPARE[type(op)](a, b) for op, a, b in zip(ops, sides, sides[1:], strict=False)]
+    return reduce(np.logical_and, tests)

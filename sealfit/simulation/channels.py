@@ -9,8 +9,8 @@ import pandas as pd
 from pydantic import Field, model_validator
 
 from sealfit.errors import ConfigError
+from sealfit.ingest.expression import evaluate, parse
 from sealfit.simulation.base import Draws, Strict, remembering
-from sealfit.simulation.formula import evaluate_formula, parse_formula
 
 Level = Literal["file", "run", "specimen", "condition"]
 GROUPS = {"file": "file", "run": "run_id", "specimen": "specimen_id", "condition": "condition"}
@@ -86,7 +86,7 @@ class FormulaChannel(Strict):
     @model_validator(mode="after")
     def _is_safe(self) -> FormulaChannel:
         try:
-            parse_formula(self.formula)
+            parse(self.formula)
         except ConfigError as error:
             raise ValueError(str(error)) from None
         return self
@@ -158,9 +158,9 @@ def _categories(channel: CategoryChannel, groups: int, random: np.random.Generat
 
 
 def _computed(channel: FormulaChannel, files: pd.DataFrame, random: np.random.Generator) -> np.ndarray:
-    formula = parse_formula(channel.formula)
-    columns = {name: files[name].to_numpy() for name in formula.channels if name in files}
-    values = np.broadcast_to(evaluate_formula(formula, columns), (len(files),))
+    formula = parse(channel.formula)
+    columns = {name: files[name].to_numpy() for name in sorted(formula.names) if name in files}
+    values = np.broadcast_to(evaluate(formula, columns), (len(files),))
     if not np.isfinite(values).all():
         raise ConfigError(f"channel '{channel.name}': {channel.formula!r} is not a number for every file.")
     return np.round(values + channel.sd * random.standard_normal(len(files)), channel.decimals)

@@ -12,8 +12,8 @@ from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect, Operation, Target
 from sealfit.effects.free import LEVELS, SMOOTH, smooth_effect
 from sealfit.errors import ConfigError, ParameterError
+from sealfit.ingest.expression import evaluate, parse
 from sealfit.simulation.base import Strict
-from sealfit.simulation.formula import evaluate_formula, parse_formula
 
 # ---------------------------------------------------------------- physics
 # The declared model of a SPEC: Eq. 14 with Eq. 15, one law for all series or one each.
@@ -136,9 +136,7 @@ class EffectEntry(Strict):
             raise ValueError("id = 'expression' and formula belong together")
         if self.formula is not None:
             try:
-                unknown = [
-                    n for n in parse_formula(self.formula).channels if n not in (*self.channels, *self.parameters)
-                ]
+                unknown = [n for n in sorted(parse(self.formula).names) if n not in (*self.channels, *self.parameters)]
             except ConfigError as error:
                 raise ValueError(str(error)) from None
             if self.channels and unknown:
@@ -253,12 +251,12 @@ def _target(entry: EffectEntry, effect: Effect, place: str) -> tuple[Target, Ope
 
 
 def _expression(entry: EffectEntry) -> BoundEffect:
-    formula = parse_formula(str(entry.formula))
+    formula = parse(str(entry.formula))
     constants = {name: np.float64(value) for name, value in entry.parameters.items()}
-    channels = tuple(name for name in formula.channels if name not in constants)
+    channels = tuple(name for name in sorted(formula.names) if name not in constants)
 
     def shape(given: Mapping[str, np.ndarray]) -> np.ndarray:
-        return evaluate_formula(formula, {**given, **constants})
+        return evaluate(formula, {**given, **constants})
 
     target, operation = entry.acts_on or "force", entry.operation or "add"
     return BoundEffect(entry.id, channels, target, operation, formula.text, dict(entry.parameters), shape)

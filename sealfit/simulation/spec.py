@@ -15,9 +15,9 @@ from pydantic import Field, ValidationError, model_validator
 
 from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
+from sealfit.ingest.expression import parse
 from sealfit.simulation.base import Strict
 from sealfit.simulation.channels import Channel
-from sealfit.simulation.formula import parse_formula
 from sealfit.simulation.model import EffectEntry, Physics, resolve_effects
 from sealfit.simulation.noise import Noise
 
@@ -273,7 +273,7 @@ class Spec(Strict):
             for category in effect.parameters if effect.id == LEVELS and effect.channels[0] in labels else ():
                 if category not in labels[effect.channels[0]]:
                     raise ValueError(f"effects.{number} (levels): '{category}' is no label of {effect.channels[0]}")
-            read = parse_formula(effect.formula).channels if effect.formula is not None else ()
+            read = sorted(parse(effect.formula).names) if effect.formula is not None else ()
             for name in (*effect.channels, *(n for n in read if n not in effect.parameters)):
                 if name not in self.channel_names:
                     raise ValueError(
