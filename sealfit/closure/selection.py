@@ -32,7 +32,7 @@ from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model, evaluate
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter
-from sealfit.store.parquet import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
+from sealfit.ingest.trace_access import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
 
 SAMPLED = ("displacement_mm", "time_s", "force_N")  # what the ripple search reads of a sample
 DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at: a far surer one may show in it

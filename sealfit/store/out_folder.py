@@ -36,7 +36,7 @@ from sealfit.store.staged_writes import PARQUET, Staged, disk, file_size, sync
 if TYPE_CHECKING:
     import pandas as pd
 
-    from sealfit.store.parquet import StoredTraces
+    from sealfit.ingest.trace_access import StoredTraces
 
 PROVENANCE = "provenance.json"
 
@@ -232,8 +232,8 @@ class Store:
     def traces(self) -> list[StoredTraces]:
         """Return where table `traces` lies, in groups of whole conditions."""
         from sealfit.ingest.stored_parts import ARROW, PARTS
+        from sealfit.ingest.trace_access import by_conditions
         from sealfit.store import parquet
-        from sealfit.store.parquet import by_conditions
 
         conditions = {}
         for path in self._parts_of("traces"):

@@ -10,8 +10,8 @@ import numpy as np
 
 from sealfit.fit.dynamic.starts import LEAST, Part
 from sealfit.ingest.segments import Pieces, median
+from sealfit.ingest.trace_access import noise_from_bends
 from sealfit.physics import bristle_limit
-from sealfit.store.parquet import noise_from_bends
 
 # ---------------------------------------------------------------- cells
 # Strokes in groups, averaged over cells of distance: all groups of a condition together.
