@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -188,6 +188,14 @@ def _columns_of(term: Term, rows: Rows) -> np.ndarray:
 # b are fitted as logarithms. Wu et al. 2020, Polymers 12(1) 102, doi:10.3390/polym12010102, Eqs. 14 and 15.
 
 LOGARITHMIC = ("b_s", "b_c", "v_s")
+QUANTITIES_OF = {
+    "mu_0": ("mu_0s", "mu_0c"),
+    "a": ("a_s", "a_c"),
+    "b": ("b_s", "b_c"),
+    "v_s": ("v_s",),
+    "sigma_2": ("sigma_2",),
+}
+"""Quantities of the declared model that an effect on each of these changes; those on mu_s and mu_c come after aging."""
 FEW = 24  # declared numbers, of two or three series, which are as quickly held whole as by blocks
 
 
@@ -242,25 +250,25 @@ class Model:
 
 def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.ndarray, Tangent | None]:
     """Return the model's force, shape (n,), and its tangent, of shape (n, model.size), at every row."""
-    state = _state(model, rows, slopes=jacobian)
+    state = _State.of(model, rows)
     if not jacobian:
-        return state["force"], None
-    slopes = state["slopes"]
-    layout = _layout(model, rows)
+        return state.force, None
+    slopes, layout = state.slopes(), _layout(model, rows)
     values = np.zeros((rows.force.size, layout.index.shape[1]))
     for quantity in QUANTITIES:
         number = model.declared.index[quantity][rows.condition]
         has = np.flatnonzero(number >= 0)
         if has.size:
-            base = state["base"][quantity] if quantity in LOGARITHMIC else 1.0
+            base = state.base[quantity] if quantity in LOGARITHMIC else 1.0
             place = layout.places[layout.block[has], number[has]]
-            values[has, place] = (slopes[quantity] * state["through"].get(quantity, 1.0) * base)[has]
+            values[has, place] = (slopes[quantity] * state.through.get(quantity, 1.0) * base)[has]
     column = layout.index.shape[1] - (model.size - model.theta.size)
-    for term, numbers, slope in zip(model.terms, model.values, state["term_slopes"], strict=True):
+    for term, numbers, shape in zip(model.terms, model.values, state.shapes, strict=True):
+        slope = state.term_slope(slopes, term.acts_on, term.operation, shape)
         for derivative in derivatives_of(term, numbers, rows):
             values[:, column] = slope * derivative
             column += 1
-    return state["force"], Tangent(layout, values)
+    return state.force, Tangent(layout, values)
 
 
 def _layout(model: Model, rows: Rows) -> Layout:
@@ -289,115 +297,122 @@ def _layout(model: Model, rows: Rows) -> Layout:
 
 def friction_of(model: Model, rows: Rows) -> np.ndarray:
     """Return the model's force less what is added to it, shape (n,): what rubber, load and gains scale."""
-    return _state(model, rows, slopes=False)["friction"]
+    return _State.of(model, rows).friction
 
 
 def term_slope(model: Model, rows: Rows, acts_on: str, operation: str) -> np.ndarray:
     """Return the force's derivative with respect to the shape of a term that is not there yet, shape (n,)."""
-    state = _state(model, rows)
-    return _slope_of(acts_on, operation, state)
+    state = _State.of(model, rows)
+    return state.term_slope(state.slopes(), acts_on, operation)
 
 
-def _state(model: Model, rows: Rows, *, slopes: bool = True) -> dict:
-    declared, theta = model.declared, model.theta
-    base = {}
+@dataclass(frozen=True)
+class _State:
+    """A model at every row: what its force is made of; each array has shape (n,)."""
+
+    rows: Rows
+    shapes: list[np.ndarray]  # of the effects
+    base: dict[str, np.ndarray]  # quantities of the declared model
+    now: dict[str, np.ndarray]  # the same with the effects on them
+    through: dict[str, np.ndarray]  # factors by which effects multiply them
+    ratio: np.ndarray  # speed over v_s
+    decay: np.ndarray  # share of mu_s in mu
+    mu: np.ndarray  # Eq. 14, before the effects on mu as a whole
+    on_mu: np.ndarray  # their factors
+    on_force: np.ndarray  # factors on the whole force
+    friction: np.ndarray  # force less what is added to it
+    force: np.ndarray
+
+    @classmethod
+    def of(cls, model: Model, rows: Rows) -> _State:
+        """Return the state of a model at some rows."""
+        shapes = [shape_of(t, v, rows) for t, v in zip(model.terms, model.values, strict=True)]
+        effects = [(t.acts_on, t.operation, shape) for t, shape in zip(model.terms, shapes, strict=True)]
+        base = _declared_values(model, rows)
+        now, through = dict(base), {}
+        for target, quantities in QUANTITIES_OF.items():
+            for quantity in quantities:
+                _change(quantity, [(o, shape) for t, o, shape in effects if t == target], now, through)
+        for quantity in LOGARITHMIC:  # a change may not carry v_s or b to zero or below
+            now[quantity] = np.maximum(now[quantity], 1e-3 * base[quantity])
+        for end in "sc":
+            mu = f"mu_{end}"
+            now[mu] = now[f"mu_0{end}"] - now[f"a_{end}"] * np.log1p(rows.days / now[f"b_{end}"])
+            _change(mu, [(o, shape) for t, o, shape in effects if t == mu], now, through)
+        speed, sign = rows.pace, np.sign(rows.pace)
+        ratio = speed / now["v_s"]
+        has_stribeck = (model.declared.index["v_s"] >= 0)[rows.condition]
+        decay = np.where(has_stribeck, np.exp(-(ratio**2)), 0.0)
+        mu = now["mu_c"] + (now["mu_s"] - now["mu_c"]) * decay
+        (on_mu, mu_added), (on_force, added) = (_factor_and_sum(effects, target, speed) for target in ("mu", "force"))
+        friction = (rows.load * (mu * on_mu + mu_added) * sign + now["sigma_2"] * speed) * on_force
+        force = friction + added
+        return cls(rows, shapes, base, now, through, ratio, decay, mu, on_mu, on_force, friction, force)
+
+    def slopes(self) -> dict[str, np.ndarray]:
+        """Return the force's derivative with respect to every quantity."""
+        now, speed, days = self.now, self.rows.pace, self.rows.days
+        drive = self.rows.load * np.sign(speed) * self.on_mu * self.on_force  # with respect to mu before its factor
+        found = {
+            "mu_s": drive * self.decay,
+            "mu_c": drive * (1 - self.decay),
+            "v_s": drive * (now["mu_s"] - now["mu_c"]) * self.decay * 2 * self.ratio**2 / now["v_s"],
+            "sigma_2": speed * self.on_force,
+        }
+        for end in "sc":
+            b = now[f"b_{end}"]
+            to_mu = found[f"mu_{end}"] * self.through.get(f"mu_{end}", 1.0)
+            found[f"mu_0{end}"] = to_mu
+            found[f"a_{end}"] = -to_mu * np.log1p(days / b)
+            found[f"b_{end}"] = to_mu * now[f"a_{end}"] * days / (b * (b + days))
+        return found
+
+    def term_slope(
+        self, slopes: Mapping[str, np.ndarray], acts_on: str, operation: str, shape: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return dF/dh for a term's shape h; `shape` is the term's own, so that its factor is not counted twice."""
+        own = 1.0 if shape is None or operation == "add" else 1 + shape
+        own = np.where(np.abs(own) < 1e-9, 1e-9, own)
+        if acts_on == "force":
+            return np.ones_like(self.force) if operation == "add" else self.friction / own
+        if acts_on == "mu":
+            drive = self.rows.load * np.sign(self.rows.pace) * self.on_force
+            return drive if operation == "add" else drive * self.mu * self.on_mu / own
+        total = 0.0
+        for quantity in QUANTITIES_OF.get(acts_on, (acts_on,)):
+            slope = slopes[quantity]
+            total = total + (slope if operation == "add" else slope * self.now[quantity] / own)
+        return total
+
+
+def _declared_values(model: Model, rows: Rows) -> dict[str, np.ndarray]:
+    """Return every quantity of the declared model at the rows; what is not fitted is 0, or 1 for v_s and b."""
+    found = {}
     for quantity in QUANTITIES:
-        number = declared.index[quantity]
-        start = 1.0 if quantity in LOGARITHMIC else 0.0
-        fitted = np.where(number >= 0, theta[np.maximum(number, 0)], 0.0)
-        value = np.where(number >= 0, np.exp(fitted), start) if quantity in LOGARITHMIC else fitted
-        base[quantity] = value[rows.condition]
-    shapes = [shape_of(t, v, rows) for t, v in zip(model.terms, model.values, strict=True)]
-    through: dict[str, np.ndarray] = {}
-    now = dict(base)
+        number = model.declared.index[quantity]
+        fitted = np.where(number >= 0, model.theta[np.maximum(number, 0)], 0.0)
+        found[quantity] = (np.exp(fitted) if quantity in LOGARITHMIC else fitted)[rows.condition]
+    return found
 
-    def change(target: str, quantities: Sequence[str]) -> None:
-        for quantity in quantities:
-            for term, shape in zip(model.terms, shapes, strict=True):
-                if term.acts_on == target:
-                    if term.operation == "multiply":
-                        now[quantity] = now[quantity] * (1 + shape)
-                        through[quantity] = through.get(quantity, 1.0) * (1 + shape)
-                    else:
-                        now[quantity] = now[quantity] + shape
 
-    for target, quantities in (
-        ("mu_0", ("mu_0s", "mu_0c")),
-        ("a", ("a_s", "a_c")),
-        ("b", ("b_s", "b_c")),
-        ("v_s", ("v_s",)),
-        ("sigma_2", ("sigma_2",)),
-    ):
-        change(target, quantities)
-    for quantity in LOGARITHMIC:  # a change may not carry v_s or b to zero or below
-        now[quantity] = np.maximum(now[quantity], 1e-3 * base[quantity])
-    days = rows.days
-    for end in "sc":
-        now[f"mu_{end}"] = now[f"mu_0{end}"] - now[f"a_{end}"] * np.log1p(days / now[f"b_{end}"])
-        change(f"mu_{end}", (f"mu_{end}",))
-    speed, sign = rows.pace, np.sign(rows.pace)
-    has_stribeck = (declared.index["v_s"] >= 0)[rows.condition]
-    ratio = speed / now["v_s"]
-    decay = np.where(has_stribeck, np.exp(-(ratio**2)), 0.0)
-    mu = now["mu_c"] + (now["mu_s"] - now["mu_c"]) * decay
-    on_mu, on_force, added, mu_added = np.ones_like(speed), np.ones_like(speed), np.zeros_like(speed), 0.0
-    for term, shape in zip(model.terms, shapes, strict=True):
-        if term.acts_on == "mu" and term.operation == "multiply":
-            on_mu = on_mu * (1 + shape)
-        elif term.acts_on == "mu":
-            mu_added = mu_added + shape
-        elif term.acts_on == "force" and term.operation == "multiply":
-            on_force = on_force * (1 + shape)
-        elif term.acts_on == "force":
+def _change(quantity: str, effects: list[tuple[str, np.ndarray]], now: dict, through: dict) -> None:
+    """Apply effects, each an operation and its shape, to a quantity in `now`; keep their factors in `through`."""
+    for operation, shape in effects:
+        if operation == "multiply":
+            now[quantity] = now[quantity] * (1 + shape)
+            through[quantity] = through.get(quantity, 1.0) * (1 + shape)
+        else:
+            now[quantity] = now[quantity] + shape
+
+
+def _factor_and_sum(
+    effects: list[tuple[str, str, np.ndarray]], target: str, like: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the product of the factors on a target and the sum of what is added to it, shape of `like` each."""
+    factor, added = np.ones_like(like), np.zeros_like(like)
+    for acts_on, operation, shape in effects:
+        if acts_on == target and operation == "multiply":
+            factor = factor * (1 + shape)
+        elif acts_on == target:
             added = added + shape
-    mu_total = mu * on_mu + mu_added
-    friction = rows.load * mu_total * sign
-    sliding = friction + now["sigma_2"] * speed
-    force = sliding * on_force + added
-    if not slopes:
-        return {"force": force, "friction": sliding * on_force}
-    drive = rows.load * sign * on_mu * on_force  # derivative with respect to mu before its factor
-    log_s, log_c = np.log1p(days / now["b_s"]), np.log1p(days / now["b_c"])
-    slope_of = {
-        "mu_s": drive * decay,
-        "mu_c": drive * (1 - decay),
-        "v_s": drive * (now["mu_s"] - now["mu_c"]) * decay * 2 * ratio**2 / now["v_s"],
-        "sigma_2": speed * on_force,
-    }
-    for end, log in (("s", log_s), ("c", log_c)):
-        factor = through.get(f"mu_{end}", 1.0)
-        slope_of[f"mu_0{end}"] = slope_of[f"mu_{end}"] * factor
-        slope_of[f"a_{end}"] = -slope_of[f"mu_{end}"] * factor * log
-        b = now[f"b_{end}"]
-        slope_of[f"b_{end}"] = slope_of[f"mu_{end}"] * factor * now[f"a_{end}"] * days / (b * (b + days))
-    state = {
-        "base": base,
-        "now": now,
-        "through": through,
-        "slopes": slope_of,
-        "force": force,
-        "gained": sliding * on_force,
-        "on_mu": on_mu,
-        "drive_mu": rows.load * sign * on_force,
-        "mu": mu,
-    }
-    state["term_slopes"] = [
-        _slope_of(t.acts_on, t.operation, state, s) for t, s in zip(model.terms, shapes, strict=True)
-    ]
-    return state
-
-
-def _slope_of(acts_on: str, operation: str, state: Mapping, shape: np.ndarray | None = None) -> np.ndarray:
-    """Return dF/dh for a term's shape h; `shape` is the term's own, so that its factor is not counted twice."""
-    own = 1.0 if shape is None or operation == "add" else 1 + shape
-    own = np.where(np.abs(own) < 1e-9, 1e-9, own)
-    if acts_on == "force":
-        return np.ones_like(state["force"]) if operation == "add" else state["gained"] / own
-    if acts_on == "mu":
-        return state["drive_mu"] if operation == "add" else state["drive_mu"] * state["mu"] * state["on_mu"] / own
-    total = 0.0
-    quantities = {"mu_0": ("mu_0s", "mu_0c"), "a": ("a_s", "a_c"), "b": ("b_s", "b_c")}.get(acts_on, (acts_on,))
-    for quantity in quantities:
-        slope = state["slopes"][quantity]
-        total = total + (slope if operation == "add" else slope * state["now"][quantity] / own)
-    return total
+    return factor, added
