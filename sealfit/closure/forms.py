@@ -99,11 +99,7 @@ def _terms_of_single(
         if target not in effect.acts_on or not _all_read(effect, channels, fitted.rows, effects):
             continue
         if effect.reads in READS_ANY and SECOND not in effect.reads:
-            if not channel.numeric or name == "direction":
-                continue
-            if effect.id == "offset_slope" and (FINER[channel.unit] <= FINER["stroke"] or _has_offset(fitted)):
-                continue  # the offset is an effect of its own inside strokes, or is in the model
-            if not _in_domain(effect, channel.values) or (name in CALENDAR and effect.id in WAVY):
+            if not _may_follow(effect, channel, fitted):
                 continue
             fixed = {"x_ref": reference(channel.values)}
             held = _within_reach(effect, channel.values)
@@ -118,8 +114,14 @@ def _terms_of_single(
         yield free_term(channel, *target, knots=knots), {}
 
 
-def _has_offset(fitted: Fitted) -> bool:
-    return any(term.effect.id == "zero_offset" for term in fitted.model.terms)
+def _may_follow(effect: Effect, channel: Channel, fitted: Fitted) -> bool:
+    """Whether a form of any channel may follow this one."""
+    if not channel.numeric or channel.name == "direction" or not _in_domain(effect, channel.values):
+        return False
+    if effect.id == "offset_slope":  # the offset is an effect of its own inside strokes, or is in the model
+        has_offset = any(term.effect.id == "zero_offset" for term in fitted.model.terms)
+        return FINER[channel.unit] > FINER["stroke"] and not has_offset
+    return channel.name not in CALENDAR or effect.id not in WAVY
 
 
 def _all_read(effect: Effect, channels: Mapping[str, Channel], rows: Rows, effects: Mapping[str, Effect]) -> bool:

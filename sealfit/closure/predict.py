@@ -65,14 +65,7 @@ def read_points(path: Path) -> Points:
     except OSError as error:
         raise RequestError(f"cannot be read ({error.strerror}).", file=path, fix="Fix its rights.") from error
     lines = csv.reader(io.StringIO(raw, newline=""))
-    names = [name.strip() for name in next(lines, [])]
-    if not any(names):
-        raise RequestError("is empty.", file=path, fix="Give a line of column names, then one row per point.")
-    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
-        raise RequestError("is not separated by commas.", file=path, line=1, fix="Save it with commas and points.")
-    doubled = sorted({name for name in names if names.count(name) > 1})
-    if doubled:
-        raise RequestError("appears twice.", file=path, line=1, column=doubled[0], fix="Keep one of the two.")
+    names = _names_of_points([name.strip() for name in next(lines, [])], path)
     rows = []
     for row in lines:
         if not any(cell.strip() for cell in row):
@@ -88,10 +81,22 @@ def read_points(path: Path) -> Points:
     text = pd.DataFrame(rows, columns=names, dtype=object)
     if text.empty:
         raise RequestError("has no rows.", file=path, fix="Give one row per point.")
+    return Points(path, text, text.apply(_numbers))
+
+
+def _names_of_points(names: list[str], path: Path) -> list[str]:
+    """Return the names of the columns of points, refused where they cannot be that."""
+    if not any(names):
+        raise RequestError("is empty.", file=path, fix="Give a line of column names, then one row per point.")
+    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+        raise RequestError("is not separated by commas.", file=path, line=1, fix="Save it with commas and points.")
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled:
+        raise RequestError("appears twice.", file=path, line=1, column=doubled[0], fix="Keep one of the two.")
     taken = [name for name in ANSWER_COLUMNS if name in names]
     if taken:
         raise RequestError("is a column of the answer.", file=path, line=1, column=taken[0], fix="Rename it.")
-    return Points(path, text, text.apply(_numbers))
+    return names
 
 
 def _numbers(cells: pd.Series) -> pd.Series:
@@ -211,23 +216,13 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
 def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -> pd.DataFrame:
     """Return the points with every column the model reads: given, derived, or the campaign's only value."""
     ranges = model["ranges"]
-    table = points.assign(file="")
-    if "elapsed_h" not in table and "started_at" in table and model.get("first_started_at"):
-        first = pd.Timestamp(model["first_started_at"])
-        started = pd.to_datetime(table["started_at"], errors="coerce", utc=first.tzinfo is not None)
-        table["elapsed_h"] = (started - first).dt.total_seconds() / 3600
+    table = _with_derived(points.assign(file=""), model)
     needed = [*config.condition, *([] if not config.rubber else config.rubber)]
     if any(form != "constant" for form in after.declared.stribeck.values()) or "speed_mm_s" in points:
         needed.append("speed_mm_s")
     if model["has_load"]:
         needed.append("load_N")
     needed += [name for term in after.terms for name in term.channels]
-    if "direction" in needed and "direction" not in table and "speed_mm_s" in table:
-        table["direction"] = np.sign(pd.to_numeric(table["speed_mm_s"], errors="coerce"))
-    if POWER in needed and POWER not in table and {"load_N", "speed_mm_s"} <= set(table):
-        table[POWER] = sliding_power(
-            *(pd.to_numeric(table[name], errors="coerce") for name in ("load_N", "speed_mm_s"))
-        )
     for name in dict.fromkeys(needed):
         if name in table:
             continue
@@ -244,9 +239,22 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
         )
     if "speed_mm_s" not in table:
         table["speed_mm_s"] = ranges["speed_mm_s"][0]
+    return table
+
+
+def _with_derived(table: pd.DataFrame, model: dict) -> pd.DataFrame:
+    """Return the points with speed and load as numbers and with what follows from their columns."""
     for name in ("speed_mm_s", "load_N"):
         if name in table:
             table[name] = pd.to_numeric(table[name], errors="coerce")
+    if "elapsed_h" not in table and "started_at" in table and model.get("first_started_at"):
+        first = pd.Timestamp(model["first_started_at"])
+        started = pd.to_datetime(table["started_at"], errors="coerce", utc=first.tzinfo is not None)
+        table["elapsed_h"] = (started - first).dt.total_seconds() / 3600
+    if "direction" not in table and "speed_mm_s" in table:
+        table["direction"] = np.sign(table["speed_mm_s"])
+    if POWER not in table and {"load_N", "speed_mm_s"} <= set(table):
+        table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
     return table
 
 

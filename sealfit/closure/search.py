@@ -94,23 +94,18 @@ def _of_shapes(
 ) -> Iterator[Candidate]:
     """Yield the candidates of a channel's columns, by the first so many of them, on every target that may take them."""
     fitted, rows = judge.fitted, judge.fitted.rows
+    if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
+        return  # too few speeds to know the Stribeck curve: what depends on speed may be just that
     both_ways = rows.speed.min() < 0 < rows.speed.max()
     slopes, places = [], []
     for acts_on, operation in targets:
         if not (_allowed(channel, acts_on, operation, both_ways) and _declared(fitted, acts_on)):
             continue
-        if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
-            continue  # too few speeds to know the Stribeck curve: what depends on speed may be just that
         slope = fitted.slope(acts_on, operation)
-        if np.abs(slope).max() <= 0:
-            continue
-        own = shapes
-        if channel.name == "direction" and acts_on != "force":
-            own = channel.values[:, None] / 2
-        slopes.append(own * slope[:, None])
-        places.append((acts_on, operation, own))
-    if not slopes:
-        return
+        if np.abs(slope).max() > 0:
+            own = channel.values[:, None] / 2 if channel.name == "direction" and acts_on != "force" else shapes
+            slopes.append(own * slope[:, None])
+            places.append((acts_on, operation, own))
     together = max(1, MOST_NUMBERS // shapes.size)
     variants: tuple[np.ndarray, ...] = ()
     for number, (acts_on, operation, own) in enumerate(places):

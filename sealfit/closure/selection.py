@@ -107,91 +107,143 @@ def grow(
     on_progress : callable, optional
         Told in words what is being done.
     """
-    say = on_progress or (lambda text: None)
-    rng = np.random.default_rng(config.loop.seed)
-    alpha, compare = config.loop.family_error, rounds is None
-    ripples = Ripples(samples, config, effects, say, compare=compare, workers=workers)
-    before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
-    channels = {c.name: c for c in channels_of(rows, config)}
-    judge = ScoreTests(before)
-    last = first = tuple(search(judge, list(channels.values()), rng))
-    fitted = ripples.added_to(before, fine)
-    added = list(ripples.added)
-    revisit = Renaming(channels, effects, ripples.samples, config, say, compare=compare)
-    refused: set[tuple] = set()
-    not_confirmed = ripples.refused
-    left: Candidate | Peak | None = None
-    hidden: list[MaskedPair] = []  # effects that hide each other, until both are in the model
-    again = False  # whether earlier effects have been asked again
-    shown: _Shown | None = None
+    growth = _Growth(rows, samples, config, effects, fine, start, rounds is not None, workers, on_progress)
+    last_round = config.loop.max_rounds + 2 if rounds is None else rounds
+    for number in range(len(growth.added) + 1, last_round + 1):
+        if growth.has_ended(number):
+            break
+    return growth.selection(whole=rounds is None)
+
+
+class _Growth:
+    """The loop while it goes on: the model, what was added and refused, and what the searches show on the model."""
+
+    def __init__(self, rows, samples, config, effects, fine, start, fold, workers, on_progress) -> None:
+        self.say = on_progress or (lambda text: None)
+        self.rows, self.config, self.effects, self.compare = rows, config, effects, not fold
+        self.rng = np.random.default_rng(config.loop.seed)
+        ripples = Ripples(samples, config, effects, self.say, compare=self.compare, workers=workers)
+        self.before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
+        self.channels = {c.name: c for c in channels_of(rows, config)}
+        self.judge = ScoreTests(self.before)
+        self.last = self.first = self.searched()
+        self.fitted = ripples.added_to(self.before, fine)
+        self.added = list(ripples.added)
+        self.ripple, self.samples, self.not_confirmed = ripples.found, ripples.samples, ripples.refused
+        self.renaming = Renaming(self.channels, effects, self.samples, config, self.say, compare=self.compare)
+        self.refused: set[tuple] = set()
+        self.left: Candidate | Peak | None = None
+        self.hidden: list[MaskedPair] = []  # effects that hide each other, until both are in the model
+        self.renamed = False  # whether earlier effects have been named anew
+        self.shown: _Shown | None = None
+
+    @property
+    def alpha(self) -> float:
+        """Level of error of the whole search."""
+        return self.config.loop.family_error
+
+    def searched(self) -> tuple[Candidate, ...]:
+        """Return every candidate of a single channel on the present model."""
+        return tuple(search(self.judge, list(self.channels.values()), self.rng))
 
     def ask(
-        base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
+        self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
     ) -> AcceptedEffect | None:
-        return confirmed(base, proposals, ripples.samples, config, number, say, compare=compare, refused=failed)
+        """Return the first of some proposals that held-out data confirm; what they refuse is added to `failed`."""
+        return confirmed(
+            base, proposals, self.samples, self.config, number, self.say, compare=self.compare, refused=failed
+        )
 
-    for number in range(len(added) + 1, (config.loop.max_rounds + 2 if rounds is None else rounds) + 1):
-        if fitted is not judge.fitted:
-            judge, shown = ScoreTests(fitted), None
-            last = tuple(search(judge, list(channels.values()), rng))
-        if shown is None:  # else the last round refused what it was shown, and the model is as it was
-            shown = _shown(judge, last, channels, effects, alpha, rng)
-            tried = f"{len(last)} candidates on {len(channels)} channels, {len(shown.pairs)} on pairs of them"
-            say(f"round {number}: {tried}; {len(shown.significant)} significant, {len(shown.hidden)} hide each other")
-            two = next((pair for pair in shown.hidden if {key[0] for key in pair.keys} == {("direction",)}), None)
-            if not hidden and two is not None:
-                both = _both(fitted, _awaited([two], shown.claimable), channels, effects, ask, number)
-                if both:
-                    added = [*added, *both]
-                    fitted = fit(added[-1].proposal.fitted.model, rows, fitted.scatter, turns=2)
-                    continue
-        if not (hidden or shown.significant):
-            hidden = [pair for pair in shown.hidden if refused.isdisjoint(pair.keys)]
-        claimable, laws = shown.claimable, shown.laws
-        significant = _awaited(hidden, (*claimable, *shown.pairs)) or list(shown.significant)
-        significant += [c for c, _ in laws if c.p_value <= alpha and c.sure]
-        left = significant[0] if significant else ripples.found
-        significant += pairs_in_disguise(judge, significant, channels)
-        open_ = [c for c in significant if c.key not in refused]
-        if not open_ or number > config.loop.max_rounds:
-            if again or len(added) < 2:
-                break
-            again, before_that = True, added
-            fitted, added = revisit.all_but_last(fitted, added)
-            if added is before_that:
-                break
-            continue
-        open_ += [c for c in _standing_for(open_, claimable) if c.key not in refused]
-        proposals = propose(fitted, open_, channels, effects, [p for _, p in laws])
-        accepted = ask(fitted, proposals, number, not_confirmed)
+    def has_ended(self, number: int) -> bool:
+        """Search, name and confirm once; return whether nothing is left to be done."""
+        if self.fitted is not self.judge.fitted:
+            self.judge, self.shown = ScoreTests(self.fitted), None
+            self.last = self.searched()
+        if self.shown is None:  # else the last round refused what it was shown, and the model is as it was
+            self.shown = self.look(number)
+            if self.adds_two_of_direction(number):
+                return False
+        open_ = self.open_candidates()
+        if not open_ or number > self.config.loop.max_rounds:
+            return not self.renames()
+        claimable, laws = self.shown.claimable, [p for _, p in self.shown.laws]
+        open_ += [c for c in _standing_for(open_, claimable) if c.key not in self.refused]
+        proposals = propose(self.fitted, open_, self.channels, self.effects, laws)
+        accepted = self.ask(self.fitted, proposals, number, self.not_confirmed)
         if accepted is None:
-            refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
-            hidden = []
-            continue
+            self.refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
+            self.hidden = []
+        else:
+            self.add(accepted)
+        return False
+
+    def look(self, number: int) -> _Shown:
+        """Return what the present model lacks."""
+        shown = _shown(self.judge, self.last, self.channels, self.effects, self.alpha, self.rng)
+        tried = f"{len(self.last)} candidates on {len(self.channels)} channels, {len(shown.pairs)} on pairs of them"
+        self.say(f"round {number}: {tried}; {len(shown.significant)} significant, {len(shown.hidden)} hide each other")
+        return shown
+
+    def adds_two_of_direction(self, number: int) -> bool:
+        """Whether two effects of the direction, which hid each other, were added."""
+        two = next((pair for pair in self.shown.hidden if {key[0] for key in pair.keys} == {("direction",)}), None)
+        if self.hidden or two is None:
+            return False
+        awaited = _awaited([two], self.shown.claimable)
+        both = _both(self.fitted, awaited, self.channels, self.effects, self.ask, number)
+        if both:
+            self.added = [*self.added, *both]
+            self.fitted = fit(both[-1].proposal.fitted.model, self.rows, self.fitted.scatter, turns=2)
+        return bool(both)
+
+    def open_candidates(self) -> list[Candidate]:
+        """Return what is significant and not refused; those of effects that hide each other where nothing else is."""
+        shown = self.shown
+        if not (self.hidden or shown.significant):
+            self.hidden = [pair for pair in shown.hidden if self.refused.isdisjoint(pair.keys)]
+        significant = _awaited(self.hidden, (*shown.claimable, *shown.pairs)) or list(shown.significant)
+        significant += [c for c, _ in shown.laws if c.p_value <= self.alpha and c.sure]
+        self.left = significant[0] if significant else self.ripple
+        significant += pairs_in_disguise(self.judge, significant, self.channels)
+        return [c for c in significant if c.key not in self.refused]
+
+    def renames(self) -> bool:
+        """Name earlier effects anew beside the later ones, once; return whether one has another name."""
+        if self.renamed or len(self.added) < 2:
+            return False
+        self.renamed, before = True, self.added
+        self.fitted, self.added = self.renaming.all_but_last(self.fitted, self.added)
+        return self.added is not before
+
+    def add(self, accepted: AcceptedEffect) -> None:
+        """Add an effect; drop what it makes needless."""
         source = accepted.proposal.source
-        hidden = [pair.without(source) for pair in hidden if source in pair.keys]
-        added, accepted = revisit.one_for_two(fitted, added, accepted)
-        added = [*added, accepted]
+        self.hidden = [pair.without(source) for pair in self.hidden if source in pair.keys]
+        earlier, accepted = self.renaming.one_for_two(self.fitted, self.added, accepted)
+        added = [*earlier, accepted]
         own = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
-        fitted = fit(own.model, rows, own.scatter, turns=2)
-        fitted, kept = _drop_needless(fitted, added)
+        self.fitted, self.added = _drop_needless(fit(own.model, self.rows, own.scatter, turns=2), added)
         # What came and went does not come again.
-        refused |= {a.proposal.source for a in added if all(a is not k for k in kept)}
-        added = kept
-    if rounds is not None:
-        return Selection(before, fitted if added else before, tuple(added), first, last, None, None, channels)
-    if isinstance(left, Candidate) and left.key in refused and left.p_value > WEAK:
-        left = None  # it is listed as refused
-    unsure = None
-    doubtful = [c for c in (*last, *(c for c, _ in laws)) if c.p_value <= alpha and not c.sure]
-    if left is None and doubtful:
-        proposals = propose(fitted, doubtful, channels, effects, [p for _, p in laws])
-        others = tuple(rivals(proposals[0], proposals))
-        left = doubtful[0]
-        unsure = AcceptedEffect(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
-    return Selection(
-        before, fitted if added else before, tuple(added), first, last, left, unsure, channels, tuple(not_confirmed)
-    )
+        self.refused |= {a.proposal.source for a in added if all(a is not k for k in self.added)}
+
+    def selection(self, *, whole: bool) -> Selection:
+        """Return the end of the loop; without what is left where not the whole campaign was searched."""
+        added = tuple(self.added)
+        after = self.fitted if added else self.before
+        found = Selection(self.before, after, added, self.first, self.last, None, None, self.channels)
+        if not whole:
+            return found
+        left, unsure = self.left, None
+        if isinstance(left, Candidate) and left.key in self.refused and left.p_value > WEAK:
+            left = None  # it is listed as refused
+        laws = self.shown.laws
+        doubtful = [c for c in (*self.last, *(c for c, _ in laws)) if c.p_value <= self.alpha and not c.sure]
+        if left is None and doubtful:
+            proposals = propose(self.fitted, doubtful, self.channels, self.effects, [p for _, p in laws])
+            others = tuple(rivals(proposals[0], proposals))
+            left = doubtful[0]
+            unsure = AcceptedEffect(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
+        return replace(found, left=left, unsure=unsure, refused=tuple(self.not_confirmed))
 
 
 def _shown(

@@ -17,7 +17,7 @@ from types import ModuleType
 import numpy as np
 
 from sealfit.effects import EFFECTS
-from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect
+from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect, Parameter
 from sealfit.effects.free import FREE
 from sealfit.errors import ConfigError, ParameterError
 
@@ -145,11 +145,20 @@ def _description_fault(effect: Effect) -> str:
     names = [p.name for p in effect.parameters]
     if len(set(names)) != len(names):
         return "two parameters share a name"
-    for p in effect.parameters:
-        if not np.isfinite(p.bounds).all():
-            return f"the bounds of {p.name} are not finite"
-        if not p.linear and isinstance(p.search, str) and p.search not in ("inside", "between", "span", "ratio"):
-            return f"search of {p.name} is '{p.search}': use numbers, 'inside', 'between', 'span' or 'ratio'"
+    return next((fault for p in effect.parameters if (fault := _parameter_fault(p))), "") or _worked_fault(
+        effect, names
+    )
+
+
+def _parameter_fault(p: Parameter) -> str:
+    if not np.isfinite(p.bounds).all():
+        return f"the bounds of {p.name} are not finite"
+    if not p.linear and isinstance(p.search, str) and p.search not in ("inside", "between", "span", "ratio"):
+        return f"search of {p.name} is '{p.search}': use numbers, 'inside', 'between', 'span' or 'ratio'"
+    return ""
+
+
+def _worked_fault(effect: Effect, names: list[str]) -> str:
     inputs, values, _ = effect.worked
     missing = [name for name in effect.reads if name not in inputs]
     if missing:

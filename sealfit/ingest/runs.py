@@ -119,25 +119,18 @@ def _config_faults(config: Config) -> list[Fault]:
     def add(column: str, value: str, reason: str, fix: str) -> None:
         faults.append(Fault("config", reason, file=f"config '{config.name}'", column=column, value=value, fix=fix))
 
-    if settings.encoding != "auto":
-        try:
-            codecs.lookup(settings.encoding)
-        except LookupError:
-            add("trace.encoding", settings.encoding, "is no encoding.", "Use auto, utf-8, latin-1 or utf-16.")
-    if settings.delimiter not in ("tab", "whitespace") and (
-        len(settings.delimiter) != 1 or settings.delimiter in '"\n\r ' or settings.delimiter.isalnum()
-    ):
+    if not _is_encoding(settings.encoding):
+        add("trace.encoding", settings.encoding, "is no encoding.", "Use auto, utf-8, latin-1 or utf-16.")
+    if not _is_delimiter(settings.delimiter):
         add("trace.delimiter", settings.delimiter, "is no delimiter.", "Use one character, 'tab' or 'whitespace'.")
     if settings.delimiter == settings.decimal:
         add("trace.delimiter", settings.delimiter, "is the decimal mark too.", "Set trace.delimiter or trace.decimal.")
-    for name in ("file", "speed_mm_s"):
-        if name in config.condition:
-            add("condition", name, "is no condition: it differs within one.", "Take it out of condition.")
-    if settings.names == "none":
-        for ours, theirs in settings.columns.items():
-            if isinstance(theirs, str):
-                fix = "Give its position, counted from 1, or names = 'header'."
-                add(f"trace.columns.{ours}", theirs, "is a name, but the files have none.", fix)
+    for name in sorted({"file", "speed_mm_s"} & set(config.condition)):
+        add("condition", name, "is no condition: it differs within one.", "Take it out of condition.")
+    named = {} if settings.names != "none" else {k: v for k, v in settings.columns.items() if isinstance(v, str)}
+    for ours, theirs in named.items():
+        fix = "Give its position, counted from 1, or names = 'header'."
+        add(f"trace.columns.{ours}", theirs, "is a name, but the files have none.", fix)
     checks = {"quantities": lambda: speed_factor(config.units)}
     if config.files.name_pattern is None:
         checks["files"] = lambda: name_parts("", config.files)
@@ -147,6 +140,19 @@ def _config_faults(config: Config) -> list[Fault]:
         except ConfigError as error:
             add(column, config.name, error.message, error.fix)
     return faults
+
+
+def _is_encoding(name: str) -> bool:
+    try:
+        return name == "auto" or codecs.lookup(name) is not None
+    except LookupError:
+        return False
+
+
+def _is_delimiter(text: str) -> bool:
+    if text in ("tab", "whitespace"):
+        return True
+    return len(text) == 1 and text not in '"\n\r ' and not text.isalnum()
 
 
 def _named(entries: Entries, config: Config) -> tuple[np.ndarray, Columns, list[Fault]]:

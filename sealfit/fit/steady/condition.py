@@ -181,6 +181,23 @@ def bound(conditions: list[Condition], rise: np.ndarray) -> None:
 
 def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
     """Return, per parameter, whether these data determine it and, in words, why not or what is worth a remark."""
+    verdict = _judge_form(condition)
+    if condition.low is None and condition.model != FULL:
+        verdict = {n: (ok, why or "no repeats and no spare run: no interval.") for n, (ok, why) in verdict.items()}
+    zero = {name for name, value in zip(condition.names, condition.values, strict=True) if value == 0.0}
+    if "sigma_2" in zero:
+        verdict["sigma_2"] = (verdict["sigma_2"][0], "at its physical limit 0: friction does not rise with speed here.")
+    for name in zero & {"mu_s", "mu_c"}:
+        verdict[name] = (False, "at its physical limit 0: these runs show no friction that it could be.")
+    against = int((condition.runs["force"] < 0).sum())
+    if against:
+        told = f"{against} runs have a force along the motion: check the sign of force or displacement."
+        verdict["mu_c"] = (verdict["mu_c"][0], f"{verdict['mu_c'][1]} {told}".strip())
+    return verdict
+
+
+def _judge_form(condition: Condition) -> dict[str, tuple[bool, str]]:
+    """Return the same by the form that these speeds can hold."""
     most = max(len(values) for values in condition.levels.values())
     verdict = dict.fromkeys(NAMES, (True, ""))
     if condition.model == CONSTANT:
@@ -207,17 +224,6 @@ def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
         verdict |= {name: (False, unknown) for name in NAMES}
     else:
         verdict |= _judge_curve(condition)
-    if condition.low is None and condition.model != FULL:
-        verdict = {n: (ok, why or "no repeats and no spare run: no interval.") for n, (ok, why) in verdict.items()}
-    if "sigma_2" in condition.names and condition.values[condition.names.index("sigma_2")] == 0.0:
-        verdict["sigma_2"] = (verdict["sigma_2"][0], "at its physical limit 0: friction does not rise with speed here.")
-    for name in ("mu_s", "mu_c"):
-        if name in condition.names and condition.values[condition.names.index(name)] == 0.0:
-            verdict[name] = (False, "at its physical limit 0: these runs show no friction that it could be.")
-    against = int((condition.runs["force"] < 0).sum())
-    if against:
-        told = f"{against} runs have a force along the motion: check the sign of force or displacement."
-        verdict["mu_c"] = (verdict["mu_c"][0], f"{verdict['mu_c'][1]} {told}".strip())
     return verdict
 
 
