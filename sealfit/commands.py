@@ -81,7 +81,7 @@ def predict(
         needs the user's own effects and no folder of them is given.
     """
     from sealfit.closure.predict import predict as answer
-    from sealfit.closure.predict import read_points, write_answers
+    from sealfit.closure.prediction_csv import read_points, write_answers
 
     store = Store.open(existing_out(out), effects_folder)
     for warning in store.warnings:

@@ -1,13 +1,14 @@
-"""Force at new points, before and after, with 95 % intervals; the CSV of points and that of answers."""
+"""Force at new points, before and after, with 95 % intervals of the mean and of one new measurement.
+
+The mean is that of the population: average specimen, set-up and repeat gain, every random effect at zero. Its
+interval holds the parameters' uncertainty, in which the scatter of specimens, runs and files already stands; that of
+a measurement adds one draw of each level and the noise of a bin. The sensor's accuracy stands apart (GUM, type B).
+"""
 
 from __future__ import annotations
 
-import csv
-import io
-import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -23,126 +24,6 @@ from sealfit.fit.joint.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.joint.whitening import Component, Scatter
 from sealfit.ingest.campaign import NO_VALUE
 from sealfit.ingest.categorical import add_keys
-from sealfit.store.paths import existing_file
-
-# ---------------------------------------------------------------- points
-# P.csv and Q.csv: the points asked for, and the same rows with their answers.
-
-MISSING = ("", "nan", "NaN", "NA", "null")
-ANSWER_COLUMNS = (
-    "force_before_N",
-    "force_after_N",
-    "force_after_lo95_N",
-    "force_after_hi95_N",
-    "meas_lo95_N",
-    "meas_hi95_N",
-    "extrapolated",
-    "note",
-)
-
-
-@dataclass(frozen=True)
-class Points:
-    """Rows as they were written, and the same with numbers where a column holds numbers only."""
-
-    path: Path
-    text: pd.DataFrame
-    values: pd.DataFrame
-
-
-def read_points(path: Path) -> Points:
-    """Return the rows of a CSV of points (comma, UTF-8, one line of names).
-
-    Raises
-    ------
-    RequestError
-        If there is no such file, or it is not such a CSV; it names the line.
-    """
-    try:
-        raw = existing_file(path, "table of points").read_text("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise RequestError("is not UTF-8.", file=path, fix="Save it as CSV UTF-8.") from error
-    except OSError as error:
-        raise RequestError(f"cannot be read ({error.strerror}).", file=path, fix="Fix its rights.") from error
-    lines = csv.reader(io.StringIO(raw, newline=""))
-    names = _names_of_points([name.strip() for name in next(lines, [])], path)
-    rows = []
-    for row in lines:
-        if not any(cell.strip() for cell in row):
-            continue
-        if len(row) != len(names):
-            raise RequestError(
-                f"has {len(row)} cells, and there are {len(names)} columns.",
-                file=path,
-                line=lines.line_num,
-                fix="Fix the row; a comma inside a cell needs quotes, a decimal comma a point.",
-            )
-        rows.append(row)
-    text = pd.DataFrame(rows, columns=names, dtype=object)
-    if text.empty:
-        raise RequestError("has no rows.", file=path, fix="Give one row per point.")
-    return Points(path, text, text.apply(_numbers))
-
-
-def _names_of_points(names: list[str], path: Path) -> list[str]:
-    """Return the names of the columns of points, refused where they cannot be that."""
-    if not any(names):
-        raise RequestError("is empty.", file=path, fix="Give a line of column names, then one row per point.")
-    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
-        raise RequestError("is not separated by commas.", file=path, line=1, fix="Save it with commas and points.")
-    doubled = sorted({name for name in names if names.count(name) > 1})
-    if doubled:
-        raise RequestError("appears twice.", file=path, line=1, column=doubled[0], fix="Keep one of the two.")
-    taken = [name for name in ANSWER_COLUMNS if name in names]
-    if taken:
-        raise RequestError("is a column of the answer.", file=path, line=1, column=taken[0], fix="Rename it.")
-    return names
-
-
-def _numbers(cells: pd.Series) -> pd.Series:
-    cells = cells.str.strip()
-    missing = cells.isin(MISSING)
-    numbers = pd.to_numeric(cells.where(~missing), errors="coerce")
-    if (numbers.notna() | missing).all():
-        return numbers.astype(float)
-    return cells.where(~missing, None)
-
-
-def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
-    """Write the rows as they were given plus their answers to `output`, whole or not at all; return the counts.
-
-    Raises
-    ------
-    RequestError
-        If `output` cannot be written or is the table of points itself.
-    """
-    if output.exists() and output.resolve() == points.path.resolve():
-        raise RequestError(f"--output {output} is the table of points.", fix="Give another name.")
-    if not output.absolute().parent.is_dir():
-        raise RequestError(f"there is no folder {output.parent} for --output.", fix="Make it first.")
-    if output.is_dir():
-        raise RequestError(f"--output {output} is a folder.", fix="Give a file name.")
-    # `answers` keeps the rows and their order; the cells of the points are written as they were given.
-    table = pd.concat([points.text, answers[list(ANSWER_COLUMNS)].reset_index(drop=True)], axis=1)
-    staged = output.with_name(f".{output.name}.{os.getpid()}")
-    try:
-        table.to_csv(staged, index=False, encoding="utf-8", lineterminator="\n")
-        os.replace(staged, output)
-    except OSError as error:
-        raise RequestError(f"{output} cannot be written ({error.strerror}).", fix="Choose another --output.") from error
-    finally:
-        staged.unlink(missing_ok=True)
-    answered = answers["force_after_N"].notna()
-    extrapolated = answers["extrapolated"].fillna(False).astype(bool) & answered
-    return {"rows": len(answers), "answered": int(answered.sum()), "extrapolated": int(extrapolated.sum())}
-
-
-# ---------------------------------------------------------------- predict
-# Force at new points, before and after, with 95 % intervals of the mean and of one new measurement.
-#
-# The mean is that of the population: average specimen, set-up and repeat gain, every random effect at zero. Its
-# interval holds the parameters' uncertainty, in which the scatter of specimens, runs and files already stands; that of
-# a measurement adds one draw of each level and the noise of a bin. The sensor's accuracy stands apart (GUM, type B).
 
 SAME_SPEED = 0.05  # relative difference within which a speed counts as a tested one
 BEYOND = 1e-6  # relative slack before a value counts as outside the tested range

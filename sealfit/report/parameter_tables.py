@@ -9,7 +9,6 @@ import pandas as pd
 from markupsafe import Markup
 
 from sealfit.config import Config
-from sealfit.report.excerpts import MOST_ROWS, spread
 from sealfit.report.notation import (
     NOTHING,
     ConditionNames,
@@ -23,7 +22,7 @@ from sealfit.report.notation import (
     symbol_html,
     true_units,
 )
-from sealfit.report.style import natural
+from sealfit.report.style import MOST_ROWS, natural, spread
 
 # ---------------------------------------------------------------- law tables
 # The joint laws of aging as rows to read: what each says, and the evidence for it.

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
 from sealfit.config import Config
-from sealfit.report.excerpts import MOST_KEYS, MOST_PANELS, rms, spread, telling
 from sealfit.report.notation import (
     ConditionNames,
     count,
@@ -28,6 +27,8 @@ from sealfit.report.style import (
     BLACK,
     CYCLE,
     FLOOR,
+    MOST_KEYS,
+    MOST_PANELS,
     QUIET,
     SKY,
     Key,
@@ -36,8 +37,11 @@ from sealfit.report.style import (
     evenly,
     natural,
     padded,
+    rms,
     round_ticks,
     shades,
+    spread,
+    telling,
 )
 from sealfit.units import Units
 

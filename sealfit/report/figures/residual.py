@@ -9,7 +9,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sealfit.config import Config
-from sealfit.report.excerpts import MOST_MARKS
 from sealfit.report.figures.speed import LOG_SPAN as SPEED_SPAN
 from sealfit.report.notation import (
     channel_label,
@@ -28,6 +27,7 @@ from sealfit.report.style import (
     AFTER,
     BEFORE,
     FLOOR,
+    MOST_MARKS,
     QUIET,
     Key,
     Panel,

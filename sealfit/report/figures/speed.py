@@ -10,24 +10,30 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sealfit.config import Config
-from sealfit.report.excerpts import MOST_KEYS, MOST_MARKS, MOST_PANELS, condition_misfits, rms, spread, telling
 from sealfit.report.notation import ConditionNames, channel_words, count, given, is_unaged, number, plain, short
 from sealfit.report.style import (
     BLACK,
     CYCLE,
     FLOOR,
     HEIGHT,
+    MOST_KEYS,
+    MOST_MARKS,
+    MOST_PANELS,
     Key,
     Panel,
     Plot,
     capital,
+    condition_misfits,
     evenly,
     in_order,
     is_number,
     log_axis,
     natural,
     padded,
+    rms,
     shades,
+    spread,
+    telling,
 )
 from sealfit.units import Units
 

@@ -1,0 +1,122 @@
+"""P.csv and Q.csv: the points asked for, and the same rows with their answers."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from sealfit.errors import RequestError
+from sealfit.store.paths import existing_file
+
+MISSING = ("", "nan", "NaN", "NA", "null")
+ANSWERS = (
+    "force_before_N",
+    "force_after_N",
+    "force_after_lo95_N",
+    "force_after_hi95_N",
+    "meas_lo95_N",
+    "meas_hi95_N",
+    "extrapolated",
+    "note",
+)
+
+
+@dataclass(frozen=True)
+class Points:
+    """Rows as they were written, and the same with numbers where a column holds numbers only."""
+
+    path: Path
+    text: pd.DataFrame
+    values: pd.DataFrame
+
+
+def read_points(path: Path) -> Points:
+    """Return the rows of a CSV of points (comma, UTF-8, one line of names).
+
+    Raises
+    ------
+    RequestError
+        If there is no such file, or it is not such a CSV; it names the line.
+    """
+    try:
+        raw = existing_file(path, "table of points").read_text("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise RequestError("is not UTF-8.", file=path, fix="Save it as CSV UTF-8.") from error
+    except OSError as error:
+        raise RequestError(f"cannot be read ({error.strerror}).", file=path, fix="Fix its rights.") from error
+    lines = csv.reader(io.StringIO(raw, newline=""))
+    names = _names_of_points([name.strip() for name in next(lines, [])], path)
+    rows = []
+    for row in lines:
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(names):
+            raise RequestError(
+                f"has {len(row)} cells, and there are {len(names)} columns.",
+                file=path,
+                line=lines.line_num,
+                fix="Fix the row; a comma inside a cell needs quotes, a decimal comma a point.",
+            )
+        rows.append(row)
+    text = pd.DataFrame(rows, columns=names, dtype=object)
+    if text.empty:
+        raise RequestError("has no rows.", file=path, fix="Give one row per point.")
+    return Points(path, text, text.apply(_numbers))
+
+
+def _names_of_points(names: list[str], path: Path) -> list[str]:
+    """Return the names of the columns of points, refused where they cannot be that."""
+    if not any(names):
+        raise RequestError("is empty.", file=path, fix="Give a line of column names, then one row per point.")
+    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+        raise RequestError("is not separated by commas.", file=path, line=1, fix="Save it with commas and points.")
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled:
+        raise RequestError("appears twice.", file=path, line=1, column=doubled[0], fix="Keep one of the two.")
+    taken = [name for name in ANSWERS if name in names]
+    if taken:
+        raise RequestError("is a column of the answer.", file=path, line=1, column=taken[0], fix="Rename it.")
+    return names
+
+
+def _numbers(cells: pd.Series) -> pd.Series:
+    cells = cells.str.strip()
+    missing = cells.isin(MISSING)
+    numbers = pd.to_numeric(cells.where(~missing), errors="coerce")
+    if (numbers.notna() | missing).all():
+        return numbers.astype(float)
+    return cells.where(~missing, None)
+
+
+def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
+    """Write the rows as they were given plus their answers to `output`, whole or not at all; return the counts.
+
+    Raises
+    ------
+    RequestError
+        If `output` cannot be written or is the table of points itself.
+    """
+    if output.exists() and output.resolve() == points.path.resolve():
+        raise RequestError(f"--output {output} is the table of points.", fix="Give another name.")
+    if not output.absolute().parent.is_dir():
+        raise RequestError(f"there is no folder {output.parent} for --output.", fix="Make it first.")
+    if output.is_dir():
+        raise RequestError(f"--output {output} is a folder.", fix="Give a file name.")
+    # `answers` keeps the rows and their order; the cells of the points are written as they were given.
+    table = pd.concat([points.text, answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
+    staged = output.with_name(f".{output.name}.{os.getpid()}")
+    try:
+        table.to_csv(staged, index=False, encoding="utf-8", lineterminator="\n")
+        os.replace(staged, output)
+    except OSError as error:
+        raise RequestError(f"{output} cannot be written ({error.strerror}).", fix="Choose another --output.") from error
+    finally:
+        staged.unlink(missing_ok=True)
+    answered = answers["force_after_N"].notna()
+    extrapolated = answers["extrapolated"].fillna(False).astype(bool) & answered
+    return {"rows": len(answers), "answered": int(answered.sum()), "extrapolated": int(extrapolated.sum())}
