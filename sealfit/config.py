@@ -19,11 +19,13 @@ from sealfit.units import Units
 AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class Strict(BaseModel):
+    """A table of a config or SPEC: unknown keys refused, values fixed, numbers finite."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class TraceFormat(_Strict):
+class TraceFormat(Strict):
     """How one trace file is written."""
 
     encoding: str = Field(
@@ -59,7 +61,7 @@ class TraceFormat(_Strict):
     integrate_per: Literal["s", "min"] = Field("s", description="time unit of that speed: rpm is per min")
 
 
-class Files(_Strict):
+class Files(Strict):
     """Where the trace files are when runs.csv does not list them, and what their names say."""
 
     glob: str | None = Field(None, description="e.g. 'raw/**/*.csv'; then runs.csv is not needed")
@@ -81,14 +83,14 @@ class Files(_Strict):
     runs_columns: dict[str, str] = Field(default_factory=dict, description="our name = runs.csv's column name")
 
 
-class Quantity(_Strict):
+class Quantity(Strict):
     """Another quantity and unit in a slot: `[quantities] force = {quantity = "torque", unit = "mN m"}`."""
 
     quantity: str
     unit: str
 
 
-class Strokes(_Strict):
+class Strokes(Strict):
     """How strokes and their steady windows are found."""
 
     smooth_samples: int = Field(7, ge=1, description="displacement is smoothed over this many samples to find turns")
@@ -99,14 +101,14 @@ class Strokes(_Strict):
     whole_file: bool = Field(False, description="every file is one steady stroke; no pre-sliding, no ramps")
 
 
-class Bins(_Strict):
+class Bins(Strict):
     """How the steady window is cut along displacement."""
 
     per_stroke: int = Field(40, ge=1)
     min_samples: int = Field(4, ge=1)
 
 
-class Quality(_Strict):
+class Quality(Strict):
     """When a row, file or repeat is left out."""
 
     max_bad_rows: float = Field(0.05, ge=0, le=1, description="share of rows a file may lose before it is left out")
@@ -120,7 +122,7 @@ class Quality(_Strict):
     speed_disagreement: float = Field(0.2, gt=0, description="share by which speed x time may miss displacement")
 
 
-class Sensor(_Strict):
+class Sensor(Strict):
     """The force sensor's accuracy: type B, one unknown shared by all samples."""
 
     accuracy: float = Field(0.2, ge=0, description="half-width in the force slot's unit")
@@ -132,7 +134,7 @@ class Sensor(_Strict):
         return self.accuracy / (3**0.5 if self.distribution == "rectangular" else 1.959964)
 
 
-class Loop(_Strict):
+class Loop(Strict):
     """How the loop is closed."""
 
     family_error: float = Field(0.005, gt=0, lt=0.5, description="chance of any false effect per campaign")
@@ -143,7 +145,7 @@ class Loop(_Strict):
     effects_folder: str | None = Field(None, description="folder of the user's own effects; Python is run from it")
 
 
-class Config(_Strict):
+class Config(Strict):
     """One rig: what its files look like and which columns make a condition."""
 
     name: str = "default"

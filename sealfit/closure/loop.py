@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import PARTLY, AcceptedEffect, RefusedEffect, covered, folds, heldout_level, varies_within
+from sealfit.closure.confirm import PARTLY, AcceptedEffect, RefusedEffect, varies_within
 from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
+from sealfit.closure.heldout import covered, folds, heldout_level
 from sealfit.closure.output import channel_table, curve_table, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
 from sealfit.closure.score_test import JACKKNIFE_UNITS

@@ -15,7 +15,6 @@ import pyarrow as pa
 import pyarrow.csv
 
 from sealfit.errors import ConfigError, OutError, RequestError
-from sealfit.simulation.base import Draws
 from sealfit.simulation.channels import TraceChannel, add_channels, trace_channel
 from sealfit.simulation.motion import (
     CONDITIONS,
@@ -28,7 +27,15 @@ from sealfit.simulation.motion import (
     steady_law,
     with_presliding,
 )
-from sealfit.simulation.noise import displacement_noise_mm, draw_defects, draw_scatter, quantised, sample_noise_N, spoil
+from sealfit.simulation.noise import (
+    Draws,
+    displacement_noise_mm,
+    draw_defects,
+    draw_scatter,
+    quantised,
+    sample_noise_N,
+    spoil,
+)
 from sealfit.simulation.spec import Spec, plan_files
 
 # ---------------------------------------------------------------- truth

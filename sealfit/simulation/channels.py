@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, model_validator
 
+from sealfit.config import Strict
 from sealfit.errors import ConfigError
 from sealfit.ingest.expression import evaluate, parse
-from sealfit.simulation.base import Draws, Strict, remembering
+from sealfit.simulation.noise import Draws, remembering
 
 Level = Literal["file", "run", "specimen", "condition"]
 GROUPS = {"file": "file", "run": "run_id", "specimen": "specimen_id", "condition": "condition"}

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field, model_validator
 
+from sealfit.config import Strict
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect, Operation, Target
 from sealfit.effects.free import LEVELS, SMOOTH, smooth_effect
 from sealfit.errors import ConfigError, ParameterError
 from sealfit.ingest.expression import evaluate, parse
-from sealfit.simulation.base import Strict
 
 # ---------------------------------------------------------------- physics
 # The declared model of a SPEC: Eq. 14 with Eq. 15, one law for all series or one each.

@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, ValidationError, model_validator
 
+from sealfit.config import Strict
 from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
 from sealfit.ingest.expression import parse
-from sealfit.simulation.base import Strict
 from sealfit.simulation.channels import Channel
 from sealfit.simulation.model import EffectEntry, Physics, resolve_effects
 from sealfit.simulation.noise import Noise

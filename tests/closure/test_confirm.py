@@ -5,7 +5,8 @@ import pandas as pd
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.confirm import Gain, blocks, confirmed, gain_between_settings, heldout_gain, varies_within
+from sealfit.closure.confirm import Gain, confirmed, gain_between_settings, heldout_gain, varies_within
+from sealfit.closure.heldout import blocks
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit, fit_declared
