@@ -13,35 +13,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import BSpline
 
-from sealfit.closure.small_sample_test import LEAST_UNITS as LEAST_SLOPES
+from sealfit.closure.criteria import (
+    FREE_DF,
+    LEAST_GROUPS_HELD_OUT,
+    MANY_RUNS,
+    MOST_LEVELS,
+    MOST_SET_VALUES,
+    SAME_VALUE,
+    WITHIN,
+)
+from sealfit.closure.criteria import LEAST_UNITS_OF_SLOPES as LEAST_SLOPES
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.joint.declared import SAME_SPEED
 from sealfit.fit.joint.rows import LEVELS, Rows, open_columns
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
-MANY_UNITS = 20  # with this many runs, a contrast inside files is judged between runs: repeats share a set-up
-LEAST_UNITS = 6  # below six runs whole files are held out, below six files strokes (design: held-out unit)
 CALENDAR = ("run_order", "elapsed_h")  # conditions are tested one after the other, so the calendar follows them
-MOST_LEVELS = (
-    100  # of a category; one with more is a label (a time as text, a file), and each level a column of all rows
-)
-FEW_DF = 2  # of a free shape along a dozen specimens: a line and a bend
-FREE_DF = 4  # columns of a free shape: enough for a peak, an approach or a step; more only costs power
-FINE_DF = 9  # of a second, finer shape, for two humps or a narrow one
-FINE_UNITS = 50  # units from which it is tried
-
-WITHIN = 1e-4
-"""Share of a channel's variance within groups, below which it counts as constant there: 1 % of its standard deviation.
-
-Measured speeds of one setting differ by 1e-5 to 1e-3 of themselves, settings by 10 % and more.
-"""
-
-SAME_VALUE = 1e-3
-"""Of a channel's range on the scale it is looked at: values nearer to each other are one setting measured twice."""
-
-MOST_SETTINGS = 50
-"""Of a channel that was set: one with more groups of values is taken as it was measured."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +148,7 @@ def settings(values: np.ndarray) -> np.ndarray:
     at = scaled(distinct)
     first = np.flatnonzero(np.r_[True, np.diff(at) > SAME_VALUE])
     widest = float((at[np.r_[first[1:] - 1, at.size - 1]] - at[first]).max())
-    if first.size > MOST_SETTINGS or not 0 < widest <= 10 * SAME_VALUE:
+    if first.size > MOST_SET_VALUES or not 0 < widest <= 10 * SAME_VALUE:
         return values
     group = (np.searchsorted(first, np.arange(at.size), side="right") - 1)[place]
     return (np.bincount(group, values) / np.bincount(group))[group]
@@ -188,9 +176,9 @@ def flip_level(unit: str, rows: Rows) -> str:
     """
     if FINER[unit] >= FINER["run"]:
         return unit
-    if rows.groups.starts["run"].size >= MANY_UNITS:
+    if rows.groups.starts["run"].size >= MANY_RUNS:
         return "run"
-    return "file" if rows.groups.starts["file"].size >= LEAST_UNITS or unit == "file" else "stroke"
+    return "file" if rows.groups.starts["file"].size >= LEAST_GROUPS_HELD_OUT or unit == "file" else "stroke"
 
 
 def _out_and_back(stroke: np.ndarray, rows: Rows) -> bool:

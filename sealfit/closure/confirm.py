@@ -9,6 +9,17 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, level_values, settings
+from sealfit.closure.criteria import (
+    COMPARED,
+    LEAST_FALL,
+    LEAST_SIZE,
+    MOSTLY,
+    REPEATED,
+    SURE_OF_CURVE,
+    SURE_OF_RIPPLE,
+    TRIES,
+    WEAK,
+)
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import blocks, covered, foldable, folds, whole_settings
 from sealfit.closure.linearised import Proposal
@@ -20,49 +31,11 @@ from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.whitening import Whitening
 
-SURE = 0.005  # p-value, over files (Wilcoxon), at which a ripple of free phase helps the half it was not fitted to
-COMPARED = 4  # rivals, best first, that are put to held-out data too
-TRIES = 3  # proposals put to held-out data in a round before the residual is called unexplained
-
-MOSTLY = 0.5
-"""Share of an effect's variance that must lie within groups for its gain to be taken about their means."""
-
-PARTLY = 0.1
-"""Share of an effect's variance within groups from which the end of the loop compares errors about their means.
-
-What warms a stroke by the power lost in it has a quarter of its variance inside strokes, where the evidence is.
-"""
-
-REPEATED = 10.0
-"""Samples for each value of the force from which its steps are those of the recorder, not of chance."""
-
 LEAST_SETTINGS, MOST_SETTINGS = 3, 15
 """Settings of a channel between which a shape interpolates: with fewer none is inside, with more they lie densely."""
 
-WEAK = 1e-6
-"""P-value above which an effect must also lower the held-out error by `LEAST_FALL`.
-
-P-values of a few specimens or runs rest on what their scatter is assumed to be; held-out data do not. Of 28 claims
-with p above 1e-5 in worlds drawn at random, 9 of the 11 true ones lower it by more, 13 of the 17 false ones by less;
-two false ones had a p between 1e-6 and 1e-5.
-"""
-
-LEAST_FALL = 0.05
-"""Share of the held-out RMSE by which an effect of weak evidence must lower it."""
-
-SURE_OF_CURVE = 1e-5
-"""P-value that a free shape must reach which changes the shape of the Stribeck curve or of the aging law.
-
-It does if it acts on one of their coefficients, or by the speed together with another variable. How the whole friction
-scatters between runs is estimated; how the coefficients do is not. In 354 worlds drawn at random 11 of 13 false claims
-of that kind had larger p-values.
-"""
-
 WHOLE = ("mu", "force")
 """What acts on these changes the whole friction."""
-
-LEAST_SIZE = 2e-4
-"""Of the RMS force: the smallest effect that counts. What is smaller may as well be the sensor's nonlinearity."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +187,7 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
     from scipy.stats import wilcoxon  # here, as scipy.stats takes half a second to load
 
     both = agreement(samples, sample_first, length, axis)
-    there = both.size > 1 and wilcoxon(both, alternative="greater").pvalue < SURE
+    there = both.size > 1 and wilcoxon(both, alternative="greater").pvalue < SURE_OF_RIPPLE
     rmse = np.sqrt(squares)
     return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(squares[0] - squares[1]) if there else -1.0)
 

@@ -9,11 +9,12 @@ import numpy as np
 import pandas as pd
 from scipy.special import fdtrc
 
-from sealfit.closure.channels import CALENDAR, FINER, FREE_DF, Channel, even_knots, scaled
+from sealfit.closure.channels import CALENDAR, FINER, Channel, even_knots, scaled
+from sealfit.closure.criteria import FREE_DF, JACKKNIFE_UNITS, KNOTS_APART, MOST_KNOTS, REACH, SEARCHES, UNITS_PER_KNOT
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.linearised import Proposal, middles
 from sealfit.closure.ripples import Peak, common_wavelength, pass_shifts
-from sealfit.closure.score_test import JACKKNIFE_UNITS, SEARCHES, Candidate, ScoreTestResult, project
+from sealfit.closure.score_test import Candidate, ScoreTestResult, project
 from sealfit.closure.small_sample_test import SmallSampleTest
 from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect
 from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, WIDE, free_effect, natural
@@ -25,11 +26,7 @@ from sealfit.fit.joint.rows import Rows
 # Which forms may act where a candidate does, and the values to try for what is not linear in them.
 
 WAVY = ("bump", "quadratic")  # through a calendar they follow whatever was tested when
-MOST_KNOTS = 24  # of a penalised free shape, whose smoothness the data decide
-UNITS_PER_KNOT = 3
-APART = 1e-3  # of a channel scaled to -1..1: knots that are nearer are one value measured twice
 MOST_PLACES = 60  # between neighbouring values that are tried
-REACH = 4.0  # spans of a channel that a width or a time constant may have
 
 NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1}
 """Of mu_s, mu_c, v_s and sigma_2, those that the speeds of a series determine, by the form of its curve."""
@@ -197,7 +194,7 @@ def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = FR
 
 def _knots(distinct: np.ndarray, count: int) -> tuple[float, ...]:
     """Return `count` knots for rising values of a channel, or these themselves where no more of them lie apart."""
-    distinct = distinct[np.r_[True, np.diff(scaled(distinct)) > APART]]
+    distinct = distinct[np.r_[True, np.diff(scaled(distinct)) > KNOTS_APART]]
     if distinct.size <= count:
         knots = distinct
     elif distinct[0] > 0 and distinct[-1] / distinct[0] >= WIDE:

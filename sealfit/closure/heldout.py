@@ -6,26 +6,14 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from sealfit.closure.channels import LEAST_UNITS
+from sealfit.closure.criteria import BEYOND, BLOCKS_OF_A_FOLD, LEAST_GROUPS_HELD_OUT, MOST_HELD_OUT, SAME_SETTING
 from sealfit.fit.joint.rows import LEVELS, Rows
-
-MOST_ROWS = 0.5
-"""Share of the rows that blocks of the calendar must hold out."""
-
-BLOCKS_OF_A_FOLD = (1, 2, 4)
-"""Blocks of the calendar that a fold holds: as few as leave most rows held out once."""
-
-BEYOND = 0.02
-"""Of the range of what the fit saw, by which a held-out row may lie outside before it counts as extrapolated."""
-
-SAME = 0.01
-"""Of a value, by which measured numbers of one setting may differ."""
 
 
 def heldout_level(rows: Rows) -> str:
     """Return the level whose groups are held out: run, or file or stroke where there are fewer than six."""
     for level in ("run", "file"):
-        if rows.groups.starts[level].size >= LEAST_UNITS:
+        if rows.groups.starts[level].size >= LEAST_GROUPS_HELD_OUT:
             return foldable(rows, level)
     return "stroke"
 
@@ -75,7 +63,7 @@ def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]
     masks: list[np.ndarray] = []
     for parts in BLOCKS_OF_A_FOLD:
         masks = list(_masks(rows, level, place * min(count * parts, start.size) // start.size % count))
-        if np.any(masks, axis=0).mean() > MOST_ROWS:
+        if np.any(masks, axis=0).mean() > MOST_HELD_OUT:
             break
     return masks
 
@@ -147,7 +135,7 @@ def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.nda
 def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return which values lie beyond those seen, by more than measured numbers of one setting differ."""
     low, high = float(seen.min()), float(seen.max())
-    slack = BEYOND * (high - low) + SAME * max(abs(low), abs(high))
+    slack = BEYOND * (high - low) + SAME_SETTING * max(abs(low), abs(high))
     return (values < low - slack) | (values > high + slack)
 
 

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from sealfit.closure.small_sample_test import LARGEST_LEVERAGE, satterthwaite_df
+from sealfit.closure.criteria import FEW_UNITS, LARGEST_LEVERAGE, LEAST_SPARE_RUNS
+from sealfit.closure.small_sample_test import satterthwaite_df
 from sealfit.fit.joint.estimate import Fitted
 from sealfit.fit.joint.rows import LEVELS
 from sealfit.fit.joint.tangent import Tangent
@@ -20,13 +21,6 @@ Interval = tuple[float, float, float]
 
 PHASES = {"A": "phi", "B": "phi_2"}
 """Amplitudes of sines, and the phase of each."""
-
-FEW_UNITS = 30
-"""Groups of a level below which a sandwich covariance is itself uncertain, and has degrees of freedom of its own."""
-
-
-LEAST_LEFT = 0.5
-"""Runs that the model must leave over for their scatter to be known at all."""
 
 
 class Sandwich(NamedTuple):
@@ -46,7 +40,7 @@ def degrees_of_freedom(fitted: Fitted) -> float:
     white = fitted.whitening(fitted.friction[:, None])[:, 0]
     white = white / np.sqrt(groups.sums(white**2, "run"))[groups.codes["run"]]
     taken = float((fitted.basis.sums(groups, "run", white).values ** 2).sum())
-    if groups.starts["run"].size - taken < LEAST_LEFT:
+    if groups.starts["run"].size - taken < LEAST_SPARE_RUNS:
         return 0.0
     active = [c.level for c in fitted.scatter.components if c.variance > 0]
     level = active[-1] if active else "file"

@@ -9,7 +9,8 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.closure.score_test import LEAST_LEFT, Candidate, project
+from sealfit.closure.criteria import IDENTIFIABLE, PAIR
+from sealfit.closure.score_test import Candidate, project
 from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.joint.estimate import Fitted, effective_df
@@ -19,7 +20,6 @@ from sealfit.fit.joint.rows import Rows
 
 PART = 32  # points of a grid whitened at once
 UNNAMED = (SMOOTH, SURFACE)
-PAIR = 10.0  # two channels together must be favoured over one by exp(5): there are many more to be chosen from
 ZERO_OFFSET = (("direction",), "force", "add")
 PREFERRED = ("mu", "mu_c", "mu_s", "force", "v_s", "sigma_2", "a", "b", "mu_0")
 
@@ -174,7 +174,7 @@ def _explained(fitted: Fitted, columns: np.ndarray, count: int) -> np.ndarray:
     gram = whole - np.einsum("npi,npj->pij", taken, taken)
     score = np.einsum("npi,n->pi", white, fitted.white_residual)
     size, least = (np.einsum("pii->pi", a) for a in (gram, whole))
-    kept = (size > LEAST_LEFT * least) & good.reshape(-1, count)
+    kept = (size > IDENTIFIABLE * least) & good.reshape(-1, count)
     score = np.where(kept, score / np.sqrt(np.where(kept, size, 1.0)), 0.0)
     unit = np.where(kept, 1 / np.sqrt(np.where(kept, size, 1.0)), 0.0)
     inverse = np.linalg.pinv(gram * unit[:, :, None] * unit[:, None, :], rcond=1e-10, hermitian=True)

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import PARTLY, AcceptedEffect, RefusedEffect, varies_within
+from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, varies_within
+from sealfit.closure.criteria import JACKKNIFE_UNITS, PARTLY
 from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import covered, folds, heldout_level
 from sealfit.closure.output import channel_table, curve_table, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
-from sealfit.closure.score_test import JACKKNIFE_UNITS
 from sealfit.closure.selection import Selection, Start, grow, numbered, predict_rows, steady_samples
 from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect_on_all, subsamples
 from sealfit.config import Config

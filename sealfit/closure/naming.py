@@ -15,6 +15,18 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel
+from sealfit.closure.criteria import (
+    ALIKE,
+    BEHIND,
+    CONTENDER,
+    DOMINANT,
+    HALF_OF_CALENDAR,
+    HELD,
+    OVERTURNED,
+    RIVAL,
+    SAME_EFFECT,
+    TIED,
+)
 from sealfit.closure.forms import periodic_terms, terms_of
 from sealfit.closure.intervals import robust_covariance
 from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
@@ -25,20 +37,10 @@ from sealfit.fit.joint.estimate import Fitted, fit, reestimated
 from sealfit.fit.joint.search import linear_solved, search_nonlinear
 from sealfit.fit.joint.whitening import Scatter, Whitening
 
-CONTENDER = 0.6  # share of the best explained sum of squares from which a rival channel is worth naming
 REFITTED = 8  # proposals refitted jointly
 FORMS_EACH = 2  # of each further quantity
 LIKELIEST = 3  # refitted first, to see whether an effect had stood in most of the scatter
-DOMINANT = 20.0  # by which an effect's own scatter lowers the deviance where it had stood in most of the scatter
-HALF = 0.5  # share of what the calendar explains from which anything else comes before it
 CALENDAR_RIVALS = 2  # refitted as rivals where something else comes first
-BEHIND = 60.0  # by which a proposal may be behind under the best one's scatter and still be worth one of its own
-TIED = 3.0  # less than this apart on the deviance scale, the simpler or more physical one is reported
-RIVAL = 10.0  # an alternative: the data favour the chosen one by less than exp(5)
-HELD = 0.5  # relative standard error beyond which a form's own number is not determined
-OVERTURNED = 1 / 3  # share of its size by which a new effect may change an earlier one, where it has equals
-ALIKE = 0.5  # correlation below which two candidates explain different things
-SAME = 0.98  # correlation above which two candidates are one effect here
 LINEAR = "linear"
 
 
@@ -70,7 +72,7 @@ def propose(
     found = [*also, *(p for form in forms for p in linearised(*form))]
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
     others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
-    if not (calendar and others and max(p.chi2 for p in others) >= HALF * max(p.chi2 for p in calendar)):
+    if not (calendar and others and max(p.chi2 for p in others) >= HALF_OF_CALENDAR * max(p.chi2 for p in calendar)):
         return named_among(fitted, _spread(found))
     # Conditions are tested one after the other and the calendar follows them: what was set or measured comes first.
     others, calendar = (_refitted(fitted, part) for part in (_spread(others), _spread(calendar)[:CALENDAR_RIVALS]))
@@ -215,7 +217,7 @@ def _simpler(proposal: Proposal, best: Proposal) -> bool:
     """
     gain = (best.term.acts_on, best.term.operation) == ("force", "multiply") and proposal.term.acts_on != "force"
     plain = proposal.rank[:2] < best.rank[:2] or proposal.source == ZERO_OFFSET or gain
-    return plain and correlation(proposal, best) > SAME and proposal.bic - best.bic < 2 * TIED
+    return plain and correlation(proposal, best) > SAME_EFFECT and proposal.bic - best.bic < 2 * TIED
 
 
 def correlation(one: Proposal, other: Proposal) -> float:
@@ -231,7 +233,7 @@ def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
 
 def _rival(proposal: Proposal, chosen: Proposal) -> bool:
     alike = correlation(proposal, chosen)
-    return alike > SAME or (alike > ALIKE and proposal.bic - chosen.bic < RIVAL)
+    return alike > SAME_EFFECT or (alike > ALIKE and proposal.bic - chosen.bic < RIVAL)
 
 
 def _identical(one: Proposal, other: Proposal) -> bool:

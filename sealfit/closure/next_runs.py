@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sealfit.closure.confirm import AcceptedEffect
+from sealfit.closure.criteria import IDENTIFIABLE
 from sealfit.closure.forms import describe, grid_of, reference
-from sealfit.closure.score_test import LEAST_LEFT
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects.contract import CHANNEL, Effect
@@ -58,7 +58,7 @@ def find_aliases(fitted: Fitted, effects: Mapping[str, Effect], taken: tuple[str
     for effect in own:
         first = None
         for *form, left in (f for target in effect.acts_on for f in _at_grid(fitted, effect, target)):
-            if left >= LEAST_LEFT:
+            if left >= IDENTIFIABLE:
                 break  # it shows there, and the rest of its grid need not be looked at
             first = first or form
         else:

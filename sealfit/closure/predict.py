@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from sealfit.closure.criteria import SAME_SPEED
 from sealfit.closure.intervals import Sandwich, mean_half_width, t_quantile
 from sealfit.closure.output import from_record
 from sealfit.config import Config
@@ -25,7 +26,6 @@ from sealfit.fit.joint.whitening import Component, Scatter
 from sealfit.ingest.campaign import NO_VALUE
 from sealfit.ingest.categorical import add_keys
 
-SAME_SPEED = 0.05  # relative difference within which a speed counts as a tested one
 BEYOND = 1e-6  # relative slack before a value counts as outside the tested range
 ANSWERS = (
     "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N", "meas_lo95_N", "meas_hi95_N",

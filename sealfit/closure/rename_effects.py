@@ -14,9 +14,10 @@ import pandas as pd
 
 from sealfit.closure.channels import Channel
 from sealfit.closure.confirm import AcceptedEffect, confirmed
+from sealfit.closure.criteria import RIVAL, TIED
 from sealfit.closure.forms import PERIODIC
 from sealfit.closure.linearised import Linearised, Proposal
-from sealfit.closure.naming import RIVAL, TIED, propose
+from sealfit.closure.naming import propose
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import of_channel
 from sealfit.config import Config

@@ -11,6 +11,7 @@ import pandas as pd
 from sealfit.closure.after import reference_of
 from sealfit.closure.channels import FINER, Channel, incomplete_channels, unit_of
 from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, about_means
+from sealfit.closure.criteria import EVEN, HALVED, HARMLESS, LACK_OF_FIT, NOT_ADJUSTED, SAME_ERROR, UNSTEADY
 from sealfit.closure.error_sizes import errors, lack_of_fit, noise_floor, scatter_list
 from sealfit.closure.forms import describe, free_term
 from sealfit.closure.intervals import effect_intervals
@@ -27,23 +28,8 @@ from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import Rows
 from sealfit.units import Units
 
-WORTH_A_LOOK = 0.05  # p-value of a channel by itself, not adjusted for the search
-EVEN = 0.5  # adjusted p-value from which chance is the likelier explanation
 OFFSET = "zero_offset"
-SAME_ERROR = 1.005
-"""Ratio of errors up to which they are equal: effects are fitted by whitened, not by plain, squares."""
-
-HARMLESS = 1.1
-"""Ratio of errors up to which an effect inside runs may move what runs differ by, where that is most of the error."""
-
-HALVED = 0.5
-"""Ratio of held-out errors below which an effect of weak evidence is sure enough to move what runs differ by."""
-
-LACK_OF_FIT = 0.05
-"""P-value of the lack of fit from which the error is called larger than the scatter of repeats."""
-
 SLOTS = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
-UNSTEADY = 0.2  # share of an offset by which it may differ from run to run and still be one offset
 
 
 @dataclass(frozen=True)
@@ -302,7 +288,7 @@ def left_entry(grown: Selection, rmse_N: float, floor_N: float | None) -> dict:
         return {"rmse_N": above, "level": effect_level(item.term, rows), "channel": names, "p_value": item.p_value}
     if left is None and grown.added:
         left = _unsteady_offset(grown) or _largest(
-            grown.after, [c for c in grown.last if c.test_result.log_p <= np.log(WORTH_A_LOOK) and c.p_value < EVEN]
+            grown.after, [c for c in grown.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < EVEN]
         )
     if isinstance(left, Peak):
         return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}

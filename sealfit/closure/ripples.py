@@ -9,7 +9,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import betaincc, gammaincc
 
-from sealfit.closure.spectrum import LOBE, Spectrum, Strokes, alike, background, smooth_background, spectra_of, tops
+from sealfit.closure.criteria import ABOVE_BACKGROUND, LEAST_FILES_OF_RIPPLE, LOBE, SHARED_PHASE
+from sealfit.closure.spectrum import Spectrum, Strokes, alike, background, smooth_background, spectra_of, tops
 from sealfit.fit.joint.model import passes
 from sealfit.fit.joint.rows import Rows
 
@@ -21,9 +22,6 @@ from sealfit.fit.joint.rows import Rows
 # :math:`R = |\sum_u Z_u|^2 / \sum_u |Z_u|^2` is large; with phases that fall as they like, R is exponential with mean
 # 1. Where each file has an origin of its own only the power is shared: it is held against the local background
 # spectrum.
-
-SHARED = 1e-3  # p-value below which the phase is taken to be common to all files
-ABOVE_BACKGROUND = 4.0  # a peak's power over the median of its neighbours: a smooth trend has no peak
 
 
 @dataclass(frozen=True)
@@ -70,10 +68,10 @@ def find_ripple(
         return None
     # What is periodic in time shows in displacement too, speed by speed, and the other way round: where both are sure,
     # the axis along which it is the same wave in all files holds more of it.
-    sure = [peak for peak in peaks if peak.p_value < SHARED]
+    sure = [peak for peak in peaks if peak.p_value < SHARED_PHASE]
     best = max(sure, key=lambda p: p.energy) if sure else min(peaks, key=lambda p: (p.p_value, -p.statistic))
     # A phase that all files share says more than power alone.
-    shared = [p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED]
+    shared = [p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED_PHASE]
     best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
 
@@ -116,7 +114,7 @@ def _incoherent(spectrum: Spectrum) -> Peak:
     p = float(np.exp(own[k])) * spectrum.frequency.size
     wavelength = _refined(spectrum.power, spectrum.frequency, k)
     energy = spectrum.amplitude**2 * spectrum.count * (1 - 1 / np.maximum(ratio, 1.0))
-    sure = peaks & (own < np.log(SHARED / spectrum.frequency.size))
+    sure = peaks & (own < np.log(SHARED_PHASE / spectrum.frequency.size))
     sure[k] = True
     return Peak(
         spectrum.axis,
@@ -152,7 +150,6 @@ def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
 # mistaken for its trend.
 
 MOST_NUMBERS = 1 << 14  # of samples times wavelengths that are computed at once
-LEAST_FILES = 9  # that a test of signs at 0.5 % wants: eight of one sign have p = 0.004, and one may be small
 AROUND = np.linspace(-0.5, 0.5, 101)  # periods per stroke on each side of a peak that are looked at once more
 
 
@@ -278,7 +275,7 @@ def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis:
     _, mine, its = np.intersect1d(*whole, assume_unique=True, return_indices=True)
     cross = (one.amplitudes[mine, 0] * other.amplitudes[its, 0]).sum(axis=1)
     files, file = np.unique(one.unit[mine], return_inverse=True)
-    return np.bincount(file, cross) if files.size >= LEAST_FILES else cross
+    return np.bincount(file, cross) if files.size >= LEAST_FILES_OF_RIPPLE else cross
 
 
 def pass_shifts(samples: pd.DataFrame, rows: Rows, wavelength: float, axis: str) -> dict[str, float]:

@@ -12,7 +12,16 @@ import numpy as np
 from scipy.special import betainc, chdtrc, fdtrc
 
 from sealfit.closure import small_sample_test
-from sealfit.closure.channels import FINER, MANY_UNITS
+from sealfit.closure.channels import FINER
+from sealfit.closure.criteria import (
+    CONSTANT_IN_RUNS,
+    IDENTIFIABLE,
+    JACKKNIFE_UNITS,
+    MANY_RUNS,
+    PROMISING,
+    SEARCHES,
+    WORTH_THE_RUNS,
+)
 from sealfit.closure.small_sample_test import (
     ClusterTests,
     ContrastTest,
@@ -48,13 +57,8 @@ from sealfit.fit.joint.tangent import OwnColumns, Tangent
 # varies within them against the scatter of their slopes (`slopes`); with fewer runs than twenty to tell slopes apart,
 # what is constant in runs against the scatter of these (`few`).
 
-JACKKNIFE_UNITS = 30  # from which the jackknife is tried
-PROMISING = 1e-3  # p-value of what columns explain, not adjusted, below which it is
-WORTH_A_LOOK = 0.05  # as above, below which columns that are constant in a run are held against the runs' own scatter
-CONSTANT = 0.9  # share of columns that is one number a run
 OWN = 1e-6  # eigenvalue of what is left without a unit, below which the unit alone determines it
 RANK = 1e-9  # singular value of what specimens do not hold of the tangent space, below which that is nothing
-LEAST_LEFT = 0.01  # share of a column's variance that must survive projection to be identifiable here
 
 
 class ScoreTestResult(NamedTuple):
@@ -119,7 +123,7 @@ def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
 
 def _distinct(left: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return what is left of columns, shape (n, k) both, with zeros for those of which next to nothing is."""
-    left[:, _squares(left) < LEAST_LEFT * _squares(columns)] = 0.0
+    left[:, _squares(left) < IDENTIFIABLE * _squares(columns)] = 0.0
     return left
 
 
@@ -166,7 +170,7 @@ class ScoreTests:
         white, basis = self.fitted.whitening(self.fitted.friction[:, None])[:, 0], self.fitted.basis
         size = rows.groups.sums(white**2, "specimen")
         taken = (basis.sums(rows.groups, "specimen", white).values ** 2).sum(axis=1)
-        told = size - taken >= LEAST_LEFT * size
+        told = size - taken >= IDENTIFIABLE * size
         own = OwnColumns(rows.codes("specimen"), white * told[rows.codes("specimen")])
         return own, basis.orthonormal(RANK, freed=own.freed)
 
@@ -222,10 +226,10 @@ class ScoreTests:
 
         It is exact there, while the variance of a slope from half a dozen runs has two or three degrees of freedom.
         """
-        if not between == level == "run" or self.fitted.rows.groups.starts["run"].size >= MANY_UNITS:
+        if not between == level == "run" or self.fitted.rows.groups.starts["run"].size >= MANY_RUNS:
             return None
         tests = [self.few["run"].test(left, target) for left in variants]
-        if any(test is None or test.share <= CONSTANT for test in tests):
+        if any(test is None or test.share <= CONSTANT_IN_RUNS for test in tests):
             return None
         return max(tests, key=lambda test: test.log_p)
 
@@ -245,9 +249,9 @@ class ScoreTests:
         jackknife = 0.0
         if units >= JACKKNIFE_UNITS:
             explained = _log(chdtrc(left.shape[1], total @ total))
-            if level == "run" and explained < np.log(WORTH_A_LOOK):
+            if level == "run" and explained < np.log(WORTH_THE_RUNS):
                 test = self.few["run"].test(left, target)
-                if test is not None and test.share > CONSTANT:
+                if test is not None and test.share > CONSTANT_IN_RUNS:
                     explained = min(explained, test.log_p)
             if explained < np.log(PROMISING):
                 jackknife = max(self._jackknife(left, level), explained)
@@ -318,7 +322,6 @@ def log_p_of(t: np.ndarray, df: int, units: int) -> np.ndarray:
 
 FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
 MOST_SIGNS = 1 << 22  # drawn at once: 34 MB
-SEARCHES = 2  # single channels and pairs of them: each search has half of the error
 
 
 def judged(judge: ScoreTests, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:

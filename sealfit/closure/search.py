@@ -11,11 +11,7 @@ import numpy as np
 
 from sealfit.closure.channels import (
     CALENDAR,
-    FEW_DF,
-    FINE_DF,
-    FINE_UNITS,
     FINER,
-    FREE_DF,
     Channel,
     even_knots,
     flip_level,
@@ -25,8 +21,22 @@ from sealfit.closure.channels import (
     scatter_level,
     unit_of,
 )
-from sealfit.closure.score_test import CONSTANT, JACKKNIFE_UNITS, SEARCHES, Candidate, ScoreTests, judged
-from sealfit.closure.small_sample_test import LEAST_ERROR_OF_RUNS, LEAST_UNITS, log_p_of
+from sealfit.closure.criteria import (
+    CONSTANT_IN_RUNS,
+    FEW_DF,
+    FINE_DF,
+    FINE_UNITS,
+    FREE_DF,
+    JACKKNIFE_UNITS,
+    LEAST_ERROR_DF_OF_RUNS,
+    LEAST_UNITS_OF_SLOPES,
+    LOGARITHMIC_SPAN,
+    MOST_CATEGORIES,
+    RARE,
+    SEARCHES,
+)
+from sealfit.closure.score_test import Candidate, ScoreTests, judged
+from sealfit.closure.small_sample_test import log_p_of
 from sealfit.effects.free import BENDS, evenly
 from sealfit.fit.joint.estimate import Fitted
 from sealfit.fit.joint.rows import POWER, Rows
@@ -154,9 +164,6 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool) ->
 
 BEHIND = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along it each acts
 ALONE = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; the calendar drifts by itself
-LOGARITHMIC = 5.0  # span of a positive channel from which its logarithm is tried as well
-RARE = 2.0  # pairs are many and seldom at work: they get half of their share of the error
-MOST_CATEGORIES = 12  # a slope for each of more would find what single units do
 
 
 def search_pairs(
@@ -274,7 +281,7 @@ def _scales(channel: Channel) -> list[np.ndarray]:
     """Return a channel, centred, and its logarithm where that is another shape (from 0 on, moved by its least)."""
     x = channel.values
     scales = [x]
-    if x.min() >= 0 and x.max() > LOGARITHMIC * x[x > 0].min(initial=np.inf):
+    if x.min() >= 0 and x.max() > LOGARITHMIC_SPAN * x[x > 0].min(initial=np.inf):
         scales.append(np.log(off_zero(x)))
     return [_centred(x) / max(float(np.ptp(x)), 1e-300) for x in scales]
 
@@ -352,7 +359,7 @@ def _pairs(
     products = [c for c in straight if c.pair]
     for one, other in (*itertools.combinations(lines, 2), *itertools.product(lines, products)):
         shared = level[id(one)] == level[id(other)]
-        few = LEAST_UNITS <= rows.groups.starts[level[id(one)]].size < JACKKNIFE_UNITS
+        few = LEAST_UNITS_OF_SLOPES <= rows.groups.starts[level[id(one)]].size < JACKKNIFE_UNITS
         if shared and few and _together(one, other, channels):
             yield (one, other), level[id(one)]
 
@@ -385,12 +392,12 @@ def _tested(judge: ScoreTests, two: tuple[Candidate, Candidate], level: str) -> 
     found = []
     for left in judge.variants(columns, unit):
         own = fitted.rows.groups.sums(numbers.direction[:, None] * left, level)
-        if ((own**2).sum(axis=0) <= CONSTANT * (left**2).sum(axis=0)).any() or not left.any(axis=0).all():
+        if ((own**2).sum(axis=0) <= CONSTANT_IN_RUNS * (left**2).sum(axis=0)).any() or not left.any(axis=0).all():
             return None
         made = numbers.root @ own
         made = made / np.sqrt((made**2).sum(axis=0))
         basis = orthonormal(made, SEPARATE)
-        if basis.shape[1] < 2 or numbers.df - 2 < LEAST_ERROR_OF_RUNS:
+        if basis.shape[1] < 2 or numbers.df - 2 < LEAST_ERROR_DF_OF_RUNS:
             return None
         joint = log_p_of(numbers.values[None, :], basis, 0.0, numbers.df)[0]
         given = max(_given(numbers.values, *made.T[order], numbers.df) for order in ([0, 1], [1, 0]))

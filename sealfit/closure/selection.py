@@ -10,10 +10,11 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel, channels_of
-from sealfit.closure.confirm import TRIES, WEAK, AcceptedEffect, RefusedEffect, confirmed
+from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, confirmed
+from sealfit.closure.criteria import DOUBTFUL, HALF_OF_CALENDAR, TRIES, WEAK
 from sealfit.closure.forms import AGING, PERIODIC, richer_laws
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.naming import HALF, propose, rivals
+from sealfit.closure.naming import propose, rivals
 from sealfit.closure.rename_effects import Renaming
 from sealfit.closure.ripple_selection import Ripples
 from sealfit.closure.ripples import Peak
@@ -35,7 +36,6 @@ from sealfit.fit.joint.whitening import Scatter
 from sealfit.ingest.trace_access import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
 
 SAMPLED = ("displacement_mm", "time_s", "force_N")  # what the ripple search reads of a sample
-DOUBTFUL = 1e-4  # p-value of a single channel above which pairs are looked at: a far surer one may show in it
 
 
 class Start(NamedTuple):
@@ -338,7 +338,7 @@ def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> 
             beside = (
                 c.channels[-1:] == shown.channels[-1:] and not shown.pair and c.columns.shape == shown.columns.shape
             )
-            if (behind or beside) and c.key not in keys and c.chi2 >= HALF * shown.chi2:
+            if (behind or beside) and c.key not in keys and c.chi2 >= HALF_OF_CALENDAR * shown.chi2:
                 found.append(replace(c, p_value=shown.p_value))
                 keys.add(c.key)
     return found

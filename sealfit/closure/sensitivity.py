@@ -16,21 +16,26 @@ import numpy as np
 from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri
 
 from sealfit.closure.channels import Channel, scatter_level
-from sealfit.closure.confirm import LEAST_FALL, LEAST_SIZE, WEAK, about_means
-from sealfit.closure.score_test import (
-    CONSTANT,
+from sealfit.closure.confirm import about_means
+from sealfit.closure.criteria import (
+    CLEARLY,
+    CONSTANT_IN_RUNS,
+    COUNTED,
     JACKKNIFE_UNITS,
+    LARGE,
+    LEAST_FALL,
+    LEAST_POWER,
+    LEAST_SIZE,
+    LEAST_UNITS_OF_SLOPES,
+    MATERIAL,
+    POWER_SOUGHT,
+    REAL_SHARE,
     SEARCHES,
-    Candidate,
-    ScoreTests,
-    critical_few,
-    critical_many,
-    project,
+    WEAK,
 )
+from sealfit.closure.score_test import Candidate, ScoreTests, critical_few, critical_many, project
 from sealfit.closure.selection import Selection
 from sealfit.closure.small_sample_test import (
-    LARGE,
-    LEAST_UNITS,
     WAYS,
     ClusterTests,
     ContrastTest,
@@ -45,40 +50,22 @@ from sealfit.fit.joint.rows import LEVELS
 from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening
 
-POWER = 0.8
-"""Chance with which the smallest effect is found."""
-
 TINY = 1e-6
 """Of the force: an effect that changes no estimate."""
 
 STEPS = 6
-"""Sizes tried, each nearer to the one that is found with `POWER`, until it is `CLOSE` (difference of logarithms)."""
+"""Sizes tried, each nearer to the one found with `POWER_SOUGHT`, until it is `CLOSE` (difference of logarithms)."""
 
 CLOSE = 0.03
-
-LEAST_POWER = 0.3
-"""Of the size, with which its margin is taken to grow at least."""
 
 WANTED_PCT = 1.0
 """Of the friction: the effect that `files_needed` refers to."""
 
-SHOWN = 1.25
-"""Times the smallest effect that counts: found with `POWER` to be larger, if its standard error is a fifth of it."""
-
 SPECIMEN, SPECIMENS = "specimen_id", "specimen"
 FRICTION = ("mu", "multiply")
 
-REAL = 0.1
-"""Of a variable's variance: a share at a level that is a real one."""
-
-CLEARLY = 3.0
-"""Times the mean square of finer levels: what varies less between groups does so because it varies within them."""
-
 ASIDE = ("run_order", "elapsed_h", "repeat")
 """Channels of the order of tests: what they show is no reason to doubt the model of friction."""
-
-MATERIAL = 0.02
-"""Of the force: scatter between units that would matter if it were an effect."""
 
 LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
 
@@ -118,12 +105,12 @@ def sensitivity(grown: Selection, alpha: float) -> list[dict]:
                 effect *= force / np.sqrt(rows.weight @ effect**2)
                 times = search.smallest(own[0], effect)
                 times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
-                smallest = force * float(max(times, SHOWN * LEAST_SIZE)) if times < 1 else None
+                smallest = force * float(max(times, COUNTED * LEAST_SIZE)) if times < 1 else None
             if smallest is None:
                 units = rows.groups.starts[scatter_level([channel], rows)].size
                 if channel.unit == "sample" and specimens > 1:
                     units = min(units, specimens)
-                needed = int(np.ceil(files * LEAST_UNITS / units)) if units < LEAST_UNITS else None
+                needed = int(np.ceil(files * LEAST_UNITS_OF_SLOPES / units)) if units < LEAST_UNITS_OF_SLOPES else None
             else:
                 needed = int(np.ceil(files * (100 * smallest / force / WANTED_PCT) ** 2))
             entries.append(
@@ -136,8 +123,8 @@ def sensitivity(grown: Selection, alpha: float) -> list[dict]:
                     "files_needed": needed,
                 }
             )
-    if len(rows.conditions) < specimens < LEAST_UNITS:  # they may differ, and no variable says how
-        needed = int(np.ceil(files * LEAST_UNITS / specimens))
+    if len(rows.conditions) < specimens < LEAST_UNITS_OF_SLOPES:  # they may differ, and no variable says how
+        needed = int(np.ceil(files * LEAST_UNITS_OF_SLOPES / specimens))
         unknown = {"variable": SPECIMEN, "level": "condition", "acts_on": "mu", "smallest_N": None}
         entries.append({**unknown, "smallest_pct": None, "files_needed": needed})
     return entries
@@ -153,7 +140,7 @@ def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
     around = dict(zip(LEVEL_NAMES, (*LEVELS, None), strict=True))[level]
     own = project(fitted, effect[:, None])[:, 0] / fitted.whitening.unit
     size, left = (float(np.sqrt(rows.weight @ about_means(x, rows, around) ** 2)) for x in (own, fitted.residual))
-    return SHOWN * left * float(np.sqrt(1 / (1 - LEAST_FALL) ** 2 - 1)) / size if size > 0 else np.inf
+    return COUNTED * left * float(np.sqrt(1 / (1 - LEAST_FALL) ** 2 - 1)) / size if size > 0 else np.inf
 
 
 def _parts(grown: Selection, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
@@ -170,7 +157,7 @@ def _parts(grown: Selection, channel: Channel, own: Sequence[Candidate]) -> Iter
         parts[level] = means[k] - means[k + 1]
         square = weight @ parts[level] ** 2
         each = square / max(sizes[k] - sizes[k + 1], 1)  # mean square
-        if square > REAL * (weight @ column**2) and each > CLEARLY * finer:
+        if square > REAL_SHARE * (weight @ column**2) and each > CLEARLY * finer:
             real.append(level)
         finer = max(finer, each)
     if len(real) < 2:
@@ -218,17 +205,17 @@ class _Search:
         return self.units[known.level].test(project(self.fitted, columns), target)
 
     def surer(self, times: float, candidate: Candidate) -> float:
-        """Return by how much an effect found with `POWER` must be multiplied to be strong evidence; infinite for few.
+        """Return the factor on an effect found with `POWER_SOUGHT` that makes it strong evidence; infinite for few.
 
         The p-value of few units falls too slowly for that.
         """
         if candidate.test_result.units < JACKKNIFE_UNITS:
             return np.inf
         found, strong = (-ndtri(p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK))
-        return times * float((strong + ndtri(POWER)) / (found + ndtri(POWER)))
+        return times * float((strong + ndtri(POWER_SOUGHT)) / (found + ndtri(POWER_SOUGHT)))
 
     def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
-        """Return by how much an effect, shape (n,), must be multiplied to be found with `POWER`; infinite for never."""
+        """Return the factor on an effect, shape (n,), with which it is found with `POWER_SOUGHT`; infinite for never."""
         size, margin, before = TINY, self.margin(candidate, TINY * effect, self.fitted), None
         for _ in range(STEPS):
             if not 0 < margin < np.inf:
@@ -312,7 +299,7 @@ class _Search:
         sums = noise.rows.groups.sums
         own, added = (float((sums(seen / length * f.unit_residual(level), level) ** 2).sum()) for f in (noise, effect))
         own *= max(1.0, k / float((scores**2).sum()))  # not quieter than noise is on average
-        beyond = ndtri(POWER) * np.sqrt(own)
+        beyond = ndtri(POWER_SOUGHT) * np.sqrt(own)
         share = 1 - betaincinv((units - k) / 2, k / 2, np.exp(self.critical_many))
         margin = length / (np.sqrt(units * share * (own + added)) + beyond)
         if units < JACKKNIFE_UNITS:
@@ -323,7 +310,7 @@ class _Search:
         if level == "run":
             target = (candidate.acts_on, candidate.operation)
             runs = ClusterTests(noise, "run"), ClusterTests(effect, "run")
-            explained = max(explained, _by_numbers(*runs, left, target, tail, least=CONSTANT))
+            explained = max(explained, _by_numbers(*runs, left, target, tail, least=CONSTANT_IN_RUNS))
         return max(margin, min(spread, explained))
 
 
@@ -353,7 +340,7 @@ def _margin(length: np.ndarray, quiet: np.ndarray, differs: np.ndarray, k: int, 
     It is held against a variance: `quiet` without it, and what it adds to that itself.
     """
     critical = fdtri(k, df, 1 - tail)
-    return np.abs(length) / np.sqrt(quiet * ncfdtrinc(k, df, 1 - POWER, critical) + k * critical * differs)
+    return np.abs(length) / np.sqrt(quiet * ncfdtrinc(k, df, 1 - POWER_SOUGHT, critical) + k * critical * differs)
 
 
 def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
@@ -392,7 +379,7 @@ def cannot_tell(grown: Selection, entries: Sequence[dict], scatter: Sequence[dic
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
         own = [s for s in scatter if channel.unit != "sample" and starts[s["level"]].size == starts[channel.unit].size]
         much = any(s["sd_rel"] > MATERIAL and s["sd_N"] < smallest for s in own)
-        few = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS
+        few = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS_OF_SLOPES
         decisive = channel.unit == "sample" or channel.name == "direction" or few
         if much or (decisive and not np.isfinite(smallest)):
             open_.append(channel.name)

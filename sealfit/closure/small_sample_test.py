@@ -11,6 +11,22 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import chdtrc, fdtrc, log_ndtr, polygamma, psi, stdtr
 
+from sealfit.closure.criteria import (
+    AGREE,
+    CLOSELY,
+    DIFFER,
+    KNOWN_DF,
+    LARGE,
+    LARGEST_LEVERAGE,
+    LEAST_DF,
+    LEAST_ERROR_DF,
+    LEAST_ERROR_DF_OF_RUNS,
+    LEAST_KNOWN_DF,
+    LEAST_LEVERAGE,
+    LEAST_OWN_VARIANCE,
+    LEAST_SPECIMENS,
+    LEAST_UNITS_OF_SLOPES,
+)
 from sealfit.fit.joint.estimate import Fitted
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.variance_components import orthonormal
@@ -32,40 +48,11 @@ from sealfit.fit.joint.whitening import Whitening
 # have independent directions. An effect stands in the scatter of all contrasts but its own, so V alone is tried as
 # well: the p-value is twice the smaller of the two. P-values are adjusted for the number of contrasts (Bonferroni).
 
-LEAST_UNITS = 5
-"""Units from which slopes are compared between them."""
-
-LEAST_DF = 1.5
-"""Satterthwaite degrees of freedom below which one or two units hold nearly all of a contrast: it is not tested."""
-
 MOST_DF = 1e4
 """Degrees of freedom of a prior that the contrasts' variances do not contradict: as good as known."""
 
 WAYS = 2
 """Variances that a contrast is held against: moderated, and its own. Each has half of the error."""
-
-LARGEST_LEVERAGE = 0.98
-"""Of a unit in a contrast; one with more owns it, and nothing else says how it scatters."""
-
-
-SHOWN = 0.05
-"""Leverage from which a specimen says something of a contrast."""
-
-AGREE = 0.1
-"""P-value of Student's t over two to four specimens, above which their own slopes do not agree."""
-
-CLOSELY = 0.005
-"""The same p-value where the slopes differ by more than noise, so that they may agree by chance."""
-
-DIFFER = 0.05
-"""P-value of chi-squared below which the slopes of specimens differ by more than noise."""
-
-LEAST_SPECIMENS = 2.5
-"""Specimens, counted by their leverages, from which slopes along strokes may agree: two do too often by chance."""
-
-LARGE = 0.01
-"""Share of the force, root mean square: what changes along the strokes of every specimen by more, and the same way, is
-no scatter of specimens. A straight line of that size changes by 3.5 % from end to end."""
 
 
 class ContrastTest(NamedTuple):
@@ -100,7 +87,7 @@ def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest 
         Level of the units.
     """
     groups = fitted.rows.groups
-    if groups.starts[level].size < LEAST_UNITS:
+    if groups.starts[level].size < LEAST_UNITS_OF_SLOPES:
         return None
     size = np.sqrt(np.einsum("ij,ij->j", left, left))
     left = left[:, size > 0] / size[size > 0]
@@ -130,9 +117,9 @@ def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
 def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     """Return whether up to four specimens show the same slope along each whitened column, shape (n, m) -> (m,).
 
-    From `LEAST_UNITS` on they are the units themselves. Along strokes each has a slope of its own, so there they must
-    be enough, and agree closely where they differ by more than noise; or all their slopes must be larger than specimens
-    have them.
+    From `LEAST_UNITS_OF_SLOPES` on they are the units themselves. Along strokes each has a slope of its own, so there
+    they must be enough, and agree closely where they differ by more than noise; or all their slopes must be larger than
+    specimens have them.
     """
     found = enough_specimens(fitted, left)
     if not few_specimens(fitted):
@@ -152,10 +139,10 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
 
 
 def _slopes_of_specimens(fitted: Fitted, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return leverage and slope of each specimen along whitened columns, shape (specimens, m); 0 where not `SHOWN`."""
+    """Return leverage and slope of each specimen along columns, (specimens, m); 0 below `LEAST_LEVERAGE`."""
     sums = fitted.rows.groups.sums
     leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
-    shown = leverage > SHOWN * leverage.sum(axis=0)
+    shown = leverage > LEAST_LEVERAGE * leverage.sum(axis=0)
     return np.where(shown, leverage, 0.0), np.where(shown, scores / np.where(shown, leverage, 1.0), 0.0)
 
 
@@ -187,7 +174,7 @@ def enough_specimens(fitted: Fitted, left: np.ndarray) -> np.ndarray:
 
 def few_specimens(fitted: Fitted) -> bool:
     """Return whether up to four specimens were tested: too few to be the units of a slope."""
-    return fitted.rows.groups.starts["specimen"].size < LEAST_UNITS
+    return fitted.rows.groups.starts["specimen"].size < LEAST_UNITS_OF_SLOPES
 
 
 def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:
@@ -279,11 +266,6 @@ def _independent(deviations: np.ndarray) -> float:
 # doi:10.1007/s11222-005-4789-5).
 
 MANY = 100  # units from which their covariance is not made as a matrix
-LEAST_LEFT = 0.01  # of a number's variance: what the model has taken out beyond that is no number any more
-KNOWN = 8.0  # degrees of freedom that a variance counts for which runs and files explain
-LEAST_KNOWN = 0.5  # of these degrees of freedom; with fewer the scale is free and no draw depends on it
-LEAST_ERROR = 4  # degrees of freedom left for the specimens' scatter, with fewer of which nothing is claimed
-LEAST_ERROR_OF_RUNS = 3  # the same for runs: three speeds both ways leave three
 
 
 class SmallSampleTest(NamedTuple):
@@ -301,7 +283,7 @@ class SmallSampleTest(NamedTuple):
     @property
     def sure(self) -> bool:
         """Whether enough is left to show the units' own scatter."""
-        return self.error_df >= (LEAST_ERROR if self.level == "specimen" else LEAST_ERROR_OF_RUNS)
+        return self.error_df >= (LEAST_ERROR_DF if self.level == "specimen" else LEAST_ERROR_DF_OF_RUNS)
 
 
 class Numbers(NamedTuple):
@@ -331,7 +313,7 @@ class Root:
 
     def __init__(self, taken: Tangent, moved: np.ndarray) -> None:
         share, axes = np.linalg.eigh(taken.gram())
-        kept = 1 - share > LEAST_LEFT
+        kept = 1 - share > LEAST_OWN_VARIANCE
         grown = np.where(kept, 1 / np.sqrt(np.where(kept, 1 - share, 1.0)) - 1, -1.0)
         self.taken, self.moved, self.df = taken, moved, int(moved.sum() - (~kept).sum())
         small = share < 1e-9  # the limit of the quotient
@@ -346,7 +328,7 @@ def small_root(taken: Tangent, moved: np.ndarray) -> np.ndarray:
     """Return the same for few units as a matrix of d rows, in the covariance's own axes, shape (d, units)."""
     dense = taken.toarray()
     share, axes = np.linalg.eigh(np.diag(moved.astype(float)) - dense @ dense.T)
-    kept = share > LEAST_LEFT
+    kept = share > LEAST_OWN_VARIANCE
     return axes[:, kept].T / np.sqrt(share[kept])[:, None]
 
 
@@ -386,7 +368,7 @@ class ClusterTests:
             white = fitted.whitening(slope)[:, 0]
             size, finer = (groups.sums(w**2, self.level) for w in (white, self._finer(slope)[:, 0]))
             explained = float(np.mean(size[finer > 0] / finer[finer > 0]))
-            self._numbers[target] = self.along(white)._replace(known=KNOWN * min(explained, 1.0))
+            self._numbers[target] = self.along(white)._replace(known=KNOWN_DF * min(explained, 1.0))
         return self._numbers[target]
 
     def along(self, white: np.ndarray) -> Numbers:
@@ -427,7 +409,7 @@ class ClusterTests:
         found = {}
         for (target, numbers), own in zip(self._numbers.items(), np.split(drawn, ends, axis=1), strict=True):
             df = numbers.known  # a variance that counts for so many is as uncertain as that
-            scale = np.sqrt(df / rng.chisquare(df, count)) if df > LEAST_KNOWN else np.ones(count)
+            scale = np.sqrt(df / rng.chisquare(df, count)) if df > LEAST_KNOWN_DF else np.ones(count)
             found[target] = own * scale[:, None]
         return found
 

@@ -12,12 +12,11 @@ from scipy.fft import next_fast_len
 from scipy.sparse import csr_array
 from scipy.special import digamma, polygamma
 
+from sealfit.closure.criteria import LEAST_SAMPLES_OF_STROKE, LOBE, NEIGHBOURS, REACHED
 from sealfit.engine.run_map import run_map
 
 # ---------------------------------------------------------------- stroke signals
 # Strokes of some samples along an axis, each to be laid on an even grid.
-
-LEAST_SAMPLES = 16  # a stroke with fewer steady samples says nothing of a ripple
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class Strokes:
         start = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]][: stroke.size])
         size = np.diff(np.r_[start, stroke.size])
         low, high = (part.reduceat(place, start) if start.size else place for part in (np.minimum, np.maximum))
-        good = (size >= LEAST_SAMPLES) & (high > low)
+        good = (size >= LEAST_SAMPLES_OF_STROKE) & (high > low)
         unit, direction = (samples[name].to_numpy()[start[good]] for name in ("unit", "direction"))
         return cls(place, residual, start[good], size[good], low[good], (high - low)[good], unit, direction)
 
@@ -76,9 +75,6 @@ class Strokes:
 
 # ---------------------------------------------------------------- background
 # The background of a spectrum, from each frequency's neighbours: what a peak stands out of.
-
-NEIGHBOURS = 25  # frequencies on each side that make the local background
-LOBE = 4  # frequencies on each side that the taper smears a peak over
 
 
 def alike(ratio: np.ndarray) -> np.ndarray:
@@ -168,7 +164,6 @@ MOST_NUMBERS = 1 << 19  # of the grids of a block: 4 MB
 WORTHWHILE = 400_000  # samples from which it takes longer to transform them than to start processes and send them
 LEAST_STROKES = 3
 LEAST_FREQUENCIES = 4
-REACHED = 0.25  # share of the strokes that must reach a frequency
 EXPONENTS = 64  # of a stroke's phase factor that are computed; the others are products of these and their powers
 
 

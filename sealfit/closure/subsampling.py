@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import channels_of
-from sealfit.closure.confirm import COMPARED, AcceptedEffect, heldout_gain
+from sealfit.closure.confirm import AcceptedEffect, heldout_gain
+from sealfit.closure.criteria import COMPARED, RIVAL
 from sealfit.closure.forms import PERIODIC, describe
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.naming import RIVAL, named_among
+from sealfit.closure.naming import named_among
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import Selection

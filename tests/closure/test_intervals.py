@@ -1,7 +1,8 @@
 import numpy as np
 from bins_helpers import make_bins, make_traces
 
-from sealfit.closure.intervals import FEW_UNITS, Sandwich, mean_half_width, sandwiches, t_quantile
+from sealfit.closure.criteria import FEW_UNITS
+from sealfit.closure.intervals import Sandwich, mean_half_width, sandwiches, t_quantile
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.config import Config

@@ -5,8 +5,9 @@ from bins_helpers import make_bins, make_traces
 from sealfit.closure import rename_effects
 from sealfit.closure.channels import find_channels
 from sealfit.closure.confirm import AcceptedEffect
+from sealfit.closure.criteria import PAIR
 from sealfit.closure.forms import terms_of
-from sealfit.closure.linearised import PAIR, Linearised, Proposal
+from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import grow, numbered, steady_samples
