@@ -10,7 +10,7 @@ from sealfit.closure.loop import _Folds
 from sealfit.closure.selection import numbered, steady_samples
 from sealfit.closure.subsampling import Subsample
 from sealfit.fit.joint.rows import make_rows, thin
-from sealfit.ingest.trace_access import StoredTraces, a_part_at_a_time
+from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time
 
 
 def stored(traces: pd.DataFrame, folder, files: list[list[str]]) -> list[StoredTraces]:

@@ -23,7 +23,7 @@ from sealfit.fit.joint.model import Model, Term, evaluate
 from sealfit.fit.joint.rows import POWER, Rows, point_rows
 from sealfit.fit.steady.fit import FORCES, fit_conditions, parameter_units, table_row
 from sealfit.fit.steady.uncertainty import SHIFT
-from sealfit.ingest.trace_access import StoredTraces
+from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import timed
 from sealfit.tables import AFTER, AGING_CURVES, AGING_FIT, SCHEMAS
 

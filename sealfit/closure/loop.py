@@ -25,7 +25,7 @@ from sealfit.engine.run_map import run_map
 from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.rows import LEVELS, Rows, make_rows
-from sealfit.ingest.trace_access import StoredTraces
+from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import timed
 
 

@@ -33,7 +33,7 @@ from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model, evaluate
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter
-from sealfit.ingest.trace_access import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
+from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
 
 SAMPLED = ("displacement_mm", "time_s", "force_N")  # what the ripple search reads of a sample
 

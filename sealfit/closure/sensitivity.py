@@ -215,7 +215,7 @@ class _Search:
         return times * float((strong + ndtri(POWER_SOUGHT)) / (found + ndtri(POWER_SOUGHT)))
 
     def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
-        """Return the factor on an effect, shape (n,), with which it is found with `POWER_SOUGHT`; infinite for never."""
+        """Return the factor on an effect, shape (n,) with which it is found with `POWER_SOUGHT`; infinite for never."""
         size, margin, before = TINY, self.margin(candidate, TINY * effect, self.fitted), None
         for _ in range(STEPS):
             if not 0 < margin < np.inf:

@@ -36,7 +36,7 @@ from sealfit.store.staged_writes import PARQUET, Staged, disk, file_size, sync
 if TYPE_CHECKING:
     import pandas as pd
 
-    from sealfit.ingest.trace_access import StoredTraces
+    from sealfit.ingest.stored_parts import StoredTraces
 
 PROVENANCE = "provenance.json"
 
@@ -231,8 +231,7 @@ class Store:
 
     def traces(self) -> list[StoredTraces]:
         """Return where table `traces` lies, in groups of whole conditions."""
-        from sealfit.ingest.stored_parts import ARROW, PARTS
-        from sealfit.ingest.trace_access import by_conditions
+        from sealfit.ingest.stored_parts import ARROW, PARTS, by_conditions
         from sealfit.store import parquet
 
         conditions = {}

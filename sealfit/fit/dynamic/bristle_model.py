@@ -10,7 +10,7 @@ import numpy as np
 
 from sealfit.fit.dynamic.starts import LEAST, Part
 from sealfit.ingest.segments import Pieces, median
-from sealfit.ingest.trace_access import noise_from_bends
+from sealfit.ingest.stored_parts import noise_from_bends
 from sealfit.physics import bristle_limit
 
 # ---------------------------------------------------------------- cells

@@ -17,7 +17,7 @@ from sealfit.fit.dynamic.starts import Along, Part, Start, starts_of, strokes_al
 from sealfit.fit.dynamic.stiffness import Stiffness, fit_stiffness
 from sealfit.fit.joint.rows import nesting_run
 from sealfit.fit.steady.fit import condition_keys, parameter_units, table_row
-from sealfit.ingest.trace_access import StoredTraces
+from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
 
 # ---------------------------------------------------------------- bristle rows

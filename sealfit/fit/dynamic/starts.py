@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.ingest.segments import median
-from sealfit.ingest.trace_access import noise_from_bends, stroke_index, strokes_of
+from sealfit.ingest.stored_parts import noise_from_bends, stroke_index, strokes_of
 
 # ---------------------------------------------------------------- ramps
 # The motion of platforms that start along a ramp of two numbers, fitted to many strokes together.
