@@ -25,14 +25,12 @@ from sealfit.fit.joint.rows import Rows
 # ---------------------------------------------------------------- forms
 # Which forms may act where a candidate does, and the values to try for what is not linear in them.
 
-WAVY = ("bump", "quadratic")  # through a calendar they follow whatever was tested when
 MOST_PLACES = 60  # between neighbouring values that are tried
 
 NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1}
 """Of mu_s, mu_c, v_s and sigma_2, those that the speeds of a series determine, by the form of its curve."""
 
 PHASES = tuple(np.arange(4) * np.pi / 4)
-PERIODIC = ("ripple", "sinusoid", "sinusoid_harmonics")  # sought in the spectrum, not along a grid of wavelengths
 
 
 def terms_of(
@@ -91,7 +89,7 @@ def _terms_of_single(
     """Yield every form of one channel on a quantity, with the values to try for each searched parameter."""
     name = channel.name
     for effect in effects.values():
-        if effect.id in PERIODIC:
+        if effect.periodic:
             continue
         if target not in effect.acts_on or not _all_read(effect, channels, fitted.rows, effects):
             continue
@@ -118,7 +116,7 @@ def _may_follow(effect: Effect, channel: Channel, fitted: Fitted) -> bool:
     if effect.id == "offset_slope":  # the offset is an effect of its own inside strokes, or is in the model
         has_offset = any(term.effect.id == "zero_offset" for term in fitted.model.terms)
         return FINER[channel.unit] > FINER["stroke"] and not has_offset
-    return channel.name not in CALENDAR or effect.id not in WAVY
+    return channel.name not in CALENDAR or effect.along_calendar
 
 
 def _all_read(effect: Effect, channels: Mapping[str, Channel], rows: Rows, effects: Mapping[str, Effect]) -> bool:

@@ -22,7 +22,7 @@ from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import SECOND, Effect
-from sealfit.effects.free import FREE, free_effect
+from sealfit.effects.free import FREE, LEVELS, SMOOTH, free_effect
 from sealfit.fit.joint.declared import QUANTITIES, Declared, JointParameter, tested_speeds
 from sealfit.fit.joint.estimate import Fitted, fit
 from sealfit.fit.joint.model import Model, Term, evaluate, term_derivatives
@@ -264,7 +264,7 @@ def _usual(values: np.ndarray, *, pair: bool) -> float | str:
 def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
     """Return the free shape fitted in place of an effect, level with it on average; None for periodic or level ones."""
     term = after.model.terms[number]
-    if len(term.channels) != 1 or term.effect.id in ("ripple", "sinusoid", "smooth", "levels") or np.isnan(x).any():
+    if len(term.channels) != 1 or term.effect.periodic or term.effect.id in (SMOOTH, LEVELS) or np.isnan(x).any():
         return None
     if term.channels[0] == "direction":
         return None

@@ -15,7 +15,6 @@ import pandas as pd
 from sealfit.closure.channels import Channel
 from sealfit.closure.confirm import AcceptedEffect, confirmed
 from sealfit.closure.criteria import RIVAL, TIED
-from sealfit.closure.forms import PERIODIC
 from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.naming import propose
 from sealfit.closure.score_test import Candidate, ScoreTests
@@ -110,4 +109,4 @@ class Renaming:
         """Return the channel along which an effect was found; None for a pair and for a ripple."""
         names = item.proposal.source[0]
         single = len(set(names) - {"direction"}) <= 1 and names[-1] in self.channels
-        return names[-1] if single and item.proposal.term.effect.id not in PERIODIC else None
+        return names[-1] if single and not item.proposal.term.effect.periodic else None

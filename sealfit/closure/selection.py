@@ -12,7 +12,7 @@ import pandas as pd
 from sealfit.closure.channels import CALENDAR, Channel, channels_of
 from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, confirmed
 from sealfit.closure.criteria import DOUBTFUL, HALF_OF_CALENDAR, TRIES, WEAK
-from sealfit.closure.forms import AGING, PERIODIC, richer_laws
+from sealfit.closure.forms import AGING, richer_laws
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import propose, rivals
 from sealfit.closure.rename_effects import Renaming
@@ -352,7 +352,7 @@ def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted,
     k = 0
     while k < len(added) - 1:
         bic_penalty = added[k].proposal.bic_penalty
-        periodic = added[k].proposal.term.effect.id in PERIODIC
+        periodic = added[k].proposal.term.effect.periodic
         if (
             periodic or _wald_statistic(fitted, k) > 2 * bic_penalty
         ):  # far from needless: no refit is wanted to see that

@@ -11,7 +11,7 @@ import pandas as pd
 from sealfit.closure.channels import channels_of
 from sealfit.closure.confirm import AcceptedEffect, heldout_gain
 from sealfit.closure.criteria import COMPARED, RIVAL
-from sealfit.closure.forms import PERIODIC, describe
+from sealfit.closure.forms import describe
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import named_among
 from sealfit.closure.score_test import ScoreTests
@@ -226,7 +226,7 @@ def _instead(
 
 
 def _periodic(proposal: Proposal) -> bool:
-    return proposal.term.effect.id in PERIODIC
+    return proposal.term.effect.periodic
 
 
 def _rivals(item: AcceptedEffect) -> list[tuple[Proposal, float]]:

@@ -108,6 +108,7 @@ QUADRATIC = Effect(
     # By hand: 2 from the reference: 0.5 * 2 - 0.25 * 4.
     worked=({"x": 5.0, "x_ref": 3.0}, {"A": 0.5, "B": -0.25}, 0.0),
     physical=False,
+    along_calendar=False,
 )
 
 
@@ -371,6 +372,8 @@ BUMP = Effect(
     # By hand: one half-width from the middle, 1/e = 0.36787944117144233.
     worked=({"x": 1.0, "x_ref": 0.0}, {"A": 2.0, "x_0": 3.0, "w": 2.0}, 2.0 * 0.36787944117144233),
     physical=False,
+    narrow=True,
+    along_calendar=False,
 )
 
 
@@ -405,6 +408,7 @@ SINUSOID = Effect(
     # By hand: 0.02 of a period of 0.04 is half a turn, and sin(pi + pi/6) = -sin(pi/6) = -1/2.
     worked=({"x": 0.02}, {"A": 4.0, "lambda_": 0.04, "phi": np.pi / 6}, -2.0),
     physical=False,
+    periodic=True,
 )
 
 
@@ -449,4 +453,5 @@ SINUSOID_HARMONICS = Effect(
     # By hand: 0.02 of a period of 0.04 is half a turn: 4 sin(pi + pi/6) = -2; a whole one: 1.5 sin(2 pi + pi/2) = 1.5.
     worked=({"x": 0.02}, {"A": 4.0, "B": 1.5, "lambda_": 0.04, "phi": np.pi / 6, "phi_2": np.pi / 2}, -0.5),
     physical=False,
+    periodic=True,
 )

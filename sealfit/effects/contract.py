@@ -110,6 +110,9 @@ class Effect:
     worked: tuple[Mapping[str, float], Mapping[str, float], float]  # inputs, values, result: by hand
     physical: bool = True  # false for a closed form that names no mechanism
     reference: str = ""  # where the shape is zero, in words
+    periodic: bool = False  # sought in the spectrum; its mean over a bin is known
+    narrow: bool = False  # may be as fine as a bin, over which its mean is computed at many places
+    along_calendar: bool = True  # false for a form that follows whatever was tested when
 
     def __post_init__(self) -> None:
         for target, operation in self.acts_on:

@@ -48,6 +48,7 @@ RIPPLE = Effect(
     source="Form: ours. A cyclic error of a screw is periodic in its angle; the sine is its first Fourier term.",
     # By hand: 0.5 mm of a 2 mm pitch is a quarter turn, pi/2; with phi = pi/3 the sine is cos(pi/3) = 1/2.
     worked=({"displacement_mm": 0.5}, {"A": 3.0, "lambda_": 2.0, "phi": np.pi / 3}, 1.5),
+    periodic=True,
 )
 
 

@@ -17,8 +17,6 @@ from sealfit.fit.joint.tangent import Layout, Tangent, blocks_of
 # ---------------------------------------------------------------- terms
 # Effects bound to channels: their shapes at the rows, averaged over each row's bin, and the derivatives of these.
 
-WAVES = ("ripple", "sinusoid", "sinusoid_harmonics")  # whose mean over a bin is known
-FINE = ("bump",)  # that may be as fine as a bin
 FEW_SAMPLES, MANY = (
     tuple((float(place), float(weight) / 2) for place, weight in zip(*np.polynomial.legendre.leggauss(k), strict=True))
     for k in (2, 4)
@@ -71,14 +69,14 @@ class Term:
             return [(1.0, inputs)]
         key = ("nodes", self.key(), id(self.fixed))
         if key not in rows.cache:
-            if self.effect.id in WAVES:
+            if self.effect.periodic:
                 widths = {width_of(name): rows.bin_width(channel) for name, channel in along}
                 found = [(1.0, {**inputs, SAMPLES: rows.samples, **widths})]
             else:
                 spread = np.sqrt(1 - 1 / np.maximum(rows.samples, 1.0) ** 2)
                 found = [
                     (weight, {**inputs, **{n: inputs[n] + 0.5 * place * spread * rows.bin_width(c) for n, c in along}})
-                    for place, weight in (MANY if self.effect.id in FINE else FEW_SAMPLES)
+                    for place, weight in (MANY if self.effect.narrow else FEW_SAMPLES)
                 ]
             rows.cache[key] = (self.fixed, found)
         return rows.cache[key][1]
