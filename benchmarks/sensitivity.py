@@ -26,6 +26,7 @@ import pandas as pd
 from counts import bounds
 
 from sealfit.closure.channels import scaled
+from sealfit.closure.confirm import Context
 from sealfit.closure.score_test import project
 from sealfit.closure.selection import Selection, grow, numbered, steady_samples
 from sealfit.closure.sensitivity import sensitivity
@@ -168,7 +169,7 @@ def close(bins: pd.DataFrame) -> Selection:
     """Return the end of the loop."""
     rows = make_rows(merged_bins(numbered(bins), CONFIG.loop.seed), has_aging=True)
     traces = bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(presliding_N=0.0, steady=True)
-    return grow(rows, steady_samples(traces, rows), CONFIG, EFFECTS)
+    return grow(rows, steady_samples(traces, rows), Context(CONFIG, EFFECTS))
 
 
 def outcome(grown: Selection, entry: dict, effect: np.ndarray) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,7 @@ from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
 from sealfit.closure.ripples import agreement, pass_shifts
 from sealfit.config import Config
+from sealfit.effects.contract import Effect
 from sealfit.fit.joint.estimate import Fitted, as_smooth_as_wanted, fit
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows
@@ -243,20 +244,44 @@ class RefusedEffect:
         return self.p_value > WEAK
 
 
+def silent(text: str) -> None:
+    """Say nothing."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """What every round of the loop needs besides the model and the data.
+
+    Parameters
+    ----------
+    config : Config
+        Levels of error, rounds, folds and units.
+    effects : mapping
+        The catalogue, the user's own effects included.
+    say : callable
+        Called with a line on what is being done.
+    compare : bool
+        Whether rivals of an accepted effect are put to held-out data too.
+    workers : int
+        Processes for what is independent.
+    """
+
+    config: Config
+    effects: Mapping[str, Effect]
+    say: Callable[[str], None] = silent
+    compare: bool = True
+    workers: int = 1
+
+
 def confirmed(
     fitted: Fitted,
     proposals: Sequence[Proposal],
     samples: pd.DataFrame,
-    config: Config,
+    context: Context,
     number: int,
-    say: Callable[[str], None],
-    *,
-    compare: bool,
     refused: list[RefusedEffect],
 ) -> AcceptedEffect | None:
     """Return the first of a round's best proposals that gains on held-out data; None where none does.
-
-    What is refused is added to `refused`, with the reason.
 
     Parameters
     ----------
@@ -266,27 +291,24 @@ def confirmed(
         Best first.
     samples : DataFrame
         Raw samples with `residual_N`.
-    config : Config
+    context : Context
         Folds, seed and units.
     number : int
         Of the round.
-    say : callable
-        Told in words what is being done.
-    compare : bool
-        Whether its rivals are asked for the held-out data too.
     refused : list of RefusedEffect
-        Grows by the best proposal where none is confirmed.
+        Grows by the best proposal, with the reason, where none is confirmed.
     """
+    config = context.config
     failed: list[RefusedEffect] = []
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
     for proposal in proposals[:TRIES]:
         gain = heldout_gain(fitted, proposal, *folds_of)
         reason = _why_not(fitted, proposal, gain, samples, folds_of[-1])
         unit = config.units.unit("force")
-        say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
+        context.say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
             others = rivals(proposal, proposals)
-            rmse = [heldout_gain(fitted, o, *folds_of).left_N for o in others[:COMPARED]] if compare else []
+            rmse = [heldout_gain(fitted, o, *folds_of).left_N for o in others[:COMPARED]] if context.compare else []
             rmse += [np.nan] * (len(others) - len(rmse))
             return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
         if proposal.p_value <= config.loop.family_error:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, varies_within
+from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, silent, varies_within
 from sealfit.closure.criteria import JACKKNIFE_UNITS, PARTLY
 from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
@@ -20,7 +20,6 @@ from sealfit.closure.selection import Selection, Start, grow, numbered, predict_
 from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.effects.contract import Effect
 from sealfit.engine.run_map import run_map
 from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model
@@ -62,12 +61,13 @@ def close_loop(
     on_progress : callable, optional
         Told in words what is being done.
     """
-    say = on_progress or (lambda text: None)
+    say = on_progress or silent
     effects = dict(EFFECTS)
     if config.loop.effects_folder is not None:
         from sealfit.effects.user import load_user_effects
 
         effects |= load_user_effects(Path(config.loop.effects_folder))
+    context = Context(config, effects, say, workers=workers)
     columns, counted = list(bins.columns), numbered(bins.reset_index(drop=True))
     del bins
     rows = make_rows(counted, has_aging=config.aging)
@@ -79,19 +79,11 @@ def close_loop(
             with timed("declared model", rows=part.every.force.size, of="bins, merged"):
                 declared = fit_declared(part.every)
             start = Start(declared.model, declared.scatter)
-        heldout = _HeldOut(rows, part, steady_samples(traces, part.rows), config, effects, workers)
+        heldout = _HeldOut(rows, part, steady_samples(traces, part.rows), context)
         fine = part.rows if part.coarse is not part.rows else None
         with timed("search", rows=part.coarse.force.size, of="bins, merged"):
-            grown = grow(
-                part.coarse,
-                heldout.samples,
-                config,
-                effects,
-                fine=fine,
-                start=None if part.whole else start,
-                workers=workers,
-                on_progress=say,
-            )
+            begin = None if part.whole else start
+            grown = grow(part.coarse, heldout.samples, context, fine=fine, start=begin)
         if not part.whole:
             grown, on_all_strokes = reselect_on_all(grown, part.every, heldout.samples, config, say)
         say("before and after on all rows")
@@ -144,19 +136,11 @@ def _on_all(rows: Rows, grown: Selection) -> tuple[Fitted, Fitted]:
 class _HeldOut:
     """The folds: everything fitted and searched again without some groups, and asked for them."""
 
-    def __init__(
-        self,
-        rows: Rows,
-        part: Subsample,
-        samples: pd.DataFrame,
-        config: Config,
-        effects: dict[str, Effect],
-        workers: int,
-    ) -> None:
-        self.rows, self.part, self.samples = rows, part, samples
-        self.config, self.effects, self.workers = config, effects, workers
+    def __init__(self, rows: Rows, part: Subsample, samples: pd.DataFrame, context: Context) -> None:
+        self.rows, self.part, self.samples, self.context = rows, part, samples, context
         self.level = heldout_level(rows)
-        self.masks = list(folds(rows, self.level, config.loop.folds, config.loop.seed))
+        loop = context.config.loop
+        self.masks = list(folds(rows, self.level, loop.folds, loop.seed))
 
     @property
     def repeats(self) -> bool:
@@ -176,7 +160,7 @@ class _HeldOut:
             before = self.refitted(grown.before)
             return before, self.refitted(grown.after) if grown.added else before
         rounds = max(a.round for a in grown.added)
-        parts = run_map(_held_out, _Folds(self, grown.before, rounds), workers=self.workers)
+        parts = run_map(_held_out, _Folds(self, grown.before, rounds), workers=self.context.workers)
         before, after = np.full(self.rows.force.size, np.nan), np.full(self.rows.force.size, np.nan)
         for k, (out, forces) in enumerate(zip(self.masks, parts, strict=True)):
             say(f"  fold {k + 1} of {len(self.masks)}")
@@ -209,8 +193,7 @@ class _Fold:
     every: Rows | None  # where `train` is of some runs only: all the fit may see
     seen: pd.DataFrame
     test: Rows
-    config: Config
-    effects: dict[str, Effect]
+    context: Context
     start: Start
     rounds: int  # of the search; without any, `start` is refitted
 
@@ -239,15 +222,14 @@ class _Folds(Sequence):
             seen = own.samples[~own.samples["stroke_id"].isin(gone)]
         every = None if part.whole else kept(part.every)
         test = own.rows.subset(out)
-        return _Fold(kept(part.coarse), fine, every, seen, test, own.config, own.effects, self.start, self.rounds)
+        quiet = replace(own.context, say=silent, compare=False, workers=1)
+        return _Fold(kept(part.coarse), fine, every, seen, test, quiet, self.start, self.rounds)
 
 
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
     """Return the forces before and after at a fold's rows; before twice where the whole campaign lacks nothing."""
     if fold.rounds:
-        part = grow(
-            fold.train, fold.seen, fold.config, fold.effects, fine=fold.fine, start=fold.start, rounds=fold.rounds
-        )
+        part = grow(fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds)
         before, after = part.before, part.after
     else:
         before = after = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)

@@ -7,20 +7,18 @@ the first was not its whole shape: one effect that does as well as the two says 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import pandas as pd
 
 from sealfit.closure.channels import Channel
-from sealfit.closure.confirm import AcceptedEffect, confirmed
+from sealfit.closure.confirm import AcceptedEffect, Context, confirmed
 from sealfit.closure.criteria import RIVAL, TIED
 from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.naming import propose
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import of_channel
-from sealfit.config import Config
-from sealfit.effects.contract import Effect
 from sealfit.fit.joint.estimate import Fitted, fit
 
 
@@ -30,18 +28,17 @@ class Renaming:
 
     Parameters
     ----------
-    channels, effects, samples, config, say
-        As for `grow`.
-    compare : bool
-        Whether rivals of what is named anew are asked for the held-out data too.
+    channels : mapping
+        Channels by name.
+    samples : DataFrame
+        Raw samples with `residual_N`.
+    context : Context
+        The catalogue, folds, seed and units.
     """
 
     channels: Mapping[str, Channel]
-    effects: Mapping[str, Effect]
     samples: pd.DataFrame
-    config: Config
-    say: Callable[[str], None]
-    compare: bool
+    context: Context
 
     def all_but_last(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
         """Return a fit and its effects with each but the last named anew beside all the others."""
@@ -97,13 +94,11 @@ class Renaming:
         there = {p.name: (values[p.name],) for p in own.effect.nonlinear}
         alike = next((c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None)
         as_it_is = Linearised(without)(own, there, alike) if alike is not None else ()
-        return without, propose(without, found, self.channels, self.effects, as_it_is)
+        return without, propose(without, found, self.channels, self.context.effects, as_it_is)
 
     def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> AcceptedEffect | None:
-        self.say(f"  round {number} again:")
-        return confirmed(
-            without, proposals, self.samples, self.config, number, self.say, compare=self.compare, refused=[]
-        )
+        self.context.say(f"  round {number} again:")
+        return confirmed(without, proposals, self.samples, self.context, number, [])
 
     def _channel(self, item: AcceptedEffect) -> str | None:
         """Return the channel along which an effect was found; None for a pair and for a ripple."""

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, confirmed
+from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
 from sealfit.closure.naming import propose_ripples
 from sealfit.closure.ripples import Peak, find_ripple
-from sealfit.config import Config
-from sealfit.effects.contract import Effect
 from sealfit.fit.joint.estimate import Fitted, fit
 from sealfit.fit.joint.model import Model, passes
 from sealfit.fit.joint.rows import Rows
@@ -25,16 +22,8 @@ class Ripples:
     ----------
     samples : DataFrame
         Steady samples, as `steady_samples` gives them.
-    config : Config
-        Levels of error, rounds, folds.
-    effects : mapping
-        The catalogue.
-    say : callable
-        Told in words what is being done.
-    compare : bool
-        Whether rivals of an accepted ripple are asked for the held-out data too.
-    workers : int
-        Processes for the spectra of many samples.
+    context : Context
+        Levels of error, rounds, folds; processes for the spectra of many samples.
 
     Attributes
     ----------
@@ -48,17 +37,8 @@ class Ripples:
         The significant one that is not in the model yet and may still be.
     """
 
-    def __init__(
-        self,
-        samples: pd.DataFrame,
-        config: Config,
-        effects: Mapping[str, Effect],
-        say: Callable[[str], None],
-        *,
-        compare: bool,
-        workers: int = 1,
-    ) -> None:
-        self.config, self.effects, self.say, self.compare, self.workers = config, effects, say, compare, workers
+    def __init__(self, samples: pd.DataFrame, context: Context) -> None:
+        self.context = context
         self.added: list[AcceptedEffect] = []
         self.refused: list[RefusedEffect] = []
         self.samples = samples.assign(residual_N=samples["force_N"])
@@ -77,12 +57,10 @@ class Ripples:
         if self.found is None:
             return fitted
         own = fitted if fine is None else fit(fitted.model, fine, fitted.scatter, turns=1)
-        while self.found is not None and len(self.added) < self.config.loop.max_rounds:
-            proposals = propose_ripples(own, self.found, self.samples, self.effects)
+        while self.found is not None and len(self.added) < self.context.config.loop.max_rounds:
+            proposals = propose_ripples(own, self.found, self.samples, self.context.effects)
             number = len(self.added) + 1
-            accepted = confirmed(
-                own, proposals, self.samples, self.config, number, self.say, compare=self.compare, refused=self.refused
-            )
+            accepted = confirmed(own, proposals, self.samples, self.context, number, self.refused)
             if accepted is None:
                 self.found = None
                 break
@@ -99,9 +77,9 @@ class Ripples:
 
     def _find(self, model: Model | None = None) -> Peak | None:
         known = [(t.channels[0], v["lambda_"]) for t, v in zip(model.terms, model.values, strict=True)] if model else []
-        common_phase = self.config.position_origin == "rig"
-        peak = find_ripple(self.samples, common_phase=common_phase, known=known, workers=self.workers)
-        return peak if peak is not None and peak.p_value <= self.config.loop.family_error else None
+        common_phase = self.context.config.position_origin == "rig"
+        peak = find_ripple(self.samples, common_phase=common_phase, known=known, workers=self.context.workers)
+        return peak if peak is not None and peak.p_value <= self.context.config.loop.family_error else None
 
 
 def _held(model: Model) -> Model:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel, channels_of
-from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, confirmed
+from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
 from sealfit.closure.criteria import DOUBTFUL, HALF_OF_CALENDAR, TRIES, WEAK
 from sealfit.closure.forms import AGING, richer_laws
 from sealfit.closure.linearised import Proposal
@@ -27,7 +27,6 @@ from sealfit.closure.search import (
     search_masked_pairs,
     search_pairs,
 )
-from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model, evaluate
@@ -74,14 +73,11 @@ class _Shown(NamedTuple):
 def grow(
     rows: Rows,
     samples: pd.DataFrame,
-    config: Config,
-    effects: Mapping[str, Effect],
+    context: Context,
     *,
     fine: Rows | None = None,
     start: Start | None = None,
     rounds: int | None = None,
-    workers: int = 1,
-    on_progress: Callable[[str], None] | None = None,
 ) -> Selection:
     """Return the model grown until no channel orders its residual.
 
@@ -91,24 +87,17 @@ def grow(
         Bins as arrays, merged along their strokes where there are many.
     samples : DataFrame
         Steady samples for the ripple search: as `steady_samples` gives them.
-    config : Config
-        Levels of error, rounds, folds.
-    effects : mapping
-        The catalogue.
+    context : Context
+        Levels of error, rounds, folds, and the catalogue.
     fine : Rows, optional
         The bins as they are, to fit ripples to, which merged bins would blur; they are held as found there.
     start : Start, optional
         Where the fit of the declared model begins, so that it need not search again.
     rounds : int, optional
-        Rounds after which a fold's search ends: nothing is asked then but what effects it adds, not for their rivals on
-        held-out data, nor for what is left.
-    workers : int
-        Processes for what is independent in the search.
-    on_progress : callable, optional
-        Told in words what is being done.
+        Rounds after which a fold's search ends: nothing is asked then but what effects it adds, not for what is left.
     """
-    growth = _Growth(rows, samples, config, effects, fine, start, rounds is not None, workers, on_progress)
-    last_round = config.loop.max_rounds + 2 if rounds is None else rounds
+    growth = _Growth(rows, samples, context, fine, start)
+    last_round = context.config.loop.max_rounds + 2 if rounds is None else rounds
     for number in range(len(growth.added) + 1, last_round + 1):
         if growth.has_ended(number):
             break
@@ -118,19 +107,21 @@ def grow(
 class _Growth:
     """The loop while it goes on: the model, what was added and refused, and what the searches show on the model."""
 
-    def __init__(self, rows, samples, config, effects, fine, start, fold, workers, on_progress) -> None:
-        self.say = on_progress or (lambda text: None)
-        self.rows, self.config, self.effects, self.compare = rows, config, effects, not fold
-        self.rng = np.random.default_rng(config.loop.seed)
-        ripples = Ripples(samples, config, effects, self.say, compare=self.compare, workers=workers)
+    def __init__(
+        self, rows: Rows, samples: pd.DataFrame, context: Context, fine: Rows | None, start: Start | None
+    ) -> None:
+        self.rows, self.context = rows, context
+        self.config, self.effects, self.say = context.config, context.effects, context.say
+        self.rng = np.random.default_rng(self.config.loop.seed)
+        ripples = Ripples(samples, context)
         self.before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
-        self.channels = {c.name: c for c in channels_of(rows, config)}
+        self.channels = {c.name: c for c in channels_of(rows, self.config)}
         self.judge = ScoreTests(self.before)
         self.last = self.first = self.searched()
         self.fitted = ripples.added_to(self.before, fine)
         self.added = list(ripples.added)
         self.ripple, self.samples, self.not_confirmed = ripples.found, ripples.samples, ripples.refused
-        self.renaming = Renaming(self.channels, effects, self.samples, config, self.say, compare=self.compare)
+        self.renaming = Renaming(self.channels, self.samples, context)
         self.refused: set[tuple] = set()
         self.left: Candidate | Peak | None = None
         self.hidden: list[MaskedPair] = []  # effects that hide each other, until both are in the model
@@ -150,9 +141,7 @@ class _Growth:
         self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
     ) -> AcceptedEffect | None:
         """Return the first of some proposals that held-out data confirm; what they refuse is added to `failed`."""
-        return confirmed(
-            base, proposals, self.samples, self.config, number, self.say, compare=self.compare, refused=failed
-        )
+        return confirmed(base, proposals, self.samples, self.context, number, failed)
 
     def has_ended(self, number: int) -> bool:
         """Search, name and confirm once; return whether nothing is left to be done."""

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.confirm import Gain, confirmed, gain_between_settings, heldout_gain, varies_within
+from sealfit.closure.confirm import Context, Gain, confirmed, gain_between_settings, heldout_gain, varies_within
 from sealfit.closure.heldout import blocks
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -79,6 +79,6 @@ def test_a_free_shape_that_bends_the_curve_wants_more_evidence(
     fitted = SimpleNamespace(rows=SimpleNamespace(force=np.full(3, 10.0)))
     samples = pd.DataFrame({"force_N": np.random.default_rng(0).normal(size=50), "stroke_id": 0})
     refused = []
-    found = confirmed(fitted, [proposal], samples, Config(), 1, lambda text: None, compare=False, refused=refused)
+    found = confirmed(fitted, [proposal], samples, Context(Config(), EFFECTS, compare=False), 1, refused)
     assert (found is not None) == claimed
     assert [item.weak for item in refused] == ([] if claimed else [True])

@@ -4,7 +4,7 @@ from bins_helpers import make_bins, make_traces
 
 from sealfit.closure import rename_effects
 from sealfit.closure.channels import find_channels
-from sealfit.closure.confirm import AcceptedEffect
+from sealfit.closure.confirm import AcceptedEffect, Context
 from sealfit.closure.criteria import PAIR
 from sealfit.closure.forms import terms_of
 from sealfit.closure.linearised import Linearised, Proposal
@@ -30,7 +30,7 @@ def test_a_shape_of_no_catalogue_is_one_effect_and_not_two_bumps():
 
     bins = make_bins(5, setup=0.003, effect=sigmoid, run_channels=OIL, bins=6)
     rows = make_rows(numbered(bins), has_aging=True)
-    grown = grow(rows, steady_samples(make_traces(bins), rows), Config(), EFFECTS)
+    grown = grow(rows, steady_samples(make_traces(bins), rows), Context(Config(), EFFECTS))
     (effect,) = grown.added
     assert effect.proposal.term.channels == ("oil_ppm",)
     assert grown.left is None
@@ -107,7 +107,7 @@ def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
     propose = rename_effects.propose
     monkeypatch.setattr(rename_effects, "propose", without_its_own_curve)
     channels = {c.name: c for c in find_channels(rows)}
-    again = rename_effects.Renaming(channels, EFFECTS, rows.table.head(0), Config(), lambda text: None, compare=False)
+    again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
     after, kept = again.all_but_last(fitted, added)
     assert refitted
     assert kept is added

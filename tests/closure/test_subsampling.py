@@ -6,6 +6,7 @@ import numpy.testing as npt
 import pytest
 from bins_helpers import TRUE, make_bins, make_traces, warm
 
+from sealfit.closure.confirm import Context
 from sealfit.closure.loop import close_loop
 from sealfit.closure.selection import grow, numbered, steady_samples
 from sealfit.closure.subsampling import FURTHER, MOST_ROWS, PER_STROKE, ROWS, merged_bins, reselect_on_all, subsamples
@@ -127,7 +128,7 @@ def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatc
     bins = numbered(make_bins(seed, effect=stiffer, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, noise_N=0.1))
     part = next(subsamples(make_rows(bins, has_aging=True), 1))
     samples = steady_samples(make_traces(bins), part.rows)
-    grown = grow(part.coarse, samples, Config(), EFFECTS)
+    grown = grow(part.coarse, samples, Context(Config(), EFFECTS))
     (found,) = grown.added
 
     def on(quantity):
