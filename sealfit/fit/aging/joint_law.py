@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import stdtrit
 
 from sealfit.effects import aging_laws
 from sealfit.errors import FitError
 from sealfit.fit.aging.joint_least_squares import solved, solved_without
+from sealfit.fit.aging.law import paule_mandel
 from sealfit.fit.joint.prior import covariance_of
 from sealfit.physics.aging_laws import LOSSES, Loss
 
@@ -309,7 +309,9 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
     x, scatter, before = None, 0.05, np.inf
     for _ in range(TURNS):
         x = solved(empty, aged.spread.whitening(scatter), x)
-        before, scatter = scatter, _scatter(aged, aged.value - empty.at(aged, x), aged.value.size - len(names))
+        left = aged.value - empty.at(aged, x)
+        chi2 = partial(aged.spread.chi2, left)
+        before, scatter = scatter, paule_mandel(chi2, aged.value.size - len(names), left / aged.value)
         if abs(scatter - before) <= SETTLED * before:
             break
     bic = aged.spread.chi2(aged.value - empty.at(aged, x), scatter) + aged.spread.log_determinant(scatter)
@@ -317,25 +319,6 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
     white = aged.spread.whitening(scatter) @ empty.slope(aged, x).T
     covariance = covariance_of(white.T @ white, np.zeros((len(names),) * 2))
     return replace(empty, x=x, covariance=covariance, scatter=scatter, bic=bic)
-
-
-def _scatter(aged: Aged, residual: np.ndarray, df: int) -> float:
-    """Return the relative scatter beyond the measured variance at which chi-square is its degrees of freedom.
-
-    Paule & Mandel 1982, J. Res. NBS 87(5), 377-385, doi:10.6028/jres.087.022.
-    """
-    if df < 1:
-        return 0.0
-
-    def excess(tau):
-        return aged.spread.chi2(residual, tau) - df
-
-    if not excess(0.0) > 0:  # also where a start gives no number
-        return 0.0
-    high = float(np.sqrt(np.mean((residual / aged.value) ** 2))) + 1e-9
-    while excess(high) > 0:
-        high *= 2
-    return float(brentq(excess, 0.0, high, xtol=1e-6 * high))
 
 
 def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw]:

@@ -6,7 +6,8 @@ together by generalised least squares; linear in mu_0 and a, and in ln b searche
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +18,7 @@ from sealfit.fit.least_squares import BatchFit, covariance_of, even_grid, global
 
 SOONEST, LATEST = 1e-9, 1e3  # b is sought from 1e-9 of the first aged day to 1000 times the last
 PER_DECADE = 8  # points of the search along b; ln(1 + t/b) changes over a decade of b
+MOST_SCATTER = 1e6  # relative: where a law is zero, no scatter of it explains what is left
 PROFILED = 17  # points along ln b at which the intervals of a and c are taken
 
 
@@ -241,27 +243,41 @@ def _rescan(found: LawFit) -> np.ndarray | None:
 def between_scatter(values: Values) -> tuple[float, LawFit]:
     """Relative scatter of single values beyond their covariance, and the fit without it; one quantity.
 
-    Paule and Mandel's estimate: the tau for which chi-square equals its degrees of freedom when every value has
-    (tau times the law)^2 added to its variance; 0 where chi-square is below its degrees of freedom already.
-
-    Notes
-    -----
-    Paule and Mandel 1982, J. Res. NBS 87(5), 377-385, doi:10.6028/jres.087.022.
+    Every value has (scatter times the law)^2 added to its variance; the estimate is Paule and Mandel's.
     """
     plain = fit_law(values)
     if plain.df <= 0 or plain.chi2 <= plain.df:
         return 0.0, plain
     scale = np.abs(plain.model)
 
-    def excess(tau):
-        wide = Values(
-            values.days, values.value, values.origin, values.curve, values.covariance + np.diag((tau * scale) ** 2)
-        )
-        return fit_law(wide, plain.x).chi2 / plain.df - 1
+    def chi2(tau: float) -> float:
+        covariance = values.covariance + np.diag((tau * scale) ** 2)
+        return fit_law(replace(values, covariance=covariance), plain.x).chi2
 
-    high = float(np.sqrt(np.mean(((plain.model - values.value) / scale) ** 2))) + 1e-12
-    for _ in range(60):
-        if excess(high) < 0:
-            break
+    return paule_mandel(chi2, plain.df, (plain.model - values.value) / scale), plain
+
+
+def paule_mandel(chi2: Callable[[float], float], df: float, residual: np.ndarray) -> float:
+    """Return the relative scatter at which chi-square equals its degrees of freedom; 0 where it is no larger already.
+
+    Parameters
+    ----------
+    chi2 : callable
+        Chi-square with a relative scatter added to the variance of every value; it falls with the scatter.
+    df : float
+        Its degrees of freedom.
+    residual : ndarray
+        Relative residuals, whose RMS is where the search begins.
+
+    Notes
+    -----
+    Paule and Mandel 1982, J. Res. NBS 87(5), 377-385, doi:10.6028/jres.087.022.
+    """
+    if df < 1 or not chi2(0.0) > df:  # also where a start gives no number
+        return 0.0
+    high = float(np.sqrt(np.mean(residual**2))) + 1e-9
+    while chi2(high) > df and high < MOST_SCATTER:
         high *= 2
-    return float(brentq(excess, 0.0, high, xtol=1e-4 * high)), plain
+    if high >= MOST_SCATTER:
+        return MOST_SCATTER
+    return float(brentq(lambda tau: chi2(tau) - df, 0.0, high, xtol=1e-6 * high))
