@@ -87,14 +87,6 @@ def test_the_command_line_starts_without_the_heavy_libraries():
     assert run.stdout == "[]\n"
 
 
-def test_the_fits_and_the_loop_do_without_scipy_stats():
-    """It takes half a second to load, half of what a small campaign's fits take."""
-    fits = "sealfit.fit.steady.fit, sealfit.fit.aging.all_series, sealfit.fit.aging.lifetime, sealfit.fit.dynamic.fit"
-    program = f"import sys, {fits}, sealfit.closure.loop; print('scipy.stats' in sys.modules)"
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert run.stdout == "False\n"
-
-
 def test_version(sealfit):
     assert re.fullmatch(r"sealfit \d+\.\d+\.\d+\n", sealfit("--version").stdout)
 

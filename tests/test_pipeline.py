@@ -84,18 +84,6 @@ def first(campaign):
     return out, run
 
 
-def test_ingest_does_without_scipy_where_no_repeat_lies_outside(campaign, tmp_path):
-    """It takes a tenth of a second to load, for one function of it."""
-    program = (
-        "import pathlib, sys, sealfit.pipeline; sealfit.pipeline.ingest(*map(pathlib.Path, sys.argv[1:]));"
-        "print('scipy' in sys.modules)"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", program, campaign, tmp_path / "out"], capture_output=True, text=True, check=True
-    )
-    assert run.stdout == "False\n"
-
-
 def test_a_run_gives_every_table_with_its_schema(first):
     out, _ = first
     for name in (*INGESTED, *FITTED, *CLOSED, *AFTER):
