@@ -23,8 +23,8 @@ from sealfit.fit.joint.declared import SPEEDS_BETWEEN, Declared
 from sealfit.fit.joint.model import Model, evaluate
 from sealfit.fit.joint.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.joint.whitening import Component, Scatter
-from sealfit.ingest.campaign import NO_VALUE
 from sealfit.ingest.categorical import add_keys
+from sealfit.ingest.quality import NO_VALUE
 
 BEYOND = 1e-6  # relative slack before a value counts as outside the tested range
 ANSWERS = (

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy.sparse import csr_array
 
-from sealfit.ingest.campaign import LEAST_KNOWN, NO_VALUE
+from sealfit.ingest.quality import LEAST_KNOWN, NO_VALUE
 from sealfit.tables import BINS
 
 # ---------------------------------------------------------------- groups
