@@ -31,35 +31,6 @@ STILL_RISING = 0.01  # share of the force that may be missing where a stroke end
 FINE_FILE = {"check": "ok", "severity": "info", "action": "kept", "reason": "nothing found.", "fix": ""}
 
 
-def suspects(
-    time_s: np.ndarray, force_N: np.ndarray, steady: np.ndarray, strokes: Pieces, settings: Quality
-) -> np.ndarray:
-    """Return in which strokes there may be a gap, or a sensor at its end or stuck, shape (strokes,).
-
-    `stroke_faults` finds none of these in the others. Arguments as in `steady_windows`; a stroke without a steady
-    window is none of them.
-    """
-    step = time_s[1:] - time_s[:-1]
-    step = np.append(step, step[-1:])
-    last, first = strokes.stop - 1, strokes.start
-    step[last] = step[np.maximum(last - 1, first)]  # the step to the next stroke is none
-    made = strokes.max(step) > settings.max_gap_factor * strokes.min(step)
-    count = strokes.sum(steady)
-    some, rows = count > 0, np.flatnonzero(steady)
-    if not len(rows):
-        return made
-    windows, force = Pieces(count[some]), force_N[rows]
-    size = np.abs(force)
-    extreme = windows.mean(size == windows.spread(windows.max(size)))
-    made[some] |= extreme >= settings.saturated_share
-    ends = windows.steps(force) != 0.0  # of runs of equal samples
-    ends[windows.stop - 1] = True
-    at = np.flatnonzero(ends)
-    runs = np.append(at[:1] + 1, at[1:] - at[:-1])
-    made[some] |= np.maximum.reduceat(runs, np.searchsorted(at, windows.start)) >= settings.stuck_samples
-    return made
-
-
 def stroke_faults(
     file: str,
     number: int | None,

@@ -21,16 +21,13 @@ from sealfit.ingest.quality import (
     rising_faults,
     speed_column_faults,
     stroke_faults,
-    suspects,
 )
 from sealfit.ingest.reader import Trace, read_traces
 from sealfit.ingest.segments import Pieces
 from sealfit.ingest.strokes import Found, displacement_noises_mm, find_all
 from sealfit.ingest.trace_checks import (
     displacement_spikes,
-    displacement_suspects,
     force_spikes,
-    force_suspects,
     speed_factor,
 )
 from sealfit.store.manifest import Fingerprint
@@ -107,9 +104,8 @@ def _bundled(bundle: _Bundle, config: Config) -> list[Made]:
     bundle, noise = _without_displacement_spikes(bundle, config)
     found = find_all(*bundle.slots(), bundle.traces, config.strokes, noise)
     made: dict[int, Made] = {}
-    suspected = force_suspects(bundle.columns["force_N"], found.steady, bundle.traces, config.quality)
-    for i in np.flatnonzero(suspected).tolist():
-        rows, force = bundle.traces.slices[i], bundle.columns["force_N"]
+    force = bundle.columns["force_N"]
+    for i, rows in enumerate(bundle.traces.slices):
         own = found.of_trace(i, rows.start)
         keep, faults = force_spikes(bundle.refs[i].file, force[rows], own, bundle.line[rows], config.quality)
         bundle.faults[i].extend(faults)
@@ -135,8 +131,8 @@ def _without_displacement_spikes(bundle: _Bundle, config: Config) -> tuple[_Bund
     displacement, traces = bundle.columns["displacement_mm"], bundle.traces
     noise = displacement_noises_mm(displacement, traces)
     keep = np.ones(traces.rows, bool)
-    for i in np.flatnonzero(displacement_suspects(displacement, traces, noise, config.quality)).tolist():
-        rows, file = traces.slices[i], bundle.refs[i].file
+    for i, rows in enumerate(traces.slices):
+        file = bundle.refs[i].file
         keep[rows], faults = displacement_spikes(file, displacement[rows], bundle.line[rows], config.quality)
         bundle.faults[i].extend(faults)
     if keep.all():
@@ -168,7 +164,6 @@ def _finished(bundle: _Bundle, found: Found, config: Config, skip: Sequence[int]
     files = [bundle.refs[i].file for i in found.trace.tolist()]
     rows = _stroke_rows(samples, files, found, strokes, factor)
     time_s, _, force = bundle.slots()
-    suspected = suspects(time_s, force, found.steady, strokes, config.quality)
     unit = config.units.unit("force")
     made, first = [], 0
     for i, own in enumerate(bundle.traces.slices):
@@ -181,10 +176,8 @@ def _finished(bundle: _Bundle, found: Found, config: Config, skip: Sequence[int]
         before = int(ref.channels.get("stroke", 1)) - 1  # strokes of the record that other files hold
         for k in mine:
             number = int(found.number[k]) if several_here else None
-            wrong: list[Fault] = []
-            if suspected[k] or found.short[k] is not None:
-                stroke = found.stroke(k, own.start)
-                wrong = stroke_faults(ref.file, number, stroke, time_s[own], force[own], bundle.line[own], config)
+            stroke = found.stroke(k, own.start)
+            wrong = stroke_faults(ref.file, number, stroke, time_s[own], force[own], bundle.line[own], config)
             used = not any(fault.action == "stroke left out" for fault in wrong)
             row = rows[k] = {**ref.channels, **rows[k], "several": several_here, "used": used}
             row["stroke"] += before

@@ -24,40 +24,6 @@ STEPS = 5.0  # a spike of displacement is off by more than so many of the usual 
 FIX = "Correct the cell if the true value is known."
 
 
-def displacement_suspects(
-    displacement_mm: np.ndarray, traces: Pieces, noise_mm: np.ndarray, settings: Quality
-) -> np.ndarray:
-    """Return which traces may hold a spike of displacement, shape (traces,): of the others none is found."""
-    off = np.abs(displacement_mm - running_median(displacement_mm, traces, NEIGHBOURS, "mirror"))
-    farthest = traces.max(off)
-    # Where more than half of the steps are as large as a share of the farthest, so is their median.
-    large = np.abs(traces.steps(displacement_mm)) >= traces.spread(farthest * ((1.0 + 1e-9) / STEPS))
-    return (
-        (traces.size >= 4 * NEIGHBOURS)
-        & (farthest > settings.spike_sigma * noise_mm)
-        & (2 * traces.sum(large) < traces.size + 1)
-    )
-
-
-def force_suspects(force_N: np.ndarray, steady: np.ndarray, traces: Pieces, settings: Quality) -> np.ndarray:
-    """Return which traces may hold a spike of force, shape (traces,): of the others none is found."""
-    off = np.abs(force_N - running_median(force_N, traces, NEIGHBOURS, "mirror"))
-    # Where more than half of the usual samples are off by a share of the farthest, so is their median.
-    noisy = off >= traces.spread(traces.max(off) * ((1.0 + 1e-9) / (1.4826 * settings.spike_sigma)))
-    usual = traces.sum(steady)
-    usual, noisy = np.where(usual > 0, (usual, traces.sum(noisy & steady)), (traces.size, traces.sum(noisy)))
-    may = (traces.size >= 4 * NEIGHBOURS) & (2 * noisy < usual + 2)
-    if not may.any():
-        return may
-    limit = np.full(len(traces), np.inf)
-    for i in np.flatnonzero(may).tolist():
-        own = off[traces.slices[i]]
-        inside = own[steady[traces.slices[i]]]
-        limit[i] = settings.spike_sigma * (1.4826 * median(inside if len(inside) else own))
-    far = off > traces.spread(limit)
-    return traces.sum(far & (steady | _beyond(force_N, far, traces))) > 0
-
-
 def _beyond(force_N: np.ndarray, suspects: np.ndarray, traces: Pieces) -> np.ndarray:
     """Return which samples reach beyond their trace without its suspects by half of its range, shape (n,)."""
     rest = np.where(suspects, 0.0, force_N)  # at rest the force may be zero
