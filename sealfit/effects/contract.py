@@ -1,7 +1,7 @@
 """What an effect declares, and the one pure function it holds.
 
 An effect is data plus a function: the search, the fit, the tables, the plots and the report read the description, so a
-new effect is one new file and one name in the list. The users' own effects follow the same contract.
+new effect is one definition in the file of its family. The users' own effects follow the same contract.
 """
 
 from __future__ import annotations

@@ -185,7 +185,7 @@ def listed(values: Sequence[object]) -> str:
 
 
 # ---------------------------------------------------------------- free
-# Free shapes, whose size the data decide: a smooth curve of a channel, a surface of two; others are in `categories`.
+# Free shapes, whose size the data decide: a smooth curve of a channel, a surface of two.
 #
 # They name no mechanism. All are rebuilt from plain data by `free_effect`, so a model file holds them whole.
 #

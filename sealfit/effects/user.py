@@ -1,4 +1,4 @@
-"""The users' own effects: Python files in a folder that the command line names (see `own_effects`).
+"""The users' own effects: Python files in a folder that the command line names (see `store.paths`).
 
 The one place where Python is run. A file holds one `Effect` (or several) at its top level, as the files beside this one
 do; helpers it imports must be installed. A file whose name starts with an underscore is not read.

@@ -1,8 +1,8 @@
 """What is wrong with a stroke by itself, with its fix; and the table of all that was found in a campaign.
 
 Every rule is scaled by the trace itself (its noise, its resolution, its sampling), so a coarse sensor is not taken for
-a stuck one, nor a slow rig for a gappy one. Single samples are judged in `spikes.py`, the commanded speed where the
-file is read (`speed_check.py`), and what needs other traces for comparison in `peers.py`.
+a stuck one, nor a slow rig for a gappy one. Single samples and the commanded speed are judged in
+`trace_checks.py`, and what needs other traces for comparison in `repeat_checks.py`.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ def stuck_samples(force_N: np.ndarray, samples: int) -> tuple[int, int] | None:
     The run must be `samples` long, five times as long as the long ones among the others, and longer than as many
     samples with this share of equal neighbours would show by chance (1e-6); and the sensor must show its noise, or a
     reading that rests on one of its coarse steps would be called stuck. A stroke that is constant all along has no
-    others: see `peers.constant_strokes`.
+    others: see `repeat_checks.constant_strokes`.
     """
     edges = np.concatenate(([0], np.flatnonzero(np.diff(force_N) != 0.0) + 1, [len(force_N)]))
     lengths = np.diff(edges)

@@ -267,7 +267,7 @@ class ConfigCopy:
     def effects_folder(self) -> Path | None:
         """Return the folder that `loop.effects_folder` names, relative to the config's own folder; None without it.
 
-        Only a config that the command line names may lead to its being run: see `own_effects`.
+        Only a config that the command line names may lead to its being run: see `own_effects_folder`.
         """
         named = self.parse().loop.effects_folder
         return None if named is None else (self.path.parent if self.path else Path()) / named

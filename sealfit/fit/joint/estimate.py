@@ -1,8 +1,8 @@
 r"""One estimator for "before" and "after": generalised least squares with scatter at every level.
 
-The weights come from the variance components (`reml.py`), which are estimated from the residual with the degrees of
-freedom of the model taken out; model and scatter are fitted in turn until neither moves. What is known beforehand of
-some numbers is in `prior.py`.
+The weights come from the variance components (`variance_components.py`), which are estimated from the residual with the
+degrees of freedom of the model taken out; model and scatter are fitted in turn until neither moves. What is known
+beforehand of some numbers is in `prior.py`.
 """
 
 from __future__ import annotations
