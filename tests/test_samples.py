@@ -6,9 +6,12 @@ import numpy as np
 import pandas as pd
 from bins_helpers import make_bins, make_traces
 
+from sealfit.closure.confirm import Context
 from sealfit.closure.loop import _Folds
 from sealfit.closure.selection import numbered, steady_samples
 from sealfit.closure.subsampling import Subsample
+from sealfit.config import Config
+from sealfit.effects import EFFECTS
 from sealfit.fit.joint.rows import make_rows, thin
 from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time
 
@@ -56,7 +59,8 @@ def test_a_fold_holds_all_bins_and_samples_only_where_it_searches():
     out = rows.codes("run") % 5 == 0
     samples = steady_samples(make_traces(bins), rows)
     part = Subsample(rows, coarse, coarse)
-    campaign = SimpleNamespace(masks=[out], rows=rows, part=part, samples=samples, config=None, effects={})
+    context = Context(Config(), EFFECTS)
+    campaign = SimpleNamespace(masks=[out], rows=rows, part=part, samples=samples, context=context)
     before = SimpleNamespace(model=None, scatter=None)
     searching, refitting = (_Folds(campaign, before, rounds)[0] for rounds in (2, 0))
     kept = set(rows.table["stroke_id"][~out])
