@@ -11,7 +11,7 @@ from campaigns import RIG, SPEEDS
 from effect_kinds import COLUMN, GRADES
 
 from sealfit.fit.joint.rows import make_rows
-from sealfit.ingest.campaign import NO_VALUE, incomplete_columns
+from sealfit.ingest.quality import NO_VALUE, incomplete_columns
 from sealfit.pipeline import STEPS, run
 from sealfit.report.summary_lines import lines
 from sealfit.simulation import Spec, simulate
