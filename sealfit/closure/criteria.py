@@ -38,7 +38,7 @@ JACKKNIFE_UNITS = 30
 """Units from which the jackknife over them is tried."""
 
 PROMISING = 1e-3
-"""P-value of what columns explain, before adjustment, below which sign flips and jackknife are computed."""
+"""P-value of what columns explain, before adjustment, below which the jackknife is computed."""
 
 WORTH_THE_RUNS = 0.05
 """P-value, before adjustment, below which columns that are constant in a run are held against the scatter of runs."""
@@ -283,5 +283,5 @@ FEW_UNITS = 30
 LEAST_SPARE_RUNS = 0.5
 """Runs that the model must leave over for their scatter to be known at all."""
 
-SAME_SPEED = 0.05
+NEAR_TESTED_SPEED = 0.05
 """Relative difference within which a speed counts as a tested one."""

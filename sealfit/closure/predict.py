@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.criteria import SAME_SPEED
+from sealfit.closure.criteria import NEAR_TESTED_SPEED
 from sealfit.closure.intervals import Sandwich, mean_half_width, t_quantile
 from sealfit.closure.output import from_record
 from sealfit.config import Config
@@ -222,7 +222,7 @@ def _outside(
     speed = np.abs(pd.to_numeric(table["speed_mm_s"], errors="coerce").to_numpy(dtype=float))
     for k in np.flatnonzero(code >= 0):
         tested = np.array(model["speeds_mm_s"][series[code[k]]])
-        if tested.size < SPEEDS_BETWEEN and not (np.abs(speed[k] / tested - 1) < SAME_SPEED).any():
+        if tested.size < SPEEDS_BETWEEN and not (np.abs(speed[k] / tested - 1) < NEAR_TESTED_SPEED).any():
             outside[k] = True
             notes[k].append(
                 f"too few speeds to know the friction between them: tested were {', '.join(f'{v:g}' for v in tested)}"

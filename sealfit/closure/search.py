@@ -300,9 +300,12 @@ def _centred(values: np.ndarray) -> np.ndarray:
 # Looked at where nothing else is significant, in few units. The pairs are simple ones only: two straight lines (an
 # offset, for the direction) that share a channel or of which one is of the direction, and a line along strokes with its
 # change along a coarser channel. Both columns must move each unit along one direction, so that a unit is one number;
-# then  .. math:: F = \frac{(RSS_0 - RSS_{12}) / 2}{RSS_{12} / (d - 2)}  holds both against what the units scatter by
-# beside them, exactly where that scatter is normal and alike. P-values are adjusted for the number of pairs
-# (Bonferroni). A pair counts where each of the two is significant given the other.
+# then
+#
+# .. math:: F = \frac{(RSS_0 - RSS_{12}) / 2}{RSS_{12} / (d - 2)}
+#
+# holds both against what the units scatter by beside them, exactly where that scatter is normal and alike. P-values are
+# adjusted for the number of pairs (Bonferroni). A pair counts where each of the two is significant given the other.
 
 OF_DIRECTION = (("force", "add"), ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
 SEPARATE = 1e-3  # singular value of two columns of length 1 below which they are one

@@ -259,9 +259,12 @@ def _independent(deviations: np.ndarray) -> float:
 # variance if specimens scatter alike. A channel's columns then stand against what is left of them by an F test. A few
 # numbers may look quieter than they are: where runs and files explain their variance of 1, that counts as if eight more
 # had been seen (moderated F: Smyth 2004, doi:10.2202/1544-6115.1027); where it is the specimens' own, it is known from
-# nothing else.  The same test holds what is constant in runs against their own scatter where there are few of these.  A
-# dozen specimens have too few sign flips for a search of hundreds of candidates, and a strong effect stands in its own
-# denominator there. The F test needs normal scatter instead; its p-values are adjusted by the largest over all
+# nothing else.
+#
+# The same test holds what is constant in runs against their own scatter where there are few of these.
+#
+# A dozen specimens have too few sign flips for a search of hundreds of candidates, and a strong effect stands in its
+# own denominator there. The F test needs normal scatter instead; its p-values are adjusted by the largest over all
 # candidates in draws of such numbers with the same covariance (a rotation test: Langsrud 2005,
 # doi:10.1007/s11222-005-4789-5).
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import warnings
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,13 +16,14 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-from sealfit.report.notation import count, plain, short, symbol_math
+from sealfit.report.notation import count, plain, power_of_ten, short, symbol_math
 
 # ---------------------------------------------------------------- excerpts
 # What of a large campaign is shown: as many panels, rows and keys as a person looks at, chosen, and said so.
@@ -103,13 +105,11 @@ def rms(values: Iterable[float]) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
-# ---------------------------------------------------------------- style
-# One look for every plot: colours, sizes and axes, and how panels become figures, SVG and PNG.
-
 # ---------------------------------------------------------------- axes
 # What several plots share: axes that read well, one scale for all panels, the order of names.
 
-MOST_TICKS = 6  # names of categories that fit below a panel
+MOST_TICKS = 8  # names of categories that fit below a panel
+MOST_VALUES = 6  # values of four digits that fit there
 TICK_APART = 0.11  # of the axis: closer ticks would write over each other
 
 
@@ -125,7 +125,7 @@ def is_logarithmic(x: np.ndarray, span: float) -> bool:
 def value_ticks(ax: Axes, x: np.ndarray) -> None:
     """Put the ticks at the values themselves where they are few and far enough apart, else at round numbers."""
     x = np.unique(x)
-    if 1 < len(x) <= MOST_TICKS and np.diff(x).min() > TICK_APART * np.ptp(x):
+    if 1 < len(x) <= MOST_VALUES and np.diff(x).min() > TICK_APART * np.ptp(x):
         ax.set_xticks(x, [f"{value:.4g}".replace("-", "−") for value in x])
     else:
         ax.xaxis.set_major_locator(round_ticks(integer=bool(np.array_equal(x, np.round(x)))))
@@ -347,9 +347,27 @@ def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> Axes:
     panel.draw(ax)
     if ax.get_xscale() == "linear" and isinstance(ax.xaxis.get_major_locator(), AutoLocator):
         ax.xaxis.set_major_locator(round_ticks())
+    for axis in (ax.xaxis, ax.yaxis):
+        _put_power_behind_title(axis)
     if panel.title:
-        ax.set_title(plain(panel.title), x=-(panel.left - _EDGE) / (WIDTH - panel.left - _EDGE))
+        ax.set_title(plain(panel.title), x=-(panel.left - _EDGE) / (WIDTH - panel.left - _EDGE), y=1.0)
     return ax
+
+
+def _put_power_behind_title(axis: Axis) -> None:
+    """Write the power of ten that an axis's labels lack behind its title: beside the axes it is in the way."""
+    formatter = axis.get_major_formatter()
+    formatter.set_locs(axis.get_majorticklocs())
+    if power := re.sub(r"([\d.]+)e([-−]?\d+)", _as_written, formatter.get_offset()):
+        axis.offsetText.set_visible(False)
+        axis.set_label_text("   ".join(text for text in (axis.get_label_text(), power) if text))
+
+
+def _as_written(found: re.Match) -> str:
+    power = f"10{power_of_ten(int(found[2].replace('−', '-')))}"
+    if found.start() == 0:  # a multiple, always of 1
+        return f"×{power}"
+    return power if found[1] == "1" else f"{found[1]}×{power}"
 
 
 def _legend_lines(legend: Sequence[Key], width: float) -> int:

@@ -45,14 +45,14 @@ def test_the_likeliest_law_before_follows_that_after(made):
     assert sum(row["before"] for row in rows) == len({row["key"] for row in rows})
 
 
-def test_the_page_is_of_the_after_model_and_says_its_reference(made, undrawn):
+def test_the_page_is_of_the_after_model_and_says_its_reference(made, unsaved):
     page = Page(build_report(*made.arguments).html)
     assert "at the reference state of its effects: cold contact (time 0)" in page.text
     assert re.search(r"value 95 % u sys before", page.text)
     assert "before, without the effects" in page.text
 
 
-def test_without_effects_nothing_is_doubled(undrawn):
+def test_without_effects_nothing_is_doubled(unsaved):
     made = aging_campaign(verdict="nothing_missing")
     tables = with_answer(made.tables)
     assert not any(name.endswith("_before") and name != "residuals_before" for name in tables)

@@ -281,6 +281,28 @@ def test_a_panel_of_the_page_holds_all_that_it_uses_and_nothing_of_its_neighbour
     assert drawn.png.startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize(
+    ("values", "power"),
+    [
+        ([0, 2e-5], "×10⁻⁵"),
+        ([1e7, 3e7], "×10⁷"),
+        ([0, 40], ""),
+        ([1e6 + 1, 1e6 + 2], "+10⁶"),
+        ([5e6, 5e6 + 2], "+5×10⁶"),
+    ],
+)
+def test_powers_of_ten_are_written_out_behind_the_title_of_an_axis(values, power):
+    def draw_values(ax):
+        ax.plot([0, 1], values)
+        ax.set_ylabel("force (N)")
+
+    axes = panel_figure(Panel("title", "alt", draw_values)).axes[0]
+    axes.figure.draw_without_rendering()
+    assert axes.get_ylabel() == ("force (N)   " + power).strip()
+    assert axes.yaxis.get_offset_text().get_visible() == (power == "")
+    assert axes.title.get_position()[1] == 1.0
+
+
 def test_every_panel_has_a_white_edge():
     for made in (aging_campaign(), torque_campaign()):
         for name, plot in draw_all(made.tables, made.closure, made.config).items():

@@ -172,7 +172,7 @@ def test_text_from_data_is_escaped():
 
 
 @pytest.mark.parametrize("missing", NAMES)
-def test_any_table_may_be_missing(missing, undrawn):
+def test_any_table_may_be_missing(missing, unsaved):
     made = aging_campaign(speeds=(1, 10), days=(4,))
     made.tables.pop(missing)
     Page(build_report(*made.arguments).html)
@@ -184,7 +184,7 @@ def test_with_no_tables_at_all_it_still_says_so():
         assert words in page.text
 
 
-def test_null_everywhere_is_a_page_too(undrawn):
+def test_null_everywhere_is_a_page_too(unsaved):
     made = aging_campaign(speeds=(1, 10), days=(4,))
     nothing = dict.fromkeys(made.closure["before"])
     made.closure.update(before=nothing, after=dict(nothing), noise_floor_N=None, heldout_unit=None, scatter=[])
@@ -204,14 +204,14 @@ def test_findings_are_counted_and_listed(pages):
     assert "friction force (N) jumps by 40 between two samples. Look at the cable." in text
 
 
-def test_many_findings_are_cut_and_counted(undrawn):
+def test_many_findings_are_cut_and_counted(unsaved):
     made = aging_campaign(speeds=(1, 10), days=(4,))
     row = made.tables["quality"].iloc[[-1]]
     made.tables["quality"] = pd.concat([row] * 900, ignore_index=True)
     assert "The first 400 of 900" in Page(build_report(*made.arguments).html).text
 
 
-def test_the_arguments_are_left_as_they_were(undrawn):
+def test_the_arguments_are_left_as_they_were(unsaved):
     made = aging_campaign(speeds=(1, 10), days=(4,))
     before = {name: frame.copy() for name, frame in made.tables.items()}
     left = dict(made.closure["left"])
@@ -232,7 +232,7 @@ def test_paper_sized_campaign_gives_a_page_that_can_be_mailed():
     )  # series, aging, channels, starts, traces, errors, levels, shape
 
 
-def test_empty_tables_may_lack_columns(undrawn):
+def test_empty_tables_may_lack_columns(unsaved):
     made = aging_campaign(speeds=(1, 10), days=(4,))
     made.tables["shapes"] = pd.DataFrame()
     made.tables["aging_curves"] = empty("aging_curves")

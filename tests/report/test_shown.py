@@ -69,7 +69,7 @@ def test_a_large_campaign_shows_twelve_panels_and_says_of_how_many(figure, large
     assert titles == sorted(titles, key=lambda title: [int(word) for word in title.split() if word.isdigit()])
 
 
-def test_the_page_says_what_is_not_drawn(large, undrawn):
+def test_the_page_says_what_is_not_drawn(large, unsaved):
     html = build_report(*large.arguments).html
     assert "12 of 14 panels are drawn" in html
     assert "12 of 14 series are drawn" in html

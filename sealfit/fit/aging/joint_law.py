@@ -173,8 +173,9 @@ def reference_of(tested: np.ndarray) -> float:
 # with T in kelvin and C the height while aging in percent. Temperature and compression change the rate of aging (w = 0:
 # time-temperature superposition, all series fall on one master curve over k t) or the loss itself (w = 1). mu_0 is that
 # of the unaged rubber, shared by all. phi is one of `sealfit.physics.aging_laws`; which shape and which way is chosen
-# by Schwarz's criterion, and the rivals are kept beside it.  Ferry 1980, Viscoelastic Properties of Polymers, chapter
-# 11 (superposition); ISO 11346 (life of rubber by Arrhenius).
+# by Schwarz's criterion, and the rivals are kept beside it.
+#
+# Ferry 1980, Viscoelastic Properties of Polymers, chapter 11 (superposition); ISO 11346 (life of rubber by Arrhenius).
 
 WAYS = ("rate", "loss")  # what temperature and compression change
 TURNS, SETTLED = 4, 0.02  # of the fit and the scatter, at most; relative change of the scatter that ends them
