@@ -111,11 +111,10 @@ class _Growth:
         self, rows: Rows, samples: pd.DataFrame, context: Context, fine: Rows | None, start: Start | None
     ) -> None:
         self.rows, self.context = rows, context
-        self.config, self.effects, self.say = context.config, context.effects, context.say
-        self.rng = np.random.default_rng(self.config.loop.seed)
+        self.rng = np.random.default_rng(self.context.config.loop.seed)
         ripples = Ripples(samples, context)
         self.before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
-        self.channels = {c.name: c for c in channels_of(rows, self.config)}
+        self.channels = {c.name: c for c in channels_of(rows, self.context.config)}
         self.judge = ScoreTests(self.before)
         self.last = self.first = self.searched()
         self.fitted = ripples.added_to(self.before, fine)
@@ -131,7 +130,7 @@ class _Growth:
     @property
     def alpha(self) -> float:
         """Level of error of the whole search."""
-        return self.config.loop.family_error
+        return self.context.config.loop.family_error
 
     def searched(self) -> tuple[Candidate, ...]:
         """Return every candidate of a single channel on the present model."""
@@ -153,11 +152,11 @@ class _Growth:
             if self.adds_two_of_direction(number):
                 return False
         open_ = self.open_candidates()
-        if not open_ or number > self.config.loop.max_rounds:
+        if not open_ or number > self.context.config.loop.max_rounds:
             return not self.renames()
         claimable, laws = self.shown.claimable, [p for _, p in self.shown.laws]
         open_ += [c for c in _standing_for(open_, claimable) if c.key not in self.refused]
-        proposals = propose(self.fitted, open_, self.channels, self.effects, laws)
+        proposals = propose(self.fitted, open_, self.channels, self.context.effects, laws)
         accepted = self.ask(self.fitted, proposals, number, self.not_confirmed)
         if accepted is None:
             self.refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
@@ -168,9 +167,11 @@ class _Growth:
 
     def look(self, number: int) -> _Shown:
         """Return what the present model lacks."""
-        shown = _shown(self.judge, self.last, self.channels, self.effects, self.alpha, self.rng)
+        shown = _shown(self.judge, self.last, self.channels, self.context.effects, self.alpha, self.rng)
         tried = f"{len(self.last)} candidates on {len(self.channels)} channels, {len(shown.pairs)} on pairs of them"
-        self.say(f"round {number}: {tried}; {len(shown.significant)} significant, {len(shown.hidden)} hide each other")
+        self.context.say(
+            f"round {number}: {tried}; {len(shown.significant)} significant, {len(shown.hidden)} hide each other"
+        )
         return shown
 
     def adds_two_of_direction(self, number: int) -> bool:
@@ -179,7 +180,7 @@ class _Growth:
         if self.hidden or two is None:
             return False
         awaited = _awaited([two], self.shown.claimable)
-        both = _both(self.fitted, awaited, self.channels, self.effects, self.ask, number)
+        both = _both(self.fitted, awaited, self.channels, self.context.effects, self.ask, number)
         if both:
             self.added = [*self.added, *both]
             self.fitted = fit(both[-1].proposal.fitted.model, self.rows, self.fitted.scatter, turns=2)
@@ -228,7 +229,7 @@ class _Growth:
         laws = self.shown.laws
         doubtful = [c for c in (*self.last, *(c for c, _ in laws)) if c.p_value <= self.alpha and not c.sure]
         if left is None and doubtful:
-            proposals = propose(self.fitted, doubtful, self.channels, self.effects, [p for _, p in laws])
+            proposals = propose(self.fitted, doubtful, self.channels, self.context.effects, [p for _, p in laws])
             others = tuple(rivals(proposals[0], proposals))
             left = doubtful[0]
             unsure = AcceptedEffect(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
