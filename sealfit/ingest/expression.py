@@ -184,7 +184,7 @@ class _Checked:
         function, fewest, most = FUNCTIONS[name]
         if not fewest <= len(arguments) <= most:
             wanted = str(fewest) if fewest == most else f"{fewest} to {most}"
-            raise ConfigError(f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.')
+            raise ConfigError(f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.', fix=_FIX)
         inner = [self.number(part, depth + 1) for part in arguments]
         return lambda values: function(*(part(values) for part in inner))
 
