@@ -1,4 +1,4 @@
-"""Which of several proposals is reported: equals by their rank, and only equals."""
+"""Which of several proposals is reported: equals by their rank, and only equals; and which are said to be rivals."""
 
 from types import SimpleNamespace
 
@@ -7,36 +7,190 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure import naming
+from sealfit.closure.linearised import ZERO_OFFSET, Proposal
+from sealfit.closure.naming import correlation, determined, named_among, rivals
 from sealfit.closure.ripples import Peak
 from sealfit.closure.selection import numbered
 from sealfit.effects import EFFECTS
+from sealfit.effects.free import free_effect
 from sealfit.fit.joint.estimate import fit_declared
-from sealfit.fit.joint.rows import make_rows
+from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.rows import Groups, make_rows
+from sealfit.fit.joint.tangent import Tangent
 
-PRICE = 11.5  # of a number, where many strokes are the evidence
+UNITS = 100  # log 100 = 4.6 a parameter
+CHANNELS = {
+    "warming_distance": ("distance_mm",), "warming_time": ("time_s",), "zero_offset": ("direction",),
+    "asymmetry": ("direction",), "offset_slope": ("oil_ppm", "direction"),
+}  # fmt: skip
+ALONG, ACROSS = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 
 
-def proposal(effect, acts_on, deviance, size):
-    effect = EFFECTS[effect]
-    term = SimpleNamespace(effect=effect, acts_on=acts_on, operation="multiply")
-    rank = (0 if effect.physical else 1, size, ("mu", "force").index(acts_on), 0)
-    fitted = SimpleNamespace(deviance=deviance)
-    bic = deviance + PRICE * size
-    return SimpleNamespace(term=term, fitted=fitted, size=size, rank=rank, bic=bic, source=(), column=np.ones(3))
+class HandFit:
+    """What naming reads of a joint fit: its effects' values with standard errors, each number told by one run."""
+
+    def __init__(self, deviance, terms, values, errors, left=0.0):
+        ends = np.cumsum([0, *(len(term.effect.parameters) for term in terms)])
+        self.deviance = deviance
+        self.model = SimpleNamespace(terms=terms, values=values, place=lambda k: slice(ends[k], ends[k + 1]))
+        self.covariance = np.diag(np.square(np.asarray(errors, dtype=float)))
+        self.white_jacobian = Tangent.dense(np.eye(ends[-1]))
+        self.rows = SimpleNamespace(groups=Groups.of({"run": np.arange(ends[-1])}))
+        self.unit_residual = lambda level: np.full(ends[-1], left)
+
+
+def numbers_of(effect):
+    return {p.name: 1.0 for p in effect.parameters}
+
+
+def proposal(effect, acts_on="mu", operation="multiply", *, behind=0.0, error=0.1, left=0.0, earlier=(), **more):
+    """A refitted proposal whose BIC is `behind` that of 0; `error` and `left` are those of each of its numbers."""
+    effect = EFFECTS[effect] if isinstance(effect, str) else effect
+    term = Term(effect, more.pop("channels", CHANNELS.get(effect.id, ("oil_ppm",))), acts_on, operation)
+    deviance = behind - len(effect.parameters) * np.log(UNITS)
+    terms, values = [t for t, _ in earlier] + [term], [v for _, v in earlier] + [numbers_of(effect)]
+    errors = np.full(sum(len(t.effect.parameters) for t in terms), error)
+    fitted = HandFit(deviance, terms, values, errors, left)
+    given = {"column": ALONG, "source": (term.channels, acts_on, operation)} | more
+    return Proposal(term, values[-1], "run", UNITS, 1.0, 1e-4, fitted=fitted, **given)
+
+
+@pytest.fixture
+def first_of(monkeypatch):
+    """Say which proposal is reported of some that are refitted already, on a model with some effects."""
+    monkeypatch.setattr(naming, "_refitted", lambda fitted, found: list(found))
+
+    def first(*found, before=()):
+        fitted = SimpleNamespace(model=SimpleNamespace(terms=[t for t, _ in before], values=[v for _, v in before]))
+        named = named_among(fitted, found)
+        assert sorted(map(id, named)) == sorted(map(id, found))  # none is lost, none comes twice
+        assert [p.bic for p in named[1:]] == sorted(p.bic for p in named[1:])
+        return named[0]
+
+    return first
+
+
+def test_a_proposal_costs_the_logarithm_of_the_units_for_each_number():
+    made = proposal("warming_distance", behind=7.0)
+    assert made.bic_penalty == pytest.approx(2 * np.log(100))
+    assert made.bic == pytest.approx(7.0)
+    assert proposal("product", channels=("oil_ppm", "dust_mg")).bic_penalty == pytest.approx(np.log(100) + 10.0)
+
+
+def test_of_none_none_is_named():
+    assert named_among(None, []) == []
+
+
+@pytest.mark.parametrize(
+    ("behind", "column", "named"),
+    [(2.9, ACROSS, "quadratic"), (3.1, ACROSS, "smooth"), (5.9, ALONG, "quadratic"), (6.1, ALONG, "smooth")],
+)
+def test_a_closed_form_comes_before_a_free_shape_that_is_hardly_better(first_of, behind, column, named):
+    """Hardly is twice as much where both add the same to the force."""
+    free = proposal(free_effect("smooth", {"knots": [0.0, 1.0, 2.0], "x_ref": 0.0}))
+    assert first_of(free, proposal("quadratic", behind=behind, column=column)).term.effect.id == named
+
+
+@pytest.mark.parametrize(("behind", "named"), [(7.5, "warming_distance"), (7.7, "log")])
+def test_a_mechanism_of_just_these_channels_need_not_pay_for_its_number_where_it_is_as_likely(first_of, behind, named):
+    """By hand: its second number costs log 100 = 4.6, and likelihoods are equal up to a deviance of 3."""
+    log = proposal("log", channels=("distance_mm",), column=ACROSS)
+    assert first_of(log, proposal("warming_distance", behind=behind)).term.effect.id == named
+
+
+def test_a_mechanism_whose_length_is_open_comes_after_a_straight_line_that_does_as_well(first_of):
+    log, line = (proposal(name, channels=("distance_mm",), column=ACROSS) for name in ("log", "linear"))
+    open_ended = proposal("warming_distance", behind=4.0, error=0.9)
+    assert first_of(log, open_ended) is open_ended
+    assert first_of(line, open_ended) is line
+
+
+@pytest.mark.parametrize(("error", "left", "known"), [(0.4, 0.0, True), (0.6, 0.0, False), (0.4, 4.0, False)])
+def test_a_time_constant_is_determined_where_its_error_is_less_than_half_of_it(error, left, known):
+    """By hand: with a whitened residual r for a run, the error that runs show is error^2 r = 0.64."""
+    assert determined(proposal("warming_time", error=error, left=left)) == known
+
+
+def test_amplitudes_and_phases_need_not_be_determined():
+    assert determined(proposal("linear", error=3.0))
+    ripple = proposal("ripple", "force", "add", channels=("displacement_mm",))
+    ripple.fitted.covariance = np.diag([9.0, 0.01, 9.0])
+    assert determined(ripple)
+    ripple.fitted.covariance = np.diag([9.0, 0.36, 9.0])
+    assert not determined(ripple)
+
+
+@pytest.mark.parametrize(("change", "named"), [(0.3, "log"), (0.4, "linear")])
+def test_of_equals_the_one_that_leaves_earlier_effects_alone_is_named(first_of, change, named):
+    term = Term(EFFECTS["asymmetry"], ("direction",), "mu", "multiply")
+    moved = proposal("log", earlier=[(term, {"A": 1.0 + change})])
+    other = proposal("linear", behind=1.0, earlier=[(term, {"A": 1.0})], channels=("dust_mg",))
+    assert first_of(moved, other, before=[(term, {"A": 1.0})]).term.effect.id == named
+
+
+def test_of_equals_friction_as_a_whole_comes_before_one_coefficient(first_of):
+    found = [proposal("linear", name, behind=k / 10) for k, name in enumerate(("sigma_2", "mu_s", "force", "mu"))]
+    assert first_of(*found).term.acts_on == "mu"
+
+
+@pytest.mark.parametrize(
+    ("behind", "column", "acts_on"), [(5.0, ALONG, "mu"), (7.0, ALONG, "force"), (5.0, ALONG + ACROSS, "force")]
+)
+def test_a_factor_on_friction_comes_before_a_gain_of_the_whole_force_where_both_add_the_same(
+    first_of, behind, column, acts_on
+):
+    gain = proposal("linear", "force")
+    assert first_of(gain, proposal("linear", "mu", behind=behind, column=column)).term.acts_on == acts_on
+
+
+def test_an_offset_of_the_amplifier_comes_before_friction_that_differs_by_direction(first_of):
+    offset = proposal("zero_offset", "force", "add", behind=2.0)
+    assert offset.source == ZERO_OFFSET
+    assert first_of(proposal("asymmetry"), offset) is offset
+
+
+def test_where_no_equal_is_determined_the_next_that_is_comes_first(first_of):
+    open_ended = proposal("saturation", error=0.9)
+    assert first_of(open_ended, proposal("quadratic", behind=9.0)).term.effect.id == "quadratic"
+    assert first_of(open_ended, proposal("quadratic", behind=11.0)) is open_ended
 
 
 @pytest.mark.parametrize(("behind", "first"), [(1.0, "mu"), (10.0, "force")])
-def test_a_mechanism_acts_on_what_the_strokes_say_where_they_say_it(behind, first, monkeypatch):
+def test_a_mechanism_acts_on_what_the_strokes_say_where_they_say_it(first_of, behind, first):
     """A logarithm with a number less is as good as both: what it saves does not make them equals of each other."""
-    monkeypatch.setattr(naming, "determined", lambda p: True)
-    monkeypatch.setattr(naming, "_overturns", lambda fitted, p: False)
+    saved = np.log(UNITS)
     found = [
-        proposal("log", "force", 0.0, 1),
-        proposal("warming_distance", "force", 0.6 - behind, 2),
-        proposal("warming_distance", "mu", 0.6, 2),
+        proposal("log", "force", channels=("distance_mm",), column=ACROSS),
+        proposal("warming_distance", "force", behind=saved + 0.6 - behind),
+        proposal("warming_distance", "mu", behind=saved + 0.6),
     ]
-    chosen = naming._ordered(None, found)[0]
+    chosen = first_of(*found)
     assert (chosen.term.effect.id, chosen.term.acts_on) == ("warming_distance", first)
+
+
+# ---------------------------------------------------------------- rivals
+def test_correlation_is_that_of_columns_whatever_their_sign_and_nothing_of_an_empty_one():
+    one, other = proposal("log"), proposal("linear", column=np.array([-1.0, 1.0]))
+    assert correlation(one, other) == pytest.approx(np.sqrt(0.5))
+    assert correlation(one, proposal("linear", column=np.zeros(2))) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("cosine", "behind", "told_apart"),
+    [(0.99, 50.0, False), (0.9, 9.0, False), (0.9, 11.0, True), (0.4, 1.0, True)],
+)
+def test_rivals_add_the_same_to_the_force_or_much_of_it_and_are_hardly_worse(cosine, behind, told_apart):
+    chosen = proposal("linear")
+    other = proposal("log", behind=behind, column=np.array([cosine, np.sqrt(1 - cosine**2)]))
+    assert rivals(chosen, [chosen, other]) == ([] if told_apart else [other])
+
+
+def test_one_equation_under_two_names_is_no_rival_of_itself():
+    chosen = proposal("warming_distance")
+    same = proposal("exponential_approach", channels=("distance_mm",))
+    assert rivals(chosen, [chosen, same]) == []
+    elsewhere = proposal("exponential_approach", "force", channels=("distance_mm",))
+    assert rivals(chosen, [chosen, elsewhere]) == [elsewhere]
 
 
 def test_rivals_are_told_apart_under_the_noise_that_the_effect_leaves():
