@@ -5,7 +5,16 @@ import pandas as pd
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.confirm import Context, Gain, confirmed, gain_between_settings, heldout_gain, varies_within
+from sealfit.closure.confirm import (
+    Context,
+    Gain,
+    about_means,
+    confirmed,
+    gain_between_settings,
+    heldout_gain,
+    unseen_N,
+    varies_within,
+)
 from sealfit.closure.heldout import blocks
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -55,6 +64,117 @@ def test_blocks_of_the_calendar_are_shorter_than_conditions_that_follow_one_anot
     assert all(np.unique(rows.condition[~out]).size == len(rows.conditions) for out in masks)
 
 
+# ---------------------------------------------------------------- the decision, on gains given by hand
+SAMPLES = pd.DataFrame({"force_N": np.random.default_rng(0).normal(size=50), "stroke_id": 0})
+FORCE = SimpleNamespace(rows=SimpleNamespace(force=np.full(3, 10.0)))
+
+
+def proposal(effect="smooth", channels=("run_order",), acts_on="mu", p_value=1e-9, physical=False):
+    own = SimpleNamespace(id=effect, physical=physical, label=effect)
+    term = SimpleNamespace(effect=own, channels=channels, acts_on=acts_on, operation="multiply")
+    return SimpleNamespace(term=term, p_value=p_value, unit="run")
+
+
+@pytest.fixture
+def decide(monkeypatch):
+    """Decide on proposals whose gains are given: held out by groups and by settings, and the force they add."""
+
+    def decided(proposals, gains, settings=(), added=1.0, samples=SAMPLES, **more):
+        held = dict(zip(map(id, proposals), gains, strict=True))
+        monkeypatch.setattr("sealfit.closure.confirm.heldout_gain", lambda before, p, *args: held[id(p)])
+        monkeypatch.setattr("sealfit.closure.confirm.gain_between_settings", lambda *args: settings)
+        monkeypatch.setattr("sealfit.closure.confirm._added_force", lambda p: np.full(3, added))
+        monkeypatch.setattr("sealfit.closure.confirm.rivals", lambda chosen, found: [p for p in found if p != chosen])
+        refused, said = [], []
+        context = Context(Config(), EFFECTS, **{"compare": False, "say": said.append} | more)
+        return confirmed(FORCE, proposals, samples, context, 2, refused), refused, said
+
+    return decided
+
+
+GOOD = Gain(0.5, 0.5, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("gain", "real", "share"),
+    [
+        (Gain(0.5, 1.5, 10.0, 2.0), True, 0.25),
+        (Gain(0.5, 1.5, 1.0, 2.0), False, 0.25),  # no more than its own scatter
+        (Gain(-0.5, 1.5, 10.0, 2.0), False, -0.5),
+        (Gain(0.0, 0.0, 0.0), False, 0.0),
+    ],
+)
+def test_a_gain_is_real_where_it_exceeds_its_scatter_and_lowers_the_error(gain, real, share):
+    assert gain.real == real
+    assert gain.share == pytest.approx(share)
+
+
+def test_the_first_that_gains_is_accepted_with_its_rivals_and_what_they_leave(decide):
+    first, second, third = (proposal(f"form {k}") for k in range(3))
+    gains = [Gain(-0.1, 1.1, 5.0), Gain(0.3, 0.7, 5.0), Gain(0.2, 0.8, 5.0)]
+    found, refused, said = decide([first, second, third], gains, compare=True)
+    assert (found.proposal, found.gain_N, found.left_N, found.round) == (second, 0.3, 0.7, 2)
+    assert found.rivals == (first, third)
+    assert found.rivals_rmse_N == (1.1, 0.8)
+    assert refused == []
+    assert said == [
+        "  round 2: form 0, factor on mu: held-out gain -0.1 N",
+        "  round 2: form 1, factor on mu: held-out gain 0.3 N",
+    ]
+    found, *_ = decide([first, second, third], gains)
+    assert np.isnan(found.rivals_rmse_N).all()  # not asked for
+
+
+def test_after_three_that_gain_nothing_none_is_tried_and_the_best_is_refused(decide):
+    found, refused, said = decide([proposal(f"form {k}") for k in range(4)], [Gain(-1, 2, -1)] * 3 + [GOOD])
+    assert found is None
+    assert [item.term.effect.id for item in refused] == ["form 0"]
+    assert len(said) == 3
+
+
+def test_what_is_not_significant_is_not_said_to_be_refused(decide):
+    found, refused, _ = decide([proposal(p_value=0.006)], [Gain(-1.0, 2.0, -1.0)])
+    assert found is None
+    assert refused == []
+
+
+STEPS = pd.DataFrame({"force_N": np.repeat([10.0, 10.1, 10.2], 40), "stroke_id": np.repeat([0, 1, 2], 40)})
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"gains": [Gain(0.5, 0.5, 1.0, 2.0)]}, "does not predict the data that were held out better"),
+        ({"gains": [Gain(0.01, 0.99, 9.0)], "p_value": 1e-4}, "lowers the held-out error by less than 5%"),
+        ({"added": 0.0019}, "smaller than the recorded force can show"),  # 2e-4 of 10 N
+        ({"added": 0.028, "samples": STEPS}, "smaller than the recorded force can show"),  # 0.1 N over sqrt(12)
+        ({"settings": [GOOD, Gain(-0.1, 1.0, 1.0)]}, "does not predict whole settings that were held out"),
+    ],
+)
+def test_why_a_proposal_is_refused_is_said(decide, given, reason):
+    given = {"gains": [GOOD], "p_value": 1e-9} | given
+    found, (refused,), _ = decide([proposal(p_value=given.pop("p_value"))], **given)
+    assert found is None
+    assert reason in refused.reason
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"gains": [Gain(0.01, 0.99, 9.0)]},  # a p-value that leaves no doubt
+        {"gains": [Gain(0.06, 0.94, 9.0)], "p_value": 1e-4},
+        {"added": 0.0021},
+        {"added": 0.029, "samples": STEPS},
+        {"settings": [GOOD, GOOD]},
+    ],
+)
+def test_what_just_suffices_is_accepted(decide, given):
+    given = {"gains": [GOOD], "p_value": 1e-9} | given
+    found, refused, _ = decide([proposal(p_value=given.pop("p_value"))], **given)
+    assert found is not None
+    assert refused == []
+
+
 @pytest.mark.parametrize(
     ("effect", "channels", "acts_on", "p_value", "claimed"),
     [
@@ -66,19 +186,25 @@ def test_blocks_of_the_calendar_are_shorter_than_conditions_that_follow_one_anot
         ("asymmetry", ("direction",), "sigma_2", 1e-4, True),
     ],
 )
-def test_a_free_shape_that_bends_the_curve_wants_more_evidence(
-    monkeypatch, effect, channels, acts_on, p_value, claimed
-):
-    monkeypatch.setattr("sealfit.closure.confirm.heldout_gain", lambda *args: Gain(0.5, 0.5, 10.0))
-    monkeypatch.setattr("sealfit.closure.confirm.gain_between_settings", lambda *args: [])
-    monkeypatch.setattr("sealfit.closure.confirm._added_force", lambda proposal: np.ones(3))
-    monkeypatch.setattr("sealfit.closure.confirm.describe", lambda term: term.acts_on)
-    own = SimpleNamespace(id=effect, physical=effect == "asymmetry")
-    term = SimpleNamespace(effect=own, channels=channels, acts_on=acts_on)
-    proposal = SimpleNamespace(term=term, p_value=p_value, unit="run")
-    fitted = SimpleNamespace(rows=SimpleNamespace(force=np.full(3, 10.0)))
-    samples = pd.DataFrame({"force_N": np.random.default_rng(0).normal(size=50), "stroke_id": 0})
-    refused = []
-    found = confirmed(fitted, [proposal], samples, Context(Config(), EFFECTS, compare=False), 1, refused)
+def test_a_free_shape_that_bends_the_curve_wants_more_evidence(decide, effect, channels, acts_on, p_value, claimed):
+    made = proposal(effect, channels, acts_on, p_value, physical=effect == "asymmetry")
+    found, refused, _ = decide([made], [GOOD])
     assert (found is not None) == claimed
     assert [item.weak for item in refused] == ([] if claimed else [True])
+
+
+# ---------------------------------------------------------------- what a recorder resolves
+def test_a_recorder_hides_what_is_less_than_the_rounding_of_its_steps():
+    assert unseen_N(STEPS) == pytest.approx(0.1 / np.sqrt(12))
+    rng = np.random.default_rng(0)
+    noisy = STEPS.assign(force_N=(STEPS["force_N"] + rng.normal(0, 0.1, len(STEPS))).round(1))
+    assert unseen_N(pd.concat([noisy] * 9)) == 0.0  # noise of a step spreads the rounding, and means resolve less
+    assert unseen_N(STEPS.assign(force_N=rng.normal(10, 0.1, len(STEPS)))) == 0.0  # no steps
+    assert unseen_N(STEPS.assign(force_N=10.0)) == 0.0
+
+
+def test_means_are_taken_in_groups_and_directions():
+    rows = SimpleNamespace(codes=lambda level: np.array([0, 0, 0, 1, 1, 1]), speed=np.array([1, 1, -1, 1, -1, -1]))
+    values = np.array([1.0, 3.0, 5.0, 7.0, 2.0, 6.0])
+    assert about_means(values, rows, "run").tolist() == [-1.0, 1.0, 0.0, 0.0, -2.0, 2.0]
+    assert about_means(values, rows, None) is values
