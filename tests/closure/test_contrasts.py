@@ -45,10 +45,10 @@ def tilted(level, size_N, seed):
 def test_slopes_that_specimens_or_runs_have_at_random_are_no_effect(days, level):
     smallest = [
         strongest(make_bins(seed, days=days, speeds=FEW_SPEEDS, repeats=2, bins=8, effect=tilted(level, 0.5, seed)))
-        for seed in range(12)
+        for seed in range(8)
     ]
-    assert min(smallest) > 0.0005  # the least of 12 uniform numbers is smaller in 6 of 1,000
-    assert sum(p < 0.05 for p in smallest) <= 3  # more in 2 of 1,000
+    assert min(smallest) > 0.0005  # the least of 8 uniform numbers is smaller in 4 of 1,000
+    assert sum(p < 0.05 for p in smallest) <= 2  # more in 6 of 1,000; of p-values below 0.05 half the time, in 86 %
 
 
 def test_the_same_slope_in_a_few_specimens_is_an_effect():
