@@ -25,6 +25,7 @@ name = "pipeline"
 seed = 11
 [design]
 days = [2, 4, 8, 16]
+speeds_mm_s = [0.5, 2, 5, 20, 50]
 repeats = 2
 max_rows = 120
 [[noise]]
@@ -78,10 +79,7 @@ def campaign(tmp_path_factory):
 @pytest.fixture(scope="module")
 def first(campaign):
     out = campaign.parent / "out"
-    began = time.monotonic()
-    run = sealfit("run", campaign, "--out", out)
-    run.seconds = time.monotonic() - began
-    return out, run
+    return out, sealfit("run", campaign, "--out", out)
 
 
 def test_a_run_gives_every_table_with_its_schema(first):
@@ -124,10 +122,10 @@ def test_a_run_ends_with_a_short_summary(first):
     out, run = first
     lines = run.stdout.splitlines()
     assert 7 <= len(lines) <= 14
-    assert lines[0] == "files       80 used, 0 left out"
+    assert lines[0] == "files       50 used, 0 left out"
     assert "verdict     nothing_missing: nothing was found that the declared model misses" in run.stdout
     assert lines[-1] == f"report      {out / 'report.html'}"
-    assert "reading trace files: 80 of 80" in run.stderr
+    assert "reading trace files: 50 of 50" in run.stderr
 
 
 def test_a_second_run_redoes_nothing_and_says_the_same(first, campaign):
@@ -151,7 +149,7 @@ def test_json_is_one_object_with_the_same_figures(first, campaign):
     said = json.loads(sealfit("run", campaign, "--out", out, "--json").stdout, parse_constant=pytest.fail)
     assert said["ok"] is True
     assert said["done"] == []
-    assert said["ingest"]["files"]["used"] == 80
+    assert said["ingest"]["files"]["used"] == 50
     assert said["close_loop"]["verdict"] == "nothing_missing"
     assert Path(said["report"]["file"]).is_file()
 
@@ -193,13 +191,22 @@ def test_a_changed_file_is_found_and_everything_after_it_redone(first, campaign,
     assert sealfit("check", copy, code=1).stdout.endswith("1 fault found.\n")
 
 
+def locked(out):
+    until = time.monotonic() + 20
+    while not (out / ".lock").exists() and time.monotonic() < until:
+        time.sleep(0.02)
+
+
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 def test_kills_lose_nothing_and_the_next_run_goes_on(first, campaign, tmp_path):
-    whole, timed = first
+    whole, _ = first
     out = tmp_path / "out"
-    for share in (0.2, 0.3, 0.4, 0.5, 0.5, 0.6):  # of a whole run; each goes on where the one before it was killed
+    for said in (None, "fitting 5", "fitting the pre", "round 1", "drawing"):  # each goes on where the last one ended
         run = started("run", campaign, "--out", out)
-        time.sleep(share * timed.seconds)
+        if said is None:
+            locked(out)
+        else:
+            assert any(line.startswith(said) for line in run.stderr)
         os.killpg(run.pid, signal.SIGKILL)
         run.communicate()
         if not (out / "state.json").exists():
@@ -218,25 +225,21 @@ def test_kills_lose_nothing_and_the_next_run_goes_on(first, campaign, tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 @pytest.mark.parametrize("said", ["fitting", "round 1"])
-def test_ctrl_c_ends_at_once_with_one_line(campaign, tmp_path, said):
+def test_ctrl_c_ends_a_run_with_one_line(campaign, tmp_path, said):
     run = started("run", campaign, "--out", tmp_path / "out")
-    while not run.stderr.readline().startswith(said):  # an end of the output gives "", which runs into the time limit
-        assert run.poll() is None
+    assert any(line.startswith(said) for line in run.stderr)
     os.killpg(run.pid, signal.SIGINT)
-    began = time.monotonic()
-    _, stderr = run.communicate(timeout=30)
-    assert time.monotonic() - began < 5
+    _, stderr = run.communicate(timeout=60)
     assert run.returncode == 130
     assert stderr.splitlines()[-1] == "sealfit: interrupted; what was complete before is kept."
     assert "Traceback" not in stderr
+    assert Store.open(tmp_path / "out").why_stale("close-loop")  # it did not go on to the end of the step
 
 
 def test_a_second_run_at_the_same_time_is_refused(campaign, tmp_path):
     out = tmp_path / "out"
     with started("run", campaign, "--out", out) as run:
-        until = time.monotonic() + 20
-        while not (out / ".lock").exists() and time.monotonic() < until:
-            time.sleep(0.02)
+        locked(out)
         time.sleep(0.1)
         os.killpg(run.pid, signal.SIGSTOP)  # a small campaign may be done before the second has started
         refused = sealfit("run", campaign, "--out", out, code=1)

@@ -24,13 +24,13 @@ def close(bins):
 
 @pytest.fixture(scope="module")
 def null():
-    bins = make_bins(3, **SCATTER)
+    bins = make_bins(3, bins=8, **SCATTER)
     return bins, close(bins)
 
 
 @pytest.fixture(scope="module")
 def warming():
-    bins = make_bins(3, effect=warm, **SCATTER)
+    bins = make_bins(3, temperatures=(60.0,), bins=8, effect=warm, **SCATTER)
     return bins, close(bins)
 
 
@@ -100,9 +100,8 @@ def points_of(bins):
 
 def test_predict_carries_the_effect_and_agrees_with_the_fit(warming):
     bins, closure = warming
-    points = points_of(bins)
-    answer = predict(closure.model, points)
-    after = closure.tables["residuals_after"].groupby("run_id", sort=False).first()
+    ends, after = (t.groupby("run_id", sort=False).last() for t in (bins, closure.tables["residuals_after"]))
+    answer = predict(closure.model, ends.reset_index())
     npt.assert_allclose(answer["force_after_N"], after["model_N"], rtol=1e-3)  # there the mean over a bin
     assert (answer["force_after_lo95_N"] < answer["force_after_N"]).all()
     assert (
@@ -156,7 +155,7 @@ def test_an_effect_of_sliding_power_is_found_and_predicted_from_load_and_speed()
         load = 50.0 * 2.0 ** (table["repeat"].to_numpy() - 2.0)
         return force * load / 49.03 * (1 - 0.1 * np.exp(-((np.log(load * table["speed_mm_s"].abs() / 400) / 0.7) ** 2)))
 
-    bins = make_bins(3, effect=warm_when_hard_driven, bins=4, setup=0.003, noise_N=0.1)
+    bins = make_bins(3, temperatures=(60.0,), effect=warm_when_hard_driven, bins=2, setup=0.003, noise_N=0.1)
     bins["load_N"] = 50.0 * 2.0 ** (bins["repeat"] - 2.0)
     bins["run_id"] = bins["run_id"] + "|" + bins["load_N"].astype(str)
     made = close(bins)
