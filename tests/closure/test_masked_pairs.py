@@ -40,8 +40,9 @@ def test_a_slope_along_strokes_and_its_change_with_pressure_hide_each_other():
 
 
 def test_pairs_of_chance_are_not_found_too_often():
-    bins = (make_bins(seed, speeds=FOUR, repeats=1, run_channels=PRESSURE, **ONE) for seed in range(30))
-    assert sum(bool(hidden(own, alpha=0.1)) for own in bins) <= 6  # 10 %: more than 6 of 30 with p 0.03
+    """By chance in 10 %: in more than 5 of 20 with p 0.01; were it 40 %, in more than 5 of 20 with p 0.87."""
+    bins = (make_bins(seed, speeds=FOUR, repeats=1, run_channels=PRESSURE, **ONE) for seed in range(20))
+    assert sum(bool(hidden(own, alpha=0.1)) for own in bins) <= 5
 
 
 def test_growth_in_one_direction_is_found_and_named():

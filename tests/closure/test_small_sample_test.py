@@ -54,7 +54,7 @@ def test_many_units_are_made_independent_as_few_are():
 def test_p_values_along_a_dozen_specimens_are_not_too_small():
     smallest = []
     for seed in range(24):
-        rows = rows_of(seed + 500, specimen=0.02)
+        rows = rows_of(seed + 500, specimen=0.02, speeds=(1.0, 4.0, 16.0, 64.0))
         days = [c for c in find_channels(rows) if c.name == "aging_days"]
         found = search(ScoreTests(fit_declared(rows)), days, np.random.default_rng(seed))
         smallest.append(min(c.p_value for c in found))

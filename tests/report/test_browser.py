@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+from functools import cache
 
 import pytest
 from report.made_campaigns import aging_campaign, not_run, torque_campaign
@@ -35,7 +36,7 @@ pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium on PATH")
 @pytest.mark.parametrize("width", [1400, 400])
 @pytest.mark.parametrize("make", [aging_campaign, torque_campaign, not_run])
 def test_nothing_overflows_and_every_image_shows(make, width, tmp_path):
-    html = build_report(*make().arguments).html
+    html = html_of(make)
     page = tmp_path / "frame.html"
     text = json.dumps(html).replace("</", "<\\/")
     page.write_text(FRAME.replace("WIDTH", str(width)).replace("PAGE", text), "utf-8")
@@ -44,6 +45,11 @@ def test_nothing_overflows_and_every_image_shows(make, width, tmp_path):
     assert scroll <= width
     assert right <= width
     assert shown == images > 0
+
+
+@cache
+def html_of(make):
+    return build_report(*make().arguments).html
 
 
 def measured(page, folder):
