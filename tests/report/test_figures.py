@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from report.made_campaigns import Made, aging_campaign, not_run, paper_sized, torque_campaign
+from report.made_campaigns import Made, aging_campaign, not_run, torque_campaign
 from report.made_tables import DROP, empty, shapes, table
 
 from sealfit.config import Config
@@ -17,7 +17,7 @@ from sealfit.report.figures import draw_all
 from sealfit.report.figures.aging import draw_aging, draw_master_curve, draw_trace, envelope, example_runs, traces_mean
 from sealfit.report.figures.residual import channel_order, draw_channel, draw_errors, draw_levels, draw_shape, run_means
 from sealfit.report.figures.speed import curve_lines, force_speed, run_points
-from sealfit.report.style import Key, Panel, Plot, draw, is_logarithmic, panel_figure, value_ticks
+from sealfit.report.style import Key, Panel, Plot, compose, draw, is_logarithmic, panel_figure, value_ticks
 from sealfit.units import Units
 
 TORQUE = Units({"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")})
@@ -31,6 +31,15 @@ def ax():
 @pytest.fixture(scope="module")
 def made():
     return aging_campaign()
+
+
+@pytest.fixture(scope="module")
+def twelve_series():
+    """A campaign of the paper's series, with two days, speeds and bins of each."""
+    return aging_campaign(
+        temperatures=(20, 40, 60, 80), compressions=(80, 90, 100), days=(4, 16), speeds=(1, 10), bins_per_file=2,
+        trace_points=50,
+    )  # fmt: skip
 
 
 # ---------------------------------------------------------------- force against speed
@@ -64,8 +73,8 @@ def test_every_series_has_a_panel_with_its_days_and_the_unaged(made):
     assert all("4 conditions" in panel.alt for panel in plot.panels)
 
 
-def test_all_panels_share_one_scale():
-    plot = force_speed(paper_sized().tables, Config())
+def test_all_panels_share_one_scale(twelve_series):
+    plot = force_speed(twelve_series.tables, Config())
     assert len(plot.panels) == 12
     assert len({panel_figure(panel).axes[0].get_ylim() for panel in plot.panels}) == 1
 
@@ -306,15 +315,18 @@ def test_powers_of_ten_are_written_out_behind_the_title_of_an_axis(values, power
 def test_every_panel_has_a_white_edge():
     for made in (aging_campaign(), torque_campaign()):
         for name, plot in draw_all(made.tables, made.closure, made.config).items():
-            white = imread(io.BytesIO(draw(plot).png))[::-1].min(axis=2) == 1.0
-            assert edge(white).all(), name
+            assert edge(white_of(compose(plot))).all(), name
             for panel in plot.panels:
-                buffer = io.BytesIO()
-                panel_figure(panel).savefig(buffer, format="png")
-                buffer.seek(0)
-                white = imread(buffer).min(axis=2) == 1.0
+                white = white_of(panel_figure(panel))
                 assert edge(white).all(), f"{name}: {panel.title}"
                 assert not white.all()
+
+
+def white_of(figure):
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    buffer.seek(0)
+    return imread(buffer).min(axis=2) == 1.0
 
 
 def edge(image):
@@ -323,15 +335,15 @@ def edge(image):
 
 @pytest.mark.parametrize("verdict", ["closed", "nothing_missing", "unexplained"])
 def test_no_panel_is_empty(verdict):
-    made: Made = aging_campaign(verdict=verdict)
+    made: Made = aging_campaign(verdict=verdict, speeds=(1, 10), days=(4,))
     for name, plot in draw_all(made.tables, made.closure, made.config).items():
         for panel in plot.panels:
             assert panel_figure(panel).axes[0].has_data(), name
             assert len(panel.alt) > 20
 
 
-def test_the_rows_of_the_example_runs_alone_give_the_same_traces():
-    made = paper_sized()
+def test_the_rows_of_the_example_runs_alone_give_the_same_traces(twelve_series):
+    made = twelve_series
     whole, rows = traces_mean(made.tables, made.config), made.tables["traces_mean"]
     chosen = example_runs(rows[["run_id", "condition"]].drop_duplicates(), made.tables["runs"])
     assert len(chosen) == 6 < rows["run_id"].nunique()
