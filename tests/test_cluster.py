@@ -183,14 +183,22 @@ def campaign(tmp_path_factory):
     return folder / "c", results(folder / "here")
 
 
-@pytest.mark.parametrize("at", ["reading trace files", "fold 1 of"], ids=["in ingest", "in the folds"])
-def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
-    campaign, tmp_path, dask, monkeypatch, at
-):
+def test_files_read_on_a_cluster_give_the_same_although_a_worker_is_killed(campaign, tmp_path, dask, monkeypatch):
+    folder, (here, _) = campaign
+    monkeypatch.setattr(partitions, "PART_FILES", 12)
+    kills = KillsAt(dask.workers[1], "reading trace files")
+    run(folder, tmp_path / "there", steps=("ingest",), scheduler=str(dask.file), progress=kills)
+    assert kills.killed
+    there = Store.open(tmp_path / "there")
+    for name in INGESTED:
+        pdt.assert_frame_equal(there.read(name), here[name], check_exact=True, obj=name)
+
+
+def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(campaign, tmp_path, dask, monkeypatch):
     folder, (here, closure) = campaign
     monkeypatch.setattr(partitions, "PART_FILES", 12)
     monkeypatch.setattr(loop, "JACKKNIFE_UNITS", 6)
-    kills = KillsAt(dask.workers[1], at)
+    kills = KillsAt(dask.workers[1], "fold 1 of")
     run(folder, tmp_path / "there", steps=STEPS[:-1], scheduler=str(dask.file), progress=kills)
     assert kills.killed
     assert_same_results(tmp_path / "there", here, closure)
