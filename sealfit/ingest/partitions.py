@@ -18,8 +18,8 @@ from sealfit.errors import Fault
 from sealfit.ingest.averages import bin_table, mean_traces
 from sealfit.ingest.categorical import condition_columns, keys_of
 from sealfit.ingest.file_names import Listing
-from sealfit.ingest.files import as_number
-from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_files
+from sealfit.ingest.files import Folder, as_number
+from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_strokes
 from sealfit.store.manifest import Fingerprint
 from sealfit.store.parquet import as_dictionary, to_arrow
 from sealfit.tables import BINS, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
@@ -175,7 +175,7 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
     config : Config
         The rig.
     """
-    files = read_files(asked.refs, campaign, config)
+    files = read_strokes(asked.refs, Folder(campaign), config)
     strokes = stroke_columns(files, config)
     known = pa.table({name: _array(values) for name, values in strokes.items()})
     found = tuple(FileFound(made.file, made.mark, made.rows, len(made.strokes)) for made in files)

@@ -195,8 +195,10 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     return Made(marks, rows, count, part.faults, None, asked.unused, asked.columns, columns, {}, stored)
 
 
-def stored_strokes(part: Made, folder: Path) -> pa.Table:
-    """Return the strokes of a part that was made in `folder`."""
+def stored_strokes(part: Made, folder: Path | None) -> pa.Table:
+    """Return the strokes of a part, from the disk if they lie there: in `folder`, in which it was made."""
+    if part.strokes is not None:
+        return part.strokes
     return parquet.read_ipc(folder / next(name for name in part.stored if name.startswith(f"{PARTS}/")))
 
 
