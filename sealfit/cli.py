@@ -150,7 +150,12 @@ def ingest(
     as_json: Json = False,
 ) -> None:
     """Read a campaign into tables of traces."""
-    _run(("ingest",), campaign, out, config, workers, scheduler, force, strict, profile, as_json)
+    options = _options(workers, scheduler, force=force, strict=strict)
+
+    def work(pipeline, progress):
+        return pipeline.ingest(campaign, out, config, progress=progress, **options)
+
+    _do("ingest", profile, as_json, work)
 
 
 @app.command("fit-steady")
@@ -163,7 +168,7 @@ def fit_steady(
     as_json: Json = False,
 ) -> None:
     """Fit steady LuGre to each condition."""
-    _single("fit-steady", out, force, profile, as_json, workers, scheduler)
+    _single("fit-steady", out, profile, as_json, **_options(workers, scheduler, force=force))
 
 
 @app.command("fit-aging")
@@ -176,7 +181,7 @@ def fit_aging(
     as_json: Json = False,
 ) -> None:
     """Fit the aging law across days."""
-    _single("fit-aging", out, force, profile, as_json, workers, scheduler)
+    _single("fit-aging", out, profile, as_json, **_options(workers, scheduler, force=force))
 
 
 @app.command("fit-dynamic")
@@ -189,7 +194,7 @@ def fit_dynamic(
     as_json: Json = False,
 ) -> None:
     """Fit sigma_0 and sigma_1 to the pre-sliding part."""
-    _single("fit-dynamic", out, force, profile, as_json, workers, scheduler)
+    _single("fit-dynamic", out, profile, as_json, **_options(workers, scheduler, force=force))
 
 
 @app.command("close-loop")
@@ -203,13 +208,14 @@ def close_loop(
     as_json: Json = False,
 ) -> None:
     """Find, name and add what the model lacks."""
-    _single("close-loop", out, force, profile, as_json, workers, scheduler, effects_folder=effects_folder)
+    options = _options(workers, scheduler, force=force, effects_folder=effects_folder)
+    _single("close-loop", out, profile, as_json, **options)
 
 
 @app.command()
 def report(out: Results, force: Force = False, profile: Profile = False, as_json: Json = False) -> None:
     """Write report.html and its plots."""
-    _single("report", out, force, profile, as_json)
+    _single("report", out, profile, as_json, force=force)
 
 
 @app.command()
@@ -225,11 +231,13 @@ def run(
     profile: Profile = False,
     as_json: Json = False,
 ) -> None:
-    """Do every step that is not current, in order."""
-    from sealfit.store.manifest import STEPS
+    """Run all out-of-date steps, in order."""
+    options = _options(workers, scheduler, force=force, strict=strict, effects_folder=effects_folder)
 
-    own = {"effects_folder": effects_folder}
-    _run(STEPS, campaign, out, config, workers, scheduler, force, strict, profile, as_json, **own)
+    def work(pipeline, progress):
+        return pipeline.run(campaign, out, config, progress=progress, **options)
+
+    _do("run", profile, as_json, work)
 
 
 @app.command()
@@ -240,7 +248,7 @@ def predict(
     effects_folder: EffectsFolder = None,
     as_json: Json = False,
 ) -> None:
-    """Answer the force at new points."""
+    """Predict the force at new points."""
     from sealfit import commands, progress
     from sealfit.report import summary_lines
 
@@ -261,13 +269,12 @@ def lifetime(
     model: Annotated[str, typer.Option("--model", help="after (with the loop's effects) or before.")] = "after",
     as_json: Json = False,
 ) -> None:
-    """Tell the days until a quantity reaches a threshold."""
+    """Compute the days until a quantity reaches a threshold."""
     from sealfit import commands
     from sealfit.report import summary_lines
 
-    asked = {"quantity": quantity, "threshold": threshold, "loss_pct": loss, "law": law, "model": model}
-    asked |= {"temperature_C": temperature, "compression_pct": compression, "years": years}
-    end("lifetime", commands.lifetime(out, **asked), summary_lines.lifetime_lines, as_json)
+    asked = commands.LifetimeRequest(quantity, threshold, loss, temperature, compression, years, law, model)
+    end("lifetime", commands.lifetime(out, asked), summary_lines.lifetime_lines, as_json)
 
 
 @app.command()
@@ -326,41 +333,7 @@ def check(
 
 
 # ---------------------------------------------------------------- what the commands share
-def _run(
-    names: tuple[str, ...],
-    campaign: Path,
-    out: Path,
-    config: Path | None,
-    workers: int | None,
-    scheduler: str | None,
-    force: bool,
-    strict: bool,
-    profile: bool,
-    as_json: bool,
-    **options: Path | None,
-) -> None:
-    count = _workers(workers, scheduler)
-    options |= {"workers": count, "scheduler": scheduler, "force": force, "strict": strict}
-    command = "ingest" if len(names) == 1 else "run"
-    _do(
-        command,
-        profile,
-        as_json,
-        lambda pipeline, progress: pipeline.run(campaign, out, config, steps=names, progress=progress, **options),
-    )
-
-
-def _single(
-    step: str,
-    out: Path,
-    force: bool,
-    profile: bool,
-    as_json: bool,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    **options: Path | None,
-) -> None:
-    options |= {"workers": _workers(workers, scheduler), "scheduler": scheduler, "force": force}
+def _single(step: str, out: Path, profile: bool, as_json: bool, **options: object) -> None:
     _do(step, profile, as_json, lambda pipeline, progress: pipeline.single(step, out, progress=progress, **options))
 
 
@@ -374,6 +347,11 @@ def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
     if profile:
         made["profile"] = progress.as_dicts(parts)
     end(command, made, lambda made: summary_lines.lines(made) + progress.lines(made.get("profile", ())), as_json)
+
+
+def _options(workers: int | None, scheduler: str | None, **more: object) -> dict:
+    """Return the options of `pipeline.Options`."""
+    return {"workers": _workers(workers, scheduler), "scheduler": scheduler, **more}
 
 
 def _workers(workers: int | None, scheduler: str | None) -> int:
