@@ -167,7 +167,7 @@ def ingest_campaign(
     make = partial(make_part, campaign=campaign, config=config, folder=place.folder)
     reader = _Reader(make, [listing.take(rows) for rows in plan], workers, on_file)
     with timed("reading trace files") as part:
-        parts = reader.parts(_known_parts(listing, plan, marks, place, config))
+        parts = reader.parts(_known_parts(reader.listings, marks, place, config))
         part.rows, part.of = reader.reread, "files"
     faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: marks.places[fault.file])
     files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
@@ -205,7 +205,7 @@ def _plan(campaign: Path, listing: Listing, marks: Fingerprints) -> list[np.ndar
         _size(os.path.join(campaign, file)) if size is None else size
         for file, size in zip(listing.files, marks.size, strict=True)
     ]
-    plan = plan_parts(listing.conditions.cells(), listing.columns["run_id"].cells(), sizes)
+    plan = plan_parts(listing.conditions, listing.columns["run_id"], sizes)
     return [np.array(files) for files in plan]
 
 
@@ -216,19 +216,12 @@ def _size(path: str) -> int:
         return 0
 
 
-def _known_parts(
-    listing: Listing, plan: Sequence[np.ndarray], marks: Fingerprints, place: Place, config: Config
-) -> dict[int, Made]:
+def _known_parts(listings: Sequence[Listing], marks: Fingerprints, place: Place, config: Config) -> dict[int, Made]:
     """Return the parts that are stored, by their numbers in the plan."""
-    if not place.known:
-        return {}
-    words, made, seen = listing.words(), {}, seen_by_parts(config)
-    known = {name: column.known for name, column in listing.columns.items()}
-    for i, rows in enumerate(plan):
-        files = [listing.files[row] for row in rows.tolist()]
-        hashes = [marks.sha256[row] for row in rows.tolist()]
-        cells = {name: column[rows] for name, column in words.items() if known[name][rows].any()}
-        path = place.known.get(part_key(files, cells, hashes, seen) or "")
+    made, seen = {}, seen_by_parts(config)
+    for i, listing in enumerate(listings if place.known else ()):
+        hashes = [marks[file].sha256 for file in listing.files]
+        path = place.known.get(part_key(listing, hashes, seen) or "")
         if path is not None:
             made[i] = load_part(path)
     return made
