@@ -66,7 +66,7 @@ def inputs_table(
     """
     others: dict[str, str] = {}  # files that are not in the listing, and their status
     for fault in faults:
-        if fault.file is not None and fault.file not in marks.places and fault.action == "file left out":
+        if fault.file is not None and fault.file not in marks and fault.action == "file left out":
             others.setdefault(fault.file, "left out" if fault.severity == "error" else "not matched")
     marks |= {file: fingerprint(campaign / file) for file in others}
     counts = np.zeros((2, len(marks)), np.int64)
@@ -74,15 +74,15 @@ def inputs_table(
     table = pd.DataFrame(
         {
             "file": pd.array(list(marks), "str"),
-            "size": pd.array(marks.size, "Int64"),
-            "mtime_ns": pd.array(marks.mtime_ns, "Int64"),
-            "sha256": pd.array(marks.sha256, "str"),
+            "size": pd.array([mark.size for mark in marks.values()], "Int64"),
+            "mtime_ns": pd.array([mark.mtime_ns for mark in marks.values()], "Int64"),
+            "sha256": pd.array([mark.sha256 for mark in marks.values()], "str"),
             "rows": counts[0],
             "strokes": counts[1],
             "status": pd.array([*np.where(used, "used", "left out").tolist(), *others.values()], "str"),
         }
     )
-    return table, marks.readable()
+    return table, {file: mark for file, mark in marks.items() if mark.sha256 is not None}
 
 
 # ---------------------------------------------------------------- campaign
@@ -111,7 +111,7 @@ class Place:
 
     folder: Path | None = None
     known: Mapping[str, Path] = field(default_factory=dict)
-    marks: Fingerprints = field(default_factory=Fingerprints)
+    marks: Fingerprints = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def ingest_campaign(
     place = place or Place()
     with timed("listing trace files") as part:
         listing, faults = list_traces(campaign, config)
-        marks = place.marks.take(listing.files)
+        marks = {file: place.marks.get(file, Fingerprint()) for file in listing.files}
         plan = _plan(campaign, listing, marks)
         part.rows, part.of = len(listing), "files"
     make = partial(make_part, campaign=campaign, config=config, folder=place.folder)
@@ -169,7 +169,8 @@ def ingest_campaign(
     with timed("reading trace files") as part:
         parts = reader.parts(_known_parts(reader.listings, marks, place, config))
         part.rows, part.of = reader.reread, "files"
-    faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: marks.places[fault.file])
+    order = {file: i for i, file in enumerate(listing.files)}
+    faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: order[fault.file])
     files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
     order = np.argsort(files, kind="stable")
     strokes = strokes_of([stored_strokes(part, place.folder) for part in parts]).take(order).reset_index(drop=True)
@@ -202,8 +203,7 @@ def ingest_campaign(
 def _plan(campaign: Path, listing: Listing, marks: Fingerprints) -> list[np.ndarray]:
     """Return the files of each part, by their numbers in the listing."""
     sizes = [
-        _size(os.path.join(campaign, file)) if size is None else size
-        for file, size in zip(listing.files, marks.size, strict=True)
+        _size(os.path.join(campaign, file)) if marks[file].size is None else marks[file].size for file in listing.files
     ]
     plan = plan_parts(listing.conditions, listing.columns["run_id"], sizes)
     return [np.array(files) for files in plan]
@@ -239,7 +239,7 @@ class _Reader:
     listings: Sequence[Listing]
     workers: int
     on_file: Callable[[int, int], None] | None
-    marks: dict[str, Fingerprint] = field(default_factory=dict)
+    marks: Fingerprints = field(default_factory=dict)
     reread: int = 0
 
     def parts(self, known: Mapping[int, Made]) -> list[Made]:
