@@ -60,9 +60,12 @@ def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.
 # Where a cut lies depends on the runs beside it alone (content-defined chunking), so files that are added to a campaign
 # change the part they belong to and, at most, its neighbours; everything else stays as it is on the disk.
 
-PART_FILES = 256  # a part of so many files is stored in one file a table: few enough files, and little to read for one
-PART_BYTES = 4_000_000  # condition; of trace files, whichever comes first: a part's samples take some ten times that
-LEAST, MOST = 0.25, 2.0  # smallest and largest part, in parts as wanted; a run is never cut
+# Files of a part: few enough to be read for one condition, many enough that 100,000 files are some 400 parts.
+PART_FILES = 256
+# Bytes of trace files of a part, if these come first. Its samples take some ten times that in memory.
+PART_BYTES = 4_000_000
+# Smallest and largest part, as multiples of the size above. A run is never cut.
+LEAST, MOST = 0.25, 2.0
 
 
 def plan_parts(conditions: Sequence[str], runs: Sequence[str], sizes: Sequence[int]) -> list[list[int]]:

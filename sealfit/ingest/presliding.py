@@ -9,24 +9,42 @@ import numpy as np
 
 from sealfit.ingest.segments import median, quantile
 
-SETTLED = np.log(50000.0)  # the rise is over when 1/50000 is left: 1/5000 showed in means over a campaign
-AFTER_RAMP = 3.0  # rise lengths after the speed ramp: the bristles follow the changing speed over one rise length
-ENOUGH = np.log(100.0)  # where 1/50000 would take more than a third of the stroke, 1 % of the rise may stay
-HALF_WAY = 0.75  # a force that begins above this share of its level comes up, if at all, over a short distance:
-SHORT = 0.01  # this share of the stroke; a longer climb is an effect (run-in, warming), and stays inside
-SOON = 0.03  # share of the stroke in which the fall of an overshoot comes down by 63 %, at most
-EARLY = (0.05, 0.5)  # share of the distance in which the plateau is read: near the rise, past any ordinary rise
-LATE = (0.6, 0.95)  # the same where the rise takes so long that half of the stroke may still be part of it
-LONG = 0.1  # rise to 63 % over more than this share of the stroke: a stroke hardly longer than its pre-sliding
-LENGTHS = np.geomspace(0.3, 3.0, 25)  # rise lengths that are tried, as multiples of the distance to 63 %
-MARGIN = 1.05  # the first arrival in the later band is early by a part of the last bend
-REFINED = 1.06 ** np.arange(-16, 17)  # those that are tried on the plateau of the speed, as multiples of the first ones
-REACH = 16.0  # rise lengths over which that fit reaches: nothing is left of the rise, a slow change is still straight
-SLOPED = 8.0  # rise lengths from which a slope beside the rise can be told from the rise itself
-POWERS = (1, 2)  # of the rivals (1 - x / k)^p: a straight rise (elasticity of the rig, fretting), and a rounded one
-ENDS = np.geomspace(0.8, 8.0, 14)  # k that are tried, as multiples of the rise length
-UNLIKELY = 10.0  # twice the log likelihood by which a rival must be better: no bristle then, and nothing is taken out
-FAR = 500.0  # rise lengths beyond which an exponential overflows
+# Rise lengths after which a rise is over: 1/50000 of it is left. 1/5000 still showed in means over a campaign.
+SETTLED = np.log(50000.0)
+# Rise lengths after a speed ramp: the bristles follow the changing speed over one of them.
+AFTER_RAMP = 3.0
+# Rise lengths after which a rise is over where `SETTLED` would take more than a third of the stroke: 1 % is left.
+ENOUGH = np.log(100.0)
+# Share of its level above which a force that begins there comes up, if at all, over a short distance.
+HALF_WAY = 0.75
+# That distance, as a share of the stroke. A longer climb is an effect (run-in, warming) and stays inside the window.
+SHORT = 0.01
+# Share of the stroke in which the fall of an overshoot comes down by 63 %, at most.
+SOON = 0.03
+# Share of the distance between which the plateau is read: near the rise, and past any ordinary rise.
+EARLY = (0.05, 0.5)
+# The same where the rise takes so long that half of the stroke may still be part of it.
+LATE = (0.6, 0.95)
+# Share of the stroke beyond which a rise to 63 % is long: the stroke is hardly longer than its pre-sliding.
+LONG = 0.1
+# Rise lengths that are tried, as multiples of the distance to 63 %.
+LENGTHS = np.geomspace(0.3, 3.0, 25)
+# Factor on the first arrival in the late band, which is early by a part of the last bend.
+MARGIN = 1.05
+# Rise lengths that are tried on the plateau of the speed, as multiples of the one found with the ramp.
+REFINED = 1.06 ** np.arange(-16, 17)
+# Rise lengths over which that fit reaches: nothing is left of the rise, and a slow change is still straight.
+REACH = 16.0
+# Rise lengths from which a slope beside the rise can be told from the rise itself.
+SLOPED = 8.0
+# Powers p of the rivals (1 - x / k)^p: a straight rise (elasticity of the rig, fretting), and a rounded one.
+POWERS = (1, 2)
+# Lengths k of the rivals that are tried, as multiples of the rise length.
+ENDS = np.geomspace(0.8, 8.0, 14)
+# Twice the log likelihood by which a rival must be better. It is then no bristle, and nothing is taken out.
+UNLIKELY = 10.0
+# Rise lengths beyond which an exponential overflows.
+FAR = 500.0
 
 
 class Start(NamedTuple):

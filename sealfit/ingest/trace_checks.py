@@ -18,10 +18,14 @@ from sealfit.units import Units
 # ---------------------------------------------------------------- spikes
 # Single samples that cannot be right: a displacement that jumps away and back, a force far off its neighbours.
 
-NEIGHBOURS = 5  # a median over five samples is blind to one or two wrong ones, and exact on any slope
-# A spike stands apart, four times as far off as 95 % of the samples (of noise: 7.8 SDs); else it is one of many bursts.
-APART, USUAL = 4.0, 0.95
-STEPS = 5.0  # a spike of displacement is off by more than so many of the usual steps: see `displacement_spikes`
+# Samples of the running median. Five are blind to one or two wrong ones, and exact on any slope.
+NEIGHBOURS = 5
+# Share of the samples that are usual.
+USUAL = 0.95
+# A spike is so many times as far off as all usual samples (of noise: 7.8 SDs); else it is one of many bursts.
+APART = 4.0
+# Usual steps by which a spike of displacement is off, at least: see `displacement_spikes`.
+STEPS = 5.0
 FIX = "Correct the cell if the true value is known."
 
 
@@ -158,10 +162,14 @@ def speed_factor(units: Units) -> float:
 # ---------------------------------------------------------------- speed check
 # Does the displacement move as fast as commanded? A factor that is wrong in a known way names the unit mixed up.
 
-BLOCKS = 100  # pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke
-FEWEST = 6  # pieces of which a noisy trace is cut at least: a rest at either end, and sliding between
-NOISE_OF_PATH = 0.1  # noise of a step between the means of two pieces, as a share of the step
-GROSS = 1.5  # beyond this factor the file contradicts itself and is left out; below, the commanded speed may be nominal
+# Pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke.
+BLOCKS = 100
+# Pieces that a noisy trace is cut into at least: a rest at either end, and sliding between.
+FEWEST = 6
+# Noise of a step between the means of two pieces, as a share of the step.
+NOISE_OF_PATH = 0.1
+# Factor beyond which the file contradicts itself and is left out. Below it the commanded speed may be nominal.
+GROSS = 1.5
 
 
 def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:

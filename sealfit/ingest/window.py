@@ -10,19 +10,34 @@ from scipy.ndimage import median_filter
 from sealfit.ingest.presliding import Rise, Start, rise_of
 from sealfit.ingest.segments import median, stretches, weighted_median
 
-REST = 0.5  # slower than this share of the plateau is a rest, not a ripple of the speed
-STANDSTILL = 0.05  # slower than this share of the plateau: not moving yet, or no more
-# A straight ramp takes 1.1 times as long for all of the plateau as for 90 % of it, and 1.8 times as long for 90 % as
-# for 50 %; a first-order lag three times as long for 99.9 %, and 3.3 times. In between, in between.
-STRAIGHT, LAG = (1.8, 0.25), (3.3, 2.0)
-BEFORE_STOP = 0.5  # an S-shaped stop leaves the plateau earlier than a straight one, by less than half its length
-ONSET, HALF_UP = 0.05, 0.5  # shares of the rise below which a force is at rest, and above which it has come up
-SPEED_PIECES = (8, 64)  # of a steady window, whose speeds are compared: at least, and at most
-LEAST_ROWS = 8  # of such a piece
-SAME_SPEED = 0.001  # share by which speeds may differ without a word: errors of screws and scales are of that size
-CLEAR = 3.0  # times the scatter by chance that speeds must show: under it, 3 strokes of 1,000 do
-SPEED_NOISE = 0.25  # noise of the local speed, as a share of the tolerance: a false exit is then a matter of four SDs
-LEAST_SAMPLES = 4  # of a steady window, or of a stroke that may have one
+# Share of the plateau speed below which the platform rests. A ripple of the speed stays above it.
+REST = 0.5
+# Share of the plateau speed below which the platform stands still: it does not move yet, or no more.
+STANDSTILL = 0.05
+# A straight ramp: its time to 90 % of the plateau speed over that to 50 % (0.9 / 0.5), and how much of the ramp is
+# left out after 90 %, as a share. The ramp itself takes 0.11 more.
+STRAIGHT = (1.8, 0.25)
+# The same of a first-order lag, ln(10) / ln(2) and ln(1000) / ln(10) - 1, after which 99.9 % are reached. Between the
+# two shapes the share is interpolated.
+LAG = (3.3, 2.0)
+# Share of the braking time by which an S-shaped stop leaves the plateau earlier than a straight one, at most.
+BEFORE_STOP = 0.5
+# Share of the rise below which a force is at rest.
+ONSET = 0.05
+# Share of the rise above which a force has come up.
+HALF_UP = 0.5
+# Pieces of a steady window whose speeds are compared: at least, and at most.
+SPEED_PIECES = (8, 64)
+# Rows of such a piece, at least.
+LEAST_ROWS = 8
+# Share by which speeds may differ without a finding. Errors of screws and scales are of that size.
+SAME_SPEED = 0.001
+# Scatter of the speeds, in units of that by chance, from which they differ. 3 strokes of 1,000 exceed it by chance.
+CLEAR = 3.0
+# Noise of the local speed, as a share of the tolerance. A false exit from the plateau then takes four SDs.
+SPEED_NOISE = 0.25
+# Samples of a steady window, or of a stroke that may have one, at least.
+LEAST_SAMPLES = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
