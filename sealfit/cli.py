@@ -21,14 +21,14 @@ from sealfit.errors import SealfitError
 
 Campaign = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder: runs.csv and the trace files.")]
 Results = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results that `ingest` or `run` made.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder of results; made if it is not there.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder of results; created if it is missing.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Rig config (TOML); default: as the README's table.")]
 Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Processes to use. [default: all cores]")]
 Scheduler = Annotated[
     str | None,
     typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on: tcp://host:port, or its file."),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Do it again even if it is current.")]
+Force = Annotated[bool, typer.Option("--force", help="Redo steps that are up to date, too.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
 Profile = Annotated[bool, typer.Option("--profile", help="Print seconds and rows per step.")]
 EffectsFolder = Annotated[
@@ -111,7 +111,6 @@ def _error(reason: str) -> dict:
 
 
 # ---------------------------------------------------------------- cli
-# The commands: paths in, messages out. Everything heavy is imported by the command that needs it.
 
 app = typer.Typer(
     help="From a friction rig's CSV files to the LuGre model of an aging rubber seal, and to what that model lacks.",
@@ -244,7 +243,7 @@ def run(
 def predict(
     out: Results,
     points: Annotated[Path, typer.Option("--points", help="CSV of points: condition columns, speed, channels.")],
-    output: Annotated[Path, typer.Option("--output", help="CSV to write: the points and their answers.")],
+    output: Annotated[Path, typer.Option("--output", help="CSV to write: the points with their predictions.")],
     effects_folder: EffectsFolder = None,
     as_json: Json = False,
 ) -> None:
@@ -260,11 +259,15 @@ def predict(
 def lifetime(
     out: Results,
     quantity: Annotated[str, typer.Option("--quantity", help="mu_s, mu_c, F_s or F_c.")] = "mu_s",
-    threshold: Annotated[float | None, typer.Option("--threshold", help="Value at which life ends.")] = None,
-    loss: Annotated[float | None, typer.Option("--loss", help="Or: percent of the start that may be lost.")] = None,
-    temperature: Annotated[float | None, typer.Option("--temperature", help="Of use, in degC.")] = None,
+    threshold: Annotated[float | None, typer.Option("--threshold", help="Value at which the life ends.")] = None,
+    loss: Annotated[
+        float | None, typer.Option("--loss", help="Or the loss at which it ends, in percent of the start.")
+    ] = None,
+    temperature: Annotated[float | None, typer.Option("--temperature", help="Temperature in use, in degC.")] = None,
     compression: Annotated[float | None, typer.Option("--compression", help="Height in use, in percent.")] = None,
-    years: Annotated[float | None, typer.Option("--years", help="Find the temperature that lasts so long.")] = None,
+    years: Annotated[
+        float | None, typer.Option("--years", help="Find the temperature at which it lasts so many years.")
+    ] = None,
     law: Annotated[str | None, typer.Option("--law", help="log, stretched, power, induction.")] = None,
     model: Annotated[str, typer.Option("--model", help="after (with the loop's effects) or before.")] = "after",
     as_json: Json = False,

@@ -12,7 +12,6 @@ from sealfit.config import Bins
 from sealfit.ingest.segments import Pieces, median
 
 # ---------------------------------------------------------------- average
-# Means of traces over the steady window and over bins of displacement, and their standard errors.
 
 LAGS = 20  # the sum of correlations ends within so few, unless the noise is slow: then all lags are computed at once
 

@@ -86,8 +86,6 @@ def inputs_table(
 
 
 # ---------------------------------------------------------------- campaign
-# A campaign folder to tables: every file read, split and judged, repeats averaged; part by part, on any number of
-# processes.
 
 OF_SAMPLES = (
     "time_s",

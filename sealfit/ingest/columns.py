@@ -206,7 +206,7 @@ def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarr
         return listed(np.flatnonzero(full), make, rest)
     labels = len(set(texts[full]))
     if labels > MAX_LABELS and labels > 0.5 * full.sum():
-        return [_left_out(name, f"{labels} different texts are no labels", "info", file)]
+        return [_left_out(name, f"{labels} different texts are too many for labels", "info", file)]
     return []
 
 
@@ -222,7 +222,7 @@ def _cell_faults(column: ColumnOfFile, at: np.ndarray, numbers: np.ndarray, text
         if cell is not None and as_number(cell, column.decimal) is None:
             return column.not_a_number(i, cell)
         value = cell if cell is not None else "" if np.isnan(numbers[i]) else str(numbers[i])  # JSON has no inf
-        reason = "is no measured number." if value != "" else "the cell holds no number."
+        reason = "is not a measured number." if value != "" else "the cell holds no number."
         return column.fault(i, "not_finite", reason, value=value, fix="Fill it or delete the line.")
 
     return listed(at, make, column.rest)

@@ -51,7 +51,7 @@ def _column(name: str, cells: Column, entries: Entries, config: Config) -> tuple
         return labels, []
     if wrong and not meant and name not in config.condition:
         i = wrong[0]
-        reason = f"{len(wrong)} of {count} cells are no numbers; the column is kept as labels."
+        reason = f"{len(wrong)} of {count} cells are not numbers; the column is kept as labels."
         fix = "Empty the cell, or put a number there."
         place = {"severity": "warning", "action": "kept", "value": labels[i], "fix": fix}
         return labels, [entries[i].fault("not_a_number", reason, name, **place)]
@@ -61,7 +61,7 @@ def _column(name: str, cells: Column, entries: Entries, config: Config) -> tuple
         return values, faults
     fix = f"Number the {COUNTS[name]} 1, 2, 3."
     faults += [
-        entries[i].fault("not_a_number", "is no whole number.", name, value=values[i], fix=fix)
+        entries[i].fault("not_a_number", "is not a whole number.", name, value=values[i], fix=fix)
         for i in np.flatnonzero(where(values, lambda value: math.isfinite(value) and value != int(value))).tolist()
     ]
     return mapped(values, lambda value: int(value) if math.isfinite(value) else -1), faults
@@ -79,10 +79,10 @@ def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
         (
             "load_N",
             lambda value: value <= 0,
-            "does not press.",
-            "The normal load is above 0; leave it empty if unknown.",
+            "is not above 0.",
+            "A normal load presses; leave the cell empty if it is unknown.",
         ),
-        ("speed_mm_s", lambda value: value == 0, "is no speed to slide at.", "Leave it empty if it is unknown."),
+        ("speed_mm_s", lambda value: value == 0, "is not a sliding speed.", "Leave it empty if it is unknown."),
     )
     found = [
         (i, entries[i].fault("out_of_range", reason, name, value=columns[name][i], fix=fix))
@@ -156,7 +156,7 @@ def add_order(entries: Entries, columns: Columns) -> tuple[Columns, list[Fault]]
     times = mapped(texts, _time)
     fix = "Write it as 2024-03-01T09:30:00."
     faults = [
-        entries[i].fault("not_a_time", "is no ISO 8601 time.", "started_at", value=text, fix=fix)
+        entries[i].fault("not_a_time", "is not an ISO 8601 time.", "started_at", value=text, fix=fix)
         for i, (text, time) in enumerate(zip(texts, times, strict=True))
         if text is not None and time is None
     ]

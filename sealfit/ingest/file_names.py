@@ -15,7 +15,6 @@ from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.files import as_number
 
 # ---------------------------------------------------------------- refs
-# What is known of a trace file before it is read.
 
 
 @dataclass(frozen=True, slots=True)

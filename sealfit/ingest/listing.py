@@ -84,7 +84,7 @@ def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list
         If there is no folder, or neither runs.csv nor a glob, or runs.csv cannot be read as a table.
     """
     if not campaign.is_dir():
-        what = "is no folder." if campaign.exists() else "does not exist."
+        what = "is not a folder." if campaign.exists() else "does not exist."
         raise _stop("missing_folder", f"the campaign folder '{campaign}' {what}", "Check the path.")
     cells: Columns = {}
     if (campaign / RUNS_CSV).exists() or (campaign / RUNS_CSV).is_symlink():

@@ -186,7 +186,6 @@ def _outliers(layout: Layout, force_N: np.ndarray, found: list[_Judged], level: 
 
 
 # ---------------------------------------------------------------- peers
-# What only a comparison of strokes shows: a force of the wrong sign, a dead sensor, a repeat that lies outside.
 
 AGAINST = -0.5  # share of its peers' force by which a force against its motion is of the wrong sign, not an offset
 

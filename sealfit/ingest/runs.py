@@ -131,13 +131,18 @@ def _config_faults(config: Config) -> list[Fault]:
         faults.append(Fault("config", reason, file=f"config '{config.name}'", column=column, value=value, fix=fix))
 
     if not _is_encoding(settings.encoding):
-        add("trace.encoding", settings.encoding, "is no encoding.", "Use auto, utf-8, latin-1 or utf-16.")
+        add("trace.encoding", settings.encoding, "is not an encoding.", "Use auto, utf-8, latin-1 or utf-16.")
     if not _is_delimiter(settings.delimiter):
-        add("trace.delimiter", settings.delimiter, "is no delimiter.", "Use one character, 'tab' or 'whitespace'.")
+        add("trace.delimiter", settings.delimiter, "is not a delimiter.", "Use one character, 'tab' or 'whitespace'.")
     if settings.delimiter == settings.decimal:
         add("trace.delimiter", settings.delimiter, "is the decimal mark too.", "Set trace.delimiter or trace.decimal.")
     for name in sorted({"file", "speed_mm_s"} & set(config.condition)):
-        add("condition", name, "is no condition: it differs within one.", "Take it out of condition.")
+        add(
+            "condition",
+            name,
+            "cannot be a condition column: it differs within a condition.",
+            "Take it out of condition.",
+        )
     named = {} if settings.names != "none" else {k: v for k, v in settings.columns.items() if isinstance(v, str)}
     for ours, theirs in named.items():
         fix = "Give its position, counted from 1, or names = 'header'."

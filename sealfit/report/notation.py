@@ -199,7 +199,6 @@ def _fixed(value: float, places: int) -> str:
 
 
 # ---------------------------------------------------------------- symbols
-# Symbols, channels and conditions as people read them: in HTML, in a plot, and always with the true unit.
 
 GREEK = {
     "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "zeta": "ζ", "eta": "η", "theta": "θ",
