@@ -157,43 +157,25 @@ def ingest(
     _do("ingest", profile, as_json, work)
 
 
-@app.command("fit-steady")
-def fit_steady(
-    out: Results,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    force: Force = False,
-    profile: Profile = False,
-    as_json: Json = False,
-) -> None:
-    """Fit steady LuGre to each condition."""
-    _single("fit-steady", out, profile, as_json, **_options(workers, scheduler, force=force))
+def _fit_command(step: str) -> Callable[..., None]:
+    """Return the command of a fit; all fits have the same options."""
+
+    def command(
+        out: Results,
+        workers: Workers = None,
+        scheduler: Scheduler = None,
+        force: Force = False,
+        profile: Profile = False,
+        as_json: Json = False,
+    ) -> None:
+        _single(step, out, profile, as_json, **_options(workers, scheduler, force=force))
+
+    return command
 
 
-@app.command("fit-aging")
-def fit_aging(
-    out: Results,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    force: Force = False,
-    profile: Profile = False,
-    as_json: Json = False,
-) -> None:
-    """Fit the aging law across days."""
-    _single("fit-aging", out, profile, as_json, **_options(workers, scheduler, force=force))
-
-
-@app.command("fit-dynamic")
-def fit_dynamic(
-    out: Results,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    force: Force = False,
-    profile: Profile = False,
-    as_json: Json = False,
-) -> None:
-    """Fit sigma_0 and sigma_1 to the pre-sliding part."""
-    _single("fit-dynamic", out, profile, as_json, **_options(workers, scheduler, force=force))
+app.command("fit-steady", help="Fit steady LuGre to each condition.")(_fit_command("fit-steady"))
+app.command("fit-aging", help="Fit the aging law across days.")(_fit_command("fit-aging"))
+app.command("fit-dynamic", help="Fit sigma_0 and sigma_1 to the pre-sliding part.")(_fit_command("fit-dynamic"))
 
 
 @app.command("close-loop")
