@@ -21,14 +21,14 @@ from sealfit.errors import SealfitError
 
 Campaign = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder: runs.csv and the trace files.")]
 Results = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results that `ingest` or `run` made.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder of results; made if it is not there.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder of results; created if it is missing.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Rig config (TOML); default: as the README's table.")]
 Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Processes to use. [default: all cores]")]
 Scheduler = Annotated[
     str | None,
     typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on: tcp://host:port, or its file."),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Do it again even if it is current.")]
+Force = Annotated[bool, typer.Option("--force", help="Redo steps that are up to date, too.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
 Profile = Annotated[bool, typer.Option("--profile", help="Print seconds and rows per step.")]
 EffectsFolder = Annotated[
@@ -111,7 +111,6 @@ def _error(reason: str) -> dict:
 
 
 # ---------------------------------------------------------------- cli
-# The commands: paths in, messages out. Everything heavy is imported by the command that needs it.
 
 app = typer.Typer(
     help="From a friction rig's CSV files to the LuGre model of an aging rubber seal, and to what that model lacks.",
@@ -150,46 +149,33 @@ def ingest(
     as_json: Json = False,
 ) -> None:
     """Read a campaign into tables of traces."""
-    _run(("ingest",), campaign, out, config, workers, scheduler, force, strict, profile, as_json)
+    options = _options(workers, scheduler, force=force, strict=strict)
+
+    def work(pipeline, progress):
+        return pipeline.ingest(campaign, out, config, progress=progress, **options)
+
+    _do("ingest", profile, as_json, work)
 
 
-@app.command("fit-steady")
-def fit_steady(
-    out: Results,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    force: Force = False,
-    profile: Profile = False,
-    as_json: Json = False,
-) -> None:
-    """Fit steady LuGre to each condition."""
-    _single("fit-steady", out, force, profile, as_json, workers, scheduler)
+def _fit_command(step: str) -> Callable[..., None]:
+    """Return the command of a fit; all fits have the same options."""
+
+    def command(
+        out: Results,
+        workers: Workers = None,
+        scheduler: Scheduler = None,
+        force: Force = False,
+        profile: Profile = False,
+        as_json: Json = False,
+    ) -> None:
+        _single(step, out, profile, as_json, **_options(workers, scheduler, force=force))
+
+    return command
 
 
-@app.command("fit-aging")
-def fit_aging(
-    out: Results,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    force: Force = False,
-    profile: Profile = False,
-    as_json: Json = False,
-) -> None:
-    """Fit the aging law across days."""
-    _single("fit-aging", out, force, profile, as_json, workers, scheduler)
-
-
-@app.command("fit-dynamic")
-def fit_dynamic(
-    out: Results,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    force: Force = False,
-    profile: Profile = False,
-    as_json: Json = False,
-) -> None:
-    """Fit sigma_0 and sigma_1 to the pre-sliding part."""
-    _single("fit-dynamic", out, force, profile, as_json, workers, scheduler)
+app.command("fit-steady", help="Fit steady LuGre to each condition.")(_fit_command("fit-steady"))
+app.command("fit-aging", help="Fit the aging law across days.")(_fit_command("fit-aging"))
+app.command("fit-dynamic", help="Fit sigma_0 and sigma_1 to the pre-sliding part.")(_fit_command("fit-dynamic"))
 
 
 @app.command("close-loop")
@@ -203,13 +189,14 @@ def close_loop(
     as_json: Json = False,
 ) -> None:
     """Find, name and add what the model lacks."""
-    _single("close-loop", out, force, profile, as_json, workers, scheduler, effects_folder=effects_folder)
+    options = _options(workers, scheduler, force=force, effects_folder=effects_folder)
+    _single("close-loop", out, profile, as_json, **options)
 
 
 @app.command()
 def report(out: Results, force: Force = False, profile: Profile = False, as_json: Json = False) -> None:
     """Write report.html and its plots."""
-    _single("report", out, force, profile, as_json)
+    _single("report", out, profile, as_json, force=force)
 
 
 @app.command()
@@ -225,22 +212,24 @@ def run(
     profile: Profile = False,
     as_json: Json = False,
 ) -> None:
-    """Do every step that is not current, in order."""
-    from sealfit.store.manifest import STEPS
+    """Run all out-of-date steps, in order."""
+    options = _options(workers, scheduler, force=force, strict=strict, effects_folder=effects_folder)
 
-    own = {"effects_folder": effects_folder}
-    _run(STEPS, campaign, out, config, workers, scheduler, force, strict, profile, as_json, **own)
+    def work(pipeline, progress):
+        return pipeline.run(campaign, out, config, progress=progress, **options)
+
+    _do("run", profile, as_json, work)
 
 
 @app.command()
 def predict(
     out: Results,
     points: Annotated[Path, typer.Option("--points", help="CSV of points: condition columns, speed, channels.")],
-    output: Annotated[Path, typer.Option("--output", help="CSV to write: the points and their answers.")],
+    output: Annotated[Path, typer.Option("--output", help="CSV to write: the points with their predictions.")],
     effects_folder: EffectsFolder = None,
     as_json: Json = False,
 ) -> None:
-    """Answer the force at new points."""
+    """Predict the force at new points."""
     from sealfit import commands, progress
     from sealfit.report import summary_lines
 
@@ -252,22 +241,25 @@ def predict(
 def lifetime(
     out: Results,
     quantity: Annotated[str, typer.Option("--quantity", help="mu_s, mu_c, F_s or F_c.")] = "mu_s",
-    threshold: Annotated[float | None, typer.Option("--threshold", help="Value at which life ends.")] = None,
-    loss: Annotated[float | None, typer.Option("--loss", help="Or: percent of the start that may be lost.")] = None,
-    temperature: Annotated[float | None, typer.Option("--temperature", help="Of use, in degC.")] = None,
+    threshold: Annotated[float | None, typer.Option("--threshold", help="Value at which the life ends.")] = None,
+    loss: Annotated[
+        float | None, typer.Option("--loss", help="Or the loss at which it ends, in percent of the start.")
+    ] = None,
+    temperature: Annotated[float | None, typer.Option("--temperature", help="Temperature in use, in degC.")] = None,
     compression: Annotated[float | None, typer.Option("--compression", help="Height in use, in percent.")] = None,
-    years: Annotated[float | None, typer.Option("--years", help="Find the temperature that lasts so long.")] = None,
+    years: Annotated[
+        float | None, typer.Option("--years", help="Find the temperature at which it lasts so many years.")
+    ] = None,
     law: Annotated[str | None, typer.Option("--law", help="log, stretched, power, induction.")] = None,
     model: Annotated[str, typer.Option("--model", help="after (with the loop's effects) or before.")] = "after",
     as_json: Json = False,
 ) -> None:
-    """Tell the days until a quantity reaches a threshold."""
+    """Compute the days until a quantity reaches a threshold."""
     from sealfit import commands
     from sealfit.report import summary_lines
 
-    asked = {"quantity": quantity, "threshold": threshold, "loss_pct": loss, "law": law, "model": model}
-    asked |= {"temperature_C": temperature, "compression_pct": compression, "years": years}
-    end("lifetime", commands.lifetime(out, **asked), summary_lines.lifetime_lines, as_json)
+    asked = commands.LifetimeRequest(quantity, threshold, loss, temperature, compression, years, law, model)
+    end("lifetime", commands.lifetime(out, asked), summary_lines.lifetime_lines, as_json)
 
 
 @app.command()
@@ -326,41 +318,7 @@ def check(
 
 
 # ---------------------------------------------------------------- what the commands share
-def _run(
-    names: tuple[str, ...],
-    campaign: Path,
-    out: Path,
-    config: Path | None,
-    workers: int | None,
-    scheduler: str | None,
-    force: bool,
-    strict: bool,
-    profile: bool,
-    as_json: bool,
-    **options: Path | None,
-) -> None:
-    count = _workers(workers, scheduler)
-    options |= {"workers": count, "scheduler": scheduler, "force": force, "strict": strict}
-    command = "ingest" if len(names) == 1 else "run"
-    _do(
-        command,
-        profile,
-        as_json,
-        lambda pipeline, progress: pipeline.run(campaign, out, config, steps=names, progress=progress, **options),
-    )
-
-
-def _single(
-    step: str,
-    out: Path,
-    force: bool,
-    profile: bool,
-    as_json: bool,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    **options: Path | None,
-) -> None:
-    options |= {"workers": _workers(workers, scheduler), "scheduler": scheduler, "force": force}
+def _single(step: str, out: Path, profile: bool, as_json: bool, **options: object) -> None:
     _do(step, profile, as_json, lambda pipeline, progress: pipeline.single(step, out, progress=progress, **options))
 
 
@@ -374,6 +332,11 @@ def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
     if profile:
         made["profile"] = progress.as_dicts(parts)
     end(command, made, lambda made: summary_lines.lines(made) + progress.lines(made.get("profile", ())), as_json)
+
+
+def _options(workers: int | None, scheduler: str | None, **more: object) -> dict:
+    """Return the options of `pipeline.Options`."""
+    return {"workers": _workers(workers, scheduler), "scheduler": scheduler, **more}
 
 
 def _workers(workers: int | None, scheduler: str | None) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,18 +93,24 @@ def predict(
     return {"out": str(store.out), "output": str(output), **write_answers(asked, answers, output)}
 
 
-def lifetime(
-    out: Path,
-    *,
-    quantity: str,
-    threshold: float | None,
-    loss_pct: float | None,
-    temperature_C: float | None,
-    compression_pct: float | None,
-    years: float | None,
-    law: str | None,
-    model: str = "after",
-) -> dict:
+@dataclass(frozen=True, slots=True)
+class LifetimeRequest:
+    """What `lifetime` is asked: the end of life is a value (`threshold`) or a loss in percent of the start.
+
+    With `years` the temperature is sought at which a seal lasts so long. Without `law` the likeliest one answers.
+    """
+
+    quantity: str = "mu_s"
+    threshold: float | None = None
+    loss_pct: float | None = None
+    temperature_C: float | None = None
+    compression_pct: float | None = None
+    years: float | None = None
+    law: str | None = None
+    model: str = "after"
+
+
+def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     """Return the days until a quantity reaches a threshold by the likeliest law and by its rivals, with intervals.
 
     Raises
@@ -118,22 +125,24 @@ def lifetime(
     from sealfit.fit.aging.lifetime import answer, finite_ends, goal_of, over_laws
 
     store = Store.open(existing_out(out))
-    if model not in MODELS:
-        raise RequestError(f"there is no model '{model}'.", fix=f"Choose one of: {', '.join(MODELS)}.")
-    goal = goal_of(threshold, loss_pct)
-    tables, taken_out = _fits_of(store, model)
-    laws = law_of(*tables, quantity, law)
-    place = {"temperature_C": temperature_C, "compression_pct": compression_pct}
-    chosen = answer(laws[0], goal, years, resample=True, **place)
-    rivals = [answer(rival, goal, years, **place) for rival in rivals_of(laws)] if law is None else []
-    if law is None and years is None:
-        chosen["ci95_over_laws"] = finite_ends(over_laws(laws, goal, **place))
-    asked = {"out": str(store.out), "quantity": quantity, "model": model, "effects": taken_out}
+    if asked.model not in MODELS:
+        raise RequestError(f"there is no model '{asked.model}'.", fix=f"Choose one of: {', '.join(MODELS)}.")
+    goal, years = goal_of(asked.threshold, asked.loss_pct), asked.years
+    tables, taken_out = _fits_of(store, asked.model)
+    laws = law_of(*tables, asked.quantity, asked.law)
+    place = {"temperature_C": asked.temperature_C, "compression_pct": asked.compression_pct}
+    chosen, rivals = answer(laws[0], goal, years, resample=True, **place), []
+    if asked.law is None:
+        rivals = [answer(rival, goal, years, **place) for rival in rivals_of(laws)]
+        if years is None:
+            chosen["ci95_over_laws"] = finite_ends(over_laws(laws, goal, **place))
+    said = {"out": str(store.out), "quantity": asked.quantity, "model": asked.model, "effects": taken_out}
     before = None
     if taken_out:
         with suppress(RequestError):  # the declared model may have no answer where this one has
-            before = answer(law_of(*_fits_of(store, "before")[0], quantity, law)[0], goal, years, **place)
-    return {**asked, **chosen, "rivals": rivals, "before": before}
+            declared = law_of(*_fits_of(store, "before")[0], asked.quantity, asked.law)[0]
+            before = answer(declared, goal, years, **place)
+    return {**said, **chosen, "rivals": rivals, "before": before}
 
 
 def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame], list[dict]]:

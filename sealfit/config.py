@@ -259,15 +259,16 @@ def parse_config(text: str, name: str) -> Config:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
     except ValidationError as error:
-        raise ConfigError(_explain(error), file=name, fix="See the README for every key.") from error
+        raise ConfigError(explain(error), file=name, fix="See the README for every key.") from error
 
 
-def _explain(error: ValidationError) -> str:
+def explain(error: ValidationError) -> str:
+    """Return one sentence per fault of a config or SPEC."""
     lines = []
     for fault in error.errors():
-        key = ".".join(str(part) for part in fault["loc"]) or "the file"
+        key, text = ".".join(str(part) for part in fault["loc"]), fault["msg"].removeprefix("Value error, ")
         if fault["type"] == "extra_forbidden":
             lines.append(f"unknown key '{key}'.")
         else:
-            lines.append(f"key '{key}': {fault['msg']}.")
+            lines.append(f"key '{key}': {text.rstrip('.')}." if key else f"{text.rstrip('.')}.")
     return " ".join(lines)

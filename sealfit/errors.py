@@ -57,10 +57,9 @@ class SealfitError(Exception):
         file: str | Path | None = None,
         line: int | None = None,
         column: str | None = None,
-        value: object = None,
         fix: str = "",
     ):
-        self.message, self.line, self.column, self.value, self.fix = message, line, column, value, fix
+        self.message, self.line, self.column, self.fix = message, line, column, fix
         self.file = str(file) if file is not None else None
         place = self.file or ""
         if line is not None:
@@ -70,17 +69,8 @@ class SealfitError(Exception):
 
     def as_dicts(self) -> list[dict]:
         """Return `[{file, line, column, value, fix, reason}]`, the `errors` of `--json`."""
-        value = self.value if isinstance(self.value, int | float | str | None) else str(self.value)
-        return [
-            {
-                "file": self.file,
-                "line": self.line,
-                "column": self.column,
-                "value": value,
-                "fix": self.fix,
-                "reason": self.message,
-            }
-        ]
+        place = {"file": self.file, "line": self.line, "column": self.column, "value": None}
+        return [{**place, "fix": self.fix, "reason": self.message}]
 
 
 class CampaignError(SealfitError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,27 +39,12 @@ Counted = tuple[int, str]
 Work = Callable[[Store, Staged, int, Silent], Counted]
 
 
-def run(
-    campaign: Path,
-    out: Path,
-    config: Path | None = None,
-    *,
-    steps: tuple[str, ...] = STEPS,
-    workers: int = 1,
-    scheduler: str | None = None,
-    force: bool = False,
-    strict: bool = False,
-    effects_folder: Path | None = None,
-    progress: Silent | None = None,
-) -> dict:
-    """Do every step of `steps` that is not current, in order, and return the summary of all of them.
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How steps are done.
 
     Parameters
     ----------
-    campaign, out : Path
-        The campaign's folder and the folder of results.
-    config : Path or None
-        A rig config, or None for the default.
     workers : int
         Processes of this computer that read trace files, fit and repeat the search.
     scheduler : str or None
@@ -69,19 +55,46 @@ def run(
         Stop at any fault of the campaign, after the first step.
     effects_folder : Path or None
         Folder of the user's own effects, which is run; it comes before the one that the config names.
+    """
+
+    workers: int = 1
+    scheduler: str | None = None
+    force: bool = False
+    strict: bool = False
+    effects_folder: Path | None = None
+
+
+def run(
+    campaign: Path,
+    out: Path,
+    config: Path | None = None,
+    *,
+    steps: tuple[str, ...] = STEPS,
+    progress: Silent | None = None,
+    **options,
+) -> dict:
+    """Do every step of `steps` that is out of date, in order, and return the summary of all of them.
+
+    Parameters
+    ----------
+    campaign, out : Path
+        The campaign's folder and the folder of results.
+    config : Path or None
+        A rig config, or None for the default.
+    **options
+        Fields of `Options`.
 
     Raises
     ------
     SealfitError
         CampaignError, ConfigError, OutError, FitError: whatever the user has to fix.
     """
-    progress = progress or Silent()
-    source = ConfigCopy.at(config)
+    chosen, source = Options(**options), ConfigCopy.at(config)
     checked = source.parse()
-    own = own_effects_folder(effects_folder, source, out, campaign)  # before OUT is made
+    own = own_effects_folder(chosen.effects_folder, source, out, campaign)  # before OUT is made
     folder = campaign_folder(campaign, checked)
-    with Store.writing(out, folder, source, own) as store, on_cluster(scheduler, folder, out):
-        return _do_steps(store, steps, workers=workers, force=force, strict=strict, progress=progress)
+    with Store.writing(out, folder, source, own) as store, on_cluster(chosen.scheduler, folder, out):
+        return _do_steps(store, steps, chosen, progress or Silent())
 
 
 def ingest(campaign: Path, out: Path, config: Path | None = None, **options) -> dict:
@@ -89,17 +102,10 @@ def ingest(campaign: Path, out: Path, config: Path | None = None, **options) -> 
     return run(campaign, out, config, steps=("ingest",), **options)
 
 
-def single(
-    step: str,
-    out: Path,
-    *,
-    workers: int = 1,
-    scheduler: str | None = None,
-    force: bool = False,
-    effects_folder: Path | None = None,
-    progress: Silent | None = None,
-) -> dict:
+def single(step: str, out: Path, *, progress: Silent | None = None, **options) -> dict:
     """Do one step after the first in an OUT whose earlier steps are current, and return its summary.
+
+    `options` are fields of `Options`.
 
     Raises
     ------
@@ -108,41 +114,34 @@ def single(
     RequestError
         If close-loop needs the user's own effects and no `effects_folder` is given.
     """
-    with Store.writing(existing_out(out), effects=effects_folder) as store, on_cluster(scheduler, out):
+    chosen = Options(**options)
+    with Store.writing(existing_out(out), effects=chosen.effects_folder) as store, on_cluster(chosen.scheduler, out):
         store.require(STEPS[STEPS.index(step) - 1])
-        return _do_steps(store, (step,), workers=workers, force=force, strict=False, progress=progress or Silent())
+        return _do_steps(store, (step,), chosen, progress or Silent())
 
 
-def _do_steps(
-    store: Store, steps: tuple[str, ...], *, workers: int, force: bool, strict: bool, progress: Silent
-) -> dict:
+def _do_steps(store: Store, steps: tuple[str, ...], options: Options, progress: Silent) -> dict:
     from sealfit.report import summary
 
     for warning in store.warnings:
         progress.warn(warning)
-    store.anew = force
+    store.anew = options.force
     done = []
     for step in steps:
         why = store.why_stale(step)
-        if why or force:
+        if why or options.force:
             if why and step in store.state.steps:
                 progress.say(why)
             with timed(step) as part, store.step(step) as staged:
-                part.rows, part.of = _WORK[step](store, staged, workers, progress)
+                part.rows, part.of = _WORK[step](store, staged, options.workers, progress)
             done.append(step)
         else:
             progress.say(f"{step}: current, not redone")
-        if step == "ingest" and strict:
-            _refuse_faults(store.read("quality"))
+        if step == "ingest" and options.strict and (faults := faults_of(store.read("quality"))):
+            raise CampaignError(faults)
     with timed("summary"):
         found = summary.of_steps(store, steps)
     return {"out": str(store.out), "done": done, **found}
-
-
-def _refuse_faults(quality: pd.DataFrame) -> None:
-    faults = faults_of(quality)
-    if faults:
-        raise CampaignError(faults)
 
 
 def faults_of(quality: pd.DataFrame) -> list[Fault]:

@@ -7,7 +7,7 @@ import pandas as pd
 from small_tables import small
 
 from sealfit.errors import Fault
-from sealfit.store.manifest import Fingerprints, fingerprint
+from sealfit.store.manifest import fingerprint
 from sealfit.tables import AFTER
 
 FAULT = Fault(
@@ -84,7 +84,7 @@ class Parts:
         good = Fault("read", "was read.", "a.csv", severity="info", action="kept")
         quality = pd.DataFrame([fault.as_dict() for fault in (good, *self.faults)])
         tables |= {"inputs": inputs, "quality": quality}
-        return SimpleNamespace(tables=tables, faults=[good, *self.faults], marks=Fingerprints.of(marks), stored={})
+        return SimpleNamespace(tables=tables, faults=[good, *self.faults], marks=marks, stored={})
 
     def fit_conditions(self, steady, config, *, workers):
         self._called("fit-steady", config)

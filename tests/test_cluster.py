@@ -113,10 +113,10 @@ def test_no_scheduler_is_a_clear_error(monkeypatch):
 
 
 def test_what_is_no_scheduler_is_said_at_once(tmp_path):
-    with pytest.raises(RequestError, match=r"'foo' is no address of a scheduler\. Write tcp://host:8786"):
+    with pytest.raises(RequestError, match=r"'foo' is not an address of a scheduler\. Write tcp://host:8786"):
         Cluster("foo")
     (tmp_path / "scheduler.json").write_text("{}")
-    with pytest.raises(RequestError, match=r"scheduler\.json is no scheduler file"):
+    with pytest.raises(RequestError, match=r"scheduler\.json is not a scheduler file"):
         Cluster(str(tmp_path / "scheduler.json"))
 
 

@@ -109,11 +109,8 @@ def test_a_folder_named_in_the_model_or_the_state_of_out_is_never_run(home, monk
                 lambda: commands.effects(out),
                 lambda: single("close-loop", out, force=True),
                 lambda: single("report", out, force=True),
-                lambda: commands.lifetime(
-                    out, quantity="mu_s", threshold=None, loss_pct=5.0, temperature_C=None, compression_pct=None,
-                    years=None, law=None,
-                ),
-            ):  # fmt: skip
+                lambda: commands.lifetime(out, commands.LifetimeRequest(loss_pct=5.0)),
+            ):
                 try:
                     doing()
                 except (RequestError, StaleError) as error:

@@ -22,7 +22,7 @@ from sealfit.config import parse_config
 from sealfit.errors import OutError, StaleError
 from sealfit.store import parquet, staged_writes
 from sealfit.store.lock import LOCK
-from sealfit.store.manifest import STEPS, ConfigCopy, Fingerprints, State, fingerprint, seen_config, to_json
+from sealfit.store.manifest import STEPS, ConfigCopy, State, fingerprint, seen_config, to_json
 from sealfit.store.out_folder import Store
 from sealfit.tables import BINS, INPUTS, QUALITY, RUNS
 from sealfit.units import Units
@@ -56,7 +56,7 @@ def do(store, step, rows=2):
     with store.step(step) as staged:
         if step == "ingest":
             campaign = store.state.campaign
-            staged.inputs = Fingerprints.of({p.name: fingerprint(p) for p in sorted(campaign.iterdir())})
+            staged.inputs = {p.name: fingerprint(p) for p in sorted(campaign.iterdir())}
         staged.table(OUTPUTS[step], small(OUTPUTS[step], rows))
 
 
@@ -402,11 +402,11 @@ def test_a_folder_that_was_made_for_nothing_goes_again(out, campaign):
 def test_what_a_step_no_longer_writes_is_removed(out, campaign):
     with Store.writing(out, campaign, ConfigCopy.at(None)) as store:
         with store.step("ingest") as staged:
-            staged.inputs = Fingerprints()
+            staged.inputs = {}
             staged.text("plots/old.svg", "old")
             staged.text("plots/both.svg", "one")
         with store.step("ingest") as staged:
-            staged.inputs = Fingerprints()
+            staged.inputs = {}
             staged.text("plots/both.svg", "two")
     assert sorted(p.name for p in (out / "plots").iterdir()) == ["both.svg"]
     assert (out / "plots/both.svg").read_text() == "two"

@@ -159,11 +159,11 @@ def _connected(scheduler: str) -> Client:
         address = json.loads(Path(scheduler).read_text("utf-8"))["address"] if Path(scheduler).is_file() else scheduler
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RequestError(
-            f"{scheduler} is no scheduler file.", fix=f"Give one that Dask wrote, or {EXAMPLE}."
+            f"{scheduler} is not a scheduler file.", fix=f"Give one that Dask wrote, or {EXAMPLE}."
         ) from error
     place = re.fullmatch(r"\w+://\[?(?P<host>[^]]+)\]?:(?P<port>\d+)", address)
     if place is None:
-        raise RequestError(f"'{scheduler}' is no address of a scheduler.", fix=f"Write {EXAMPLE}, or its file.")
+        raise RequestError(f"'{scheduler}' is not an address of a scheduler.", fix=f"Write {EXAMPLE}, or its file.")
     try:  # by hand first: a client that finds nobody holds the program for a minute
         socket.create_connection((place["host"], int(place["port"])), timeout=CONNECT_S).close()
         return Client(address, timeout=CONNECT_S, set_as_default=False)

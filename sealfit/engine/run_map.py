@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------- engine
-# Map work over the cores of this computer or over a cluster, in order; the only file that knows which.
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")

@@ -9,10 +9,9 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Bins
-from sealfit.ingest.segments import Pieces, median, numbered
+from sealfit.ingest.segments import Pieces, median
 
 # ---------------------------------------------------------------- average
-# Means of traces over the steady window and over bins of displacement, and their standard errors.
 
 LAGS = 20  # the sum of correlations ends within so few, unless the noise is slow: then all lags are computed at once
 
@@ -36,19 +35,11 @@ def standard_error(values: np.ndarray) -> float:
     >>> round(standard_error(np.array([1.0, 2.0, 1.0, 2.0])), 4)  # not correlated: s / sqrt(n) = 0.5774 / 2
     0.2887
     """
-    return float(standard_errors(values, Pieces([len(values)]))[0]) if len(values) else float("nan")
-
-
-def standard_errors(values: np.ndarray, series: Pieces) -> np.ndarray:
-    """Return the standard error of the mean of every series, shape (series,): see `standard_error`."""
-    means = series.mean(values).tolist()
-    return np.array([_standard_error(values[own] - mean) for own, mean in zip(series.slices, means, strict=True)])
-
-
-def _standard_error(centred: np.ndarray) -> float:
-    n, square = len(centred), float(centred @ centred)
+    n = len(values)
     if n < 2:
-        return float("nan")
+        return math.nan
+    centred = values - values.mean()
+    square = float(centred @ centred)
     if square == 0.0:
         return 0.0
     tau = 0.5
@@ -112,7 +103,7 @@ def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, n
         `row`, `bin` (from 0 in the direction of motion), `n`, `force_sd_N`, and the mean of every column of `samples`.
     """
     row, own = owners(samples["row"])
-    run, runs = numbered([strokes["run_id"][i] for i in row.tolist()])
+    run, runs = _numbered(strokes["run_id"], row)
     back = np.asarray(strokes["direction"])[row] < 0
     group, width = _bin_of(np.asarray(samples["displacement_mm"]), own, run, runs, back, settings)
     group, count = _joined(group, len(own), width, settings.min_samples)
@@ -138,6 +129,12 @@ def owners(row: np.ndarray) -> tuple[np.ndarray, Pieces]:
     count = np.bincount(row)
     there = np.flatnonzero(count)
     return there, Pieces(count[there])
+
+
+def _numbered(labels: Sequence[str], rows: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return a number for the label of each of these rows, as they appear, and how many labels there are."""
+    codes, different = pd.factorize(np.array(labels, object)[rows])
+    return codes, len(different)
 
 
 def _bin_of(
@@ -211,7 +208,7 @@ def mean_traces(samples: Samples, strokes: Strokes) -> dict[str, np.ndarray]:
         What table `traces_mean` holds of numbers, and `row`, the first stroke of the run.
     """
     row, own = owners(samples["row"])
-    (run, runs), (file, files) = (numbered([strokes[name][i] for i in row.tolist()]) for name in ("run_id", "file"))
+    (run, runs), (file, files) = (_numbered(strokes[name], row) for name in ("run_id", "file"))
     back = np.asarray(strokes["direction"])[row] < 0
     low, step, cells = _grid(np.asarray(samples["displacement_mm"]), own, run, runs)
     grid, places = Pieces(cells[run]), Pieces(cells)  # the cells of every stroke, and of every run, end to end

@@ -31,7 +31,7 @@ from sealfit.ingest.stored_parts import (
     stored_strokes,
 )
 from sealfit.progress import timed
-from sealfit.store.manifest import Fingerprints, fingerprint
+from sealfit.store.manifest import Fingerprint, Fingerprints, fingerprint
 from sealfit.store.parquet import spelled_out
 from sealfit.tables import RUNS, STEADY
 
@@ -66,7 +66,7 @@ def inputs_table(
     """
     others: dict[str, str] = {}  # files that are not in the listing, and their status
     for fault in faults:
-        if fault.file is not None and fault.file not in marks.places and fault.action == "file left out":
+        if fault.file is not None and fault.file not in marks and fault.action == "file left out":
             others.setdefault(fault.file, "left out" if fault.severity == "error" else "not matched")
     marks |= {file: fingerprint(campaign / file) for file in others}
     counts = np.zeros((2, len(marks)), np.int64)
@@ -74,20 +74,18 @@ def inputs_table(
     table = pd.DataFrame(
         {
             "file": pd.array(list(marks), "str"),
-            "size": pd.array(marks.size, "Int64"),
-            "mtime_ns": pd.array(marks.mtime_ns, "Int64"),
-            "sha256": pd.array(marks.sha256, "str"),
+            "size": pd.array([mark.size for mark in marks.values()], "Int64"),
+            "mtime_ns": pd.array([mark.mtime_ns for mark in marks.values()], "Int64"),
+            "sha256": pd.array([mark.sha256 for mark in marks.values()], "str"),
             "rows": counts[0],
             "strokes": counts[1],
             "status": pd.array([*np.where(used, "used", "left out").tolist(), *others.values()], "str"),
         }
     )
-    return table, marks.readable()
+    return table, {file: mark for file, mark in marks.items() if mark.sha256 is not None}
 
 
 # ---------------------------------------------------------------- campaign
-# A campaign folder to tables: every file read, split and judged, repeats averaged; part by part, on any number of
-# processes.
 
 OF_SAMPLES = (
     "time_s",
@@ -104,11 +102,14 @@ SHOWN = 20  # faults that a campaign without a single usable stroke lists
 
 @dataclass(frozen=True)
 class Place:
-    """Where parts are stored, those that are there already, by their keys, and the campaign's files as they are now."""
+    """Where parts are stored, those that are there already, by their keys, and the campaign's files as they are now.
 
-    folder: Path
+    Without a folder the parts are kept in memory.
+    """
+
+    folder: Path | None = None
     known: Mapping[str, Path] = field(default_factory=dict)
-    marks: Fingerprints = field(default_factory=Fingerprints)
+    marks: Fingerprints = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -155,19 +156,23 @@ def ingest_campaign(
         For faults that concern the whole campaign, or where not one stroke can be used.
     """
     campaign = Path(campaign)
+    place = place or Place()
     with timed("listing trace files") as part:
         listing, faults = list_traces(campaign, config)
-        marks = (place.marks if place else Fingerprints()).take(listing.files)
+        marks = {file: place.marks.get(file, Fingerprint()) for file in listing.files}
         plan = _plan(campaign, listing, marks)
         part.rows, part.of = len(listing), "files"
-    make = _Maker(campaign, config, listing, plan, marks, workers=workers, on_file=on_file, place=place)
+    make = partial(make_part, campaign=campaign, config=config, folder=place.folder)
+    reader = _Reader(make, [listing.take(rows) for rows in plan], workers, on_file)
     with timed("reading trace files") as part:
-        parts = make.parts()
-        part.rows, part.of = make.reread, "files"
-    faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: marks.places[fault.file])
+        parts = reader.parts(_known_parts(reader.listings, marks, place, config))
+        part.rows, part.of = reader.reread, "files"
+    order = {file: i for i, file in enumerate(listing.files)}
+    faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: order[fault.file])
     files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
     order = np.argsort(files, kind="stable")
-    strokes, files = strokes_of([make.strokes(part) for part in parts]).take(order).reset_index(drop=True), files[order]
+    strokes = strokes_of([stored_strokes(part, place.folder) for part in parts]).take(order).reset_index(drop=True)
+    files = files[order]
     parts = [replace(part, strokes=None) for part in parts]  # they are in one table now
     strokes, found = judged(strokes)
     faults += found
@@ -177,17 +182,17 @@ def ingest_campaign(
     faults += found
     faults += incomplete_columns(steady)
     strokes = strokes.assign(used=_still_used(strokes, steady))
-    parts = make.reestimated(parts, _ruled_out(plan, strokes, files))
+    parts = reader.reestimated(parts, _ruled_out(plan, strokes, files))
     used = np.zeros(len(listing), bool)
     used[files[strokes["used"].to_numpy(bool)]] = True
-    inputs, marks = inputs_table(campaign, make.marks, plan, parts, used, faults)
+    inputs, marks = inputs_table(campaign, marks | reader.marks, plan, parts, used, faults)
     tables = {
         "inputs": inputs,
         "runs": shaped(strokes, RUNS, drop=(*STEADY_ONLY, *OF_SAMPLES)),
         "quality": quality_table(faults, inputs["file"].tolist()),
         "steady": shaped(steady, STEADY),
     }
-    if place is None:
+    if place.folder is None:
         tables |= {name: _stacked([part.tables[name] for part in parts if name in part.tables]) for name in SAMPLED}
     stored = {name: size for part in parts for name, size in part.stored.items()}
     return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY], marks, stored)
@@ -196,10 +201,9 @@ def ingest_campaign(
 def _plan(campaign: Path, listing: Listing, marks: Fingerprints) -> list[np.ndarray]:
     """Return the files of each part, by their numbers in the listing."""
     sizes = [
-        _size(os.path.join(campaign, file)) if size is None else size
-        for file, size in zip(listing.files, marks.size, strict=True)
+        _size(os.path.join(campaign, file)) if marks[file].size is None else marks[file].size for file in listing.files
     ]
-    plan = plan_parts(listing.conditions.cells(), listing.columns["run_id"].cells(), sizes)
+    plan = plan_parts(listing.conditions, listing.columns["run_id"], sizes)
     return [np.array(files) for files in plan]
 
 
@@ -210,77 +214,60 @@ def _size(path: str) -> int:
         return 0
 
 
-class _Maker:
-    """Makes the parts of a plan: takes those that are stored, reads the others.
+def _known_parts(listings: Sequence[Listing], marks: Fingerprints, place: Place, config: Config) -> dict[int, Made]:
+    """Return the parts that are stored, by their numbers in the plan."""
+    made, seen = {}, seen_by_parts(config)
+    for i, listing in enumerate(listings if place.known else ()):
+        hashes = [marks[file].sha256 for file in listing.files]
+        path = place.known.get(part_key(listing, hashes, seen) or "")
+        if path is not None:
+            made[i] = load_part(path)
+    return made
 
-    `marks` are the files of the listing as they were read, or as they were known where they need not be read.
+
+@dataclass
+class _Reader:
+    """Reads the parts of a plan.
+
+    `make` reads one of them, `listings` are their files. `marks` are the files that were read, and `reread` counts
+    them.
     """
 
-    def __init__(
-        self,
-        campaign: Path,
-        config: Config,
-        listing: Listing,
-        plan: Sequence[np.ndarray],
-        marks: Fingerprints,
-        *,
-        workers: int,
-        on_file: Callable[[int, int], None] | None,
-        place: Place | None,
-    ) -> None:
-        self._make = partial(make_part, campaign=campaign, config=config, folder=place.folder if place else None)
-        self._config, self._workers, self._on_file = config, workers, on_file or (lambda done, total: None)
-        self._listing, self._plan, self._place = listing, plan, place
-        self.marks, self.reread = marks, 0
+    make: Callable[[Asked], Made]
+    listings: Sequence[Listing]
+    workers: int
+    on_file: Callable[[int, int], None] | None
+    marks: Fingerprints = field(default_factory=dict)
+    reread: int = 0
 
-    def parts(self) -> list[Made]:
-        """Return every part, by what its own files say."""
-        made = self._known()
-        made |= self._read(
-            {i: Asked(self._listing.take(self._plan[i])) for i in range(len(self._plan)) if i not in made}
-        )
-        return [made[i] for i in range(len(self._plan))]
-
-    def strokes(self, part: Made) -> pa.Table:
-        """Return the strokes of a part, from the disk if they lie there."""
-        return stored_strokes(part, self._place.folder) if part.strokes is None else part.strokes
+    def parts(self, known: Mapping[int, Made]) -> list[Made]:
+        """Return every part, by what its own files say; those that are known are not read."""
+        asked = {i: Asked(listing) for i, listing in enumerate(self.listings) if i not in known}
+        made = {**known, **self._read(asked)}
+        return [made[i] for i in range(len(self.listings))]
 
     def reestimated(self, parts: Sequence[Made], unused: Sequence[frozenset]) -> list[Made]:
         """Return the parts, made again where the whole campaign leaves out other strokes or has other columns."""
         columns = common_columns(parts)
         again = {
-            i: Asked(self._listing.take(self._plan[i]), out, columns if part.columns else None)
+            i: Asked(self.listings[i], out, columns if part.columns else None)
             for i, (part, out) in enumerate(zip(parts, unused, strict=True))
             if part.unused != out or not agrees(part, columns)
         }
         made = self._read(again)
         return [made.get(i, part) for i, part in enumerate(parts)]
 
-    def _known(self) -> dict[int, Made]:
-        """Return the parts that are stored, by their numbers in the plan."""
-        if self._place is None or not self._place.known:
-            return {}
-        words, made, seen = self._listing.words(), {}, seen_by_parts(self._config)
-        known = {name: column.known for name, column in self._listing.columns.items()}
-        for i, rows in enumerate(self._plan):
-            files = [self._listing.files[row] for row in rows.tolist()]
-            hashes = [self.marks.sha256[row] for row in rows.tolist()]
-            cells = {name: column[rows] for name, column in words.items() if known[name][rows].any()}
-            path = self._place.known.get(part_key(files, cells, hashes, seen) or "")
-            if path is not None:
-                made[i] = load_part(path)
-        return made
-
     def _read(self, asked: Mapping[int, Asked]) -> dict[int, Made]:
         """Return the parts; the largest are read first, so that at the end no process has much left alone."""
         order = sorted(asked, key=lambda i: -len(asked[i].refs))
         total, done, made = sum(len(part.refs) for part in asked.values()), 0, {}
-        results = run_map(self._make, [asked[i] for i in order], workers=self._workers, together=1)
+        results = run_map(self.make, [asked[i] for i in order], workers=self.workers, together=1)
         for i, part in zip(order, results, strict=True):
             made[i] = part
             done += len(part.rows)
-            self._on_file(done, total)
-        self.marks |= {file: mark for part in made.values() for file, mark in part.marks.items()}
+            if self.on_file is not None:
+                self.on_file(done, total)
+            self.marks |= part.marks
         self.reread += total
         return made
 

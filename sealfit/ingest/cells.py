@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 
 from sealfit.config import TraceFormat
-from sealfit.errors import Fault
+from sealfit.errors import BadFile, Fault
 from sealfit.ingest.files import Layout, as_number, split_line, without_strays
 
 # ---------------------------------------------------------------- rows
@@ -36,28 +36,22 @@ class Rows:
 def clean(rows: Rows, names: list[str], file: str) -> tuple[Rows, int, list[Fault]]:
     """Return the rows whose slots are finite and whose time rises, the number left out, and the faults."""
     names = [name for name in names if name in rows.columns]
-    if _in_order(rows, names):
-        return rows, 0, []
     faults: list[Fault] = []
     finite = np.ones(len(rows.line), bool)
     for name in names:
         sizes = np.abs(rows.columns[name])
+        if (sizes < OVERLOAD).all():  # not so of nan
+            continue
         wrong, overload = ~np.isfinite(sizes), (sizes >= OVERLOAD) & np.isfinite(sizes)
         finite &= ~(wrong | overload)
         faults += _row_faults("not_finite", "the computed value is not a finite number.", name, rows, wrong, file)
         faults += _row_faults("overload", "is an instrument's mark for overload.", name, rows, overload, file)
     good = rows.where(finite)
     back = _out_of_order(good.columns["time_s"])
+    if not back.any():
+        return good, int((~finite).sum()), faults
     faults += _row_faults("time_order", "time repeats or runs backwards.", "time_s", good, back, file)
     return good.where(~back), int((~finite).sum() + back.sum()), faults
-
-
-def _in_order(rows: Rows, names: Sequence[str]) -> bool:
-    """Return whether nothing is to be found: every slot measured, time rising throughout."""
-    time_s = rows.columns["time_s"]
-    if len(time_s) < 2 or not (time_s[1:] > time_s[:-1]).all():
-        return False
-    return all(np.abs(rows.columns[name]).max() < OVERLOAD for name in names)  # not so of nan
 
 
 def _row_faults(check: str, reason: str, name: str, rows: Rows, wrong: np.ndarray, file: str) -> list[Fault]:
@@ -130,85 +124,117 @@ class Cells:
     faults: tuple[Fault, ...]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ColumnOfFile:
+    """A column of a trace file as messages name it; `line` are the lines of its rows, shape (n,)."""
+
+    file: str
+    name: str
+    line: np.ndarray
+    decimal: str
+
+    def fault(self, row: int, check: str, reason: str, **more) -> Fault:
+        """Return a fault of the cell in a row, which is left out."""
+        place = {"file": self.file, "line": int(self.line[row]), "column": self.name, "action": "row left out"}
+        return Fault(check, reason, **place, **more)
+
+    def not_a_number(self, row: int, cell: str) -> Fault:
+        """Return the fault of a cell that holds text; the fix is another decimal mark where that would do."""
+        fix = decimal_fix(cell, self.decimal) or "Put a number there or delete the line."
+        return self.fault(row, "not_a_number", "is not a number.", value=cell.strip(), fix=fix)
+
+    def rest(self, count: int) -> Fault:
+        """Return the fault that counts further cells."""
+        reason = f"and {count} more cells of this column that are not numbers."
+        place = {"file": self.file, "column": self.name, "action": "row left out"}
+        return Fault("not_a_number", reason, value=float(count), **place)
+
+
 def listed(rows: np.ndarray, make: Callable[[int], Fault], rest: Callable[[int], Fault]) -> list[Fault]:
     """Return a fault for each of the first rows, and one that counts the others: nothing floods, all is counted."""
     faults = [make(int(row)) for row in rows[:LISTED]]
     return [*faults, rest(len(rows) - LISTED)] if len(rows) > LISTED else faults
 
 
+def body_of(text: bytes, layout: Layout, settings: TraceFormat, file: str) -> bytes:
+    """Return the data lines of a file, without the line ends after the last one.
+
+    Raises
+    ------
+    BadFile
+        If it has none.
+    """
+    body = text[layout.start :].rstrip(b"\n \t" if settings.delimiter == "whitespace" else b"\n")
+    if not body.strip(b"\n \t,;"):
+        place = {"file": file, "action": "file left out"}
+        raise BadFile(Fault("no_rows", "has a header but no data.", fix="Export it again.", **place))
+    return body
+
+
+def width_of(body: bytes, delimiter: str) -> int:
+    """Return how many cells the first line has."""
+    first = body.partition(b"\n")[0]
+    return len(split_line(first.decode("utf-8", "replace"), delimiter))
+
+
 def read_cells(
-    bodies: Sequence[bytes],
-    files: Sequence[str],
-    layout: Layout,
-    settings: TraceFormat,
-    numeric: Mapping[int, str],
+    bodies: Sequence[tuple[str, bytes]], layout: Layout, settings: TraceFormat, numeric: Mapping[int, str]
 ) -> list[Cells]:
-    """Return the data of trace files that are written alike, those of each file by themselves.
+    """Return the data of trace files that have the same header, those of each file by themselves.
 
     Parameters
     ----------
-    bodies : sequence of bytes
-        The data lines of each file as clean UTF-8 (`text.body_of`), none of them empty.
-    files : sequence of str
-        What messages call the files.
+    bodies : sequence of (str, bytes)
+        What messages call each file, and its data lines as clean UTF-8 (`body_of`).
     layout : Layout
         Where the data begin, in all of the files.
     numeric : mapping of int to str
         Positions (from 0) that must hold numbers, and the names that messages call them.
     """
-    found = _fast(bodies, layout, settings, numeric)
+    sizes = [body.count(b"\n") + 1 for _, body in bodies]
+    columns = _fast(b"\n".join(body for _, body in bodies), sum(sizes), layout, settings, numeric)
+    if len(bodies) > 1 and (columns is None or any(values.dtype == object for values in columns.values())):
+        # One file spoils the reading of all, or what is text in one file may be numbers in another.
+        return [cells for one in bodies for cells in read_cells([one], layout, settings, numeric)]
+    if columns is None:
+        ((file, body),) = bodies
+        return [_patient(body, layout, settings, numeric, file)]
+    stops = np.cumsum(sizes)
     return [
-        _patient(body, layout, settings, numeric, file) if cells is None else cells
-        for cells, body, file in zip(found, bodies, files, strict=True)
+        Cells(
+            {i: values[stop - size : stop] for i, values in columns.items()},
+            np.arange(layout.first_line, layout.first_line + size),
+            np.zeros(size, bool),
+            (),
+        )
+        for size, stop in zip(sizes, stops, strict=True)
     ]
 
 
 def _fast(
-    bodies: Sequence[bytes], layout: Layout, settings: TraceFormat, numeric: Mapping[int, str]
-) -> list[Cells | None]:
-    """Return the cells as Arrow reads them, all files in one go; None for a file that is beyond it.
-
-    A file that spoils the reading of all is found by halving, so that it costs the others little.
-    """
-    rows = [_lines(body) for body in bodies]
-    table = _arrow(b"\n".join(bodies), sum(rows), settings, numeric)
-    texts = table is not None and any(not _is_number(column.type) for column in table.columns)
-    if len(bodies) > 1 and (table is None or texts):
-        # What is text in one file may be numbers in the next: such files are read one by one.
-        size = 1 if texts else (len(bodies) + 1) // 2
-        parts = [bodies[i : i + size] for i in range(0, len(bodies), size)]
-        return [cells for part in parts for cells in _fast(part, layout, settings, numeric)]
-    columns = None if table is None else _named_columns(table, layout)
-    if columns is None:
-        alone = ([None] if len(bodies) == 1 else _fast([body], layout, settings, numeric) for body in bodies)
-        return [cells for found in alone for cells in found]
-    stops = np.cumsum(rows)
-    starts = stops - rows
-    finite = np.ones(stops[-1], bool)
-    for i in numeric:
-        finite &= np.isfinite(columns[i])
-    made: list[Cells | None] = []
-    for start, stop, sound in zip(starts, stops, np.logical_and.reduceat(finite, starts), strict=True):
-        own = {i: values[start:stop] for i, values in columns.items()}
-        line = np.arange(layout.first_line, layout.first_line + stop - start)
-        # Empty cells, NaN and inf are to be named as they stand in the file.
-        made.append(Cells(own, line, np.zeros(stop - start, bool), ()) if sound else None)
-    return made
+    body: bytes, rows: int, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str]
+) -> dict[int, np.ndarray] | None:
+    """Return the columns as Arrow reads them; None where a cell, a line or the delimiter is beyond it."""
+    table = _arrow(body, settings, numeric)
+    # Blank lines, or line ends inside quotes: the line numbers would be wrong.
+    columns = None if table is None or table.num_rows != rows else _named_columns(table, layout)
+    # Empty cells, NaN and inf are to be named as they stand in the file.
+    finite = columns is not None and all(np.isfinite(columns[i]).all() for i in numeric)
+    return columns if finite else None
 
 
-def _arrow(body: bytes, rows: int, settings: TraceFormat, numeric: Mapping[int, str]) -> pa.Table | None:
+def _arrow(body: bytes, settings: TraceFormat, numeric: Mapping[int, str]) -> pa.Table | None:
     """Return the table that Arrow reads; None where a cell, a line or the delimiter is beyond it."""
     delimiter = settings.delimiter
     if delimiter == "whitespace":
         body, delimiter = _single_tabs(body), "tab"
     mark = "\t" if delimiter == "tab" else delimiter
-    first = body[: body.find(b"\n")] if b"\n" in body else body
-    width = len(split_line(first.decode("utf-8", "replace"), delimiter))
+    width = width_of(body, delimiter)
     if width <= max(numeric, default=0) or len(mark.encode()) != 1:
         return None
     names = [str(i) for i in range(width)]
     try:
-        table = pacsv.read_csv(
+        return pacsv.read_csv(
             pa.BufferReader(body),
             read_options=pacsv.ReadOptions(column_names=names, use_threads=False, block_size=max(len(body) + 1, 1024)),
             parse_options=pacsv.ParseOptions(delimiter=mark),
@@ -218,8 +244,6 @@ def _arrow(body: bytes, rows: int, settings: TraceFormat, numeric: Mapping[int, 
         )
     except pa.ArrowInvalid:
         return None
-    # Blank lines, or line ends inside quotes: the line numbers would be wrong.
-    return table if table.num_rows == rows else None
 
 
 def _named_columns(table: pa.Table, layout: Layout) -> dict[int, np.ndarray] | None:
@@ -230,10 +254,6 @@ def _named_columns(table: pa.Table, layout: Layout) -> dict[int, np.ndarray] | N
             return None
         del columns[i]
     return columns
-
-
-def _lines(body: bytes) -> int:
-    return int(np.count_nonzero(np.frombuffer(body, np.uint8) == ord("\n"))) + 1
 
 
 def _is_number(kind: pa.DataType) -> bool:
@@ -273,7 +293,8 @@ def _patient(body: bytes, layout: Layout, settings: TraceFormat, numeric: Mappin
         values = np.array([_float(cell, settings.decimal) for cell in cells], dtype=float)
         wrong = ~np.isfinite(values)
         bad |= wrong
-        faults += _cell_faults(np.flatnonzero(wrong), cells, rows, line, name, settings.decimal, file)
+        column = ColumnOfFile(file, name, line, settings.decimal)
+        faults += _cell_faults(column, np.flatnonzero(wrong), cells, rows)
         columns[i] = values
     beyond = np.array([any(cell.strip() for cell in row[width:]) for row in rows], dtype=bool)
     faults += _beyond_faults(np.flatnonzero(beyond & ~bad), rows, line, width, file)
@@ -291,34 +312,32 @@ def _float(cell: str | None, decimal: str) -> float:
     return np.nan if number is None else number
 
 
-def _cell_faults(at, cells, rows, line, name, decimal, file) -> list[Fault]:
+def _cell_faults(
+    column: ColumnOfFile, at: np.ndarray, cells: Sequence[str | None], rows: Sequence[Sequence[str]]
+) -> list[Fault]:
     def make(i: int) -> Fault:
         cell = cells[i]
-        place = {"file": file, "line": int(line[i]), "column": name, "action": "row left out"}
         if cell is None:
             reason = f"the line ends after {len(rows[i])} cells."
-            return Fault("too_few_cells", reason, fix="Complete or delete the line.", **place)
+            return column.fault(i, "too_few_cells", reason, fix="Complete or delete the line.")
         if not cell.strip():
-            return Fault("empty_cell", "the cell is empty.", fix="Fill it or delete the line.", value="", **place)
-        if as_number(cell, decimal) is not None:
-            return Fault("not_finite", "is not a finite number.", value=cell.strip(), fix="Delete the line.", **place)
+            return column.fault(i, "empty_cell", "the cell is empty.", value="", fix="Fill it or delete the line.")
+        if as_number(cell, column.decimal) is not None:
+            fix = "Delete the line."
+            return column.fault(i, "not_finite", "is not a finite number.", value=cell.strip(), fix=fix)
         if match := _REMARK.match(cell):
-            remark = match["remark"]
-            reason = f"a remark stands beside the number: {remark!r}."
+            reason = f"a remark stands beside the number: {match['remark']!r}."
             fix = "Put the right number alone in the cell."
-            return Fault("remark", reason, value=cell.strip(), fix=fix, **place)
-        fix = decimal_fix(cell, decimal) or "Put a number there or delete the line."
+            return column.fault(i, "remark", reason, value=cell.strip(), fix=fix)
         if i == 0 and len(at) < len(cells) and not any(char.isdigit() for char in cell):
             fix = "If this is a row of units, set units_row = true in the rig config; otherwise delete the line."
-        elif _CLOCK.fullmatch(cell.strip()):
+            return column.fault(i, "not_a_number", "is not a number.", value=cell.strip(), fix=fix)
+        if _CLOCK.fullmatch(cell.strip()):
             fix = "Export the time as seconds, not as time of day."
-        return Fault("not_a_number", "is not a number.", value=cell.strip(), fix=fix, **place)
+            return column.fault(i, "not_a_number", "is not a number.", value=cell.strip(), fix=fix)
+        return column.not_a_number(i, cell)
 
-    def rest(count: int) -> Fault:
-        reason = f"and {count} more cells of this column that are not numbers."
-        return Fault("not_a_number", reason, file=file, column=name, value=float(count), action="row left out")
-
-    return listed(at, make, rest)
+    return listed(at, make, column.rest)
 
 
 def decimal_fix(cell: str, decimal: str) -> str:

@@ -1,18 +1,17 @@
-"""What stands in each column of a trace file: ours, channels of numbers, labels; files written alike share it."""
+"""What stands in each column of a trace file: our columns, channels of numbers, or labels."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import BadFile, Fault
-from sealfit.ingest.cells import OVERLOAD, decimal_fix, listed
+from sealfit.ingest.cells import OVERLOAD, ColumnOfFile, listed
 from sealfit.ingest.expression import parse
-from sealfit.ingest.files import Layout, as_number, find_layout, split_line
+from sealfit.ingest.files import Layout, as_number, split_line
 from sealfit.tables import BINS, RUNS
 
 # ---------------------------------------------------------------- columns
@@ -139,7 +138,6 @@ MAX_LABELS = 20  # a text column with more different values, most of them used o
 
 def channel_columns(
     columns: Mapping[str, np.ndarray],
-    slots: Collection[str],
     good: np.ndarray,
     line: np.ndarray,
     config: Config,
@@ -154,13 +152,13 @@ def channel_columns(
     Parameters
     ----------
     columns : mapping of str to ndarray, shape (n,)
-        Float or object columns under our names; `slots` are passed on as they are.
+        Float or object columns under our names; those of `SLOTS` are passed on as they are.
     good, line : ndarray, shape (n,)
         Rows that are good so far, and the line numbers of all rows.
     """
     kept, drop, faults = dict(columns), np.zeros(len(good), bool), []
     for name, values in columns.items():
-        if name in slots:
+        if name in SLOTS:
             continue
         numbers, texts = (
             (values, None) if values.dtype.kind == "f" else (_numbers(values, config.trace.decimal), values)
@@ -184,7 +182,8 @@ def channel_columns(
             del kept[name]
         elif share:
             drop |= missing
-            faults += _cell_faults(name, numbers, texts, np.flatnonzero(missing), line, config.trace.decimal, file)
+            column = ColumnOfFile(file, name, line, config.trace.decimal)
+            faults += _cell_faults(column, np.flatnonzero(missing), numbers, texts)
     return kept, drop, faults
 
 
@@ -207,7 +206,7 @@ def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarr
         return listed(np.flatnonzero(full), make, rest)
     labels = len(set(texts[full]))
     if labels > MAX_LABELS and labels > 0.5 * full.sum():
-        return [_left_out(name, f"{labels} different texts are no labels", "info", file)]
+        return [_left_out(name, f"{labels} different texts are too many for labels", "info", file)]
     return []
 
 
@@ -217,84 +216,13 @@ def _left_out(name: str, reason: str, severity: str, file: str) -> Fault:
     return Fault("channel_left_out", reason, file=file, column=name, severity=severity, action="kept", fix=fix)
 
 
-def _cell_faults(name, numbers, texts, at, line, decimal, file) -> list[Fault]:
+def _cell_faults(column: ColumnOfFile, at: np.ndarray, numbers: np.ndarray, texts: np.ndarray | None) -> list[Fault]:
     def make(i: int) -> Fault:
-        place = {"file": file, "line": int(line[i]), "column": name, "action": "row left out"}
         cell = None if texts is None else texts[i]
-        if cell is not None and as_number(cell, decimal) is None:
-            fix = decimal_fix(cell, decimal) or "Put a number there or delete the line."
-            return Fault("not_a_number", "is not a number.", value=cell, fix=fix, **place)
+        if cell is not None and as_number(cell, column.decimal) is None:
+            return column.not_a_number(i, cell)
         value = cell if cell is not None else "" if np.isnan(numbers[i]) else str(numbers[i])  # JSON has no inf
-        reason = "is no measured number." if value != "" else "the cell holds no number."
-        return Fault("not_finite", reason, value=value, fix="Fill it or delete the line.", **place)
+        reason = "is not a measured number." if value != "" else "the cell holds no number."
+        return column.fault(i, "not_finite", reason, value=value, fix="Fill it or delete the line.")
 
-    def rest(count: int) -> Fault:
-        reason = f"and {count} more cells of this column that are not numbers."
-        return Fault("not_a_number", reason, file=file, column=name, value=float(count), action="row left out")
-
-    return listed(at, make, rest)
-
-
-# ---------------------------------------------------------------- form
-# How a trace file is written: its head, and what stands in each of its columns. Files written alike share it.
-
-
-@dataclass(frozen=True, slots=True)
-class Form:
-    """What files that begin with the same `head` and have as many cells in their first data line have in common.
-
-    `ours` holds our name of each position (from 0), `numeric` those that must hold numbers.
-    """
-
-    head: bytes
-    layout: Layout
-    cells: int
-    ours: Mapping[int, str]
-    numeric: Mapping[int, str]
-    delimiter: str
-
-    def fits(self, text: bytes) -> bool:
-        """Return whether a file is written like this."""
-        start = len(self.head)
-        if not text.startswith(self.head) or (start and not self.head.endswith(b"\n")):  # it ended within the head
-            return False
-        return _has_data(text, start) and _cells(text, start, self.delimiter) == self.cells
-
-    def body(self, text: bytes) -> bytes:
-        """Return the data lines of a file without the line ends after the last one."""
-        return text[self.layout.start :].rstrip(b"\n \t" if self.delimiter == "whitespace" else b"\n")
-
-
-def form_of(text: bytes, settings: TraceFormat, file: str) -> Form:
-    """Return how a file is written.
-
-    Parameters
-    ----------
-    text : bytes
-        The whole file as clean UTF-8 (`text.as_utf8`).
-
-    Raises
-    ------
-    BadFile
-        If its header does not end, it has no data, or a column is missing or named twice.
-    """
-    layout = find_layout(text, settings, file)
-    start = layout.start
-    if not _has_data(text, start):
-        place = {"file": file, "action": "file left out"}
-        raise BadFile(Fault("no_rows", "has a header but no data.", fix="Export it again.", **place))
-    cells = _cells(text, start, settings.delimiter)
-    ours = locate(layout, len(layout.names) or cells, settings, file)
-    must = numeric_names(settings)
-    numeric = {i: name for i, name in ours.items() if name in must}
-    return Form(text[:start], layout, cells, ours, numeric, settings.delimiter)
-
-
-def _has_data(text: bytes, start: int) -> bool:
-    blank = b"\n \t,;"
-    return bool(text[start : start + 256].strip(blank) or text[start:].strip(blank))
-
-
-def _cells(text: bytes, start: int, delimiter: str) -> int:
-    end = text.find(b"\n", start)
-    return len(split_line(text[start : end if end >= 0 else len(text)].decode("utf-8", "replace"), delimiter))
+    return listed(at, make, column.rest)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 
 from sealfit.config import Config
 from sealfit.errors import Fault
-from sealfit.ingest.categorical import Coded, Columns, add_keys, condition_columns, nothing
+from sealfit.ingest.categorical import Column, Columns, condition_columns, keys_of, known, mapped, over, put, where
 from sealfit.ingest.file_names import TEXT_COLUMNS
 from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import Entries, Entry
@@ -40,37 +39,37 @@ def to_values(entries: Entries, columns: Columns, config: Config) -> tuple[Colum
     return made, faults
 
 
-def _column(name: str, cells: Coded, entries: Entries, config: Config) -> tuple[Coded, list[Fault]]:
-    labels = cells.map(lambda cell: cell if isinstance(cell, str) else f"{cell:g}")
+def _column(name: str, cells: Column, entries: Entries, config: Config) -> tuple[Column, list[Fault]]:
+    labels = mapped(cells, _text)
     if name in TEXT_COLUMNS:
         return labels, []
-    number = [cell if isinstance(cell, float) else as_number(cell) for cell in cells.values]
-    bad = [value is None or not math.isfinite(value) for value in number]
-    wrong = np.flatnonzero(np.array([*bad, False], bool)[cells.codes])
-    count = int(cells.known.sum())
-    known = name in NUMBERS or name in COUNTS
-    if len(wrong) and not known and len(wrong) >= (1 - _MOSTLY) * count:
+    values = mapped(cells, _number)  # nan: not missing, but wrong
+    wrong = np.flatnonzero(where(values, lambda value: not math.isfinite(value))).tolist()
+    count = int(known(cells).sum())
+    meant = name in NUMBERS or name in COUNTS  # as numbers
+    if wrong and not meant and len(wrong) >= (1 - _MOSTLY) * count:
         return labels, []
-    if len(wrong) and not known and name not in config.condition:
-        i = int(wrong[0])
-        reason = f"{len(wrong)} of {count} cells are no numbers; the column is kept as labels."
+    if wrong and not meant and name not in config.condition:
+        i = wrong[0]
+        reason = f"{len(wrong)} of {count} cells are not numbers; the column is kept as labels."
         fix = "Empty the cell, or put a number there."
         place = {"severity": "warning", "action": "kept", "value": labels[i], "fix": fix}
         return labels, [entries[i].fault("not_a_number", reason, name, **place)]
     fix = "Put a number there."
-    faults = [
-        entries[i].fault("not_a_number", "is not a number.", name, value=labels[i], fix=fix) for i in wrong.tolist()
-    ]
-    # nan: not missing, but wrong
-    values = Coded(cells.codes, [math.nan if value is None else value for value in number])
+    faults = [entries[i].fault("not_a_number", "is not a number.", name, value=labels[i], fix=fix) for i in wrong]
     if name not in COUNTS:
         return values, faults
     fix = f"Number the {COUNTS[name]} 1, 2, 3."
     faults += [
-        entries[i].fault("not_a_number", "is no whole number.", name, value=values[i], fix=fix)
-        for i in np.flatnonzero(values.where(lambda value: math.isfinite(value) and value != int(value))).tolist()
+        entries[i].fault("not_a_number", "is not a whole number.", name, value=values[i], fix=fix)
+        for i in np.flatnonzero(where(values, lambda value: math.isfinite(value) and value != int(value))).tolist()
     ]
-    return values.map(lambda value: int(value) if math.isfinite(value) else -1), faults
+    return mapped(values, lambda value: int(value) if math.isfinite(value) else -1), faults
+
+
+def _number(cell: float | str) -> float:
+    number = cell if isinstance(cell, float) else as_number(cell)
+    return math.nan if number is None else number
 
 
 def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
@@ -80,16 +79,16 @@ def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
         (
             "load_N",
             lambda value: value <= 0,
-            "does not press.",
-            "The normal load is above 0; leave it empty if unknown.",
+            "is not above 0.",
+            "A normal load presses; leave the cell empty if it is unknown.",
         ),
-        ("speed_mm_s", lambda value: value == 0, "is no speed to slide at.", "Leave it empty if it is unknown."),
+        ("speed_mm_s", lambda value: value == 0, "is not a sliding speed.", "Leave it empty if it is unknown."),
     )
     found = [
         (i, entries[i].fault("out_of_range", reason, name, value=columns[name][i], fix=fix))
         for name, wrong, reason, fix in rules
         if name in columns
-        for i in np.flatnonzero(columns[name].where(wrong)).tolist()
+        for i in np.flatnonzero(where(columns[name], wrong)).tolist()
     ]
     return [fault for _, fault in sorted(found, key=lambda one: one[0])]
 
@@ -103,29 +102,19 @@ SETTING = 0.005  # commanded speeds and loads closer than this share are one set
 SAME_SPEED = 0.05  # measured speeds closer than this share are one commanded speed; rigs repeat within a few percent
 
 
-def condition_keys(columns: Columns, files: int, config: Config) -> Coded:
-    """Return the condition of each of so many files in words, as `conditions.add_keys` spells it.
+def condition_keys(columns: Columns, files: int, config: Config) -> list[str]:
+    """Return the condition of each of so many files in words, as `categorical.add_keys` spells it.
 
     Examples
     --------
-    >>> sixty, eighty, four = (Coded.of([value]) for value in (60.0, 80.0, 4.0))
-    >>> campaign = {"temperature_C": sixty, "compression_ratio_pct": eighty, "aging_days": four}
-    >>> condition_keys(campaign, 1, Config()).values
+    >>> campaign = {"temperature_C": [60.0], "compression_ratio_pct": [80.0], "aging_days": [4.0]}
+    >>> condition_keys(campaign, 1, Config())
     ['temperature_C=60, compression_ratio_pct=80, aging_days=4']
-    >>> condition_keys({"aging_days": Coded.of([0.0])}, 1, Config()).values
+    >>> condition_keys({"aging_days": [0.0]}, 1, Config())
     ['unaged']
     """
-    names = condition_columns(config)
-    own = [columns.get(name, nothing(files)) for name in names]
-    group = np.zeros(files, np.int64)
-    for column in own:
-        group = pd.factorize(group * (len(column.values) + 1) + column.codes)[0]
-    first = _first(group)
-    one = np.unique(first)  # a file of each condition
-    cells = [Coded(column.codes[one], column.values).cells() for column in own]
-    table = pd.DataFrame({name: pd.Series(column, dtype=object) for name, column in zip(names, cells, strict=True)})
-    words = Coded.of(add_keys(table, config)["condition"].tolist())
-    return Coded(words.codes[np.searchsorted(one, first)], words.values)
+    own = {name: columns.get(name, [None] * files) for name in condition_columns(config)}
+    return keys_of(own, files, config)["condition"]
 
 
 def _text(value: float | str) -> str:
@@ -141,22 +130,18 @@ def as_set(columns: Columns) -> Columns:
     return columns | {name: _one_setting(columns[name]) for name in ("speed_mm_s", "load_N") if name in columns}
 
 
-def _one_setting(column: Coded) -> Coded:
-    values = column.values
-    count = np.bincount(column.codes[column.known], minlength=len(values))
-    order = sorted(
-        (k for k in range(len(values)) if math.isfinite(values[k])), key=lambda k: (abs(values[k]), values[k])
-    )
-    groups: list[list[int]] = []
+def _one_setting(column: Column) -> Column:
+    count = Counter(value for value in column if value is not None and math.isfinite(value))
+    order = sorted(count, key=lambda value: (abs(value), value))
+    usual: dict[float, float] = {}
     for sign in (1.0, -1.0):
-        start = None
-        for k in (k for k in order if math.copysign(1.0, values[k]) == sign):
-            if start is None or abs(values[k]) > abs(values[start]) * (1 + SETTING):
-                start = k
-                groups.append([])
-            groups[-1].append(k)
-    usual = {values[k]: values[max(group, key=lambda k: count[k])] for group in groups for k in group}
-    return column.map(lambda value: usual.get(value, value))
+        group: list[float] = []
+        for value in (value for value in order if math.copysign(1.0, value) == sign):
+            if group and abs(value) > abs(group[0]) * (1 + SETTING):
+                group = []
+            group.append(value)
+            usual.update(dict.fromkeys(group, max(group, key=count.__getitem__)))
+    return mapped(column, lambda value: usual.get(value, value))
 
 
 def add_order(entries: Entries, columns: Columns) -> tuple[Columns, list[Fault]]:
@@ -167,28 +152,26 @@ def add_order(entries: Entries, columns: Columns) -> tuple[Columns, list[Fault]]
     """
     if "started_at" not in columns:
         return columns, []
-    started = columns["started_at"]
-    texts = [str(value).strip() for value in started.values]
-    times = [_time(text) for text in texts]
+    texts = mapped(columns["started_at"], lambda value: str(value).strip())
+    times = mapped(texts, _time)
     fix = "Write it as 2024-03-01T09:30:00."
-    bad = np.array([*(time is None for time in times), False], bool)[started.codes]
     faults = [
-        entries[i].fault("not_a_time", "is no ISO 8601 time.", "started_at", value=texts[started.codes[i]], fix=fix)
-        for i in np.flatnonzero(bad).tolist()
+        entries[i].fault("not_a_time", "is not an ISO 8601 time.", "started_at", value=text, fix=fix)
+        for i, (text, time) in enumerate(zip(texts, times, strict=True))
+        if text is not None and time is None
     ]
     if any(time.tzinfo for time in times if time is not None):
-        zoned = [time if time is None or time.tzinfo else time.replace(tzinfo=UTC) for time in times]
-        times = [None if time is None else time.astimezone(UTC).replace(tzinfo=None) for time in zoned]
-    moment = pa.array([*times, None], pa.timestamp("us")).to_numpy(zero_copy_only=False)[started.codes]
-    known = ~np.isnat(moment)
-    if not known.any():
+        times = mapped(times, lambda time: (time if time.tzinfo else time.replace(tzinfo=UTC)).astimezone(UTC))
+    moments = pd.Series(pd.to_datetime(pd.Series(times, dtype=object), utc=True))
+    if not moments.notna().any():
         return columns, faults
-    different, of, count = np.unique(moment[known], return_inverse=True, return_counts=True)
-    codes = np.full(len(entries), -1, np.int32)
-    codes[known] = of
-    place = 1.0 + np.cumsum(count) - count
-    hours = (different - different[0]).astype(np.int64) / 1e6 / 3600
-    return {**columns, "run_order": Coded(codes, place.tolist()), "elapsed_h": Coded(codes, hours.tolist())}, faults
+    hours = (moments - moments.min()) / pd.Timedelta(hours=1)
+    derived = {"run_order": moments.rank(method="min"), "elapsed_h": hours}
+    return columns | {name: _with_none(values) for name, values in derived.items()}, faults
+
+
+def _with_none(values: pd.Series) -> Column:
+    return [None if math.isnan(value) else value for value in values.tolist()]
 
 
 def _time(text: str) -> datetime | None:
@@ -198,37 +181,39 @@ def _time(text: str) -> datetime | None:
         return None
 
 
-def add_specimens(columns: Columns, conditions: Coded) -> Columns:
+def add_specimens(columns: Columns, conditions: list[str]) -> Columns:
     """Return the columns with `specimen_id`: one per condition where none is named."""
     if "specimen_id" not in columns:
         return {"specimen_id": conditions, **columns}
-    return {**columns, "specimen_id": columns["specimen_id"].over(conditions)}
+    return {**columns, "specimen_id": over(columns["specimen_id"], conditions)}
 
 
-def add_runs(columns: Columns, conditions: Coded, measured: Sequence[float], unit: str) -> tuple[Columns, list[Fault]]:
+def add_runs(
+    columns: Columns, conditions: list[str], measured: Sequence[float], unit: str
+) -> tuple[Columns, list[Fault]]:
     """Return the columns with a `run_id` for every file, and what is to be said of it.
 
     Where none is given there is one per condition, commanded speed and (named) specimen.
 
     Parameters
     ----------
-    columns : dict of str to Coded
+    columns : dict of str to list
         What is known of the files; `speed_mm_s` is signed where a sign was given.
-    conditions : Coded
+    conditions : list of str
         Condition of each file in words.
     measured : sequence of float
         Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run.
     unit : str
         Unit of the speeds.
     """
-    none = nothing(len(conditions.codes))
+    none = [None] * len(conditions)
     given = columns.get("run_id", none)
-    if given.known.all():
+    if None not in given:
         return columns, []
     run_ids: dict[int, str] = {}
     groups = defaultdict(list)
     specimens, speeds = columns.get("specimen_id", none), columns.get("speed_mm_s", none)
-    for i in np.flatnonzero(~given.known).tolist():
+    for i in np.flatnonzero(~known(given)).tolist():
         words = [conditions[i]]
         if specimens[i] is not None:
             words.append(str(specimens[i]))
@@ -247,7 +232,7 @@ def add_runs(columns: Columns, conditions: Coded, measured: Sequence[float], uni
                 name = words if math.isnan(middle) else f"{words}, about {middle:.3g} {unit}"
                 run_ids.update(dict.fromkeys(cluster, name))
                 cluster = []
-    added = {**columns, "run_id": given.put(run_ids)}
+    added = {**columns, "run_id": put(given, run_ids)}
     if not groups:
         return added, []
     reason = "neither run_id nor a commanded speed is given; files of one condition share a run within 5 % of speed."
@@ -261,13 +246,13 @@ def add_repeats(columns: Columns) -> Columns:
     Files that hold different strokes of a run, as their column `stroke` says, are numbered stroke by stroke.
     """
     run = columns["run_id"]
-    none = nothing(len(run.codes))
+    none = [None] * len(run)
     given, hours, stroke = (columns.get(name, none) for name in ("repeat", "elapsed_h", "stroke"))
-    if given.known.all():
+    if None not in given:
         return columns
     runs = defaultdict(list)
-    for i, code in enumerate(zip(run.codes.tolist(), stroke.codes.tolist(), strict=True)):
-        runs[code].append(i)
+    for i, key in enumerate(zip(run, stroke, strict=True)):
+        runs[key].append(i)
     numbers: dict[int, int] = {}
     for members in runs.values():
         if all(hours[i] is not None for i in members):
@@ -275,25 +260,21 @@ def add_repeats(columns: Columns) -> Columns:
         used = {given[i] for i in members if given[i] is not None}
         free = (number for number in range(1, len(members) + len(used) + 1) if number not in used)
         numbers.update({i: next(free) for i in members if given[i] is None})
-    return {**columns, "repeat": given.put(numbers)}
+    return {**columns, "repeat": put(given, numbers)}
 
 
-def disagreements(entries: Entries, columns: Columns, conditions: Coded) -> list[Fault]:
+def disagreements(entries: Entries, columns: Columns, conditions: list[str]) -> list[Fault]:
     """Return faults of runs: a repeat that stands twice, or differs from its run in condition, speed or load."""
-    none = nothing(len(entries))
+    none = [None] * len(entries)
     run, repeat, specimen = (columns[name] for name in ("run_id", "repeat", "specimen_id"))
     stroke = columns.get("stroke", none)
     told = {"speed_mm_s": columns.get("speed_mm_s", none), "load_N": columns.get("load_N", none)}
     told["condition"] = conditions
-    first = _first(run.codes)
-    same_repeat = _first(run.codes.astype(np.int64) * (len(repeat.values) + 1) + repeat.codes)
-    same_repeat = _first(same_repeat * (len(stroke.values) + 1) + stroke.codes)
-    odd = same_repeat != np.arange(len(entries))
-    for column in (*told.values(), specimen):
-        odd |= column.codes != column.codes[first]
+    first: dict[object, int] = {}  # file of each run, and of each repeat
     faults = []
-    for i in np.flatnonzero(odd).tolist():
-        entry, j, other = entries[i], int(first[i]), int(same_repeat[i])
+    for i, entry in enumerate(entries):
+        j = first.setdefault(run[i], i)
+        other = first.setdefault((run[i], repeat[i], stroke[i]), i)
         if other != i:
             reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
             fix = "Give every file of a run its own repeat number, or each stroke of a repeat its number."
@@ -311,13 +292,6 @@ def disagreements(entries: Entries, columns: Columns, conditions: Coded) -> list
             place = {"severity": "warning", "action": "kept", "fix": "Give each specimen a run_id of its own."}
             faults.append(entry.fault("run_specimens", reason, "specimen_id", value=specimen[i], **place))
     return faults
-
-
-def _first(groups: np.ndarray) -> np.ndarray:
-    """Return for every file the first one of its group, shape (files,)."""
-    of = pd.factorize(groups)[0]  # numbered as they appear
-    first = np.flatnonzero(np.diff(np.maximum.accumulate(of), prepend=-1))
-    return first[of]
 
 
 def _place(entry: Entry) -> str:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sealfit.config import Files
 from sealfit.errors import ConfigError
-from sealfit.ingest.categorical import Coded, Columns
+from sealfit.ingest.categorical import Columns, taken
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.files import as_number
 
 # ---------------------------------------------------------------- refs
-# What is known of a trace file before it is read.
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,14 +33,14 @@ class TraceRef:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Listing(Sequence[TraceRef]):
-    """The trace files of a campaign, or some of them, in order; column by column, as they are many.
+    """The trace files of a campaign, or some of them, in order.
 
     `columns` hold the channels; `conditions` the condition of each file in words.
     """
 
     files: list[str]
     columns: Columns
-    conditions: Coded
+    conditions: list[str]
 
     def __len__(self) -> int:
         return len(self.files)
@@ -50,21 +49,12 @@ class Listing(Sequence[TraceRef]):
         known = ((name, column[i]) for name, column in self.columns.items())
         return TraceRef(self.files[i], {name: value for name, value in known if value is not None})
 
-    def __iter__(self) -> Iterator[TraceRef]:
-        cells = (column.cells() for column in self.columns.values())
-        for file, *values in zip(self.files, *cells, strict=True):
-            known = zip(self.columns, values, strict=True)
-            yield TraceRef(file, {name: value for name, value in known if value is not None})
-
-    def words(self) -> dict[str, np.ndarray]:
-        """Return every column in words, shape (files,)."""
-        return {name: column.words() for name, column in self.columns.items()}
-
     def take(self, files: np.ndarray) -> Listing:
         """Return some of the files, by their numbers, with the columns in which any of them has a value."""
-        taken = {name: column.take(files) for name, column in self.columns.items()}
-        filled = {name: column for name, column in taken.items() if column.values}
-        return Listing([self.files[i] for i in files.tolist()], filled, self.conditions.take(files))
+        chosen = files.tolist()
+        columns = taken(self.columns, chosen)
+        filled = {name: c for name, c in columns.items() if any(value is not None for value in c)}
+        return Listing([self.files[i] for i in chosen], filled, [self.conditions[i] for i in chosen])
 
 
 # ---------------------------------------------------------------- names

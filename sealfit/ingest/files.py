@@ -105,7 +105,7 @@ def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, 
     try:
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
-            raise _bad_path(file, "unreadable_file", "is no file.", "Check the path.")
+            raise _bad_path(file, "unreadable_file", "is not a file.", "Check the path.")
         raw = os.read(handle, status.st_size + 1 if size is None else size)
         # Short where it is the whole file; a network's file system, or a file above 2 GB, may give it piece by piece.
         while size is None and len(raw) != status.st_size and (more := os.read(handle, 1 << 24)):
@@ -126,7 +126,7 @@ def _not_opened(path: str, file: str, error: OSError) -> BadFile:
     if isinstance(error, FileNotFoundError):
         return _bad_path(file, "missing_file", "does not exist.", _similar(Path(path)))
     if os.path.exists(path) and not os.path.isfile(path):  # a folder, where folders cannot be opened
-        return _bad_path(file, "unreadable_file", "is no file.", "Check the path.")
+        return _bad_path(file, "unreadable_file", "is not a file.", "Check the path.")
     return _bad_path(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.")
 
 

@@ -5,95 +5,20 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from difflib import SequenceMatcher
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv as pa_csv
 
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, Fault
-from sealfit.ingest.categorical import Coded, Columns
+from sealfit.ingest.categorical import Columns, mapped
 from sealfit.ingest.columns import nearest, suggestion
-from sealfit.ingest.files import as_number, as_utf8, inside, read_bytes, split_line
-
-# ---------------------------------------------------------------- listing
-# What lies in the folders of a campaign: each folder is looked into once, however many files are listed in it.
-
-
-class _Names(NamedTuple):
-    """What lies in a folder, as paths below the campaign."""
-
-    plain: frozenset[str]  # what is no link and lies inside the campaign, as its folder does
-    all: frozenset[str]
-
-
-@dataclass(frozen=True)
-class Folders:
-    """The folders of `campaign` that were asked for; a folder is its path below the campaign, "" for the campaign."""
-
-    campaign: Path
-    _seen: dict[str, _Names] = field(default_factory=dict)
-
-    def hold(self, file: str) -> bool:
-        """Return whether a path, there or not, lies inside the campaign, links followed: as `folder.inside`."""
-        if not _may_be_a_drive(file) and file in self._names(file.rpartition("/")[0]).plain:
-            return True
-        return inside(self.campaign, file) is not None
-
-    def outside(self, files: Collection[str]) -> set[str]:
-        """Return those of the paths that do not lie inside the campaign: as `hold`, a folder at a time."""
-        odd = set(files).difference(*(self._names(folder).plain for folder in _folders(files)))
-        if _may_be_a_drive("/".join(files)):
-            odd |= {file for file in files if _may_be_a_drive(file)}
-        return {file for file in odd if not self.hold(file)}
-
-    def beside(self, files: Collection[str]) -> set[str]:
-        """Return the files that lie beside `files`, in the same folders and with one of their endings; not `files`."""
-        others = set().union(*(self._names(folder).all for folder in _folders(files))).difference(files)
-        if not others:
-            return others
-        wanted = {_ending(file) for file in others}
-        endings = {ending for ending in wanted if any(_ending(file) == ending for file in files)}  # the first has it
-        return {file for file in others if _ending(file) in endings and (self.campaign / file).is_file()}
-
-    def _names(self, folder: str) -> _Names:
-        if folder not in self._seen:
-            below = f"{folder}/" if folder else ""
-            try:
-                with os.scandir(self.campaign / folder) as entries:
-                    link = {below + entry.name: entry.is_symlink() for entry in entries}
-            except OSError:  # no folder, or one that may not be read: its files will say so when they are read
-                link = {}
-            within = not folder or inside(self.campaign, folder) is not None
-            plain = (file for file, is_link in link.items() if within and not is_link)
-            self._seen[folder] = _Names(frozenset(plain), frozenset(link))
-        return self._seen[folder]
-
-
-def _folders(files: Iterable[str]) -> set[str]:
-    return {file.rpartition("/")[0] for file in files}
-
-
-def _may_be_a_drive(path: str) -> bool:
-    return ":" in path or "\\" in path
-
-
-def _ending(file: str) -> str:
-    """Return the suffix of a path as pathlib has it: none of `.csv` and `name.`."""
-    name = file.rpartition("/")[2]
-    dot = name.rfind(".")
-    return name[dot:] if 0 < dot < len(name) - 1 else ""
-
-
-# ---------------------------------------------------------------- runs csv
-# Which trace files a campaign has and what its table or its folder says of each: runs.csv, or a glob.
+from sealfit.ingest.files import Folder, as_number, as_utf8, read_bytes, split_line
 
 RUNS_CSV = "runs.csv"
 KNOWN = (
@@ -110,7 +35,6 @@ KNOWN = (
 
 
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
-_DETOURS = ("\\", "//", "/./", "/../")
 _BLANK = b" \t,;\n"  # a line of nothing else is none
 
 
@@ -129,20 +53,22 @@ class Entry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entries(Sequence[Entry]):
-    """The trace files of a campaign in order, and their lines in runs.csv, shape (files,), where there is one."""
+    """The trace files of a campaign in order, and the line of each in runs.csv, where there is one."""
 
     files: list[str]
-    lines: np.ndarray | None = None
+    lines: list[int] | None = None
 
     def __len__(self) -> int:
         return len(self.files)
 
     def __getitem__(self, i: int) -> Entry:
-        return Entry(self.files[i], None if self.lines is None else int(self.lines[i]))
+        return Entry(self.files[i], None if self.lines is None else self.lines[i])
 
     def take(self, files: np.ndarray) -> Entries:
         """Return some of the files, by their numbers."""
-        return Entries([self.files[i] for i in files.tolist()], None if self.lines is None else self.lines[files])
+        chosen = files.tolist()
+        lines = None if self.lines is None else [self.lines[i] for i in chosen]
+        return Entries([self.files[i] for i in chosen], lines)
 
 
 def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list[Fault]]:
@@ -158,7 +84,7 @@ def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list
         If there is no folder, or neither runs.csv nor a glob, or runs.csv cannot be read as a table.
     """
     if not campaign.is_dir():
-        what = "is no folder." if campaign.exists() else "does not exist."
+        what = "is not a folder." if campaign.exists() else "does not exist."
         raise _stop("missing_folder", f"the campaign folder '{campaign}' {what}", "Check the path.")
     cells: Columns = {}
     if (campaign / RUNS_CSV).exists() or (campaign / RUNS_CSV).is_symlink():
@@ -169,9 +95,9 @@ def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list
         count = sum(1 for _ in campaign.rglob("*.csv"))
         fix = f"Write one (the folder holds {count} CSV files), or give a config with files.glob."
         raise _stop("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", fix, file=RUNS_CSV)
-    folders = Folders(campaign)
-    outside = folders.outside(entries.files)
-    faults = faults + _paths(campaign, entries, outside) + _unlisted(folders, entries, outside, config)
+    folder = Folder(campaign)
+    outside = {file for file in entries.files if folder.inside(file) is None}
+    faults = faults + _paths(campaign, entries, outside) + _unlisted(campaign, entries, outside, config)
     return entries, cells, faults
 
 
@@ -189,19 +115,19 @@ def _read_runs(campaign: Path, config: Config) -> tuple[Entries, Columns, list[F
         text = as_utf8(read_bytes(campaign, RUNS_CSV), "auto", RUNS_CSV)
     except BadFile as error:
         raise _stop(error.fault.check, error.fault.reason, error.fault.fix, file=RUNS_CSV) from error
-    first, head = next(_lines(text), (1, ""))
+    _, head = next(_lines(text), (1, ""))
     delimiter = max(",;\t", key=head.count)
     names, faults = _our_names(_cells(head, delimiter) if head else [], config)
     if "file" not in names:
         fix = suggestion("file", _cells(head, delimiter) if head else [])
         raise _stop("missing_column", "there is no such column.", fix, file=RUNS_CSV, line=1, column="file")
-    lines, columns = _plain_table(text, names, delimiter, first) or _line_by_line(text, names, delimiter, faults)
+    lines, columns = _rows(text, names, delimiter, faults)
     if delimiter != ",":  # decimal commas are plain here: no cell of a table of ; or tabs can be split by them
-        columns = {name: column.map(_decimal_point) for name, column in columns.items()}
-    files = _posix_paths(campaign, columns.pop("file").cells())
+        columns = {name: mapped(column, _decimal_point) for name, column in columns.items()}
+    files = [_posix(campaign, file) for file in columns.pop("file", [])]
     if not files and not any(fault.severity == "error" for fault in faults):
         raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=RUNS_CSV)
-    return Entries(files, lines), {name: column.map(_said) for name, column in columns.items()}, faults
+    return Entries(files, lines), {name: mapped(column, _said) for name, column in columns.items()}, faults
 
 
 def _lines(text: bytes) -> Iterator[tuple[int, str]]:
@@ -223,33 +149,8 @@ def _decimal_point(cell: str) -> str:
     return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
 
 
-def _plain_table(text: bytes, names: list[str], delimiter: str, first: int) -> tuple[np.ndarray, Columns] | None:
-    """Return what `_line_by_line` would, at once; None unless every line has a cell for every name, none in quotes."""
-    if first > 1 or b'"' in text or len(set(names)) < len(names):
-        return None
-    places = [str(i) for i in range(len(names))]
-    try:
-        table = pa_csv.read_csv(
-            pa.BufferReader(text),
-            pa_csv.ReadOptions(column_names=places, skip_rows=1, block_size=len(text) + 1, use_threads=False),
-            pa_csv.ParseOptions(delimiter=delimiter, quote_char=False, ignore_empty_lines=False),
-            pa_csv.ConvertOptions(column_types=dict.fromkeys(places, pa.dictionary(pa.int32(), pa.string()))),
-        )
-    except pa.ArrowInvalid:
-        return None
-    columns: Columns = {}
-    for name, found in zip(names, table.unify_dictionaries().columns, strict=True):
-        cells = found.combine_chunks()
-        coded = Coded(cells.indices.to_numpy(), cells.dictionary.to_pylist()).map(lambda cell: cell.strip() or None)
-        if name == "file" and not coded.known.all():
-            return None
-        if name:
-            columns[name] = coded
-    return np.arange(2, len(table) + 2), columns
-
-
-def _line_by_line(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) -> tuple[np.ndarray, Columns]:
-    """Return the line of every trace file, shape (files,), and the columns that have a name; adds to `faults`."""
+def _rows(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) -> tuple[list[int], Columns]:
+    """Return the line of every trace file, and the columns that have a name; adds to `faults`."""
     lines, rows = [], []
     for number, line in islice(_lines(text), 1, None):
         cells = _cells(line, delimiter)
@@ -264,7 +165,7 @@ def _line_by_line(text: bytes, names: list[str], delimiter: str, faults: list[Fa
             continue
         lines.append(number)
         rows.append(row)
-    return np.array(lines, int), {name: Coded.of(row.get(name) for row in rows) for name in names if name}
+    return lines, {name: [row.get(name) for row in rows] for name in names if name}
 
 
 def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault]]:
@@ -290,11 +191,6 @@ def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault
             place = {"file": RUNS_CSV, "line": 1, "column": name}
             faults.append(Fault("column_name", reason, severity="warning", action="kept", fix=fix, **place))
     return names, faults
-
-
-def _posix_paths(campaign: Path, files: list[str]) -> list[str]:
-    text = "/" + "/\n/".join(files) + "/"
-    return [_posix(campaign, file) for file in files] if any(mark in text for mark in _DETOURS) else files
 
 
 def _posix(campaign: Path, file: str) -> str:
@@ -342,15 +238,15 @@ def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:
     return faults
 
 
-def _unlisted(folders: Folders, entries: Entries, outside: set[str], config: Config) -> list[Fault]:
+def _unlisted(campaign: Path, entries: Entries, outside: set[str], config: Config) -> list[Fault]:
     """Return files that runs.csv does not list: beside the traces and of the same ending, or matched by the glob."""
     if not entries or entries.lines is None:
         return []
     listed = set(entries.files)
-    there = folders.beside(listed - outside)
+    there = files_beside(campaign, listed - outside)
     if config.files.glob and ".." not in config.files.glob and not config.files.glob.startswith("/"):
-        found = (p for p in folders.campaign.glob(config.files.glob) if p.is_file())
-        there |= {p.relative_to(folders.campaign).as_posix() for p in found}
+        found = (p for p in campaign.glob(config.files.glob) if p.is_file())
+        there |= {p.relative_to(campaign).as_posix() for p in found}
     files = there - listed - {RUNS_CSV}
     fix = "Add it to runs.csv if it is a trace."
     return [
@@ -358,3 +254,17 @@ def _unlisted(folders: Folders, entries: Entries, outside: set[str], config: Con
         for f in sorted(files, key=natural)
         if not any(fnmatchcase(f, pattern) for pattern in config.files.exclude)
     ]
+
+
+def files_beside(campaign: Path, files: Collection[str]) -> set[str]:
+    """Return the files that lie beside `files`, in the same folders and with one of their endings; not `files`."""
+    endings, found = {os.path.splitext(file)[1] for file in files}, set()
+    for folder in {file.rpartition("/")[0] for file in files}:
+        below = f"{folder}/" if folder else ""
+        try:
+            with os.scandir(campaign / folder) as entries:
+                names = [e.name for e in entries if os.path.splitext(e.name)[1] in endings and e.is_file()]
+        except OSError:  # no folder, or one that may not be read: its files will say so when they are read
+            continue
+        found.update(below + name for name in names)
+    return found.difference(files)

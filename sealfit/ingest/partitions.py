@@ -18,8 +18,8 @@ from sealfit.errors import Fault
 from sealfit.ingest.averages import bin_table, mean_traces
 from sealfit.ingest.categorical import condition_columns, keys_of
 from sealfit.ingest.file_names import Listing
-from sealfit.ingest.files import as_number
-from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_files
+from sealfit.ingest.files import Folder, as_number
+from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_strokes
 from sealfit.store.manifest import Fingerprint
 from sealfit.store.parquet import as_dictionary, to_arrow
 from sealfit.tables import BINS, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
@@ -60,9 +60,12 @@ def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.
 # Where a cut lies depends on the runs beside it alone (content-defined chunking), so files that are added to a campaign
 # change the part they belong to and, at most, its neighbours; everything else stays as it is on the disk.
 
-PART_FILES = 256  # a part of so many files is stored in one file a table: few enough files, and little to read for one
-PART_BYTES = 4_000_000  # condition; of trace files, whichever comes first: a part's samples take some ten times that
-LEAST, MOST = 0.25, 2.0  # smallest and largest part, in parts as wanted; a run is never cut
+# Files of a part: few enough to be read for one condition, many enough that 100,000 files are some 400 parts.
+PART_FILES = 256
+# Bytes of trace files of a part, if these come first. Its samples take some ten times that in memory.
+PART_BYTES = 4_000_000
+# Smallest and largest part, as multiples of the size above. A run is never cut.
+LEAST, MOST = 0.25, 2.0
 
 
 def plan_parts(conditions: Sequence[str], runs: Sequence[str], sizes: Sequence[int]) -> list[list[int]]:
@@ -175,7 +178,7 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
     config : Config
         The rig.
     """
-    files = read_files(asked.refs, campaign, config)
+    files = read_strokes(asked.refs, Folder(campaign), config)
     strokes = stroke_columns(files, config)
     known = pa.table({name: _array(values) for name, values in strokes.items()})
     found = tuple(FileFound(made.file, made.mark, made.rows, len(made.strokes)) for made in files)

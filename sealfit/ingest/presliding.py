@@ -3,32 +3,48 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from sealfit.ingest.segments import median, quantile
 
-SETTLED = np.log(50000.0)  # the rise is over when 1/50000 is left: 1/5000 showed in means over a campaign
-AFTER_RAMP = 3.0  # rise lengths after the speed ramp: the bristles follow the changing speed over one rise length
-ENOUGH = np.log(100.0)  # where 1/50000 would take more than a third of the stroke, 1 % of the rise may stay
-HALF_WAY = 0.75  # a force that begins above this share of its level comes up, if at all, over a short distance:
-SHORT = 0.01  # this share of the stroke; a longer climb is an effect (run-in, warming), and stays inside
-SOON = 0.03  # share of the stroke in which the fall of an overshoot comes down by 63 %, at most
-EARLY = (0.05, 0.5)  # share of the distance in which the plateau is read: near the rise, past any ordinary rise
-LATE = (0.6, 0.95)  # the same where the rise takes so long that half of the stroke may still be part of it
-LONG = 0.1  # rise to 63 % over more than this share of the stroke: a stroke hardly longer than its pre-sliding
-LENGTHS = np.geomspace(0.3, 3.0, 25)  # rise lengths that are tried, as multiples of the distance to 63 %
-GRID_ROWS = 8192  # rows of starts fitted at once: bounds the memory, times the lengths that are tried
-MARGIN = 1.05  # the first arrival in the later band is early by a part of the last bend
-REFINED = 1.06 ** np.arange(-16, 17)  # those that are tried on the plateau of the speed, as multiples of the first ones
-REACH = 16.0  # rise lengths over which that fit reaches: nothing is left of the rise, a slow change is still straight
-SLOPED = 8.0  # rise lengths from which a slope beside the rise can be told from the rise itself
-POWERS = (1, 2)  # of the rivals (1 - x / k)^p: a straight rise (elasticity of the rig, fretting), and a rounded one
-ENDS = np.geomspace(0.8, 8.0, 14)  # k that are tried, as multiples of the rise length
-UNLIKELY = 10.0  # twice the log likelihood by which a rival must be better: no bristle then, and nothing is taken out
-FAR = 500.0  # rise lengths beyond which an exponential overflows
+# Rise lengths after which a rise is over: 1/50000 of it is left. 1/5000 still showed in means over a campaign.
+SETTLED = np.log(50000.0)
+# Rise lengths after a speed ramp: the bristles follow the changing speed over one of them.
+AFTER_RAMP = 3.0
+# Rise lengths after which a rise is over where `SETTLED` would take more than a third of the stroke: 1 % is left.
+ENOUGH = np.log(100.0)
+# Share of its level above which a force that begins there comes up, if at all, over a short distance.
+HALF_WAY = 0.75
+# That distance, as a share of the stroke. A longer climb is an effect (run-in, warming) and stays inside the window.
+SHORT = 0.01
+# Share of the stroke in which the fall of an overshoot comes down by 63 %, at most.
+SOON = 0.03
+# Share of the distance between which the plateau is read: near the rise, and past any ordinary rise.
+EARLY = (0.05, 0.5)
+# The same where the rise takes so long that half of the stroke may still be part of it.
+LATE = (0.6, 0.95)
+# Share of the stroke beyond which a rise to 63 % is long: the stroke is hardly longer than its pre-sliding.
+LONG = 0.1
+# Rise lengths that are tried, as multiples of the distance to 63 %.
+LENGTHS = np.geomspace(0.3, 3.0, 25)
+# Factor on the first arrival in the late band, which is early by a part of the last bend.
+MARGIN = 1.05
+# Rise lengths that are tried on the plateau of the speed, as multiples of the one found with the ramp.
+REFINED = 1.06 ** np.arange(-16, 17)
+# Rise lengths over which that fit reaches: nothing is left of the rise, and a slow change is still straight.
+REACH = 16.0
+# Rise lengths from which a slope beside the rise can be told from the rise itself.
+SLOPED = 8.0
+# Powers p of the rivals (1 - x / k)^p: a straight rise (elasticity of the rig, fretting), and a rounded one.
+POWERS = (1, 2)
+# Lengths k of the rivals that are tried, as multiples of the rise length.
+ENDS = np.geomspace(0.8, 8.0, 14)
+# Twice the log likelihood by which a rival must be better. It is then no bristle, and nothing is taken out.
+UNLIKELY = 10.0
+# Rise lengths beyond which an exponential overflows.
+FAR = 500.0
 
 
 class Start(NamedTuple):
@@ -61,21 +77,8 @@ class Rise(NamedTuple):
         return self.left_N * np.exp(-distance_mm / self.length_mm) if self.left_N else np.zeros(len(distance_mm))
 
 
-def rise_end_mm(distance_mm: np.ndarray, force_N: np.ndarray, ramp_end: int) -> float:
-    """Return the distance from which the force of one start is past its pre-sliding rise: see `rises`.
-
-    Examples
-    --------
-    >>> x = np.linspace(0.0, 40.0, 1001)
-    >>> end = rise_end_mm(x, 30.0 * (1.0 - np.exp(-x / 0.5)), 0)  # 0.5 mm * ln(50000) = 5.41 mm
-    >>> 5.1 < end < 5.8
-    True
-    """
-    return rises([Start(distance_mm, force_N, ramp_end)])[0].end_mm
-
-
-def rises(starts: Sequence[Start]) -> list[Rise]:
-    """Return, for every start, where its pre-sliding rise is over (0 mm without one), and what is left of it there.
+def rise_of(start: Start) -> Rise:
+    """Return where the pre-sliding rise of a start is over (0 mm without one), and what is left of it there.
 
     A bristle at constant speed follows dz/dx = 1 - z / z_ss (LuGre, Eq. 2 divided by v), so the force comes up as
     F(x) = A + B x - C exp(-x / x_0); A + B x stands for whatever changes slowly beside it. For every x_0 on a grid
@@ -93,17 +96,43 @@ def rises(starts: Sequence[Start]) -> list[Rise]:
     Notes
     -----
     Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10.1109/9.376053.
+
+    Examples
+    --------
+    >>> x = np.linspace(0.0, 40.0, 1001)
+    >>> end = rise_of(Start(x, 30.0 * (1.0 - np.exp(-x / 0.5)), 0)).end_mm  # 0.5 mm * ln(50000) = 5.41 mm
+    >>> 5.1 < end < 5.8
+    True
     """
-    made = _rises(starts)
-    over = [(i, *found) for i, start in enumerate(starts) if (found := _overshoot(start))]
-    falls = _rises([fall for *_, fall in over])
-    over = [(*one, fall) for one, fall in zip(over, falls, strict=True) if _by_damping(starts[one[0]], one[1], fall)]
-    left = _left_over([start for _, _, start, _ in over], [fall.length_mm for *_, fall in over])
-    for (i, peak, _, fall), (left_N, length) in zip(over, left, strict=True):
-        if left_N < 0.0:  # it follows the law
-            unsettled = -left_N * math.exp(min(peak / length, FAR)) if fall.left_N else 0.0
-            made[i] = Rise(peak + fall.end_mm, unsettled, length)
-    return made
+    if (peak := _early_peak(start)) is not None:
+        turned, peak_mm = _turned(start, peak), float(start.distance_mm[peak])
+        fall = _rise(turned)
+        if _by_damping(start, peak_mm, fall):
+            left_N, length = _left_over(turned, fall.length_mm)
+            if left_N < 0.0:  # it follows the law
+                unsettled = -left_N * math.exp(min(peak_mm / length, FAR)) if fall.left_N else 0.0
+                return Rise(peak_mm + fall.end_mm, unsettled, length)
+    return _rise(start)
+
+
+def _early_peak(start: Start) -> int | None:
+    """Return the row at which the force peaks in the first half of the stroke, if the fall from there may be over soon
+    enough (`_by_damping`); None where it cannot, or where the force is highest at the end of that half."""
+    distance = start.distance_mm
+    half = int(distance.searchsorted(EARLY[1] * distance[-1]))
+    if half < 2:
+        return None
+    peak = int(start.force_N[:half].argmax())
+    soon = distance[peak] <= start.plateau_mm + SOON * distance[-1]
+    return peak if soon and peak < half - 1 else None
+
+
+def _turned(start: Start, peak: int) -> Start:
+    """Return the fall from a peak, turned upside down: it comes up as a rise does."""
+    distance, force = start.distance_mm, start.force_N
+    early, half = (int(distance.searchsorted(share * distance[-1])) for share in EARLY)
+    level = median(force[max(early, peak) : half])
+    return Start(distance[peak:] - distance[peak], 2.0 * level - force[peak:], max(start.ramp_end - peak, 0))
 
 
 def _by_damping(start: Start, peak_mm: float, fall: Rise) -> bool:
@@ -113,78 +142,53 @@ def _by_damping(start: Start, peak_mm: float, fall: Rise) -> bool:
     return soon and peak_mm <= start.plateau_mm + fall.length_mm
 
 
-def _overshoot(start: Start) -> tuple[float, Start] | None:
-    """Return where the force peaks in the first half, in mm, and the fall from there turned upside down; None where the
-    force is highest at the end of that half."""
-    distance, force = start.distance_mm, start.force_N
-    early, late = (int(distance.searchsorted(share * distance[-1])) for share in EARLY)
-    if late < 2:
-        return None
-    peak = int(force[:late].argmax())
-    if peak >= late - 1:
-        return None
-    level = median(force[max(early, peak) : late])
-    fall = Start(distance[peak:] - distance[peak], 2.0 * level - force[peak:], max(start.ramp_end - peak, 0))
-    return float(distance[peak]), fall
+def _rise(start: Start) -> Rise:
+    """Return the rise of a start whose force comes up, and none of any other."""
+    level = _level_N(start)
+    scale = _scale_mm(start, level)
+    if not scale > 0.0:
+        return Rise(0.0)
+    slow = _slow(start, level, scale)
+    length = _rise_length_mm(start, 12.0 * scale, scale * LENGTHS, not slow)
+    end = MARGIN * _arrival_mm(start.distance_mm, start.force_N) if slow else _settled_mm(start, level, length)
+    if not end > 0.0:
+        return Rise(end)
+    ramp = start.plateau_mm if start.plateau_mm > length else 0.0  # along a short one nothing else happens
+    if end < ramp + 0.99 * SETTLED * length:
+        return Rise(end, *_left_over(start, length))
+    return Rise(end, 0.0, length)
 
 
-def _rises(starts: Sequence[Start]) -> list[Rise]:
-    """Return the rise of every start whose force comes up, and none for the others."""
-    levels = [_level_N(start) for start in starts]
-    scales = [_scale_mm(start, level) for start, level in zip(starts, levels, strict=True)]
-    rising = [i for i, scale in enumerate(scales) if scale > 0.0]
-    own, scales = [starts[i] for i in rising], [scales[i] for i in rising]
-    slow = [_slow(starts[i], levels[i], scale) for i, scale in zip(rising, scales, strict=True)]
-    lengths = _rise_lengths_mm(own, [12.0 * scale for scale in scales], scales, LENGTHS, [not one for one in slow])
-    made = [Rise(0.0)] * len(starts)
-    unsettled = []
-    for k, (i, is_slow, length) in enumerate(zip(rising, slow, lengths, strict=True)):
-        end = MARGIN * _arrival_mm(*starts[i][:2]) if is_slow else _settled_mm(starts[i], levels[i], length)
-        made[i] = Rise(end, 0.0, length if end > 0.0 else 0.0)
-        ramp = starts[i].plateau_mm if starts[i].plateau_mm > length else 0.0  # along a short one nothing else happens
-        if 0.0 < end < ramp + 0.99 * SETTLED * length:
-            unsettled.append(k)
-    left = _left_over([own[k] for k in unsettled], [lengths[k] for k in unsettled])
-    for k, parts in zip(unsettled, left, strict=True):
-        made[rising[k]] = Rise(made[rising[k]].end_mm, *parts)
-    return made
-
-
-def _left_over(starts: Sequence[Start], lengths_mm: Sequence[float]) -> list[tuple[float, float]]:
-    """Return C and x_0 of F = A + B x + C exp(-x / x_0) of every start, from its rows of constant speed.
+def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
+    """Return C and x_0 of F = A + B x + C exp(-x / x_0) of a start, from its rows of constant speed.
 
     C is 0 where the force does not follow that law: where a rise that is over at some distance fits better.
     """
-    plateaus = []
-    for start in starts:
-        distance = start.distance_mm[start.ramp_end :]
-        plateaus.append(Start(distance - distance[0], start.force_N[start.ramp_end :], 0))
-    reaches = [REACH * length for length in lengths_mm]
-    sloped = [min(p.distance_mm[-1], r) >= SLOPED * x for p, r, x in zip(plateaus, reaches, lengths_mm, strict=True)]
-    near = _rise_lengths_mm(plateaus, reaches, lengths_mm, REFINED, sloped)
-    ends = [_rise_lengths_mm(plateaus, reaches, near, ENDS, sloped, power) for power in POWERS]
-    made = []
-    for i, (start, plateau, length, has_slope) in enumerate(zip(starts, plateaus, near, sloped, strict=True)):
-        n = _rows_within(plateau, reaches[i])
-        x, beside = plateau.distance_mm[:n], _Beside(plateau.distance_mm[:n], has_slope)
-        force = beside.free(plateau.force_N[:n])
-        left, squares = beside.fitted(_shape(x, length), force)
-        rival = min(beside.fitted(_shape(x, end[i], p), force)[1] for p, end in zip(POWERS, ends, strict=True))
-        if n * math.log(max(squares, 1e-300) / max(rival, 1e-300)) > UNLIKELY:
-            left = 0.0
-        made.append((left * math.exp(min(start.plateau_mm / length, FAR)), length))
-    return made
+    distance = start.distance_mm[start.ramp_end :]
+    plateau = Start(distance - distance[0], start.force_N[start.ramp_end :], 0)
+    reach = REACH * length_mm
+    sloped = min(plateau.distance_mm[-1], reach) >= SLOPED * length_mm
+    length = _rise_length_mm(plateau, reach, length_mm * REFINED, sloped)
+    n = _rows_within(plateau, reach)
+    x, beside = plateau.distance_mm[:n], _Beside(plateau.distance_mm[:n], sloped)
+    force = beside.free(plateau.force_N[:n])
+    left, squares = beside.fitted(_shape(x, length), force)
+    ends = [_rise_length_mm(plateau, reach, length * ENDS, sloped, power) for power in POWERS]
+    rival = min(beside.fitted(_shape(x, end, power), force)[1] for power, end in zip(POWERS, ends, strict=True))
+    if n * math.log(max(squares, 1e-300) / max(rival, 1e-300)) > UNLIKELY:
+        left = 0.0
+    return left * math.exp(min(start.plateau_mm / length, FAR)), length
 
 
 class _Beside:
     """What stands beside a rise, A + B x, and is taken out of what is fitted; B is 0 where there is no slope."""
 
     def __init__(self, x_mm: np.ndarray, has_slope: bool) -> None:
-        self.x = x_mm - np.add.reduce(x_mm) / len(x_mm) if has_slope else None
+        self.x = x_mm - x_mm.mean() if has_slope else None
 
     def free(self, values: np.ndarray) -> np.ndarray:
         """Return values without the A + B x that fits them best, shape (n,)."""
-        values = values - np.add.reduce(values) / len(values)
+        values = values - values.mean()
         return values if self.x is None else values - (self.x @ values) / (self.x @ self.x) * self.x
 
     def fitted(self, shape: np.ndarray, force_N: np.ndarray) -> tuple[float, float]:
@@ -233,9 +237,6 @@ def _below(plateau_N: np.ndarray, begin_N: float) -> bool:
     """Return whether the force begins below everything that the plateau shows, its noise included."""
     steps = np.abs(plateau_N[1:] - plateau_N[:-1])
     to_noise = 1.0 / (0.6745 * math.sqrt(2.0))
-    # A median is at most twice the mean: far below, no percentile is needed.
-    if begin_N < float(plateau_N.min()) - 8.0 * to_noise * float(np.add.reduce(steps)) / len(steps):
-        return True
     return begin_N < quantile(plateau_N, 0.01) - 4.0 * (median(steps) * to_noise)
 
 
@@ -269,78 +270,43 @@ def _rows_within(start: Start, reach_mm: float) -> int:
     return min(max(int(start.distance_mm.searchsorted(reach_mm)), 16), len(start.distance_mm))
 
 
-def _rise_lengths_mm(
-    starts: Sequence[Start],
-    reaches_mm: Sequence[float],
-    scales_mm: Sequence[float],
-    multiples: np.ndarray,
-    sloped: Sequence[bool],
-    power: int | None = None,
-) -> list[float]:
-    """Return x_0 of F = A + B x - C exp(-x / x_0) of every start, by least squares on a grid around its scale, refined.
+def _rise_length_mm(
+    start: Start, reach_mm: float, lengths_mm: np.ndarray, sloped: bool, power: int | None = None
+) -> float:
+    """Return x_0 of F = A + B x - C exp(-x / x_0) by least squares on a grid of lengths, refined.
 
     What A + B x explains is the same for every x_0. So both are taken out of the force and of each exponential, and
-    the best x_0 is the one whose exponential's rest explains most of the force's rest. B is 0 where a start is not
+    the best x_0 is the one whose exponential's rest explains most of the force's rest. B is 0 where the start is not
     `sloped`; with a `power`, the exponential is that of `_shape`.
     """
-    alike: dict[int, list[int]] = {}
-    rows = []
-    for i, (start, reach) in enumerate(zip(starts, reaches_mm, strict=True)):
-        rows.append(_rows_within(start, reach))
-        alike.setdefault(rows[-1].bit_length(), []).append(i)
-    made = [0.0] * len(starts)
-    for bits, members in alike.items():
-        size = max(GRID_ROWS >> bits, 1)
-        for group in (members[i : i + size] for i in range(0, len(members), size)):
-            lengths = np.array([scales_mm[i] for i in group])[:, None] * multiples
-            parts = [starts[i] for i in group], [rows[i] for i in group], [sloped[i] for i in group]
-            for i, length in zip(group, _at_most(lengths, _explained(*parts, lengths, power)), strict=True):
-                made[i] = length
-    return made
+    n = _rows_within(start, reach_mm)
+    distance, force = start.distance_mm[:n], start.force_N[:n]
+    force = force - force.mean()
+    shapes = _shape(distance, lengths_mm[:, None], power)
+    whole = np.einsum("ij,ij->i", shapes, shapes)
+    rest = whole - shapes.sum(axis=1) ** 2 / n
+    if sloped:
+        x = distance - distance.mean()
+        square = float(x @ x)
+        force = force - float(x @ force) / square * x
+        rest -= (shapes @ x) ** 2 / square
+    # Of two different distances only (a coarse sensor), a straight line explains all that an exponential can.
+    explained = np.divide((shapes @ force) ** 2, rest, out=np.zeros(len(rest)), where=rest > 1e-12 * whole)
+    return _at_most(lengths_mm, explained)
 
 
-def _at_most(lengths_mm: np.ndarray, explained: np.ndarray) -> list[float]:
-    """Return for every start the length at which most is explained: the vertex of the parabola, over the logarithm,
-    through the best of its lengths and the two beside it. It moves without a jump from one length to the next.
+def _at_most(lengths_mm: np.ndarray, explained: np.ndarray) -> float:
+    """Return the length at which most is explained: the vertex of the parabola, over the logarithm, through the best
+    of the lengths and the two beside it. It moves without a jump from one length to the next.
 
     Examples
     --------
-    >>> _at_most(np.array([[1.0, 2.0, 4.0, 8.0]]), np.array([[0.0, 3.0, 3.0, 0.0]]))  # the square root of 8
-    [2.8284271247461903]
+    >>> round(_at_most(np.array([1.0, 2.0, 4.0, 8.0]), np.array([0.0, 3.0, 3.0, 0.0])), 4)  # the square root of 8
+    2.8284
     """
-    rows, best = np.arange(len(lengths_mm)), np.argmax(explained, axis=1)
-    middle = np.clip(best, 1, lengths_mm.shape[1] - 2)
-    before, here, after = (explained[rows, middle + k] for k in (-1, 0, 1))
-    bend = before - 2.0 * here + after
-    inside = (middle == best) & (bend < 0.0)
-    step = np.where(inside, 0.5 * (before - after) / np.where(inside, bend, 1.0), 0.0)
-    return (lengths_mm[rows, best] * (lengths_mm[:, 1] / lengths_mm[:, 0]) ** step).tolist()
-
-
-def _explained(
-    starts: Sequence[Start],
-    rows: Sequence[int],
-    sloped: Sequence[bool],
-    lengths_mm: np.ndarray,
-    power: int | None,
-) -> np.ndarray:
-    """Return the sum of squares that each of the lengths, shape (starts, lengths), explains in the first `rows` rows of
-    every start."""
-    shape = len(starts), max(rows)
-    distance, x, y = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)  # beyond its rows the shape is 0
-    square = np.ones((len(starts), 1))
-    for i, (start, n, has_slope) in enumerate(zip(starts, rows, sloped, strict=True)):
-        own, force = start.distance_mm[:n], start.force_N[:n]
-        distance[i, :n] = own
-        force = force - np.add.reduce(force) / n
-        if has_slope:
-            own = own - np.add.reduce(own) / n
-            square[i] = own @ own
-            x[i, :n], force = own, force - (float(own @ force) / float(square[i, 0])) * own
-        y[i, :n] = force
-    rise = _shape(distance[:, None, :], lengths_mm[:, :, None], power)
-    whole = np.einsum("kij,kij->ki", rise, rise)
-    total, slope, explained = rise.sum(axis=2), (rise @ x[:, :, None])[:, :, 0], (rise @ y[:, :, None])[:, :, 0]
-    rest = whole - total**2 / np.array(rows)[:, None] - slope**2 / square
-    # Of two different distances only (a coarse sensor), a straight line explains all that an exponential can.
-    return np.divide(explained**2, rest, out=np.zeros(rest.shape), where=rest > 1e-12 * whole)
+    best, step = int(np.argmax(explained)), 0.0
+    if 0 < best < len(lengths_mm) - 1:
+        before, here, after = explained[best - 1 : best + 2]
+        bend = before - 2.0 * here + after
+        step = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    return float(lengths_mm[best] * (lengths_mm[1] / lengths_mm[0]) ** step)

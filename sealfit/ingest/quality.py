@@ -14,7 +14,6 @@ import pandas as pd
 
 from sealfit.config import Config, Quality
 from sealfit.errors import Fault
-from sealfit.ingest.segments import Pieces
 from sealfit.ingest.strokes import Stroke
 from sealfit.ingest.trace_checks import resolution
 from sealfit.tables import QUALITY, STEADY
@@ -32,20 +31,14 @@ FINE_FILE = {"check": "ok", "severity": "info", "action": "kept", "reason": "not
 
 
 def stroke_faults(
-    file: str,
-    number: int | None,
-    stroke: Stroke,
-    time_s: np.ndarray,
-    force_N: np.ndarray,
-    line: np.ndarray,
-    config: Config,
+    stroke: Stroke, time_s: np.ndarray, force_N: np.ndarray, line: np.ndarray, settings: Quality
 ) -> list[Fault]:
     """Return what is wrong with one stroke by itself: too short, gappy, saturated, stuck.
 
+    Findings of this module do not say which file and stroke they belong to; whoever asks adds that.
+
     Parameters
     ----------
-    number : int or None
-        What findings call the stroke; None in a file of one stroke.
     time_s, force_N, line : ndarray, shape (n,)
         The whole trace, and the line in the file of each of its rows.
     """
@@ -54,29 +47,24 @@ def stroke_faults(
             Fault(
                 "too_short",
                 f"{stroke.short}.",
-                file=file,
-                stroke=number,
                 value=float(len(stroke.rows)),
-                severity="error",
                 action="stroke left out",
                 fix="Slide further or sample faster; or set strokes.min_samples and min_steady_share in the config.",
             )
         ]
-    whole, steady, settings = slice(stroke.start, stroke.stop), stroke.rows, config.quality
-    found = [
+    whole, steady = slice(stroke.start, stroke.stop), stroke.rows
+    force_N, steady_line = force_N[steady], line[steady]
+    return [
         *_gaps(time_s[whole], line[whole], settings),
-        *(_saturated(force_N[steady], line[steady], settings) or _stuck(force_N[steady], line[steady], settings)),
+        *(_saturated(force_N, steady_line, settings) or _stuck(force_N, steady_line, settings)),
     ]
-    return [Fault(**{**fault.as_dict(), "file": file, "stroke": number}) for fault in found]
 
 
-def rising_faults(file: str, number: int | None, left_N: float, force_N: float, unit: str) -> list[Fault]:
+def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:
     """Return that a stroke ends before its friction is steady, if it does.
 
     Parameters
     ----------
-    number : int or None
-        What findings call the stroke; None in a file of one stroke.
     left_N, force_N : float
         What is left of the pre-sliding rise where the steady window ends, and the mean force without it.
     unit : str
@@ -88,9 +76,7 @@ def rising_faults(file: str, number: int | None, left_N: float, force_N: float, 
         Fault(
             "never_steady",
             f"the stroke ends before its friction is steady: {abs(left_N):.3g} of {abs(force_N):.4g} {unit} are still "
-            "to come. Its steady force is what the bristles of the model lead to.",
-            file=file,
-            stroke=number,
+            "to come. Its steady force is extrapolated by the bristle model.",
             column="force_N",
             value=abs(left_N),
             severity="info",
@@ -123,14 +109,9 @@ def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault
     ]
 
 
-def equal_neighbours(force_N: np.ndarray, windows: Pieces) -> np.ndarray:
-    """Return the share of samples of every window that equal the one before, shape (windows,).
-
-    Near 0 where noise is finer than the sensor's steps.
-    """
-    same = windows.steps(force_N) == 0.0
-    same[windows.stop - 1] = False
-    return windows.sum(same) / np.maximum(windows.size - 1, 1)
+def equal_neighbours(force_N: np.ndarray) -> float:
+    """Return the share of samples that equal the one before; near 0 where noise is finer than the sensor's steps."""
+    return float(np.mean(np.diff(force_N) == 0.0)) if len(force_N) > 1 else 0.0
 
 
 def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault]:
@@ -216,7 +197,7 @@ def stuck_samples(force_N: np.ndarray, samples: int) -> tuple[int, int] | None:
     return int(edges[longest]), run
 
 
-def speed_column_faults(file: str, number: int | None, measured: float, column: float, config: Config) -> list[Fault]:
+def speed_column_faults(measured: float, column: float, config: Config) -> list[Fault]:
     """Return where a trace's own speed column contradicts its displacement over time; the latter is used."""
     if not abs(abs(column) - abs(measured)) > config.quality.speed_disagreement * abs(measured):
         return []
@@ -225,8 +206,6 @@ def speed_column_faults(file: str, number: int | None, measured: float, column: 
         Fault(
             "speed_disagreement",
             f"the speed column says {column:.4g} {unit}, displacement over time {measured:.4g} {unit}.",
-            file=file,
-            stroke=number,
             column="speed_mm_s",
             value=float(column),
             severity="warning",
@@ -236,7 +215,7 @@ def speed_column_faults(file: str, number: int | None, measured: float, column: 
     ]
 
 
-def load_faults(file: str, measured: float, declared: float, unit: str) -> list[Fault]:
+def load_faults(measured: float, declared: float, unit: str) -> list[Fault]:
     """Return where the load measured along the trace differs from the declared one by more than a tenth."""
     if not abs(measured - declared) > LOAD_TOLERANCE * abs(declared):
         return []
@@ -244,7 +223,6 @@ def load_faults(file: str, measured: float, declared: float, unit: str) -> list[
         Fault(
             "load",
             f"measured {measured:.4g} {unit}, declared {declared:.4g} {unit}.",
-            file=file,
             column="load_N",
             value=float(measured),
             severity="warning",

@@ -12,13 +12,12 @@ import pandas as pd
 
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import BadFile, ConfigError, Fault
-from sealfit.ingest.cells import Cells, Rows, clean, read_cells
-from sealfit.ingest.columns import RESERVED, SLOTS, Form, beside, channel_columns, form_of, required
+from sealfit.ingest.cells import Cells, Rows, body_of, clean, read_cells, width_of
+from sealfit.ingest.columns import RESERVED, SLOTS, beside, channel_columns, locate, numeric_names, required
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.file_names import TraceRef, name_parts
-from sealfit.ingest.files import Layout, as_utf8, header_fields, read_bytes
-from sealfit.ingest.segments import Pieces
-from sealfit.ingest.trace_checks import speed_faults
+from sealfit.ingest.files import Layout, as_utf8, find_layout, header_fields, read_bytes
+from sealfit.ingest.trace_checks import speed_fault
 
 MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
 
@@ -37,6 +36,11 @@ class Trace:
     line: np.ndarray
     rows_read: int
     faults: tuple[Fault, ...]
+
+    def where(self, keep: np.ndarray, faults: Sequence[Fault]) -> Trace:
+        """Return the trace with some of its rows, and with further findings."""
+        columns = {name: values[keep] for name, values in self.columns.items()}
+        return replace(self, columns=columns, line=self.line[keep], faults=(*self.faults, *faults))
 
     @property
     def table(self) -> pd.DataFrame:
@@ -69,63 +73,66 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
 
 
 def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list[Trace | BadFile]:
-    """Return a trace for each of several files, or why it must be left out; files written alike are read in one go.
+    """Return a trace for each of several files, or why it must be left out.
+
+    Files with the same header are parsed in one go: Arrow hands every call over to another thread, which takes longer
+    than to parse a short file.
 
     Parameters
     ----------
     files : sequence of (TraceRef, bytes)
-        What is known of each file, and its bytes; some dozens of them, as all are held at once.
+        What is known of each file, and its bytes.
     config : Config
         How the files are written.
     """
-    found: list[Trace | BadFile | None] = [None] * len(files)
-    alike: dict[int, list[tuple[int, bytes]]] = {}
-    forms: list[Form] = []
-    for place, (ref, raw) in enumerate(files):
+    opened: list[_Opened | BadFile] = []
+    alike: dict[tuple[Layout, int], list[int]] = {}
+    for i, (ref, raw) in enumerate(files):
         try:
-            text = as_utf8(raw, config.trace.encoding, ref.file)
-            number = next((i for i, form in enumerate(forms) if form.fits(text)), None)
-            if number is None:
-                number = len(forms)
-                forms.append(form_of(text, config.trace, ref.file))
-            alike.setdefault(number, []).append((place, forms[number].body(text)))
+            opened.append(_Opened.of(raw, ref.file, config.trace))
+            alike.setdefault((opened[i].layout, opened[i].width), []).append(i)
         except BadFile as error:
-            found[place] = error
-    for number, members in alike.items():
-        form, names = forms[number], [files[place][0].file for place, _ in members]
-        made = read_cells([body for _, body in members], names, form.layout, config.trace, form.numeric)
-        for (place, _), cells in zip(members, made, strict=True):
+            opened.append(error)
+    found: list[Trace | BadFile] = list(opened)
+    for (layout, _), members in alike.items():
+        bodies = [(files[i][0].file, opened[i].body) for i in members]
+        made = read_cells(bodies, layout, config.trace, opened[members[0]].numeric)
+        for i, cells in zip(members, made, strict=True):
             try:
-                found[place] = _trace(cells, form, files[place][0], config)
+                found[i] = _trace(cells, opened[i], files[i][0], config)
             except BadFile as error:
-                found[place] = error
-    return _at_their_speed(found, config)
+                found[i] = error
+    return found
 
 
-def _at_their_speed(found: Sequence[Trace | BadFile], config: Config) -> list[Trace | BadFile]:
-    """Return the traces with what is to be said of their speed; those that contradict it grossly are left out."""
-    traces = [trace for trace in found if isinstance(trace, Trace)]
-    if not traces:
-        return list(found)
-    time_s, displacement = (np.concatenate([t.columns[name] for t in traces]) for name in ("time_s", "displacement_mm"))
-    pieces = Pieces([len(trace.line) for trace in traces])
-    faults = iter(speed_faults(time_s, displacement, pieces, [trace.ref for trace in traces], config))
-    made: list[Trace | BadFile] = []
-    for trace in found:
-        fault = next(faults) if isinstance(trace, Trace) else None
-        if fault is None:
-            made.append(trace)
-        elif fault.action == "file left out":
-            made.append(BadFile(*trace.faults, fault))
-        else:
-            made.append(replace(trace, faults=(*trace.faults, fault)))
-    return made
+@dataclass(frozen=True, slots=True, eq=False)
+class _Opened:
+    """A trace file before its cells are parsed.
+
+    `body` are its data lines, `width` is the number of cells in the first of them; `ours` holds our name of each
+    position (from 0), `numeric` those that must hold numbers.
+    """
+
+    layout: Layout
+    body: bytes
+    width: int
+    ours: Mapping[int, str]
+    numeric: Mapping[int, str]
+
+    @classmethod
+    def of(cls, raw: bytes, file: str, settings: TraceFormat) -> _Opened:
+        text = as_utf8(raw, settings.encoding, file)
+        layout = find_layout(text, settings, file)
+        body = body_of(text, layout, settings, file)
+        width = width_of(body, settings.delimiter)
+        ours, must = locate(layout, len(layout.names) or width, settings, file), numeric_names(settings)
+        return cls(layout, body, width, ours, {i: name for i, name in ours.items() if name in must})
 
 
-def _trace(cells: Cells, form: Form, ref: TraceRef, config: Config) -> Trace:
+def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trace:
     """Return the trace that the cells of a file make; raises as `read_trace`."""
-    settings, file, layout = config.trace, ref.file, form.layout
-    rows = Rows({name: cells.columns[i] for i, name in form.ours.items() if i in cells.columns}, cells.line)
+    settings, file, layout, ours = config.trace, ref.file, opened.layout, opened.ours
+    rows = Rows({name: cells.columns[i] for i, name in ours.items() if i in cells.columns}, cells.line)
     known: Mapping[str, object] = {}
     if settings.compute or settings.keep is not None:
         known = {**ref.channels, **name_parts(file, config.files).values, **header_fields(layout.header, settings)}
@@ -133,7 +140,7 @@ def _trace(cells: Cells, form: Form, ref: TraceRef, config: Config) -> Trace:
     good = ~cells.bad
     first = settings.drop_first_rows
     counted = max(len(good) - first, 1)
-    columns, dropped, found = channel_columns(rows.columns, SLOTS, good, rows.line, config, file)
+    columns, dropped, found = channel_columns(rows.columns, good, rows.line, config, file)
     faults += found
     good &= ~dropped
     bad = len(good[first:]) - int(np.count_nonzero(good[first:]))
@@ -147,6 +154,10 @@ def _trace(cells: Cells, form: Form, ref: TraceRef, config: Config) -> Trace:
     if len(rows.line) < MIN_ROWS:
         reason = f"{len(rows.line)} of {len(good)} data rows are left; a trace needs {MIN_ROWS}."
         raise BadFile(*faults, _bad_file("no_rows", reason, file, "Check drop_first_rows, keep and the export."))
+    if fault := speed_fault(ref, rows.columns["time_s"], rows.columns["displacement_mm"], config):
+        faults.append(fault)
+        if fault.action == "file left out":
+            raise BadFile(*faults)
     return Trace(ref, _named_beside(rows, ref, settings), rows.line, len(good), tuple(faults))
 
 
@@ -169,7 +180,7 @@ def _derive(
         required(rows.columns, layout, file)
         return rows, bad, faults
     required(rows.columns, layout, file)
-    rows, bad, faults = clean(rows, [name for name in SLOTS if name in rows.columns], file)
+    rows, bad, faults = clean(rows, list(SLOTS), file)
     return rows, bad, faults
 
 

@@ -16,11 +16,16 @@ from sealfit.ingest.scatter import Layout, ScatterFit, fit_scatter, repeat_means
 # ---------------------------------------------------------------- outlying
 # Repeats that lie outside: those that disagree with their runs beyond the scatter pooled over all runs.
 
-MAX_OUTLIERS = 0.1  # share of repeats that the search takes out at most: beyond that the bulk is not known
-TOGETHER = 0.002  # taken out at once at most, as a share of the degrees of freedom: one at a time up to 1,000
-SQUARES = 0.02  # and of the squares, so that the scatter changes by a percent a round
-NEAR = 10.0  # a p within this factor of the level is found again one by one before it decides
-ALONE = 1e-9  # a residual that keeps less of its variance is that of a run's only repeat
+# Share of the repeats that the search takes out at most. Beyond it the bulk is not known.
+MAX_OUTLIERS = 0.1
+# Repeats taken out at once at most, as a share of the degrees of freedom: one at a time up to 1,000.
+TOGETHER = 0.002
+# Share of the sum of squares taken out at once at most. The scatter then changes by a percent a round.
+SQUARES = 0.02
+# Factor on the level within which a p-value is found again one by one before it decides.
+NEAR = 10.0
+# Share of its variance below which a residual is that of a run's only repeat.
+ALONE = 1e-9
 
 
 class _Judged(NamedTuple):
@@ -181,7 +186,6 @@ def _outliers(layout: Layout, force_N: np.ndarray, found: list[_Judged], level: 
 
 
 # ---------------------------------------------------------------- peers
-# What only a comparison of strokes shows: a force of the wrong sign, a dead sensor, a repeat that lies outside.
 
 AGAINST = -0.5  # share of its peers' force by which a force against its motion is of the wrong sign, not an offset
 

@@ -16,7 +16,18 @@ import numpy as np
 
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, ConfigError, Fault
-from sealfit.ingest.categorical import Columns, columns_of, condition_columns, in_order, nothing, overlaid
+from sealfit.ingest.categorical import (
+    Columns,
+    columns_of,
+    condition_columns,
+    in_order,
+    known,
+    mapped,
+    overlaid,
+    put,
+    taken,
+    where,
+)
 from sealfit.ingest.columns import RESERVED, beside, suggestion
 from sealfit.ingest.derived_columns import (
     add_order,
@@ -89,7 +100,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
 def _kept(files: np.ndarray, entries: Entries, columns: Columns) -> tuple[Entries, Columns]:
     if len(files) == len(entries):
         return entries, columns
-    return entries.take(files), {name: column.take(files) for name, column in columns.items()}
+    return entries.take(files), taken(columns, files.tolist())
 
 
 def _nothing_left() -> Fault:
@@ -102,7 +113,7 @@ def _set_speed(columns: Columns) -> Columns:
     if "speed_mm_s" not in columns:
         return columns
     renamed = dict(columns)
-    renamed["speed_set_mm_s"] = renamed.pop("speed_mm_s").map(abs)
+    renamed["speed_set_mm_s"] = mapped(renamed.pop("speed_mm_s"), abs)
     return renamed
 
 
@@ -120,13 +131,18 @@ def _config_faults(config: Config) -> list[Fault]:
         faults.append(Fault("config", reason, file=f"config '{config.name}'", column=column, value=value, fix=fix))
 
     if not _is_encoding(settings.encoding):
-        add("trace.encoding", settings.encoding, "is no encoding.", "Use auto, utf-8, latin-1 or utf-16.")
+        add("trace.encoding", settings.encoding, "is not an encoding.", "Use auto, utf-8, latin-1 or utf-16.")
     if not _is_delimiter(settings.delimiter):
-        add("trace.delimiter", settings.delimiter, "is no delimiter.", "Use one character, 'tab' or 'whitespace'.")
+        add("trace.delimiter", settings.delimiter, "is not a delimiter.", "Use one character, 'tab' or 'whitespace'.")
     if settings.delimiter == settings.decimal:
         add("trace.delimiter", settings.delimiter, "is the decimal mark too.", "Set trace.delimiter or trace.decimal.")
     for name in sorted({"file", "speed_mm_s"} & set(config.condition)):
-        add("condition", name, "is no condition: it differs within one.", "Take it out of condition.")
+        add(
+            "condition",
+            name,
+            "cannot be a condition column: it differs within a condition.",
+            "Take it out of condition.",
+        )
     named = {} if settings.names != "none" else {k: v for k, v in settings.columns.items() if isinstance(v, str)}
     for ours, theirs in named.items():
         fix = "Give its position, counted from 1, or names = 'header'."
@@ -216,9 +232,9 @@ class _Needed:
 
     def missing(self, columns: Columns, files: int) -> dict[str, np.ndarray]:
         """Return which of so many files lack each of them, shape (files,)."""
-        none = nothing(files)
-        unaged = columns.get("aging_days", none).where(lambda days: days == 0)
-        return {name: ~columns.get(name, none).known & (~unaged | (name in self.unaged)) for name in self.aged}
+        none = [None] * files
+        unaged = where(columns.get("aging_days", none), lambda days: days == 0)
+        return {name: ~known(columns.get(name, none)) & (~unaged | (name in self.unaged)) for name in self.aged}
 
 
 def _from_traces(
@@ -228,9 +244,9 @@ def _from_traces(
 
     Also the measured speed of each file read (nan of the others), the files to leave out, and their faults.
     """
-    none = nothing(len(entries))
+    none = [None] * len(entries)
     lacking = needed.missing(columns, len(entries))
-    runs = columns.get("run_id", none).known | columns.get("speed_mm_s", none).known
+    runs = known(columns.get("run_id", none)) | known(columns.get("speed_mm_s", none))
     added: dict[str, dict[int, float | str]] = {}
     measured = [math.nan] * len(entries)
     left_out: set[int] = set()
@@ -262,7 +278,7 @@ def _from_traces(
                 place = {"file": file, "column": name, "action": "file left out", "fix": fix}
                 faults.append(Fault("condition_varies", reason, **place))
                 left_out.add(i)
-    whole = {**columns, **{name: columns.get(name, none).put(values) for name, values in added.items()}}
+    whole = {**columns, **{name: put(columns.get(name, none), values) for name, values in added.items()}}
     return whole, measured, left_out, faults
 
 

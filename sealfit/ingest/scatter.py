@@ -15,8 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-ALIKE = 1e-12  # (spread of x)^2 over (its size)^2 below which a constant and x cannot be told apart
-PATTERN_RUNS = 3  # fewer runs cannot tell a common pattern of their repeats from the scatter itself
+# Square of the spread of x over that of its size, below which a constant and x cannot be told apart.
+ALIKE = 1e-12
+# Runs below which a common pattern of their repeats cannot be told from the scatter itself.
+PATTERN_RUNS = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,6 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ import pyarrow as pa
 from sealfit import __version__
 from sealfit.config import Config
 from sealfit.errors import Fault
+from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, Asked, read_part
 from sealfit.ingest.segments import median
 from sealfit.store import parquet
@@ -174,7 +174,7 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
             name: parquet.with_columns(table, asked.columns[name], config.units) for name, table in tables.items()
         }
     hashes = [found.mark.sha256 for found in part.files]
-    name = _file_name(part_key(asked.refs.files, asked.refs.words(), hashes, seen_by_parts(config)), asked)
+    name = _file_name(part_key(asked.refs, hashes, seen_by_parts(config)), asked)
     with disk(folder.parent), _whole_files(folder) as write:
         stored = {
             (file := f"{of}{PARQUET}/{name}"): write(file, table, parquet.write_arrow) for of, table in tables.items()
@@ -195,8 +195,10 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     return Made(marks, rows, count, part.faults, None, asked.unused, asked.columns, columns, {}, stored)
 
 
-def stored_strokes(part: Made, folder: Path) -> pa.Table:
-    """Return the strokes of a part that was made in `folder`."""
+def stored_strokes(part: Made, folder: Path | None) -> pa.Table:
+    """Return the strokes of a part, from the disk if they lie there: in `folder`, in which it was made."""
+    if part.strokes is not None:
+        return part.strokes
     return parquet.read_ipc(folder / next(name for name in part.stored if name.startswith(f"{PARTS}/")))
 
 
@@ -205,29 +207,22 @@ def seen_by_parts(config: Config) -> str:
     return json.dumps([__version__, FORMAT, config.model_dump(mode="json")])
 
 
-def part_key(
-    files: Sequence[str], known: Mapping[str, np.ndarray], hashes: Sequence[str | None], seen: str
-) -> str | None:
+def part_key(listing: Listing, hashes: Sequence[str | None], seen: str) -> str | None:
     """Return a hash of what a part is made from, or None where a file's content is not known.
 
     Parameters
     ----------
-    files : sequence of str, length n
-        Its files.
-    known : dict of str to ndarray, each of shape (n,)
-        What is known of them, in words: the columns in which any of them has a value.
-    hashes : sequence of str or None, length n
-        Of their content.
+    listing : Listing
+        Its files, and what is known of them.
+    hashes : sequence of str or None
+        Of the content of each.
     seen : str
         What `seen_by_parts` says.
     """
     if None in hashes:
         return None
-    cells = chain.from_iterable(words.tolist() for words in known.values())
-    told = [seen, json.dumps(list(known)), *files, *hashes, *cells]
-    # Words may hold any mark, so that their lengths are told too.
-    lengths = np.fromiter(map(len, told), np.int64, len(told))
-    return hashlib.sha256(lengths.tobytes() + "".join(told).encode("utf-8", "surrogatepass")).hexdigest()[:20]
+    about = json.dumps([seen, listing.files, hashes, listing.columns])
+    return hashlib.sha256(about.encode("utf-8", "surrogatepass")).hexdigest()[:20]
 
 
 def _file_name(key: str | None, asked: Asked) -> str:

@@ -13,10 +13,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from sealfit.config import Strokes
-from sealfit.ingest.segments import Pieces, median, quantile, running_mean, running_median
-from sealfit.ingest.window import slopes, speeds_along, steady_windows
+from sealfit.ingest.segments import median, quantile, smoothed
+from sealfit.ingest.window import slope, speed_along, steady_window
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,8 +26,10 @@ class Stroke:
 
     `origin` is the row where it begins to move, from which its distance counts (and, in a file of several strokes, its
     time): the first row, unless rows of rest come before the file's first stroke. `speed_mm_s` is in displacement units
-    per time unit, signed. `steady` marks the rows of the window, `sliding` those in which it moves, both of shape
-    (stop - start,). `short` says why the window is too short to be used; None if it is long enough.
+    per time unit, signed. Arrays are of shape (stop - start,): `steady` marks the rows of the window, `sliding` those
+    in which it moves; `presliding_N` is what is left of the pre-sliding rise in the window, with the sign of the
+    force, 0 elsewhere; `speed_along_mm_s` is the speed at every row, where it is seen to differ from the stroke's.
+    `short` says why the window is too short to be used; None if it is long enough.
     """
 
     number: int
@@ -37,6 +40,8 @@ class Stroke:
     speed_mm_s: float
     steady: np.ndarray
     sliding: np.ndarray
+    presliding_N: np.ndarray
+    speed_along_mm_s: np.ndarray
     short: str | None = None
 
     @property
@@ -45,175 +50,107 @@ class Stroke:
         return self.start + np.flatnonzero(self.steady)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Found:
-    """The strokes of several traces that lie one after the other.
+class _Motion(NamedTuple):
+    """A trace as strokes are found in it: arrays of shape (n,), and the noise of a displacement sample."""
 
-    Arrays of shape (strokes,), in order: `trace` (its place among the traces) and what a `Stroke` has, with `start`,
-    `stop` and `origin` as rows of the flat arrays. `steady` and `sliding` are of shape (rows,), false in traces
-    without strokes; so is `presliding_N`, what is left of the pre-sliding rise in the steady windows, with the sign
-    of the force, 0 elsewhere. `speed_along_mm_s` is the speed at every row, where it is seen to differ from the
-    stroke's.
-    """
-
-    trace: np.ndarray
-    number: np.ndarray
-    start: np.ndarray
-    stop: np.ndarray
-    origin: np.ndarray
-    direction: np.ndarray
-    speed_mm_s: np.ndarray
-    short: list[str | None]
-    steady: np.ndarray
-    sliding: np.ndarray
-    presliding_N: np.ndarray
-    speed_along_mm_s: np.ndarray
-
-    def of_trace(self, trace: int, first_row: int) -> list[Stroke]:
-        """Return the strokes of one trace, whose first row is given, with rows counted from there."""
-        return [self.stroke(i, first_row) for i in np.flatnonzero(self.trace == trace).tolist()]
-
-    def stroke(self, i: int, first_row: int) -> Stroke:
-        """Return one stroke, with rows counted from the first one of its trace."""
-        rows = slice(int(self.start[i]), int(self.stop[i]))
-        ends = (int(row) - first_row for row in (self.start[i], self.stop[i], self.origin[i]))
-        way, speed = int(self.direction[i]), float(self.speed_mm_s[i])
-        return Stroke(int(self.number[i]), *ends, way, speed, self.steady[rows], self.sliding[rows], self.short[i])
+    time_s: np.ndarray
+    displacement_mm: np.ndarray
+    force_N: np.ndarray
+    noise_mm: float
 
 
 def find_strokes(
     time_s: np.ndarray, displacement_mm: np.ndarray, force_N: np.ndarray, settings: Strokes
 ) -> list[Stroke]:
-    """Return the strokes of one trace in order; none where nothing moves. For arguments see `find_all`."""
-    if not len(time_s):
-        return []
-    return find_all(time_s, displacement_mm, force_N, Pieces([len(time_s)]), settings).of_trace(0, 0)
-
-
-def find_all(
-    time_s: np.ndarray,
-    displacement_mm: np.ndarray,
-    force_N: np.ndarray,
-    traces: Pieces,
-    settings: Strokes,
-    noise_mm: np.ndarray | None = None,
-) -> Found:
-    """Return the strokes of several traces.
+    """Return the strokes of one trace in order; none where nothing moves.
 
     Parameters
     ----------
     time_s, displacement_mm, force_N : ndarray, shape (n,)
-        Traces in the rig's own units, one after the other, finite, time rising in each (steps may differ, and hide
-        gaps); displacement without spikes.
-    traces : Pieces
-        Where each of them lies.
+        A trace in the rig's own units, finite, time rising (steps may differ, and hide gaps); displacement without
+        spikes.
     settings : Strokes
         The config's `strokes`.
-    noise_mm : ndarray, shape (traces,), optional
-        What `displacement_noises_mm` says of them, where it is known.
 
     Returns
     -------
-    Found
+    list of Stroke
         Strokes shorter than `min_travel_mm` are part of their neighbours' ends.
     """
-    moves = (traces.size >= 3) & (traces.max(displacement_mm) != traces.min(displacement_mm))
+    if len(time_s) < 3 or not np.ptp(displacement_mm) > 0.0:
+        return []
     if settings.whole_file:
-        whole = np.flatnonzero(moves)
-        last, first = displacement_mm[traces.stop[whole] - 1], displacement_mm[traces.start[whole]]
-        way = np.where(last >= first, 1, -1)
-        cut = _Cut(whole, np.ones_like(whole), traces.start[whole], traces.stop[whole], traces.start[whole], way)
-        return _whole_files(time_s, displacement_mm, traces.spread(moves), cut, settings)
-    noise = displacement_noises_mm(displacement_mm, traces) if noise_mm is None else noise_mm
-    smooth = smoothed(displacement_mm, traces, settings.smooth_samples)
-    span = traces.max(smooth) - traces.min(smooth)
-    moves &= ~(span <= 8.0 * noise)  # the range of some hundred samples of noise alone is about six SDs
+        return [_whole_file(time_s, displacement_mm, settings)]
+    noise, smooth = displacement_noise_mm(displacement_mm), smoothed(displacement_mm, settings.smooth_samples)
+    span = float(np.ptp(smooth))
+    if span <= 8.0 * noise:  # the range of some hundred samples of noise alone is about six SDs
+        return []
     # The smoothed noise of a thousand samples comes back by three SDs of one sample: no turn.
-    travel = np.maximum(0.05 * span, 4.0 * noise)
-    if settings.min_travel_mm is not None:
-        travel = np.full(len(traces), settings.min_travel_mm)
-    cut = _cut(smooth, traces, moves, travel, np.maximum(3.0 * noise, 1e-3 * span), settings.smooth_samples)
-    moves = np.isin(np.arange(len(traces)), cut.trace)
-    rows = slice(None) if moves.all() else traces.spread(moves)
-    strokes = Pieces(cut.stop - cut.start)
-    way = strokes.spread(cut.direction)
-    filtered = running_median(force_N, traces, 3)  # single spikes must not decide where a rise ends
-    time_s, along, displacement_mm = time_s[rows], way * displacement_mm[rows], displacement_mm[rows]
-    steady, sliding, left = np.zeros(traces.rows, bool), np.zeros(traces.rows, bool), np.zeros(traces.rows)
-    if not len(strokes):
-        return Found(*cut, np.empty(0), [], steady, sliding, left, np.zeros(traces.rows))
-    steady[rows], sliding[rows], against, lag = steady_windows(
-        time_s, along, way * filtered[rows], strokes, cut.origin - cut.start, noise[cut.trace], settings.speed_tolerance
+    travel = max(0.05 * span, 4.0 * noise) if settings.min_travel_mm is None else settings.min_travel_mm
+    turns = turning_rows(smooth, travel)
+    if len(turns) < 2:
+        return []
+    bounds, origin = _bounds(smooth, turns, max(3.0 * noise, 1e-3 * span), settings.smooth_samples)
+    # Single spikes must not decide where a rise ends.
+    motion = _Motion(time_s, displacement_mm, median_filter(force_N, 3, mode="nearest"), noise)
+    found = []
+    for number, (start, stop) in enumerate(pairwise(bounds), start=1):
+        way = 1 if smooth[turns[number]] > smooth[turns[number - 1]] else -1
+        first = origin if number == 1 else start
+        found.append(_stroke(motion, settings, number, slice(start, stop), first, way))
+    return found
+
+
+def _stroke(motion: _Motion, settings: Strokes, number: int, rows: slice, origin: int, way: int) -> Stroke:
+    """Return the stroke that takes these rows of a trace."""
+    time_s, displacement_mm, force_N = (values[rows] for values in motion[:3])
+    along, noise = way * displacement_mm, motion.noise_mm
+    window = steady_window(time_s, along, way * force_N, origin - rows.start, noise, settings.speed_tolerance)
+    speed = slope(time_s, displacement_mm, window.steady)
+    return Stroke(
+        number,
+        rows.start,
+        rows.stop,
+        origin,
+        way,
+        speed,
+        window.steady,
+        window.sliding,
+        way * window.left_N,
+        speed_along(time_s, displacement_mm, window, speed, noise),
+        _too_short(along, window.steady, settings),
     )
-    left[rows] = way * against
-    count, share = strokes.sum(steady[rows]), _share_covered(along, steady[rows], strokes)
-    short = [_too_short(n, part, settings) for n, part in zip(count.tolist(), share.tolist(), strict=True)]
-    speed, along_it = slopes(time_s, displacement_mm, steady[rows], strokes), np.zeros(traces.rows)
-    along_it[rows] = speeds_along(time_s, displacement_mm, steady[rows], strokes, speed, noise[cut.trace], lag)
-    return Found(*cut, speed, short, steady, sliding, left, along_it)
 
 
-def smoothed(values: np.ndarray, traces: Pieces, samples: int) -> np.ndarray:
-    """Return `values` as a running mean of running medians over `samples` samples, shape (n,)."""
-    if samples == 1:
-        return np.asarray(values, float)
-    return running_mean(running_median(values, traces, samples), traces, samples)
+def _whole_file(time_s: np.ndarray, displacement_mm: np.ndarray, settings: Strokes) -> Stroke:
+    """Return a trace as one stroke, steady throughout."""
+    n, every = len(time_s), np.ones(len(time_s), bool)
+    way = 1 if displacement_mm[-1] >= displacement_mm[0] else -1
+    speed, least = slope(time_s, displacement_mm, every), settings.min_samples
+    short = None if n >= least else f"only {n} samples; at least {least} are needed"
+    return Stroke(1, 0, n, 0, way, speed, every, every, np.zeros(n), np.full(n, speed), short)
 
 
-def displacement_noises_mm(displacement_mm: np.ndarray, traces: Pieces) -> np.ndarray:
-    """Return the standard deviation of one displacement sample, noise and resolution together, of every trace.
+def displacement_noise_mm(displacement_mm: np.ndarray) -> float:
+    """Return the standard deviation of one displacement sample of a trace, noise and resolution together.
 
     Second differences of a steady motion hold noise only: their variance is six times that of a sample. The 90th
     percentile is blind to gaps, stops and spikes. Where most of the way is covered by single steps between rows that
     hardly differ, these are the resolution, whose rounding error is uniform: step / sqrt(12). A rest before or after
     the motion is no such step, be its rows equal or not. 0 of less than three samples.
     """
-    steps = traces.steps(displacement_mm)
-    bend = np.zeros(len(steps))
-    np.abs(steps[1:] - steps[:-1], out=bend[:-1])
+    if len(displacement_mm) < 3:
+        return 0.0
+    steps = np.diff(displacement_mm)
+    noise = quantile(np.abs(np.diff(steps)), 0.9) / (1.645 * np.sqrt(6.0))
     steps = np.abs(steps)
     beside = np.zeros(len(steps))
     beside[1:] += steps[:-1]
     beside[:-1] += steps[1:]
     single = steps > 2.0 * beside
-    coarse = traces.sum(np.where(single, steps, 0.0)) > 0.5 * traces.sum(steps)
-    made = np.zeros(len(traces))
-    for i, rows in enumerate(traces.slices):
-        if rows.stop - rows.start < 3:
-            continue
-        made[i] = quantile(bend[rows.start : rows.stop - 2], 0.9) / (1.645 * np.sqrt(6.0))
-        if coarse[i]:
-            made[i] = max(made[i], median(steps[rows][single[rows]]) / np.sqrt(12.0))
-    return made
-
-
-class _Cut(NamedTuple):
-    """Where strokes lie, as `Found` has it."""
-
-    trace: np.ndarray
-    number: np.ndarray
-    start: np.ndarray
-    stop: np.ndarray
-    origin: np.ndarray
-    direction: np.ndarray
-
-
-def _cut(
-    smooth_mm: np.ndarray, traces: Pieces, moves: np.ndarray, travel_mm: np.ndarray, near_mm: np.ndarray, samples: int
-) -> _Cut:
-    """Return the strokes of every trace that moves."""
-    made: list[tuple[int, ...]] = []
-    for i, (rows, change) in enumerate(zip(traces.slices, traces.split(_extremes(smooth_mm, traces)), strict=True)):
-        own = smooth_mm[rows]
-        turns = _turns(own, change.tolist(), float(travel_mm[i])) if moves[i] else []
-        if len(turns) < 2:
-            continue
-        bounds, origin = _bounds(own, turns, float(near_mm[i]), samples)
-        for number, (start, stop) in enumerate(pairwise(bounds), start=1):
-            way = 1 if own[turns[number]] > own[turns[number - 1]] else -1
-            first = origin if number == 1 else start
-            made.append((i, number, rows.start + start, rows.start + stop, rows.start + first, way))
-    return _Cut(*np.array(made, np.int64).reshape(-1, 6).T)
+    if steps[single].sum() > 0.5 * steps.sum():
+        noise = max(noise, median(steps[single]) / np.sqrt(12.0))
+    return float(noise)
 
 
 def turning_rows(smooth_mm: np.ndarray, travel_mm: float) -> list[int]:
@@ -222,20 +159,11 @@ def turning_rows(smooth_mm: np.ndarray, travel_mm: float) -> list[int]:
     A turn counts once the displacement has come back by `travel_mm`, so neither noise nor a small backlash is one.
     Fewer than two rows where nothing moves that far.
     """
-    return _turns(smooth_mm, _extremes(smooth_mm, Pieces([len(smooth_mm)])).tolist(), travel_mm)
-
-
-def _extremes(smooth_mm: np.ndarray, traces: Pieces) -> np.ndarray:
-    """Return the rows in all traces where the motion changes its sign."""
-    step = np.sign(traces.steps(smooth_mm))
-    nonzero = np.flatnonzero(step)
-    of, way = traces.of[nonzero], step[nonzero]
-    return nonzero[1:][(way[1:] != way[:-1]) & (of[1:] == of[:-1])]
-
-
-def _turns(smooth_mm: np.ndarray, extremes: list[int], travel_mm: float) -> list[int]:
+    step = np.sign(np.diff(smooth_mm))
+    moving = np.flatnonzero(step)
+    change = moving[1:][step[moving[1:]] != step[moving[:-1]]]
     # Only local extremes can be turning points; the ends belong to them.
-    candidates = [0, *extremes, len(smooth_mm) - 1]
+    candidates = [0, *change.tolist(), len(smooth_mm) - 1]
     values = smooth_mm[candidates].tolist()
     turns: list[int] = []
     heading = high = low = 0  # `high` and `low` are places in `candidates`
@@ -273,31 +201,13 @@ def _last_at_rest(smooth_mm: np.ndarray, turn: int, after: int, near_mm: float, 
     return turn + rest if rest > 3.0 * near_mm / per_row + samples else turn
 
 
-def _whole_files(
-    time_s: np.ndarray, displacement_mm: np.ndarray, moves: np.ndarray, cut: _Cut, settings: Strokes
-) -> Found:
-    """Return every trace that moves as one stroke, steady throughout."""
-    size = cut.stop - cut.start
-    least = settings.min_samples
-    short = [None if n >= least else f"only {n} samples; at least {least} are needed" for n in size.tolist()]
-    strokes = Pieces(size)
-    speed = slopes(time_s[moves], displacement_mm[moves], np.ones(strokes.rows, bool), strokes)
-    along_it = np.zeros(len(moves))
-    along_it[moves] = strokes.spread(speed)
-    return Found(*cut, speed, short, moves, moves.copy(), np.zeros(len(moves)), along_it)
-
-
-def _too_short(samples: int, share: float, settings: Strokes) -> str | None:
+def _too_short(along_mm: np.ndarray, steady: np.ndarray, settings: Strokes) -> str | None:
     """Return why a steady window is too short to be used."""
+    samples = int(np.count_nonzero(steady))
     if samples < settings.min_samples:
         return f"the steady window has {samples} samples; at least {settings.min_samples} are needed"
+    covered = np.abs(np.diff(along_mm))[steady[1:] & steady[:-1]].sum()
+    share = covered / max(float(np.ptp(along_mm)), 1e-300)
     if share < settings.min_steady_share:
         return f"the steady window is {share:.0%} of the stroke; at least {settings.min_steady_share:.0%} is needed"
     return None
-
-
-def _share_covered(along_mm: np.ndarray, steady: np.ndarray, strokes: Pieces) -> np.ndarray:
-    """Return the share of its range that a stroke covers within its steady window."""
-    covered = np.abs(strokes.steps(along_mm))
-    covered[:-1] *= steady[1:] & steady[:-1]
-    return strokes.sum(covered) / np.maximum(strokes.max(along_mm) - strokes.min(along_mm), 1e-300)

@@ -6,30 +6,34 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from sealfit.config import Config, Quality
 from sealfit.errors import ConfigError, Fault
 from sealfit.ingest.file_names import TraceRef
-from sealfit.ingest.segments import Pieces, median, quantile, running_median
-from sealfit.ingest.strokes import Stroke, displacement_noises_mm
+from sealfit.ingest.segments import median, quantile
+from sealfit.ingest.strokes import Stroke, displacement_noise_mm
 from sealfit.units import Units
 
 # ---------------------------------------------------------------- spikes
 # Single samples that cannot be right: a displacement that jumps away and back, a force far off its neighbours.
 
-NEIGHBOURS = 5  # a median over five samples is blind to one or two wrong ones, and exact on any slope
-# A spike stands apart, four times as far off as 95 % of the samples (of noise: 7.8 SDs); else it is one of many bursts.
-APART, USUAL = 4.0, 0.95
-STEPS = 5.0  # a spike of displacement is off by more than so many of the usual steps: see `displacement_spikes`
+# Samples of the running median. Five are blind to one or two wrong ones, and exact on any slope.
+NEIGHBOURS = 5
+# Share of the samples that are usual.
+USUAL = 0.95
+# A spike is so many times as far off as all usual samples (of noise: 7.8 SDs); else it is one of many bursts.
+APART = 4.0
+# Usual steps by which a spike of displacement is off, at least: see `displacement_spikes`.
+STEPS = 5.0
 FIX = "Correct the cell if the true value is known."
 
 
-def _beyond(force_N: np.ndarray, suspects: np.ndarray, traces: Pieces) -> np.ndarray:
+def _beyond(force_N: np.ndarray, suspects: np.ndarray) -> np.ndarray:
     """Return which samples reach beyond their trace without its suspects by half of its range, shape (n,)."""
     rest = np.where(suspects, 0.0, force_N)  # at rest the force may be zero
-    low, high = np.minimum(traces.min(rest), 0.0), np.maximum(traces.max(rest), 0.0)
-    reach = np.maximum(traces.spread(low) - force_N, force_N - traces.spread(high))
-    return reach > traces.spread(0.5 * (high - low))
+    low, high = min(rest.min(), 0.0), max(rest.max(), 0.0)
+    return np.maximum(low - force_N, force_N - high) > 0.5 * (high - low)
 
 
 def displacement_spikes(
@@ -42,11 +46,10 @@ def displacement_spikes(
     keep = np.ones(len(displacement_mm), bool)
     if len(displacement_mm) < 4 * NEIGHBOURS:
         return keep, []
-    one = Pieces([len(displacement_mm)])
-    off = displacement_mm - running_median(displacement_mm, one, NEIGHBOURS, "mirror")
+    off = displacement_mm - median_filter(displacement_mm, NEIGHBOURS, mode="mirror")
     # At a turn the median lags by one step of the fastest samples around, never by more than a few of the usual ones.
     step = median(np.abs(np.diff(displacement_mm)))
-    (noise,) = displacement_noises_mm(displacement_mm, one)
+    noise = displacement_noise_mm(displacement_mm)
     least = max(STEPS * step, APART * quantile(np.abs(off), USUAL), 1e-9 * float(np.ptp(displacement_mm)))
     spikes = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, least))
     if len(spikes) > settings.max_bad_rows * len(off):
@@ -68,8 +71,8 @@ def force_spikes(
     keep = np.ones(len(force_N), bool)
     if len(force_N) < 4 * NEIGHBOURS:
         return keep, []
-    one, steady = Pieces([len(force_N)]), np.zeros(len(force_N), bool)
-    off = force_N - running_median(force_N, one, NEIGHBOURS, "mirror")
+    steady = np.zeros(len(force_N), bool)
+    off = force_N - median_filter(force_N, NEIGHBOURS, mode="mirror")
     for stroke in strokes:
         steady[stroke.rows] = True
     usual = off[steady] if steady.any() else off
@@ -79,7 +82,7 @@ def force_spikes(
     suspects = np.abs(off) > max(settings.spike_sigma * noise, apart)
     if not suspects.any():
         return keep, []
-    spikes = np.flatnonzero(suspects & (steady | _beyond(force_N, suspects, one)))
+    spikes = np.flatnonzero(suspects & (steady | _beyond(force_N, suspects)))
     if len(spikes) > settings.max_bad_rows * len(force_N):
         reason = f"{len(spikes)} samples jump away from their neighbours: too many to be single wrong samples."
         fix = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
@@ -159,14 +162,29 @@ def speed_factor(units: Units) -> float:
 # ---------------------------------------------------------------- speed check
 # Does the displacement move as fast as commanded? A factor that is wrong in a known way names the unit mixed up.
 
-BLOCKS = 100  # pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke
-FEWEST = 6  # pieces of which a noisy trace is cut at least: a rest at either end, and sliding between
-NOISE_OF_PATH = 0.1  # noise of a step between the means of two pieces, as a share of the step
-GROSS = 1.5  # beyond this factor the file contradicts itself and is left out; below, the commanded speed may be nominal
+# Pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke.
+BLOCKS = 100
+# Pieces that a noisy trace is cut into at least: a rest at either end, and sliding between.
+FEWEST = 6
+# Noise of a step between the means of two pieces, as a share of the step.
+NOISE_OF_PATH = 0.1
+# Factor beyond which the file contradicts itself and is left out. Below it the commanded speed may be nominal.
+GROSS = 1.5
 
 
 def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
-    """Return the mean speed of a trace, rests included, and its plateau speed: see `measured_speeds`.
+    """Return the mean speed of a trace, rests included, and its plateau speed; magnitudes, nan if there is none.
+
+    Parameters
+    ----------
+    time_s, displacement_mm : ndarray, shape (n,)
+        Rising time and displacement of a trace, in any unit; the speeds are in their quotient.
+
+    Notes
+    -----
+    A trace is cut into 100 pieces, or 50 per stroke. The mean is that of all pieces; the plateau is the median of
+    those faster than half their 90th percentile, so rests, turns and ramps do not count. In stick-slip the speed that
+    was set is the mean, in a stroke with rests it is the plateau; elsewhere the two agree.
 
     Examples
     --------
@@ -175,64 +193,20 @@ def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[flo
     >>> round(mean, 6), round(plateau, 6)
     (1.5, 3.0)
     """
-    mean, plateau = measured_speeds(time_s, displacement_mm, Pieces([len(time_s)]))
-    return float(mean[0]), float(plateau[0])
+    cuts = min(len(time_s), BLOCKS * max(1, _strokes(displacement_mm) // 2) + 1)
+    if cuts < 2:
+        return math.nan, math.nan
+    at = np.linspace(0, len(time_s) - 1, cuts).astype(np.int64)
+    return _of_cuts(time_s[at], displacement_mm[at])
 
 
-def measured_speeds(time_s: np.ndarray, displacement_mm: np.ndarray, traces: Pieces) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean speed of every trace, rests included, and its plateau speed; magnitudes, nan if there is none.
-
-    Parameters
-    ----------
-    time_s, displacement_mm : ndarray, shape (n,)
-        Rising time and displacement of traces, one after the other, in any unit; the speeds are in their quotient.
-    traces : Pieces
-        Where each of them lies.
-
-    Notes
-    -----
-    A trace is cut into 100 pieces, or 50 per stroke. The mean is that of all pieces; the plateau is the median of
-    those faster than half their 90th percentile, so rests, turns and ramps do not count. In stick-slip the speed that
-    was set is the mean, in a stroke with rests it is the plateau; elsewhere the two agree.
-    """
-    pieces = np.full(len(traces), BLOCKS)
-    for i in np.flatnonzero(~_slides_once(displacement_mm, traces)).tolist():
-        pieces[i] *= max(1, _strokes(displacement_mm[traces.slices[i]]) // 2)
-    cuts = np.minimum(traces.size, pieces + 1)
-    mean, plateau = np.full(len(traces), np.nan), np.full(len(traces), np.nan)
-    for count in np.unique(cuts[cuts > 1]).tolist():
-        alike = np.flatnonzero(cuts == count)
-        at = np.linspace(0, traces.size[alike] - 1, count, axis=1).astype(np.int64) + traces.start[alike, None]
-        mean[alike], plateau[alike] = _of_cuts(time_s[at], displacement_mm[at])
-    return mean, plateau
-
-
-def _of_cuts(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and plateau of traces of which so many rows are given, shape (traces, rows)."""
+def _of_cuts(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
+    """Return mean and plateau of a trace of which these rows are given."""
     with np.errstate(all="ignore"):  # beyond 1e308 there is no speed: nan or inf, and no check
         path, time = np.abs(np.diff(displacement_mm)), np.diff(time_s)
-        speeds = np.sort(path / time)
-        usual = np.quantile(speeds, 0.9, axis=1)
-        slow = (speeds <= 0.5 * usual[:, None]).sum(axis=1)
-        fast = speeds.shape[1] - slow
-        # The middle of those that are faster, which stand at the end.
-        ends = np.minimum(slow + np.array([(fast - 1) // 2, fast // 2]), speeds.shape[1] - 1)
-        low, high = np.take_along_axis(speeds, ends.T, axis=1).T
-        return path.sum(axis=1) / time.sum(axis=1), np.where(fast > 0, (low + high) / 2.0, np.nan)
-
-
-def _slides_once(displacement_mm: np.ndarray, traces: Pieces) -> np.ndarray:
-    """Return which traces surely hold less than four strokes, shape (traces,).
-
-    A stroke, as `_strokes` counts it, covers half of what lies between the 1st and the 99th percentile. Where a
-    hundredth of the samples lies in the tenth at either end, that is 0.4 of the range.
-    """
-    low, high = traces.min(displacement_mm), traces.max(displacement_mm)
-    tenth, few = 0.1 * (high - low), 0.01 * (traces.size - 1) + 1.0
-    below = traces.sum(displacement_mm <= traces.spread(low + tenth))
-    above = traces.sum(displacement_mm >= traces.spread(high - tenth))
-    path = traces.sum(np.abs(traces.steps(displacement_mm)))
-    return (below >= few + 1.0) & (above >= few + 1.0) & (path < 4.0 * 0.4 * (high - low))
+        speeds = path / time
+        fast = speeds[speeds > 0.5 * quantile(speeds, 0.9)]
+        return float(path.sum() / time.sum()), median(fast) if len(fast) else math.nan
 
 
 def _strokes(displacement_mm: np.ndarray) -> int:
@@ -244,72 +218,47 @@ def _strokes(displacement_mm: np.ndarray) -> int:
     return int(np.count_nonzero(np.diff(ends > 0.5 * (low + high))))
 
 
-def speed_faults(
-    time_s: np.ndarray, displacement_mm: np.ndarray, traces: Pieces, refs: Sequence[TraceRef], config: Config
-) -> list[Fault | None]:
-    """Return, for every trace, a fault if time and displacement disagree with the commanded speed.
+def speed_fault(ref: TraceRef, time_s: np.ndarray, displacement_mm: np.ndarray, config: Config) -> Fault | None:
+    """Return a fault if time and displacement of a trace disagree with the commanded speed.
 
     None if they agree or no speed is commanded. They agree if the commanded speed lies between the measured mean and
     the plateau, or misses them by no more than `quality.speed_disagreement`. Up to a factor of 1.5 the file is kept
     with a warning: every table holds the measured speed. Beyond, the file is left out, and the fix names the mix-up
-    that fits the factor. Arguments as in `measured_speeds`.
+    that fits the factor. Arguments as in `measured_speed`.
     """
-    commanded = [_commanded(ref) for ref in refs]
-    if not any(commanded):
-        return [None] * len(refs)
-    factor = speed_factor(config.units)
-    speeds = (factor * speed for speed in measured_speeds(time_s, displacement_mm, traces))
-    faults: list[Fault | None] = []
-    for ref, speed, mean, plateau, own in zip(
-        refs, commanded, *(s.tolist() for s in speeds), traces.slices, strict=True
-    ):
-        fault = None
-        if speed and 0 < plateau < math.inf and mean < math.inf:  # else nothing moves: said where strokes are sought
-            fault = _disagreement(ref, speed, mean, plateau, time_s[own], displacement_mm[own], config)
-        faults.append(fault)
-    return faults
-
-
-def _commanded(ref: TraceRef) -> float | None:
-    speed = ref.channels.get("speed_set_mm_s")
-    return speed if isinstance(speed, int | float) and speed > 0 else None
-
-
-def _disagreement(
-    ref: TraceRef,
-    commanded: float,
-    mean: float,
-    plateau: float,
-    time_s: np.ndarray,
-    displacement: np.ndarray,
-    config: Config,
-) -> Fault | None:
-    tolerance = config.quality.speed_disagreement
+    commanded = _commanded(ref)
+    if commanded is None:
+        return None
+    factor, tolerance = speed_factor(config.units), config.quality.speed_disagreement
+    mean, plateau = (factor * speed for speed in measured_speed(time_s, displacement_mm))
+    if not (0 < plateau < math.inf and mean < math.inf):  # nothing moves: said where strokes are sought
+        return None
     measured = _nearest(commanded, mean, plateau)
     if abs(measured / commanded - 1) <= tolerance:
         return None
-    of_means = speed_factor(config.units) * np.array(_speeds_of_means(time_s, displacement))
+    of_means = [factor * speed for speed in _speeds_of_means(time_s, displacement_mm)]
     if np.isfinite(of_means).all():
-        measured = _nearest(commanded, *of_means.tolist())
+        measured = _nearest(commanded, *of_means)
     ratio = measured / commanded
     if abs(ratio - 1) <= tolerance:
         return None
-    unit = config.units.unit("speed")
-    reason = f"displacement over time gives {measured:.4g} {unit}, commanded are {commanded:.4g} {unit}."
-    gross = not 1 / GROSS <= ratio <= GROSS
-    fix = (
-        _mix_up(ratio, time_s, displacement, tolerance) if gross else "Check the commanded speed, or slip in the drive."
-    )
+    unit, gross = config.units.unit("speed"), not 1 / GROSS <= ratio <= GROSS
+    fix = "Check the commanded speed, or slip in the drive."
     return Fault(
         "speed_disagreement",
-        reason,
+        f"displacement over time gives {measured:.4g} {unit}, commanded are {commanded:.4g} {unit}.",
         file=ref.file,
         column="displacement_mm",
         value=measured,
         severity="error" if gross else "warning",
         action="file left out" if gross else "kept",
-        fix=fix,
+        fix=_mix_up(ratio, time_s, displacement_mm, tolerance) if gross else fix,
     )
+
+
+def _commanded(ref: TraceRef) -> float | None:
+    speed = ref.channels.get("speed_set_mm_s")
+    return speed if isinstance(speed, int | float) and speed > 0 else None
 
 
 def _nearest(commanded: float, mean: float, plateau: float) -> float:
@@ -324,7 +273,7 @@ def _speeds_of_means(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[f
     longer by noise that must stay small beside the travel.
     """
     n, travel = len(time_s), float(np.ptp(displacement_mm))
-    noise = float(displacement_noises_mm(displacement_mm, Pieces([n]))[0])
+    noise = displacement_noise_mm(displacement_mm)
     if noise <= 0.0 or n < 2 * FEWEST:
         return math.nan, math.nan
     count = int((NOISE_OF_PATH * travel / noise * math.sqrt(n / 2.0)) ** (2.0 / 3.0))
@@ -332,8 +281,7 @@ def _speeds_of_means(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[f
         return math.nan, math.nan
     cut = np.linspace(0, n, count + 1).astype(np.int64)
     means = [np.add.reduceat(values, cut[:-1]) / np.diff(cut) for values in (time_s, displacement_mm)]
-    mean, plateau = _of_cuts(*(values[None, :] for values in means))
-    return float(mean[0]), float(plateau[0])
+    return _of_cuts(*means)
 
 
 def _mix_up(ratio: float, time_s: np.ndarray, displacement: np.ndarray, tolerance: float) -> str:

@@ -2,116 +2,110 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 
-from sealfit.ingest.presliding import Start, rises
-from sealfit.ingest.segments import Pieces, median, running_median, weighted_medians
+from sealfit.ingest.presliding import Rise, Start, rise_of
+from sealfit.ingest.segments import median, stretches, weighted_median
 
-REST = 0.5  # slower than this share of the plateau is a rest, not a ripple of the speed
-STANDSTILL = 0.05  # slower than this share of the plateau: not moving yet, or no more
-# A straight ramp takes 1.1 times as long for all of the plateau as for 90 % of it, and 1.8 times as long for 90 % as
-# for 50 %; a first-order lag three times as long for 99.9 %, and 3.3 times. In between, in between.
-STRAIGHT, LAG = (1.8, 0.25), (3.3, 2.0)
-BEFORE_STOP = 0.5  # an S-shaped stop leaves the plateau earlier than a straight one, by less than half its length
-ONSET, HALF_UP = 0.05, 0.5  # shares of the rise below which a force is at rest, and above which it has come up
-SPEED_PIECES = (8, 64)  # of a steady window, whose speeds are compared: at least, and at most
-LEAST_ROWS = 8  # of such a piece
-SAME_SPEED = 0.001  # share by which speeds may differ without a word: errors of screws and scales are of that size
-CLEAR = 3.0  # times the scatter by chance that speeds must show: under it, 3 strokes of 1,000 do
-SPEED_NOISE = 0.25  # noise of the local speed, as a share of the tolerance: a false exit is then a matter of four SDs
+# Share of the plateau speed below which the platform rests. A ripple of the speed stays above it.
+REST = 0.5
+# Share of the plateau speed below which the platform stands still: it does not move yet, or no more.
+STANDSTILL = 0.05
+# A straight ramp: its time to 90 % of the plateau speed over that to 50 % (0.9 / 0.5), and how much of the ramp is
+# left out after 90 %, as a share. The ramp itself takes 0.11 more.
+STRAIGHT = (1.8, 0.25)
+# The same of a first-order lag, ln(10) / ln(2) and ln(1000) / ln(10) - 1, after which 99.9 % are reached. Between the
+# two shapes the share is interpolated.
+LAG = (3.3, 2.0)
+# Share of the braking time by which an S-shaped stop leaves the plateau earlier than a straight one, at most.
+BEFORE_STOP = 0.5
+# Share of the rise below which a force is at rest.
+ONSET = 0.05
+# Share of the rise above which a force has come up.
+HALF_UP = 0.5
+# Pieces of a steady window whose speeds are compared: at least, and at most.
+SPEED_PIECES = (8, 64)
+# Rows of such a piece, at least.
+LEAST_ROWS = 8
+# Share by which speeds may differ without a finding. Errors of screws and scales are of that size.
+SAME_SPEED = 0.001
+# Scatter of the speeds, in units of that by chance, from which they differ. 3 strokes of 1,000 exceed it by chance.
+CLEAR = 3.0
+# Noise of the local speed, as a share of the tolerance. A false exit from the plateau then takes four SDs.
+SPEED_NOISE = 0.25
+# Samples of a steady window, or of a stroke that may have one, at least.
+LEAST_SAMPLES = 4
 
 
-def steady_windows(
-    time_s: np.ndarray,
-    along_mm: np.ndarray,
-    force_N: np.ndarray,
-    strokes: Pieces,
-    origin: np.ndarray,
-    noise_mm: np.ndarray,
-    tolerance: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return which rows of strokes are in their steady window, in which they slide at all, and what is left there of
-    the pre-sliding rise (in N, positive against the motion; 0 outside the window), shape (n,) each; and the length of
-    the rise of each stroke in mm, shape (strokes,), 0 without one.
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """The steady window of one stroke; arrays of shape (n,).
+
+    `steady` marks its rows, `sliding` those in which the stroke moves at all; `left_N` is what is left in the window
+    of the pre-sliding rise, positive against the motion, 0 outside; `rise_mm` is the length of that rise, 0 without
+    one.
+    """
+
+    steady: np.ndarray
+    sliding: np.ndarray
+    left_N: np.ndarray
+    rise_mm: float
+
+
+def steady_window(
+    time_s: np.ndarray, along_mm: np.ndarray, force_N: np.ndarray, origin: int, noise_mm: float, tolerance: float
+) -> Window:
+    """Return the steady window of one stroke.
 
     Parameters
     ----------
     time_s, along_mm, force_N : ndarray, shape (n,)
-        Strokes, one after the other; displacement rising with the motion, force positive against it.
-    strokes : Pieces
-        Where each of them lies.
-    origin : ndarray of int, shape (strokes,)
-        Row, counted from the stroke's first one, from which it may move.
-    noise_mm : ndarray, shape (strokes,)
+        The stroke; displacement rising with the motion, force positive against it.
+    origin : int
+        Row from which it may move.
+    noise_mm : float
         Standard deviation of a displacement sample.
     tolerance : float
         Share by which the speed may be off its plateau.
     """
+    n = len(time_s)
+    steady, sliding, left, length = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n), 0.0
+    if n < LEAST_SAMPLES:
+        return Window(steady, sliding, left, length)
     # A glitch of one sample is not a rest.
-    speed, half, blurred = local_speeds(time_s, running_median(along_mm, strokes, 5), strokes, noise_mm, tolerance)
-    plateau = plateau_speeds(time_s, speed, strokes)
-    steady = np.zeros(len(time_s), bool)
-    usual = strokes.spread(plateau)
-    slow = speed < STANDSTILL * usual
-    fast = speed >= (1.0 - tolerance) * usual
-    sliding = speed > STANDSTILL * usual
-    moves = speed > REST * usual
-    for start, rows in zip(strokes.start[origin > 0].tolist(), origin[origin > 0].tolist(), strict=True):
-        sliding[start : start + rows] = moves[start : start + rows] = False
-    begins, ends = (strokes.split(rows) for rows in _edges(moves, strokes))
-    stretches: list[_Stretch] = []
-    for i, rows in enumerate(strokes.slices):
-        if plateau[i] <= 0.0:
-            continue
-        own = (values[rows] for values in (time_s, along_mm, speed, slow, fast))
-        stroke, since = _Motion(*own, float(plateau[i]), int(half[i])), 0 if blurred[i] else int(origin[i])
-        for first, last in stroke.moving(begins[i].tolist(), ends[i].tolist()):
-            still = stroke.standstill(since, first)
-            begin, end = stroke.ramp_end(still, first, last), stroke.stop_begin(first, last)
-            if blurred[i]:  # neither the rest nor the ramp can be seen: the force says better when the motion begins
-                still = max(still, first_motion(force_N[rows][:end], still))
-                begin = max(begin, still)
-            if end - begin >= 4:
-                places = (rows.start + row for row in (still, begin, end))
-                stretches.append(_Stretch(*places, 0 if blurred[i] else int(half[i])))
-            since = last
-    left, length = np.zeros(len(time_s)), np.zeros(len(strokes))
-    for begin, end, left_N, length_mm in _past_rises(time_s, along_mm, force_N, stretches):
-        steady[begin:end] = True
-        left[begin:end] = left_N
-        length[strokes.of[begin]] = length_mm
-    return steady, sliding, left, length
+    speed, half, blurred = local_speed(time_s, median_filter(along_mm, 5, mode="nearest"), noise_mm, tolerance)
+    plateau = plateau_speed(time_s, speed)
+    moves = speed > REST * plateau
+    sliding = speed > STANDSTILL * plateau
+    sliding[:origin] = moves[:origin] = False
+    if plateau <= 0.0:
+        return Window(steady, sliding, left, length)
+    fast = speed >= (1.0 - tolerance) * plateau
+    stroke, since = _Motion(time_s, along_mm, speed, fast, plateau, half), 0 if blurred else origin
+    for first, last in stroke.moving(moves):
+        still = stroke.standstill(since, first)
+        begin, end = stroke.ramp_end(still, first, last), stroke.stop_begin(first, last)
+        if blurred:  # neither the rest nor the ramp can be seen: the force says better when the motion begins
+            still = max(still, first_motion(force_N[:end], still))
+            begin = max(begin, still)
+        if end - begin >= LEAST_SAMPLES:
+            rows = slice(still, end)
+            distance = _distance(time_s[rows], along_mm[rows], begin - still, 0 if blurred else half)
+            rise = rise_of(Start(distance, force_N[rows], begin - still))
+            begin = max(begin, still + _rows_of(rise, distance))
+            steady[begin:end] = True
+            left[begin:end] = rise.at(distance[begin - still :])
+            length = rise.length_mm
+        since = last
+    return Window(steady, sliding, left, length)
 
 
-class _Stretch(NamedTuple):
-    """A stretch of motion: rows of its standstill and of where the speed is steady (the last one exclusive), and over
-    how many rows the displacement is to be averaged; 0 where its noise hides how the stretch starts."""
-
-    still: int
-    begin: int
-    end: int
-    averaged: int
-
-
-def _past_rises(
-    time_s: np.ndarray, along_mm: np.ndarray, force_N: np.ndarray, stretches: Sequence[_Stretch]
-) -> list[tuple[int, int, np.ndarray, float]]:
-    """Return the rows of each stretch from where the force is past its pre-sliding rise, what is left of it there, and
-    its length in mm."""
-    starts = []
-    for still, begin, end, averaged in stretches:
-        distance = _distance(time_s[still:end], along_mm[still:end], begin - still, averaged)
-        starts.append(Start(distance, force_N[still:end], begin - still))
-    made = []
-    for (still, begin, end, _), start, rise in zip(stretches, starts, rises(starts), strict=True):
-        past = int(start.distance_mm.searchsorted(rise.end_mm)) if rise.end_mm > 0.0 else 0
-        first = max(begin, still + past)
-        made.append((first, end, rise.at(start.distance_mm[first - still :]), rise.length_mm))
-    return made
+def _rows_of(rise: Rise, distance_mm: np.ndarray) -> int:
+    """Return how many rows of a start lie before the end of its rise."""
+    return int(distance_mm.searchsorted(rise.end_mm)) if rise.end_mm > 0.0 else 0
 
 
 def _distance(time_s: np.ndarray, along_mm: np.ndarray, ramp_end: int, averaged: int) -> np.ndarray:
@@ -139,35 +133,31 @@ def _averaged(values: np.ndarray, rows: int) -> np.ndarray:
     return (sums[high] - sums[low]) / (high - low)
 
 
-def local_speeds(
-    time_s: np.ndarray, along_mm: np.ndarray, strokes: Pieces, noise_mm: np.ndarray, tolerance: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the speed over `half` rows to either side of each row, each stroke's `half`: wide enough for noise; and
-    in which strokes a rest or a ramp shorter than that cannot be seen.
+def local_speed(
+    time_s: np.ndarray, along_mm: np.ndarray, noise_mm: float, tolerance: float
+) -> tuple[np.ndarray, int, bool]:
+    """Return the speed over `half` rows to either side of each row; `half`, wide enough for the noise; and whether a
+    rest or a ramp shorter than that cannot be seen.
 
     Differences of displacement over differences of time: a gap does no harm. Of single samples, or, where these would
     have to be more than a quarter of the stroke apart, of the means of all samples to either side.
     """
-    last = strokes.stop - 1
-    mean_step = np.abs(along_mm[last] - along_mm[strokes.start]) / np.maximum(strokes.size - 1, 1)
+    n = len(time_s)
+    mean_step = abs(along_mm[-1] - along_mm[0]) / (n - 1)
     # The speed's SD is sqrt(2) noise over the width, wanted below SPEED_NOISE * tolerance of the speed itself.
-    wanted = np.sqrt(2.0) * noise_mm / np.maximum(2.0 * SPEED_NOISE * tolerance * mean_step, 1e-300)
-    most = np.maximum(strokes.size // 8, 1)
-    half = np.minimum(np.maximum(np.ceil(wanted), 1), most).astype(np.int64)
-    blurred = wanted > most
-    # Of means of `half` samples each, `half` apart, it is sqrt(2 / half) noise over `half` steps.
-    half[blurred] = np.minimum(np.ceil((2.0 * wanted[blurred]) ** (2.0 / 3.0)), most[blurred]).astype(np.int64)
-    rows, width = np.arange(strokes.rows), strokes.spread(half)
-    low = np.maximum(rows - width, strokes.spread(strokes.start))
-    high = np.minimum(rows + width, strokes.spread(last))
-    speed = (along_mm[high] - along_mm[low]) / (time_s[high] - time_s[low])
-    for i in np.flatnonzero(blurred).tolist():
-        own = strokes.slices[i]
-        speed[own] = _speeds_of_means(time_s[own], along_mm[own], int(half[i]))
-    return speed, half, blurred
+    wanted = np.sqrt(2.0) * noise_mm / max(2.0 * SPEED_NOISE * tolerance * mean_step, 1e-300)
+    most = max(n // 8, 1)
+    if wanted > most:
+        # Of means of `half` samples each, `half` apart, it is sqrt(2 / half) noise over `half` steps.
+        half = int(min(np.ceil((2.0 * wanted) ** (2.0 / 3.0)), most))
+        return _speed_of_means(time_s, along_mm, half), half, True
+    half = max(int(np.ceil(wanted)), 1)
+    rows = np.arange(n)
+    low, high = np.maximum(rows - half, 0), np.minimum(rows + half, n - 1)
+    return (along_mm[high] - along_mm[low]) / (time_s[high] - time_s[low]), half, False
 
 
-def _speeds_of_means(time_s: np.ndarray, along_mm: np.ndarray, half: int) -> np.ndarray:
+def _speed_of_means(time_s: np.ndarray, along_mm: np.ndarray, half: int) -> np.ndarray:
     """Return the speed at every row of a stroke from the means of `half` rows before and after it; near the ends that
     of the nearest row which has so many."""
     sums = [np.concatenate(([0.0], np.cumsum(values - values[0]))) for values in (along_mm, time_s)]
@@ -194,58 +184,40 @@ def first_motion(force_N: np.ndarray, since: int) -> int:
     return since if still is None else since + still
 
 
-def plateau_speeds(time_s: np.ndarray, speed: np.ndarray, strokes: Pieces) -> np.ndarray:
+def plateau_speed(time_s: np.ndarray, speed: np.ndarray) -> float:
     """Return the speed at which half of the distance is slid slower and half faster: blind to rests and ramps."""
-    lasts = np.empty(len(time_s))  # how long each sample lasts, as np.gradient says it
-    lasts[1:-1] = (time_s[2:] - time_s[:-2]) / 2.0
-    first, last = strokes.start, strokes.stop - 1
-    lasts[first] = time_s[np.minimum(first + 1, last)] - time_s[first]
-    lasts[last] = time_s[last] - time_s[np.maximum(last - 1, first)]
-    return weighted_medians(speed, np.maximum(speed, 0.0) * lasts, strokes)
+    return weighted_median(speed, np.maximum(speed, 0.0) * np.gradient(time_s))
 
 
-def slopes(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray, strokes: Pieces) -> np.ndarray:
-    """Return the slope of displacement over time by least squares, with one slope for all pieces of a stroke's window.
+def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -> float:
+    """Return the slope of displacement over time by least squares, with one slope for all pieces of a steady window.
 
     Each piece (between rests) has its own intercept, so a rest does not count as slow sliding. NaN without samples.
     """
-    made, sums = np.full(len(strokes), np.nan), np.zeros((len(strokes), 3))
-    firsts, lasts = _edges(steady, strokes)
-    for i, first, last in zip(strokes.of[firsts].tolist(), firsts.tolist(), lasts.tolist(), strict=True):
-        t, d, n = time_s[first : last + 1], displacement_mm[first : last + 1], last + 1 - first
-        t = t - np.add.reduce(t) / n
-        sums[i] += n, t @ (d - np.add.reduce(d) / n), t @ t
-    enough = sums[:, 0] > 1
-    with np.errstate(invalid="ignore"):  # rows that are all single pieces have no slope
-        made[enough] = sums[enough, 1] / sums[enough, 2]
-    return made
+    product = square = 0.0
+    for first, stop in stretches(steady):
+        t, d = time_s[first:stop], displacement_mm[first:stop]
+        t = t - t.mean()
+        product += float(t @ (d - d.mean()))
+        square += float(t @ t)
+    return product / square if square > 0.0 else np.nan
 
 
-def speeds_along(
-    time_s: np.ndarray,
-    displacement_mm: np.ndarray,
-    steady: np.ndarray,
-    strokes: Pieces,
-    speed: np.ndarray,
-    noise_mm: np.ndarray,
-    lag_mm: np.ndarray,
+def speed_along(
+    time_s: np.ndarray, displacement_mm: np.ndarray, window: Window, speed: float, noise_mm: float
 ) -> np.ndarray:
-    """Return the speed that the friction at every row of the steady windows follows, shape (n,): the stroke's, and how
-    it changes along it, `lag_mm` before: bristles follow a slow change by the length of their rise behind (Eq. 2).
+    """Return the speed that the friction at every row of a steady window follows, shape (n,): the stroke's, and how
+    it changes along it, a rise length before: bristles follow a slow change by the length of their rise behind (Eq. 2).
 
-    A window is cut into pieces of equal time, each with a slope by least squares; where these differ clearly, the
-    speed is straight between their middles. `speed` is that of each stroke; it is returned as it is elsewhere, and
-    where a window is short or has rests. `noise_mm` of a displacement sample decides how many pieces a stroke has.
+    The window is cut into pieces of equal time, each with a slope by least squares; where these differ clearly, the
+    speed is straight between their middles. `speed` is that of the stroke; it is returned as it is elsewhere, and
+    where the window is short or has rests. `noise_mm` of a displacement sample decides how many pieces it has.
     """
-    made = strokes.spread(speed)
-    firsts, lasts = _edges(steady, strokes)
-    stroke = strokes.of[firsts]
-    count = np.bincount(stroke, minlength=len(strokes))
-    for i, first, last in zip(stroke.tolist(), firsts.tolist(), lasts.tolist(), strict=True):
-        if count[i] == 1 and last + 1 - first >= SPEED_PIECES[0] * LEAST_ROWS and abs(speed[i]) > 0.0:
-            rows = slice(first, last + 1)
-            lag_s = float(lag_mm[i] / abs(speed[i]))
-            made[rows] += _off_speed(time_s[rows], displacement_mm[rows], float(speed[i]), float(noise_mm[i]), lag_s)
+    made = np.full(len(time_s), speed)
+    parts = stretches(window.steady)
+    if len(parts) == 1 and abs(speed) > 0.0 and parts[0][1] - parts[0][0] >= SPEED_PIECES[0] * LEAST_ROWS:
+        rows = slice(*parts[0])
+        made[rows] += _off_speed(time_s[rows], displacement_mm[rows], speed, noise_mm, window.rise_mm / abs(speed))
     return made
 
 
@@ -278,46 +250,40 @@ def _off_speed(
     return np.interp(time_s - lag_s, at, off)
 
 
-def _edges(mask: np.ndarray, strokes: Pieces) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first rows of all stretches of `mask`, none longer than its stroke, and their last rows."""
-    begins, ends = mask.copy(), mask.copy()
-    begins[1:] &= ~mask[:-1]
-    ends[:-1] &= ~mask[1:]
-    begins[strokes.start] = mask[strokes.start]
-    ends[strokes.stop - 1] = mask[strokes.stop - 1]
-    return np.flatnonzero(begins), np.flatnonzero(ends)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
-    """How one stroke moves: arrays of shape (n,); `slow` and `fast` mark standstill and the band of the plateau."""
+    """How one stroke moves: arrays of shape (n,); `fast` marks the band of the plateau."""
 
     time_s: np.ndarray
     along_mm: np.ndarray
     speed: np.ndarray
-    slow: np.ndarray
     fast: np.ndarray
     plateau: float
     half: int
 
-    def moving(self, begins: list[int], ends: list[int]) -> list[tuple[int, int]]:
+    @property
+    def slow(self) -> np.ndarray:
+        """Rows at standstill."""
+        return self.speed < STANDSTILL * self.plateau
+
+    def moving(self, moves: np.ndarray) -> list[tuple[int, int]]:
         """Return first and last (exclusive) row of every stretch of motion, from where it is faster than a rest.
 
         Slow samples are a rest only if they cost more time than the width over which the speed is taken: noise does
         not.
         """
-        stretches: list[tuple[int, int]] = []
+        joined: list[tuple[int, int]] = []
         time_s, along_mm, half = self.time_s, self.along_mm, self.half
-        step = median(time_s[1:] - time_s[:-1]) if len(begins) > 1 else 0.0
-        for first, end in zip(begins, ends, strict=True):
-            if stretches:
-                a, b = max(stretches[-1][1] - half, 0), min(first + half, len(time_s) - 1)
+        step = median(np.diff(time_s))
+        for first, last in stretches(moves):
+            if joined:
+                a, b = max(joined[-1][1] - half, 0), min(first + half, len(time_s) - 1)
                 lost = (time_s[b] - time_s[a]) - (along_mm[b] - along_mm[a]) / self.plateau
                 if lost <= 2.0 * half * step:
-                    stretches[-1] = (stretches[-1][0], end + 1)
+                    joined[-1] = (joined[-1][0], last)
                     continue
-            stretches.append((first, end + 1))
-        return [(first, last) for first, last in stretches if last - first > 2 * half + 3]
+            joined.append((first, last))
+        return [(first, last) for first, last in joined if last - first > 2 * half + 3]
 
     def standstill(self, since: int, first: int) -> int:
         """Return the last row from `since` on, and before `first`, at which the platform still stood; else `since`."""

@@ -110,20 +110,6 @@ def measured(value: float | None, lo: float | None, hi: float | None, digits: in
     return _fixed(value, places) + tail, f"[{_fixed(lo, places)}, {_fixed(hi, places)}]" + tail
 
 
-def uncertain(value: float | None, u: float | None) -> str:
-    """Return a value rounded to two significant digits of its uncertainty.
-
-    Examples
-    --------
-    >>> uncertain(1.23456, 0.034), uncertain(1.23456, None)
-    ('1.235', '1.23')
-    """
-    if not known(value) or not known(u) or u <= 0:
-        return number(value)
-    power = _power(max(abs(value), abs(u)))
-    return _fixed(value / 10.0**power, min(decimals(u / 10.0**power), 9)) + _times_ten(power)
-
-
 def together(values: Sequence[float | None], digits: int = 2) -> list[str]:
     """Return several numbers of one unit with the same decimals: the smallest shows `digits` significant ones.
 
@@ -213,7 +199,6 @@ def _fixed(value: float, places: int) -> str:
 
 
 # ---------------------------------------------------------------- symbols
-# Symbols, channels and conditions as people read them: in HTML, in a plot, and always with the true unit.
 
 GREEK = {
     "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "zeta": "ζ", "eta": "η", "theta": "θ",

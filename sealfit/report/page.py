@@ -152,7 +152,6 @@ def complete(tables: Mapping[str, pd.DataFrame], names: tuple[str, ...]) -> dict
 
 
 # ---------------------------------------------------------------- page
-# One self-contained report.html: its tables and sentences, and every plot as an image inside it.
 
 TABLES = (
     "inputs", "runs", "quality", "traces_mean", "steady", "steady_fit", "aging_fit", "aging_curves",

@@ -188,7 +188,6 @@ def parameter_tables(
     fit = fit[~fit["quantity"].isin(HIDDEN)]
     if fit.empty:
         return []
-    earlier = _values(before, key) if before is not None else None
     names = ConditionNames.of(config)
     of_quantity = {
         quantity: tuple(dict.fromkeys(zip(rows["parameter"], rows["unit"].fillna(""), strict=True)))
@@ -202,7 +201,7 @@ def parameter_tables(
         if quantities == ["statistics"]:
             tables.append(_statistics(rows, key, names, config))
         else:
-            tables.append(_table(rows, key, quantities, parameters, names, config, earlier))
+            tables.append(_table(rows, key, parameters, config, before))
     return [replace(table, note=note) for table in tables]
 
 
@@ -226,12 +225,12 @@ def _readable(fit: pd.DataFrame, key: str, names: ConditionNames) -> tuple[pd.Da
 def _table(
     fit: pd.DataFrame,
     key: str,
-    quantities: Sequence[str],
     parameters: Sequence[tuple[str, str]],
-    names: ConditionNames,
     config: Config,
-    earlier: Mapping[tuple[str, str, str], Mapping] | None,
+    before: pd.DataFrame | None,
 ) -> ParameterTable:
+    names, quantities = ConditionNames.of(config), list(dict.fromkeys(fit["quantity"]))
+    earlier = _values(before, key) if before is not None else None
     several = len(quantities) > 1 or key == "series"
     found = []
     for (name, quantity), by in _rows_of(fit, key, "quantity", names):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 # ---------------------------------------------------------------- summary lines
-# What a command ends with, in a few lines: the figures of `summary` as people read them.
 
 
 def lines(summary: Mapping) -> list[str]:

@@ -26,10 +26,10 @@ from sealfit.report.notation import (
 )
 from sealfit.report.summary import power_clause, quality_clause, untold_clause
 
-FLAT = 0.02  # of its span: a shape that crosses zero by less is of one sign
-STARTS = (
-    0.1  # of its span: a shape that starts nearer to zero than this and ends at its largest is told without "up to"
-)
+# Share of its span: a shape that crosses zero by less is of one sign.
+FLAT = 0.02
+# Share of its span: a shape that starts nearer to zero and ends at its largest is described without "up to".
+STARTS = 0.1
 PARTS = {"trace": "within a trace", "stroke": "between strokes", "repeat": "between repeats", "run": "between runs",
          "condition": "between conditions", "campaign": "along the campaign", "file": "between files",
          "specimen": "between specimens", "sample": "within a stroke"}  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, ValidationError, model_validator
 
-from sealfit.config import Strict
+from sealfit.config import Strict, explain
 from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
 from sealfit.ingest.expression import parse
@@ -311,15 +311,3 @@ def load_spec(path: Path) -> Spec:
     except ConfigError as error:
         raise ConfigError(error.message, file=path, fix=error.fix) from error
     return spec
-
-
-def explain(error: ValidationError) -> str:
-    """Return one sentence per fault of a SPEC."""
-    lines = []
-    for fault in error.errors():
-        key = ".".join(str(part) for part in fault["loc"]) or "the file"
-        if fault["type"] == "extra_forbidden":
-            lines.append(f"unknown key '{key}'.")
-        else:
-            lines.append(f"key '{key}': {fault['msg'].removeprefix('Value error, ')}.")
-    return " ".join(lines)

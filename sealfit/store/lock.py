@@ -17,7 +17,7 @@ from sealfit.store.manifest import STATE
 from sealfit.store.staged_writes import STAGING, disk
 
 # ---------------------------------------------------------------- interrupts
-# Signals that end a process, held back while half of what it does would be worse than none.
+# Ctrl-C is held back while files are moved, since half of that would leave OUT stale.
 
 
 @contextlib.contextmanager
@@ -148,7 +148,7 @@ def _sign(handle: int, path: Path) -> None:
 
 
 # ---------------------------------------------------------------- own folder
-# Whose a folder OUT is: made where there is none, refused where others made it, and held by one writer.
+# Ownership of the output folder: create it, or refuse one made by another program; one writer holds it.
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatch
 from importlib.metadata import PackageNotFoundError, version
@@ -47,67 +47,7 @@ class Fingerprint(NamedTuple):
     sha256: str | None = None
 
 
-@dataclass(frozen=True)
-class Fingerprints(Mapping[str, Fingerprint]):
-    """Fingerprints of files by their names, column by column, as they are many.
-
-    `places` has the place of every file in the other columns, from 0, rising.
-    """
-
-    places: dict[str, int] = field(default_factory=dict)
-    size: list[int | None] = field(default_factory=list)
-    mtime_ns: list[int | None] = field(default_factory=list)
-    sha256: list[str | None] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, marks: Mapping[str, Fingerprint]) -> Fingerprints:
-        """Return these fingerprints as columns."""
-        return cls() | marks
-
-    @classmethod
-    def of_columns(cls, file: Sequence[str], **columns: list) -> Fingerprints:
-        """Return what `columns` told; ValueError if they differ in length."""
-        made = cls({name: i for i, name in enumerate(file)}, **columns)
-        if any(len(column) != len(made) for column in made.columns().values()):
-            raise ValueError("columns of different length")
-        return made
-
-    def columns(self) -> dict[str, list]:
-        """Return the columns by their names, `file` and those of a fingerprint."""
-        return {"file": list(self.places), "size": self.size, "mtime_ns": self.mtime_ns, "sha256": self.sha256}
-
-    def __len__(self) -> int:
-        return len(self.places)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.places)
-
-    def __getitem__(self, file: str) -> Fingerprint:
-        i = self.places[file]
-        return Fingerprint(self.size[i], self.mtime_ns[i], self.sha256[i])
-
-    def __or__(self, other: Mapping[str, Fingerprint]) -> Fingerprints:
-        """Return these with those of `other`, which come in their places or after them."""
-        if not other:
-            return self
-        made = Fingerprints(dict(self.places), list(self.size), list(self.mtime_ns), list(self.sha256))
-        for file, mark in other.items():
-            i = made.places.setdefault(file, len(made.places))
-            for column, value in zip((made.size, made.mtime_ns, made.sha256), mark, strict=True):
-                column[i : i + 1] = [value]
-        return made
-
-    def take(self, files: Sequence[str]) -> Fingerprints:
-        """Return those of `files`, in this order; all None of a file that is not among these."""
-        at = [self.places.get(file, -1) for file in files]
-        told = {name: [*getattr(self, name), None] for name in Fingerprint._fields}
-        return Fingerprints.of_columns(files, **{name: [column[i] for i in at] for name, column in told.items()})
-
-    def readable(self) -> Fingerprints:
-        """Return those of the files that could be read."""
-        if None not in self.sha256:
-            return self
-        return Fingerprints.of({file: mark for file, mark in self.items() if mark.sha256 is not None})
+Fingerprints = dict[str, Fingerprint]  # of files by their names
 
 
 def fingerprint(path: Path | str) -> Fingerprint:
@@ -132,15 +72,15 @@ def changes(folder: Path, known: Fingerprints, config: Config) -> dict[str, Fing
     A file is read only if its size or time differ from those known.
     """
     place, changed = os.path.join(folder, ""), []
-    for file, size, mtime_ns in zip(known.places, known.size, known.mtime_ns, strict=True):
+    for file, mark in known.items():
         try:
             status = os.stat(place + file)
         except OSError:
             changed.append(file)
             continue
-        if status.st_mtime_ns != mtime_ns or status.st_size != size:
+        if (status.st_size, status.st_mtime_ns) != mark[:2]:
             changed.append(file)
-    changed += [file for file in glob_names(folder, config.files) if file not in known.places]
+    changed += [file for file in glob_names(folder, config.files) if file not in known]
     return {file: fingerprint(place + file) for file in changed}
 
 
@@ -164,8 +104,8 @@ def step_keys(inputs: Fingerprints, config: Config, effects: Mapping[str, str | 
     """
     config = config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
     keys: dict[str, str] = {}
-    names = sorted(inputs.places)
-    hashes = (inputs.sha256[inputs.places[name]] or "" for name in names)
+    names = sorted(inputs)
+    hashes = (inputs[name].sha256 or "" for name in names)
     known = "\0".join([*names, *hashes])  # \0 stands in no path
     before = hashlib.sha256(os.fsencode(known)).hexdigest()
     for step in STEPS:
@@ -184,7 +124,6 @@ PACKAGES = ("numpy", "pandas", "scipy", "pyarrow", "matplotlib", "pydantic", "ji
 
 def provenance(state: State) -> dict:
     """Return versions, campaign, config, every input with its hash, and when each step was done."""
-    known = state.inputs
     return {
         "program": "sealfit",
         "version": __version__,
@@ -198,9 +137,9 @@ def provenance(state: State) -> dict:
             "text": state.config.text,
         },
         "inputs": [
-            {"file": name, "size": size, "sha256": sha256}
-            for name, size, sha256 in zip(known.places, known.size, known.sha256, strict=True)
-            if sha256 is not None
+            {"file": name, "size": mark.size, "sha256": mark.sha256}
+            for name, mark in state.inputs.items()
+            if mark.sha256 is not None
         ],
         "own_effects": [{"file": name, "sha256": sha256} for name, sha256 in state.effects.items()],
         "steps": [
@@ -221,7 +160,7 @@ def _version(package: str) -> str | None:
 # What OUT knows of itself: its campaign, its config, its inputs, and the key under which each step was made.
 
 STATE = "state.json"
-FORMAT = 5
+FORMAT = 6
 DEFAULT = "default"
 
 
@@ -290,7 +229,7 @@ class State:
 
     campaign: Path
     config: ConfigCopy
-    inputs: Fingerprints = field(default_factory=Fingerprints)
+    inputs: Fingerprints = field(default_factory=dict)
     effects: dict[str, str | None] = field(default_factory=dict)  # SHA-256 of the user's own effects, by file name
     steps: dict[str, Done] = field(default_factory=dict)
 
@@ -301,7 +240,7 @@ class State:
             "format": FORMAT,
             "campaign": str(self.campaign),
             "config": {"path": str(self.config.path) if self.config.path else None, "text": self.config.text},
-            "inputs": self.inputs.columns(),
+            "inputs": self.inputs,
             "own_effects": self.effects,
             "steps": {name: asdict(done) for name, done in self.steps.items()},
         }
@@ -326,7 +265,7 @@ class State:
                 return cls(*belongs)
             return cls(
                 *belongs,
-                Fingerprints.of_columns(**kept["inputs"]),
+                {name: Fingerprint(*mark) for name, mark in kept["inputs"].items()},
                 dict(kept.get("own_effects", {})),
                 {name: _inside(Done(**done)) for name, done in kept["steps"].items()},
             )

@@ -21,7 +21,6 @@ from sealfit.store.manifest import (
     ConfigCopy,
     Done,
     Fingerprint,
-    Fingerprints,
     State,
     changes,
     fingerprint,
@@ -126,8 +125,8 @@ class Store:
             return cls(out, State(campaign, source, effects=hashes), known=False, kept=kept, effects=effects)
         store_inputs, moved = kept.inputs, kept.campaign != campaign
         if moved:
-            store_inputs = Fingerprints.of({name: fingerprint(campaign / name) for name in kept.inputs})
-            if store_inputs.sha256 != kept.inputs.sha256:
+            store_inputs = {name: fingerprint(campaign / name) for name in kept.inputs}
+            if any(mark.sha256 != kept.inputs[name].sha256 for name, mark in store_inputs.items()):
                 raise OutError(
                     f"belongs to the campaign {kept.campaign}, and {campaign} holds other data.",
                     file=out,
@@ -290,7 +289,7 @@ class Store:
         # Until every file is in its place the step counts as not done: a kill in between cannot pass a mixture of old
         # and new tables as current. All is on the disk before the first move, so a full disk changes nothing in OUT.
         earlier = {step: self.state.steps[step] for step in STEPS[: STEPS.index(name)] if step in self.state.steps}
-        known = inputs if earlier else Fingerprints()  # none are known of steps not done
+        known = inputs if earlier else {}  # none are known of steps not done
         begun = replace(self.state, inputs=known, steps=earlier)
         ended = replace(begun, inputs=inputs, steps={**earlier, name: done})
         staged.text("begun.json", to_json(begun.as_dict(), indent=None))

@@ -37,7 +37,7 @@ def test_links_are_followed_and_none_leads_outside(tmp_path):
 
 def test_folders_and_closed_files_are_named(tmp_path):
     (tmp_path / "a.csv").mkdir()
-    with pytest.raises(BadFile, match="is no file"):
+    with pytest.raises(BadFile, match="is not a file"):
         Folder(tmp_path).read("a.csv")
     (tmp_path / "b.csv").write_text("1")
     (tmp_path / "b.csv").chmod(0)

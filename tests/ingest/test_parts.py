@@ -151,13 +151,13 @@ def test_three_added_files_leave_the_other_parts_as_they_are(campaign, tmp_path,
 def count_reading(monkeypatch, read):
     from sealfit.ingest import partitions
 
-    real = partitions.read_files
+    real = partitions.read_strokes
 
     def counted(refs, *args):
         read.extend(ref.file for ref in refs)
         return real(refs, *args)
 
-    monkeypatch.setattr(partitions, "read_files", counted)
+    monkeypatch.setattr(partitions, "read_strokes", counted)
 
 
 def test_a_changed_file_and_a_deleted_one_are_seen(campaign, tmp_path):

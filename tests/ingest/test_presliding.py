@@ -6,9 +6,8 @@ import pytest
 
 from sealfit.config import Config, Strokes
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.ingest.presliding import Start, rises
-from sealfit.ingest.segments import Pieces
-from sealfit.ingest.strokes import find_all
+from sealfit.ingest.presliding import Start, rise_of
+from sealfit.ingest.strokes import find_strokes
 
 LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
 
@@ -35,8 +34,8 @@ def steady_forces(ratio, many=12, **more):
     made = []
     for seed in range(many):
         time, place, force = bristle_trace(ratio, seed=seed, **more)
-        found = find_all(time, place, force, Pieces([time.size]), Strokes())
-        assert found.short == [None]
+        (found,) = find_strokes(time, place, force, Strokes())
+        assert found.short is None
         made.append((force[found.steady].mean(), (force - found.presliding_N)[found.steady].mean()))
     return np.array(made).T
 
@@ -71,14 +70,14 @@ def test_the_end_of_a_rise_follows_its_length_without_jumps():
     lengths, x = np.geomspace(0.4, 0.6, 200), np.linspace(0.0, 40.0, 2001)
     noise = np.random.default_rng(0).normal(0.0, NOISE, x.size)
     starts = [Start(x, LEVEL * (1.0 - np.exp(-x / length)) + noise, 0) for length in lengths]
-    end = np.array([rise.end_mm for rise in rises(starts)])
+    end = np.array([rise_of(start).end_mm for start in starts])
     assert np.abs(np.diff(np.log(end / lengths))).max() < 0.002
 
 
 def test_a_rise_along_a_straight_line_is_no_bristle_and_is_not_corrected():
     time, place, _ = bristle_trace(40.0)
     force = np.minimum(place / 3.0, 1.0) * LEVEL  # elastic over 3 of 18 mm
-    found = find_all(time, place, force, Pieces([time.size]), Strokes())
+    (found,) = find_strokes(time, place, force, Strokes())
     assert not found.presliding_N.any()
     assert place[found.steady].min() > 2.9
 

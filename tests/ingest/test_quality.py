@@ -22,7 +22,7 @@ def trace(n=1000, noise=0.1, step=0.0, seed=0, ripple=0.0):
 def checks(time, x, force, **quality):
     config = Config(quality=Quality(**quality))
     (stroke,) = find_strokes(time, x, force, config.strokes)
-    return stroke_faults("f.csv", None, stroke, time, force, 2 + np.arange(len(time)), config)
+    return stroke_faults(stroke, time, force, 2 + np.arange(len(time)), config.quality)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -57,9 +57,10 @@ def test_clipping_at_the_sensor_s_end_is_named_with_value_and_line():
 
 def blamed(force):
     every = np.ones(len(force), bool)
-    stroke = Stroke(1, 0, len(force), 0, 1, 5.0, every, every)
+    none = np.zeros(len(force))
+    stroke = Stroke(1, 0, len(force), 0, 1, 5.0, every, every, none, none + 5.0)
     time = np.linspace(0.0, 8.0, len(force))
-    return [f.check for f in stroke_faults("f.csv", None, stroke, time, force, 2 + np.arange(len(force)), Config())]
+    return [f.check for f in stroke_faults(stroke, time, force, 2 + np.arange(len(force)), Quality())]
 
 
 def test_a_few_samples_of_a_short_stroke_may_share_its_extreme():
@@ -107,8 +108,8 @@ def test_gaps_are_told_and_too_much_hidden_time_leaves_the_stroke_out():
 def test_a_stroke_too_short_says_what_is_needed():
     time, x, force = trace(n=18)
     (stroke,) = find_strokes(time, x, force, Strokes())
-    (fault,) = stroke_faults("f.csv", 3, stroke, time, force, np.arange(18), Config())
-    assert (fault.check, fault.stroke, fault.action) == ("too_short", 3, "stroke left out")
+    (fault,) = stroke_faults(stroke, time, force, np.arange(18), Quality())
+    assert (fault.check, fault.action) == ("too_short", "stroke left out")
     assert "at least 20 are needed" in fault.reason
     assert "strokes.min_samples" in fault.fix
 
@@ -230,11 +231,11 @@ def test_an_outlying_repeat_is_flagged_and_left_out_only_where_the_config_says_s
 
 
 def test_speed_and_load_columns_are_compared_with_what_was_measured_and_declared():
-    assert speed_column_faults("f", None, 5.0, -5.2, Config()) == []
-    (fault,) = speed_column_faults("f", 2, 5.0, 300.0, Config())
-    assert (fault.check, fault.stroke, fault.action) == ("speed_disagreement", 2, "kept")
-    assert load_faults("f", 50.0, 49.0, "N") == []
-    (fault,) = load_faults("f", 60.0, 49.03, "N")
+    assert speed_column_faults(5.0, -5.2, Config()) == []
+    (fault,) = speed_column_faults(5.0, 300.0, Config())
+    assert (fault.check, fault.action) == ("speed_disagreement", "kept")
+    assert load_faults(50.0, 49.0, "N") == []
+    (fault,) = load_faults(60.0, 49.03, "N")
     assert fault.reason == "measured 60 N, declared 49.03 N."
 
 

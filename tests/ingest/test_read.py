@@ -176,7 +176,7 @@ def test_many_short_strokes_with_rests_have_the_speed_of_their_plateaus(tmp_path
 
 def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
-    with pytest.raises(BadFile, match="is no file"):
+    with pytest.raises(BadFile, match="is not a file"):
         read_trace(tmp_path, TraceRef("pipe.csv", {}), config())
 
 

@@ -5,10 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealfit.config import Strokes
-from sealfit.ingest.presliding import rise_end_mm
-from sealfit.ingest.segments import Pieces
-from sealfit.ingest.strokes import displacement_noises_mm, find_all, find_strokes, turning_rows
-from sealfit.ingest.window import slopes
+from sealfit.ingest.presliding import Start, rise_of
+from sealfit.ingest.strokes import displacement_noise_mm, find_strokes, turning_rows
+from sealfit.ingest.window import slope
 
 
 def stroke(
@@ -52,7 +51,7 @@ def there_and_back(turns=4, v=5.0, length=40.0, rest=0.0, dt=0.01, noise=0.05, b
 
 
 def speeds_along(time, x, force):
-    found = find_all(time, x, force, Pieces([time.size]), Strokes())
+    (found,) = find_strokes(time, x, force, Strokes())
     return found.speed_along_mm_s[found.steady], found.steady
 
 
@@ -154,7 +153,7 @@ def test_the_noise_of_the_displacement_does_not_rest_on_equal_neighbours(step):
     _, x, *_ = stroke(lead=3.0, blur=0.0)  # a rest whose rows are equal to the last digit
     x = np.round(x / step) * step if step else x
     jittered = x + 1e-6 * np.random.default_rng(0).standard_normal(x.size)
-    noise = [displacement_noises_mm(values, Pieces([x.size]))[0] for values in (x, jittered)]
+    noise = [displacement_noise_mm(values) for values in (x, jittered)]
     assert noise[0] == pytest.approx(step / np.sqrt(12.0), abs=1e-5)
     assert noise[1] == pytest.approx(noise[0], abs=1e-5)
 
@@ -276,13 +275,13 @@ def test_slope_of_two_pieces_ignores_the_rest_between_them():
     time = np.arange(10.0)
     x = np.array([0, 2, 4, 6, 8, 8, 8, 10, 12, 14.0])
     steady = np.array([1, 1, 1, 1, 0, 0, 1, 1, 1, 1], bool)
-    assert slopes(time, x, steady, Pieces([10]))[0] == pytest.approx(2.0)
+    assert slope(time, x, steady) == pytest.approx(2.0)
 
 
 def test_no_rise_is_found_in_a_force_that_falls_or_begins_within_its_later_band():
     x = np.linspace(0.0, 40.0, 1000)
-    assert rise_end_mm(x, 30.0 + 5.0 * np.exp(-x / 3.0), 0) == 0.0
-    assert rise_end_mm(x, np.full(1000, 30.0), 0) == 0.0
+    assert rise_of(Start(x, 30.0 + 5.0 * np.exp(-x / 3.0), 0)).end_mm == 0.0
+    assert rise_of(Start(x, np.full(1000, 30.0), 0)).end_mm == 0.0
 
 
 def test_a_stroke_hardly_longer_than_its_rise_keeps_its_plateau():

@@ -3,9 +3,9 @@ import numpy.testing as npt
 import pytest
 from trace_helpers import config
 
-from sealfit.ingest import stroke_means
 from sealfit.ingest.file_names import TraceRef
-from sealfit.ingest.stroke_means import read_files, read_strokes
+from sealfit.ingest.files import Folder
+from sealfit.ingest.stroke_means import read_strokes
 
 
 def stroke_file(folder, file, *, strokes=1, rows=300, resolution=0.0, spoil=None, channel=None):
@@ -61,14 +61,11 @@ def refs(tmp_path):
     return [TraceRef(file, {"run_id": file, "speed_set_mm_s": 5.0}) for file in files]
 
 
-@pytest.mark.parametrize(("batch_bytes", "bundle_rows"), [(4_000_000, 16_384), (20_000, 500)])
-def test_files_read_together_give_what_each_gives_alone(tmp_path, refs, monkeypatch, batch_bytes, bundle_rows):
-    monkeypatch.setattr(stroke_means, "BATCH_BYTES", batch_bytes)
-    monkeypatch.setattr(stroke_means, "BUNDLE_ROWS", bundle_rows)
-    found = read_files(refs, tmp_path, config())
+def test_files_read_together_give_what_each_gives_alone(tmp_path, refs):
+    found = read_strokes(refs, Folder(tmp_path), config())
     assert {fault.check for made in found for fault in made.faults} >= {"spike", "stuck", "no_motion", "empty_file"}
     for ref, made in zip(refs, found, strict=True):
-        alone = read_strokes(ref, tmp_path, config())
+        (alone,) = read_strokes([ref], Folder(tmp_path), config())
         assert (made.file, made.mark, made.rows, made.faults) == (alone.file, alone.mark, alone.rows, alone.faults)
         assert len(made.strokes) == len(alone.strokes)
         for ours, theirs in zip(made.strokes, alone.strokes, strict=True):

@@ -1,18 +1,13 @@
 """Work that must grow with the campaign and not with its square, counted; and that less of it gives the same."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
-from trace_helpers import campaign, config
 
-from sealfit.ingest import derived_columns, listing, repeat_checks
-from sealfit.ingest.files import inside
-from sealfit.ingest.listing import Folders
+from sealfit.ingest import repeat_checks
+from sealfit.ingest.files import Folder, inside
+from sealfit.ingest.listing import files_beside
 from sealfit.ingest.repeat_checks import outlying_repeats
-from sealfit.ingest.runs import list_traces
 
 HEAD = "file,run_id,repeat,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s,started_at"
 
@@ -22,33 +17,6 @@ def counted(monkeypatch, module, name):
     calls, function = [], getattr(module, name)
     monkeypatch.setattr(module, name, lambda *given, **named: (calls.append(given), function(*given, **named))[1])
     return calls
-
-
-def listed(folder, files):
-    """A campaign of small files in two folders; only their names are looked at."""
-    rows = [
-        f"t{k % 2}/{k}.csv,r{k // 3},{k % 3 + 1},{60 + k // 3 % 2 * 20},80,4,49.03,5,"
-        f"2024-03-01T09:{k // 60:02d}:{k % 60:02d}"
-        for k in range(files)
-    ]
-    for k in range(files):
-        place = folder / f"t{k % 2}" / f"{k}.csv"
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_text("")
-    return campaign(folder, "\n".join([HEAD, *rows]))
-
-
-def test_listing_follows_links_per_folder_and_reads_each_different_cell_once(tmp_path, monkeypatch):
-    work = []
-    for files in (30, 300):
-        folder = listed(tmp_path / str(files), files)
-        resolved, parsed = counted(monkeypatch, listing, "inside"), counted(monkeypatch, derived_columns, "as_number")
-        looked = counted(monkeypatch, os, "scandir")
-        refs, faults = list_traces(folder, config())
-        assert (len(refs), faults) == (files, [])
-        work.append((len(resolved), len(looked), len(parsed)))
-        monkeypatch.undo()
-    assert work[0] == work[1]  # two folders; seven different numbers and three repeats in each
 
 
 def test_what_lies_inside_is_told_from_names_as_from_following_every_link(tmp_path):
@@ -70,11 +38,9 @@ def test_what_lies_inside_is_told_from_names_as_from_following_every_link(tmp_pa
         "in/deep/a.csv", "self/b.csv", "self", "loop", "loop/a.csv", "..", "../outside/a.csv", ".", "traces",
         str(place / "b.csv"), "C:/a.csv", "\\\\host\\a.csv", "b.csv/a.csv", "",
     ]  # fmt: skip
-    found = Folders(place)
+    found = Folder(place)
     for file in asked:
-        assert found.hold(file) == (inside(place, file) is not None), file
-    assert Folders(place).outside(asked) == {file for file in asked if inside(place, file) is None}
-    assert Folders(place).outside(["b.csv", "/b.csv"]) == {"/b.csv"}
+        assert (found.inside(file) is not None) == (inside(place, file) is not None), file
 
 
 def test_files_beside_have_an_ending_of_the_listed_and_are_files(tmp_path):
@@ -84,7 +50,8 @@ def test_files_beside_have_an_ending_of_the_listed_and_are_files(tmp_path):
     (tmp_path / "folder.csv").mkdir()
     (tmp_path / "link.csv").symlink_to(tmp_path / "c.txt")
     (tmp_path / "broken.csv").symlink_to(tmp_path / "none")
-    assert Folders(tmp_path).beside({"a.csv", "t/none.csv", "gone/x.csv"}) == {"b.csv", "link.csv", "t/d.csv"}
+    assert files_beside(tmp_path, {"a.csv", "t/none.csv", "gone/x.csv"}) == {"b.csv", "link.csv", "t/d.csv"}
+    assert files_beside(tmp_path / "none", {"a.csv"}) == set()
 
 
 def repeats(runs, seed, far):
@@ -142,8 +109,3 @@ def test_a_turned_stroke_is_held_against_the_median_of_its_mates():
     # -21 against the median 22 of 20, 22, 24; -9 against the median 22 of 20, 22, -21, 24, 30: not below -11.
     assert keep.tolist() == [True, True, False, True, True, True]
     assert [fault.severity for fault in found] == ["error", "warning"]
-
-
-def test_names_of_a_folder_that_may_not_be_read_are_left_to_the_reading(tmp_path):
-    assert Folders(tmp_path).beside({"gone/a.csv"}) == set()
-    assert Folders(Path(tmp_path / "none")).beside({"a.csv"}) == set()

@@ -3,7 +3,7 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealfit.report.notation import decimals, measured, number, p_value, together, uncertain
+from sealfit.report.notation import decimals, measured, number, p_value, together
 
 SIGNS = str.maketrans("−⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "--0123456789")
 sizes = st.floats(1e-12, 1e12)
@@ -71,8 +71,3 @@ def test_small_p_values_are_bounds_not_zeros():
     assert p_value(0.0) == "< 0.001"
     assert p_value(0.00999) == "= 0.010"
     assert p_value(1.0) == "> 0.99"
-
-
-def test_uncertain_matches_the_uncertainty():
-    assert uncertain(12345.6, 120.0) == "12\u202f350"
-    assert uncertain(0.5, 0.0) == "0.500"

@@ -46,7 +46,6 @@ from sealfit.report.style import (
 from sealfit.units import Units
 
 # ---------------------------------------------------------------- figures curves
-# Aging curves, and a few averaged traces.
 
 TRACE_BUCKETS = 350  # of each, the lowest and the highest sample are drawn: what the eye can see of a trace
 MOST_TRACES = 6

@@ -176,7 +176,6 @@ def variance_levels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot 
 
 
 # ---------------------------------------------------------------- figures residual
-# The residual along every channel, and what the effects look like.
 
 MOST_CHANNELS = 18
 MANY_CATEGORIES = 24
