@@ -109,7 +109,7 @@ def _best_on_grid(model: Model, rows: Rows, whitening: Whitening, group: list[in
     for value in np.linspace(low[group[0]], high[group[0]], GRID_POINTS):
         vector = model.vector()
         vector[group] = value
-        cost, solved = _linear_solved(model.at(vector), *prior, rows, whitening)
+        cost, solved = _linear_solved(model.at(vector), *prior, rows, whitening, most=best)
         if cost < best - 1e-9:
             best, chosen = cost, solved
     return model.at(np.clip(chosen.vector(), low, high))
@@ -133,11 +133,18 @@ def _linear_prior(model: Model) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _linear_solved(
-    model: Model, precision: np.ndarray, centre: np.ndarray, rows: Rows, whitening: Whitening
+    model: Model,
+    precision: np.ndarray,
+    centre: np.ndarray,
+    rows: Rows,
+    whitening: Whitening,
+    *,
+    most: float = np.inf,
 ) -> tuple[float, Model]:
     """Return the whitened sum of squares left, and the model, its linear numbers solved for at once in their bounds.
 
-    Without the bounds, a v_s far off can seem the best, with a negative friction that the fit cannot have.
+    Without the bounds, a v_s far off can seem the best, with a negative friction that the fit cannot have. Bounds only
+    add to what is left: where that is more than `most` without them, they are not asked.
     """
     force, jacobian = evaluate(model, rows)
     residual = whitening((rows.force - force)[:, None])[:, 0]
@@ -147,17 +154,29 @@ def _linear_solved(
     away = vector[linear] - centre
     normal, gradient = normal + precision, gradient - precision @ away
     low, high = (bound[linear] - vector[linear] for bound in bounds_of(model, rows))
-    step = least_squares_within(normal, gradient, low, high)
+    there = float(residual @ residual + away @ precision @ away)
+
+    def left(step: np.ndarray) -> float:
+        return there - 2 * float(step @ gradient) + float(step @ normal @ step)
+
+    step = least_squares(normal, gradient)
+    if left(step) < most:
+        step = least_squares_within(normal, gradient, low, high, step)
     vector[linear] += step
-    left = residual @ residual + away @ precision @ away - 2 * step @ gradient + step @ normal @ step
-    return float(left), model.at(vector)
+    return left(step), model.at(vector)
 
 
-def least_squares_within(normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the x between bounds that minimises x' normal x / 2 - gradient' x, shape (k,)."""
-    step, *_ = np.linalg.lstsq(normal, gradient, rcond=1e-10)
-    if np.all((step >= low) & (step <= high)):
-        return step
+def least_squares(normal: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Return the smallest x that minimises x' normal x / 2 - gradient' x, shape (k,)."""
+    return np.linalg.lstsq(normal, gradient, rcond=1e-10)[0]
+
+
+def least_squares_within(
+    normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, free: np.ndarray
+) -> np.ndarray:
+    """Return the x between bounds that does so, shape (k,), from `free`, the x that does so without them."""
+    if np.all((free >= low) & (free <= high)):
+        return free
     square = np.diag(normal)
     acts = square > 1e-30 * square.max()  # a column that does nothing keeps its scale
     scale = 1 / np.sqrt(np.where(acts, square, 1.0))
