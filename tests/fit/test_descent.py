@@ -91,6 +91,16 @@ def test_bounds_are_asked_only_where_the_best_so_far_could_be_beaten(monkeypatch
     assert few < len(solved) / 2
 
 
+def test_series_are_searched_on_their_own_rows_as_on_all(monkeypatch):
+    model, rows, curved = astray(one_specimen=False, aging=True)
+    moving, still = joint_search._parted(model, rows, [int(curved[0])])
+    assert 0 < moving.force.size < rows.force.size == moving.force.size + still.force.size
+    assert set(moving.table["specimen_id"]).isdisjoint(still.table["specimen_id"])
+    found = search_nonlinear(model, rows, SCATTER)
+    monkeypatch.setattr(joint_search, "_parted", lambda model, rows, group: (rows, None))
+    npt.assert_allclose(search_nonlinear(model, rows, SCATTER).vector(), found.vector(), rtol=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_least_squares_within_bounds(seed):
     rng = np.random.default_rng(seed)
