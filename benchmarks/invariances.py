@@ -7,7 +7,8 @@ A campaign is changed (measured numbers jittered by 1e-6 to 1e-3 of themselves, 
 strokes, other units and signs through the config, idle columns, another seed, ...) and analysed again. Verdict and
 effects (id, channels, acts_on, operation) must stay, and numbers move by at most a tenth of a standard error, after
 conversion of units; the error after over that before by at most a tenth. The table says, per campaign and change, what
-moved. Pairs that are in the file already are not run again.
+moved. Each pair is kept with the build that ran it (commit, and a hash of what differs from it). Pairs that are in the
+file already are not run again; those of another build are, so that no table mixes builds.
 
 Two kinds of change do alter what the data say, and their numbers are held to what must follow from that.
 
@@ -37,6 +38,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from campaigns import RIG
+from commit import build
 from effect_kinds import COLUMN, EFFECT_CAMPAIGNS
 from measured import emps_plateaus, kidney_plain, measured
 
@@ -494,7 +496,8 @@ def main(arguments: list[str] | None = None) -> int:
         print("campaigns:", *names(), "\nchanges:", *CHANGES)
         return 0
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    done = _read(given.out)
+    own = build()
+    done = _read(given.out, own)
     with given.out.open("a") as file:
         for name in given.campaigns:
             tenths = [CHANGES[change].tenth for change in given.changes if CHANGES[change].tenth]
@@ -502,19 +505,21 @@ def main(arguments: list[str] | None = None) -> int:
             wanted = [change for change in wanted if (name, change) not in done]
             made = campaign(name) if wanted else None
             for number, change in enumerate(wanted):
-                row = _run(name, change, made)
+                row = {"build": own, **_run(name, change, made)}
                 done[name, change] = row
                 print(json.dumps(row), file=file, flush=True)
                 said = f"{name}: {number + 1} of {len(wanted)}, {change}: {row.get('error') or 'done'}"
                 print(f"{said} ({row['seconds']} s)", file=sys.stderr)
     moved = table(done, given.campaigns, given.changes)
-    print("\n".join(moved.lines))
+    print("\n".join([f"build {own}", "", *moved.lines]))
     return int(moved.count > 0)
 
 
-def _read(path: Path) -> dict[tuple[str, str], dict]:
+def _read(path: Path, own: str) -> dict[tuple[str, str], dict]:
+    """Return the pairs of a file that a build has run, by campaign and change."""
     lines = path.read_text().splitlines() if path.is_file() else []
-    return {(row["campaign"], row["change"]): row for row in map(json.loads, lines)}
+    rows = [row for row in map(json.loads, lines) if row.get("build") == own]
+    return {(row["campaign"], row["change"]): row for row in rows}
 
 
 def _run(name: str, change: str, made: Campaign) -> dict:

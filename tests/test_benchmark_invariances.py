@@ -1,8 +1,13 @@
 """The suite of invariances: its own parts by hand, and a short form of it on small campaigns."""
 
+import json
+import subprocess
+
+import invariances
 import numpy as np
 import pandas as pd
 import pytest
+from commit import build, newest_commit
 from invariances import CHANGES, Campaign, Change, campaign, closed, factor, in_proportion, moved_by, moves
 
 from sealfit.config import parse_config
@@ -94,6 +99,46 @@ def test_every_change_leaves_a_campaign_that_its_config_reads(name):
     assert changed
     assert (config.trace.compute != {}) == name.endswith("_turned")
     assert runs["speed_mm_s"].tolist() == [5.0] * 4  # the campaign as it was is let be
+
+
+# ---------------------------------------------------------------- one build a table
+def test_a_build_is_its_commit_and_what_differs_from_it(tmp_path):
+    def git(*words):
+        who = ("-c", "user.name=n", "-c", "user.email=e@example.org", "-c", "commit.gpgsign=false")
+        subprocess.run(["git", "-C", tmp_path, *who, *words], check=True, capture_output=True)
+
+    git("init")
+    code = tmp_path / "fit.py"
+    code.write_text("a = 1\n")
+    (tmp_path / "README.md").write_text("one\n")
+    git("add", ".")
+    git("commit", "-m", "first")
+    first = build(tmp_path)
+    assert first == newest_commit(tmp_path)
+    (tmp_path / "README.md").write_text("two\n")
+    assert build(tmp_path) == first
+    code.write_text("a = 2\n")
+    second = build(tmp_path)
+    code.write_text("a = 3\n")
+    assert len({first, second, build(tmp_path)}) == 3
+    assert second.startswith(first + "+")
+    code.write_text("a = 1\n")
+    assert build(tmp_path) == first
+    (tmp_path / "new.py").write_text("b = 1\n")
+    assert build(tmp_path) != first
+
+
+def test_pairs_of_another_build_are_run_again(tmp_path, monkeypatch, capsys):
+    ran = []
+    monkeypatch.setattr(invariances, "closed", lambda given: ran.append(given) or closure(verdict="nothing_missing"))
+    out = tmp_path / "pairs.jsonl"
+    asked = ["--campaigns", "short", "--changes", "renamed", "--out", str(out)]
+    for own, runs in (("one", 2), ("one", 2), ("two", 4)):
+        monkeypatch.setattr(invariances, "build", lambda own=own: own)
+        assert invariances.main(asked) == 0
+        assert len(ran) == runs
+        assert capsys.readouterr().out.startswith(f"build {own}\n")
+    assert [json.loads(line)["build"] for line in out.read_text().splitlines()] == ["one"] * 2 + ["two"] * 2
 
 
 # ---------------------------------------------------------------- the short form

@@ -1,4 +1,5 @@
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from worlds.main import read
 from worlds.motion import batches, force_at, integrate
 from worlds.parameters import aged_series, laws_inside
 from worlds.priors import PRIORS
-from worlds.run import copies, read_closure, true_effects
+from worlds.run import command, copies, read_closure, true_effects
 from worlds.score import NONE, RIGHT, SAME_AT_DESIGN, Target, explained_by, grade, named_rightly, on_variables, scored
 from worlds.summary import alarmed, summarise
 from worlds.true_form import make_rows, z_values
@@ -259,6 +260,15 @@ def test_the_summary_counts_what_the_records_say(tmp_path):
         "\n".join(json.dumps(r) for r in [*records, {"seed_text": "s", "index": 9, "size": "small", "error": "x"}])
     )
     assert [r["index"] for r in read(path)] == [0, 1, 2, 3, 4, 5]
+
+
+def test_processor_time_is_that_of_all_of_a_commands_processes():
+    busy = "import time\nwhile time.process_time() < 0.4: pass"
+    inner = f"import subprocess, sys, time; subprocess.run([sys.executable, '-c', {busy!r}]); time.sleep(0.2)"
+    command([sys.executable, "-c", busy], 60.0)  # that of another command is not counted again
+    ended = command([sys.executable, "-c", inner], 60.0)
+    assert ended.code == 0
+    assert 0.4 <= ended.cpu_seconds < ended.seconds + 0.4
 
 
 def test_intervals_of_the_law_are_held_to_the_series_truth(tmp_path):

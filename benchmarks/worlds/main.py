@@ -6,21 +6,16 @@ import argparse
 import json
 import multiprocessing
 import os
-import subprocess
 import sys
 import time
 import traceback
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
+from commit import newest_commit
+
 from worlds.run import THREADS, Task, run_world
 from worlds.summary import line, summarise
-
-
-def newest_commit() -> str:
-    """Return the hash of the newest commit of the repository this file lies in."""
-    words = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    return subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def guarded(task: Task) -> dict:

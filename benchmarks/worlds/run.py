@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import tempfile
@@ -53,6 +54,7 @@ class Ended:
 
     code: int | None  # None: killed at the time limit
     seconds: float
+    cpu_seconds: float  # of all its processes, which a busy machine does not lengthen as it does the clock's
     peak_bytes: int  # resident, of the whole process tree
     output: str
 
@@ -66,7 +68,7 @@ class Ended:
 
 def command(words: list[str], limit_s: float) -> Ended:
     """Run a command with a time limit and look at the resident memory of all its processes."""
-    started, peak = time.monotonic(), 0
+    started, spent, peak = time.monotonic(), _cpu_seconds(), 0
     with tempfile.TemporaryFile("w+", encoding="utf-8") as said:
         environment = {**os.environ, **dict.fromkeys(THREADS, "1")}
         process = subprocess.Popen(words, stdout=said, stderr=said, env=environment, start_new_session=True)
@@ -74,11 +76,17 @@ def command(words: list[str], limit_s: float) -> Ended:
             if time.monotonic() - started > limit_s:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
-                return Ended(None, time.monotonic() - started, peak, "")
+                return Ended(None, time.monotonic() - started, _cpu_seconds() - spent, peak, "")
             peak = max(peak, memory(tree(process.pid), proportional=False)[0])
             time.sleep(LOOK_EVERY_S)
         said.seek(0)
-        return Ended(process.returncode, time.monotonic() - started, peak, said.read())
+        return Ended(process.returncode, time.monotonic() - started, _cpu_seconds() - spent, peak, said.read())
+
+
+def _cpu_seconds() -> float:
+    """Return the processor time of all commands that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def run_world(task: Task) -> dict:
@@ -105,6 +113,7 @@ def run_world(task: Task) -> dict:
             "exit": ended.code,
             "traceback": ended.traceback,
             "seconds": ended.seconds,
+            "cpu_s": ended.cpu_seconds,
             "peak_MB": ended.peak_bytes / 1e6,
         }
         if ended.code != 0:

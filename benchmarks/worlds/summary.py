@@ -103,6 +103,7 @@ def figures(records: list[dict], fine: list[dict]) -> str:
     own = sum(n["inside"] for n in noted), sum(n["points"] for n in noted)
     stated = [(e["own_rms_N"] / e["smallest_N"], e["grade"] > 0) for r in fine for e in r["effects"] if e["smallest_N"]]
     near = [found for ratio, found in stated if NEAR_STATED[0] <= ratio <= NEAR_STATED[1]]
+    spent = np.array([r["cpu_s"] for r in fine if "cpu_s" in r] or [0.0])
     seconds, memory = np.array([r["seconds"] for r in fine] or [0.0]), np.array([r["peak_MB"] for r in fine] or [0.0])
     rows = [
         ("worlds", f"{len(records)} ({len(fine)} answered, {len(nulls)} of them hide nothing)"),
@@ -129,6 +130,7 @@ def figures(records: list[dict], fine: list[dict]) -> str:
         ("intervals of lifetimes, nothing hidden", share(*_lifetimes(fine))),
         ("effects of about the size that `sensitivity` states: found", share(sum(near), len(near))),
         ("seconds of `run`: median, 95th percentile, most", _quantiles(seconds, last=True)),
+        ("processor seconds of `run`, the same", _quantiles(spent, last=True)),
         ("peak resident MB: median, 95th percentile, most", _quantiles(memory, last=True)),
         ("verdicts", ", ".join(f"{k} {n}" for k, n in Counter(r["verdict"] for r in fine).most_common())),
         ("fit quality", ", ".join(f"{k} {n}" for k, n in _states(fine).most_common()) or "not stated"),

@@ -29,6 +29,7 @@ from sealfit.fit.joint.declared import SAME_SPEED
 from sealfit.fit.joint.rows import LEVELS, Rows, open_columns
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
+ROUNDING = 1e-9  # of the largest value: what lies between the mean of equal numbers and these themselves
 CALENDAR = ("run_order", "elapsed_h")  # conditions are tested one after the other, so the calendar follows them
 
 
@@ -85,7 +86,7 @@ def find_channels(
             continue
         values = np.abs(rows.speed) if name == "speed_mm_s" else rows.values(name)
         if values.dtype.kind == "f":
-            if not np.isfinite(values).all() or np.ptp(values) <= 1e-9 * max(np.abs(values).max(), 1e-300):
+            if not (np.isfinite(values).all() and varies(values)):
                 continue
             if name == "speed_mm_s" and values.max() <= SAME_SPEED * values.min():
                 continue  # one setting: what is left of the speed tells directions apart, or strokes
@@ -102,6 +103,11 @@ def find_channels(
             channel = replace(channel, grouping=True)
         found.append(channel)
     return found
+
+
+def varies(values: np.ndarray) -> bool:
+    """Whether numbers differ by more than rounding."""
+    return bool(np.ptp(values) > ROUNDING * max(float(np.abs(values).max()), 1e-300))
 
 
 def incomplete_channels(rows: Rows) -> list[dict]:
@@ -125,8 +131,7 @@ def unit_of(values: np.ndarray, rows: Rows) -> str:
         if not numeric:
             constant = (values == values[start][code]).all()
         else:
-            # Rounding leaves 1e-9 of the largest value between the mean of equal numbers and these themselves.
-            rounding = 1e-9 * float(np.abs(values).max())
+            rounding = ROUNDING * float(np.abs(values).max())
             constant = np.mean((values - rows.groups.means(values, level)[code]) ** 2) <= max(least, rounding**2)
         if constant:
             return level
@@ -148,7 +153,7 @@ def settings(values: np.ndarray) -> np.ndarray:
     at = scaled(distinct)
     first = np.flatnonzero(np.r_[True, np.diff(at) > SAME_VALUE])
     widest = float((at[np.r_[first[1:] - 1, at.size - 1]] - at[first]).max())
-    if first.size > MOST_SET_VALUES or not 0 < widest <= 10 * SAME_VALUE:
+    if first.size == at.size or first.size > MOST_SET_VALUES or widest > 10 * SAME_VALUE:
         return values
     group = (np.searchsorted(first, np.arange(at.size), side="right") - 1)[place]
     return (np.bincount(group, values) / np.bincount(group))[group]

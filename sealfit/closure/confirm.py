@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, level_values, settings
+from sealfit.closure.channels import CALENDAR, level_values, settings, varies
 from sealfit.closure.criteria import (
     COMPARED,
     LEAST_FALL,
@@ -89,7 +89,7 @@ def gain_between_settings(before: Fitted, proposal: Proposal, known: dict[tuple,
         return
     for name in proposal.term.channels:
         values = rows.values(name)
-        if name in CALENDAR or values.dtype.kind != "f":
+        if name in CALENDAR or values.dtype.kind != "f" or not varies(values):
             continue
         values = settings(level_values(np.abs(values) if name == "speed_mm_s" else values, rows))
         if LEAST_SETTINGS <= np.unique(values).size <= MOST_SETTINGS:

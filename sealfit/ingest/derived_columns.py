@@ -202,7 +202,8 @@ def add_runs(
     conditions : list of str
         Condition of each file in words.
     measured : sequence of float
-        Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run.
+        Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run. So do strokes there
+        and back of one record, a file each, as the column `stroke` tells them.
     unit : str
         Unit of the speeds.
     """
@@ -221,23 +222,40 @@ def add_runs(
             run_ids[i] = ", ".join([*words, f"{speeds[i]:g} {unit}"])
         else:
             groups[", ".join(words)].append(i)
+    stroke = columns.get("stroke", none)
     for words, members in groups.items():
-        members.sort(key=lambda i: measured[i])
-        cluster: list[int] = []
-        for place, i in enumerate(members):
-            cluster.append(i)
-            after = members[place + 1] if place + 1 < len(members) else None
-            if after is None or not measured[after] <= measured[i] * (1 + SAME_SPEED):
-                middle = measured[cluster[len(cluster) // 2]]
-                name = words if math.isnan(middle) else f"{words}, about {middle:.3g} {unit}"
-                run_ids.update(dict.fromkeys(cluster, name))
-                cluster = []
+        settings = _of_one_speed(members, measured)
+        if _there_and_back([[stroke[i] for i in own] for own in settings]):
+            settings = [[i for own in settings for i in own]]
+        for own in settings:
+            middle = measured[own[len(own) // 2]]
+            name = words if math.isnan(middle) else f"{words}, about {middle:.3g} {unit}"
+            run_ids.update(dict.fromkeys(own, name))
     added = {**columns, "run_id": put(given, run_ids)}
     if not groups:
         return added, []
     reason = "neither run_id nor a commanded speed is given; files of one condition share a run within 5 % of speed."
     said = Fault("run_id_derived", reason, severity="info", action="kept", fix="Give run_id or speed_mm_s.")
     return added, [said]
+
+
+def _of_one_speed(members: Sequence[int], measured: Sequence[float]) -> list[list[int]]:
+    """Return files by speed, slowest first: those within 5 % of the next together."""
+    found: list[list[int]] = []
+    for i in sorted(members, key=lambda i: measured[i]):
+        if found and measured[i] <= measured[found[-1][-1]] * (1 + SAME_SPEED):
+            found[-1].append(i)
+        else:
+            found.append([i])
+    return found
+
+
+def _there_and_back(strokes: Sequence[Sequence[int | None]]) -> bool:
+    """Whether the files of two speeds hold the odd strokes of one record and the even ones, each stroke once."""
+    if len(strokes) != 2 or None in (every := [*strokes[0], *strokes[1]]) or len({*every}) < len(every):
+        return False
+    first, second = ({int(number) % 2 for number in own} for own in strokes)
+    return len(first) == len(second) == 1 and first != second
 
 
 def add_repeats(columns: Columns) -> Columns:

@@ -30,6 +30,21 @@ def test_a_form_of_one_number_is_not_asked_between_settings():
     assert list(gain_between_settings(before, SimpleNamespace(term=line), {})) == []
 
 
+@pytest.mark.parametrize("jitter", [0.0, 1e-15])
+def test_the_one_load_of_a_campaign_has_no_settings_whatever_its_rounding(jitter):
+    bins = make_bins(0, temperatures=(60.0,), days=(4.0,), bins=6, speeds=(1.0, 3.0, 10.0, 30.0, 100.0))
+    rng = np.random.default_rng(0)
+    load = bins["load_N"].iloc[0] * (1 + jitter * rng.integers(0, 3, len(bins)))
+    rows = make_rows(bins.assign(load_N=load), has_aging=True)
+    before = fit_declared(rows)
+    warming = EFFECTS["warming_power"]
+    term = Term(warming, warming.reads, "mu", "multiply", {"load_N_ref": 49.03, "speed_mm_s_ref": 10.0})
+    after = fit(before.model.with_term(term, {"A": 0.01, "tau": 5.0}), rows, before.scatter, turns=0)
+    known = {}
+    list(gain_between_settings(before, SimpleNamespace(term=term, fitted=after, unit="run"), known))
+    assert {(name, number) for _, name, number in known} == {("speed_mm_s", k) for k in range(3)}
+
+
 def test_a_share_lost_along_strokes_is_held_out_about_their_means_however_much_friction_differs_between_runs():
     bins = make_bins(0, temperatures=(60.0,), days=(4.0,), bins=6, speeds=(0.1, 1.0, 100.0))
     rows = make_rows(bins, has_aging=True)

@@ -127,6 +127,8 @@ def test_settings_are_groups_of_values_with_gaps_between_them():
     rng = np.random.default_rng(0)
     measured = np.repeat([1.0, 2.0, 50.0], 20) * (1 + 1e-4 * rng.normal(size=60))
     assert np.unique(settings(measured)).size == 3
+    rounded = np.array([0.5, 15.0, np.nextafter(15.0, 16.0), 50.0])
+    assert np.unique(settings(rounded)).size == 3
     goes_on = rng.uniform(1, 2, 300)
     assert settings(goes_on) is goes_on
 

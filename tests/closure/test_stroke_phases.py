@@ -5,6 +5,7 @@ from bins_helpers import make_bins
 
 from sealfit.closure.ripples import agreement, common_wavelength, pass_shifts
 from sealfit.closure.spectrum import _on_grid
+from sealfit.fit.joint.model import passes
 from sealfit.fit.joint.rows import make_rows
 
 
@@ -40,6 +41,22 @@ def test_phase_of_each_pass_is_found_about_its_middle():
     for shift, phase in zip(shifts.values(), phases, strict=True):
         assert abs(middle + shift) <= 1.5 + 1e-9
         assert np.cos(2 * np.pi * shift / 3.0 - phase) > 0.99
+
+
+def test_strokes_split_into_files_keep_the_passes_of_their_record():
+    """Whatever files are left: the first of a record may be among those held out."""
+    bins = make_bins(temperatures=(60.0,), days=(4.0,), speeds=(1.0, 2.0), directions=(1, -1), repeats=2, bins=3)
+    way = np.where(bins["direction"] > 0, "+", "-")
+    bins["stroke"] = 2 * bins["repeat"] - (bins["direction"] > 0)
+    run = bins["run_id"].str.replace("-", "")
+    bins = bins.assign(run_id=run + way, repeat=1, stroke_id=np.arange(len(bins)) // 3)
+    rows = make_rows(bins, has_aging=False)
+    assert rows.groups.starts["file"].size == rows.groups.starts["run"].size == 2 * len(rows.conditions)
+    names = passes(rows.table)
+    assert names.nunique() == 2 * rows.groups.starts["file"].size
+    later = rows.subset(rows.table["stroke"].to_numpy() > 2)
+    assert set(passes(later.table)) == set(names)
+    assert set(later.table["file"]).isdisjoint(rows.table["record"])
 
 
 def test_halves_agree_on_a_wave_and_on_nothing_else():

@@ -6,6 +6,7 @@ import numpy.testing as npt
 import pytest
 from scipy.optimize import lsq_linear
 
+import sealfit.fit.joint.search as joint_search
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fitted_at
 from sealfit.fit.joint.model import Term
@@ -13,6 +14,7 @@ from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.search import (
     ROWS_FOR_START,
     bounds_of,
+    least_squares,
     least_squares_within,
     linear_solved,
     search_nonlinear,
@@ -64,19 +66,54 @@ def test_a_search_never_ends_worse_than_it_began(gain, noise):
     assert after <= before
 
 
+def within(normal, gradient, low, high):
+    return least_squares_within(normal, gradient, low, high, least_squares(normal, gradient))
+
+
+def test_bounds_are_asked_only_where_the_best_so_far_could_be_beaten(monkeypatch):
+    model, rows, _ = astray(one_specimen=False, aging=True)
+    solved = []
+
+    def counted(*given, **told):
+        solved.append(given)
+        return lsq_linear(*given, **told)
+
+    monkeypatch.setattr("sealfit.fit.joint.search.lsq_linear", counted)
+    found = search_nonlinear(model, rows, SCATTER)
+    few, solved[:] = len(solved), []
+    every = joint_search._linear_solved
+
+    def without_limit(*given, most=np.inf):
+        return every(*given)
+
+    monkeypatch.setattr(joint_search, "_linear_solved", without_limit)
+    npt.assert_array_equal(search_nonlinear(model, rows, SCATTER).vector(), found.vector())
+    assert few < len(solved) / 2
+
+
+def test_series_are_searched_on_their_own_rows_as_on_all(monkeypatch):
+    model, rows, curved = astray(one_specimen=False, aging=True)
+    moving, still = joint_search._parted(model, rows, [int(curved[0])])
+    assert 0 < moving.force.size < rows.force.size == moving.force.size + still.force.size
+    assert set(moving.table["specimen_id"]).isdisjoint(still.table["specimen_id"])
+    found = search_nonlinear(model, rows, SCATTER)
+    monkeypatch.setattr(joint_search, "_parted", lambda model, rows, group: (rows, None))
+    npt.assert_allclose(search_nonlinear(model, rows, SCATTER).vector(), found.vector(), rtol=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_least_squares_within_bounds(seed):
     rng = np.random.default_rng(seed)
     columns, force = rng.normal(size=(30, 4)), rng.normal(size=30)
     low, high = -rng.uniform(0.0, 0.2, 4), rng.uniform(0.0, 0.2, 4)
-    found = least_squares_within(columns.T @ columns, columns.T @ force, low, high)
+    found = within(columns.T @ columns, columns.T @ force, low, high)
     npt.assert_allclose(found, lsq_linear(columns, force, (low, high), tol=1e-14).x, atol=1e-6)
 
 
 def test_least_squares_within_bounds_of_columns_that_are_alike():
     column = np.linspace(1.0, 2.0, 9)[:, None]
     both = np.hstack([column, column])
-    found = least_squares_within(both.T @ both, both.T @ column[:, 0], np.array([-1.0, -1.0]), np.array([0.3, 2.0]))
+    found = within(both.T @ both, both.T @ column[:, 0], np.array([-1.0, -1.0]), np.array([0.3, 2.0]))
     npt.assert_allclose(found.sum(), 1.0, rtol=1e-6)
     assert found[0] <= 0.3
 
@@ -84,7 +121,7 @@ def test_least_squares_within_bounds_of_columns_that_are_alike():
 def test_a_column_that_does_nothing_stays_where_it_is():
     columns = np.column_stack([np.linspace(1.0, 2.0, 9), np.zeros(9), np.full(9, 1e-160)])
     low, high = np.array([-0.2, -1.0, 0.0]), np.array([0.3, 1.0, np.inf])
-    found = least_squares_within(columns.T @ columns, columns.T @ (2 * columns[:, 0]), low, high)
+    found = within(columns.T @ columns, columns.T @ (2 * columns[:, 0]), low, high)
     npt.assert_allclose(found[:2], [0.3, 0.0], atol=1e-6)
     assert np.isfinite(found).all()
 

@@ -90,6 +90,21 @@ def test_runs_without_a_commanded_speed_are_told_apart_by_the_measured_one(tmp_p
     assert all("speed_set_mm_s" not in ref.channels for ref in refs)
 
 
+@pytest.mark.parametrize(
+    ("strokes", "runs"),
+    [((1, 2, 3), 1), ((1, 3, 2), 2), ((1, 1, 2), 2), (("", 2, 3), 2)],
+    ids=["there and back", "both speeds one way", "a stroke twice", "a stroke without a number"],
+)
+def test_strokes_there_and_back_of_one_record_share_a_run_though_the_rig_is_faster_one_way(tmp_path, strokes, runs):
+    cells = "\n".join(f"{file}.csv,4,{stroke}" for file, stroke in zip("abc", strokes, strict=True))
+    folder = campaign(tmp_path, f"file,aging_days,stroke\n{cells}")
+    trace(folder, "b.csv", speed=5.5)
+    given = channels(folder, DAYS).values()
+    assert len({own["run_id"] for own in given}) == runs
+    if runs == 1:
+        assert {own["repeat"] for own in given} == {1}
+
+
 def test_named_specimens_and_opposite_speeds_are_runs_of_their_own(tmp_path):
     folder = campaign(tmp_path, "file,aging_days,specimen_id,speed_mm_s\na.csv,4,S1,5\nb.csv,4,S2,5\nc.csv,4,S1,-5")
     found = channels(folder, DAYS)

@@ -87,9 +87,10 @@ class Term:
 
 
 def passes(table: pd.DataFrame) -> pd.Series:
-    """Return the name of each row's pass: its file and the direction in it, as play in a drive shifts one against the
+    """Return the name of each row's pass: its record and the direction in it, as play in a drive shifts one against the
     other."""
-    return table["file"] + np.where(table["speed_mm_s"] >= 0, "+", "-") if len(table) else table["file"]
+    record = table.get("record", table["file"])
+    return record + np.where(table["speed_mm_s"] >= 0, "+", "-") if len(table) else record
 
 
 def mean_derivatives(

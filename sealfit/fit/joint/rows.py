@@ -121,6 +121,7 @@ POWER = "power"
 
 NOT_CHANNELS = {
     "file",
+    "record",
     "run_id",
     "bin",
     "stroke_id",
@@ -249,13 +250,13 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
     conditions : DataFrame, optional
         Conditions of the campaign that these are a part of, as `Rows` holds them: a model of it then fits both.
     """
-    table = bins.reset_index(drop=True)
+    table = bins.reset_index(drop=True).assign(record=records(bins).to_numpy())
     base_run = nesting_run(table)
     keys = pd.DataFrame(
         {
             "specimen": pd.factorize(table["specimen_id"], sort=True)[0],
             "run": pd.factorize(base_run, sort=True)[0],
-            "file": pd.factorize(records(table), sort=True)[0],
+            "file": pd.factorize(table["record"], sort=True)[0],
             "stroke": table["stroke"].to_numpy(),
         }
     )
@@ -396,7 +397,7 @@ def _unsigned(run: pd.Series) -> pd.Series:
 
 def open_columns(table: pd.DataFrame) -> list[str]:
     """Return the channels that the campaign added to `bins`."""
-    fixed = set(BINS.names())
+    fixed = {*BINS.names(), "record"}
     return [name for name in table.columns if name not in fixed]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.optimize import lsq_linear
 
@@ -90,29 +92,55 @@ def search_nonlinear(model: Model, rows: Rows, scatter: Scatter) -> Model:
     mu_0, so that one v_s alone may not get out: all are tried together first, then each by itself.
     """
     rows = rows.sparse(ROWS_FOR_START)
-    whitening = Whitening(scatter, rows.force, rows.groups)
     quantities = [p.quantity for p in model.declared.parameters]
     stribeck = [k for k, name in enumerate(quantities) if name == "v_s"]
     if stribeck:
-        model = _best_on_grid(model, rows, whitening, stribeck)
+        model = _best_on_grid(model, rows, scatter, stribeck)
     for number in stribeck if len(stribeck) > 1 else ():
-        model = _best_on_grid(model, rows, whitening, [number])
+        model = _best_on_grid(model, rows, scatter, [number])
     laws = [k for k, name in enumerate(quantities) if name in ("b_s", "b_c")]
-    return _best_on_grid(model, rows, whitening, laws) if laws else model
+    return _best_on_grid(model, rows, scatter, laws) if laws else model
 
 
-def _best_on_grid(model: Model, rows: Rows, whitening: Whitening, group: list[int]) -> Model:
-    """Return the model with the numbers of a group, equal to one another, at the best of a few values or as it is."""
+def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) -> Model:
+    """Return the model with the numbers of a group, equal to one another, at the best of a few values or as it is.
+
+    Rows on which the group does not act are summed once.
+    """
     low, high = bounds_of(model, rows)
     prior = _linear_prior(model)
-    best, chosen = _linear_solved(model, *prior, rows, whitening)
+    moving, still = _parted(model, rows, group)
+    whitening = Whitening(scatter, moving.force, moving.groups)
+    rest = None if still is None else _equations(model, still, Whitening(scatter, still.force, still.groups))
+
+    def solved_at(at: Model, most: float = np.inf) -> tuple[float, Model]:
+        own = _equations(at, moving, whitening)
+        return _linear_solved(at, own if rest is None else own.plus(rest), *prior, (low, high), most=most)
+
+    best, chosen = solved_at(model)
     for value in np.linspace(low[group[0]], high[group[0]], GRID_POINTS):
         vector = model.vector()
         vector[group] = value
-        cost, solved = _linear_solved(model.at(vector), *prior, rows, whitening)
+        cost, solved = solved_at(model.at(vector), best)
         if cost < best - 1e-9:
             best, chosen = cost, solved
     return model.at(np.clip(chosen.vector(), low, high))
+
+
+def _parted(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, Rows | None]:
+    """Return the rows that numbers of the declared model act on, and the others; all and None where they do not part.
+
+    Rows of one specimen are not independent and stay together.
+    """
+    acts = np.any([np.isin(numbers, group) for numbers in model.declared.index.values()], axis=0)[rows.condition]
+    specimen = rows.codes("specimen")
+    acts = (np.bincount(specimen, acts) > 0)[specimen]
+    if acts.all() or not acts.any():
+        return rows, None
+    key = ("parted", acts.tobytes())
+    if key not in rows.cache:
+        rows.cache[key] = (rows.subset(acts), rows.subset(~acts))
+    return rows.cache[key]
 
 
 def linear_solved(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
@@ -122,7 +150,8 @@ def linear_solved(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarr
     descent throws the rest anywhere.
     """
     low, high = bounds_of(model, rows)
-    solved = _linear_solved(model, *_linear_prior(model), rows, Whitening(scatter, friction, rows.groups))[1]
+    equations = _equations(model, rows, Whitening(scatter, friction, rows.groups))
+    solved = _linear_solved(model, equations, *_linear_prior(model), (low, high))[1]
     return model.at(np.clip(solved.vector(), low, high))
 
 
@@ -132,32 +161,66 @@ def _linear_prior(model: Model) -> tuple[np.ndarray, np.ndarray]:
     return precision_of(model)[np.ix_(linear, linear)], centre_of(model)[linear]
 
 
-def _linear_solved(
-    model: Model, precision: np.ndarray, centre: np.ndarray, rows: Rows, whitening: Whitening
-) -> tuple[float, Model]:
-    """Return the whitened sum of squares left, and the model, its linear numbers solved for at once in their bounds.
+class _Equations(NamedTuple):
+    """Normal equations of the numbers that act linearly, and the whitened sum of squares before they are solved."""
 
-    Without the bounds, a v_s far off can seem the best, with a negative friction that the fit cannot have.
-    """
+    normal: np.ndarray  # (k, k)
+    gradient: np.ndarray  # (k,)
+    square: float
+
+    def plus(self, other: _Equations) -> _Equations:
+        """Return the equations of these rows and of others that are independent of them."""
+        return _Equations(self.normal + other.normal, self.gradient + other.gradient, self.square + other.square)
+
+
+def _equations(model: Model, rows: Rows, whitening: Whitening) -> _Equations:
     force, jacobian = evaluate(model, rows)
     residual = whitening((rows.force - force)[:, None])[:, 0]
     linear = ~model.bent  # one step far from the optimum would throw the others anywhere
-    normal, gradient = whitening.normal(jacobian.columns(linear), residual)
-    vector = model.vector()
+    return _Equations(*whitening.normal(jacobian.columns(linear), residual), float(residual @ residual))
+
+
+def _linear_solved(
+    model: Model,
+    equations: _Equations,
+    precision: np.ndarray,
+    centre: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    *,
+    most: float = np.inf,
+) -> tuple[float, Model]:
+    """Return the whitened sum of squares left, and the model, its linear numbers solved for at once in their bounds.
+
+    Without the bounds, a v_s far off can seem the best, with a negative friction that the fit cannot have. Bounds only
+    add to what is left: where that is more than `most` without them, they are not asked.
+    """
+    linear, vector = ~model.bent, model.vector()
     away = vector[linear] - centre
-    normal, gradient = normal + precision, gradient - precision @ away
-    low, high = (bound[linear] - vector[linear] for bound in bounds_of(model, rows))
-    step = least_squares_within(normal, gradient, low, high)
+    normal, gradient = equations.normal + precision, equations.gradient - precision @ away
+    low, high = (bound[linear] - vector[linear] for bound in bounds)
+    there = equations.square + float(away @ precision @ away)
+
+    def left(step: np.ndarray) -> float:
+        return there - 2 * float(step @ gradient) + float(step @ normal @ step)
+
+    step = least_squares(normal, gradient)
+    if left(step) < most:
+        step = least_squares_within(normal, gradient, low, high, step)
     vector[linear] += step
-    left = residual @ residual + away @ precision @ away - 2 * step @ gradient + step @ normal @ step
-    return float(left), model.at(vector)
+    return left(step), model.at(vector)
 
 
-def least_squares_within(normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the x between bounds that minimises x' normal x / 2 - gradient' x, shape (k,)."""
-    step, *_ = np.linalg.lstsq(normal, gradient, rcond=1e-10)
-    if np.all((step >= low) & (step <= high)):
-        return step
+def least_squares(normal: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Return the smallest x that minimises x' normal x / 2 - gradient' x, shape (k,)."""
+    return np.linalg.lstsq(normal, gradient, rcond=1e-10)[0]
+
+
+def least_squares_within(
+    normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, free: np.ndarray
+) -> np.ndarray:
+    """Return the x between bounds that does so, shape (k,), from `free`, the x that does so without them."""
+    if np.all((free >= low) & (free <= high)):
+        return free
     square = np.diag(normal)
     acts = square > 1e-30 * square.max()  # a column that does nothing keeps its scale
     scale = 1 / np.sqrt(np.where(acts, square, 1.0))
