@@ -14,12 +14,26 @@ from sealfit.errors import FitError
 # ---------------------------------------------------------------- least squares
 # Nonlinear least squares by Levenberg-Marquardt, of one or many small problems at once, and its covariance.
 
+# Steps of one search, at most.
 STEPS = 2000
-SAME = 1e-13  # relative change of the sum of squares that is rounding
-SHRINKS = 0.9  # from one step to the next where they converge: the sum of squares is flat at its minimum
-DAMPING = 1e-3  # to begin with; below it a step is one of Gauss and Newton
-STUCK = 1e12  # damping above which there is no way down
-RANK = 1e-11  # singular values this small against the largest, columns scaled to length 1, are zero
+
+# A relative change of the sum of squares below this is rounding.
+SAME = 1e-13
+
+# A step shorter than this share of the last one converges: the sum of squares is flat at its minimum.
+SHRINKS = 0.9
+
+# Marquardt's number of the first step; with a smaller one a step is as good as that of Gauss and Newton.
+DAMPING = 1e-3
+
+# With a larger Marquardt's number there is no way down.
+STUCK = 1e12
+
+# So many steps in a row that gain less than CREEPING times `enough` go along a valley in which the data hold nothing.
+CREPT, CREEPING = 4, 100.0
+
+# Singular values below this share of the largest, columns scaled to length 1, are zero.
+RANK = 1e-11
 
 
 def levenberg_marquardt(
@@ -29,6 +43,7 @@ def levenberg_marquardt(
     high: np.ndarray,
     *,
     damping: float = DAMPING,
+    enough: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the least-squares optima that the starts lead to, and their sums of squares.
 
@@ -43,6 +58,8 @@ def levenberg_marquardt(
         Closed bounds; infinite where there is none, equal where a number is held.
     damping : float
         Of the first step; next to none from starts that are nearly there.
+    enough : float
+        A lightly damped step that lowers the sum of squares by less is the last.
 
     Returns
     -------
@@ -59,6 +76,7 @@ def levenberg_marquardt(
     x, todo = np.clip(start, low, high), np.arange(len(start))
     damping = np.full(len(x), damping)
     length = np.full(len(x), np.inf)  # of the last step, in standard errors
+    crept = np.zeros(len(x), int)
     scale = np.zeros(x.shape)
     with np.errstate(all="ignore"):  # a trial step that overflows is a bad step, not an error
         rest, slope = evaluate(x, todo)
@@ -78,7 +96,10 @@ def levenberg_marquardt(
             gain, step = rss[todo] - _squares(left), np.linalg.norm((trial - at) * size, axis=1)
             same, shrinks = np.abs(gain) <= SAME * rss[todo], step < SHRINKS * length[todo]
             better = (gain > 0) | (same & shrinks)
-            done = same & ~(shrinks & (step > 0)) & ((damping[todo] < DAMPING) | ~better)
+            light = damping[todo] < DAMPING
+            done = same & ~(shrinks & (step > 0)) & (light | ~better)
+            crept[todo] = np.where(better & (gain < CREEPING * enough), crept[todo] + 1, crept[todo] * ~better)
+            done |= (crept[todo] >= CREPT) | (better & light & (gain < enough))
             moved = todo[better]
             x[moved], rest[moved], slope[moved], length[moved] = (
                 trial[better],
