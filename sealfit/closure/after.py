@@ -137,7 +137,7 @@ def _at_start(model: Model, reference: Model, rows: Rows) -> np.ndarray:
     table, way = rows.table, np.sign(rows.speed)
     origin = table["displacement_mm"] - way * table["distance_mm"].to_numpy(float)
     start = table.assign(displacement_mm=origin, distance_mm=0.0, time_s=0.0)
-    begun = replace(rows, table=start, cache={})
+    begun = replace(rows, table=start)
     return evaluate(model, begun, jacobian=False)[0] - evaluate(reference, begun, jacobian=False)[0]
 
 

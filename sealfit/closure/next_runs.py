@@ -259,7 +259,7 @@ def _moved(rows: Rows, changes: Mapping[str, object]) -> Rows:
         load = np.full_like(rows.load, float(changes["load_N"]))
     if POWER in table and POWER not in changes:
         table[POWER] = sliding_power(load, speed)
-    return replace(rows, table=table, speed=speed, pace=speed, days=days, load=load, cache={})
+    return replace(rows, table=table, speed=speed, pace=speed, days=days, load=load)
 
 
 def _plain(value: object) -> object:

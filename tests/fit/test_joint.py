@@ -94,7 +94,7 @@ def test_a_straight_line_through_three_speeds_is_mostly_left_one():
     for seed in range(10):
         files = np.random.default_rng(seed).normal(1, 0.01, rows.groups.starts["file"].size)[rows.codes("file")]
         line = rows.load * (0.5 + 0.002 * np.abs(rows.speed)) * np.sign(rows.speed) * files
-        forms += declare(replace(rows, force=line, cache={})).stribeck.values()
+        forms += declare(replace(rows, force=line)).stribeck.values()
     assert forms.count("viscous") > 0.7 * len(forms)  # Akaike's criterion prefers a needless number one time in six
 
 

@@ -59,9 +59,9 @@ def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
     otherwise pass for a Stribeck curve. Made once for the same rows. Rows that are a part of a campaign, with its
     conditions, may carry its model: `as_in` is the campaign.
     """
-    if ("declared",) not in rows.cache:
-        rows.cache["declared",] = _declare(rows) if as_in is None else declare(as_in)
-    return rows.cache["declared",]
+    if ("declared",) not in rows.kept:
+        rows.kept["declared",] = _declare(rows) if as_in is None else declare(as_in)
+    return rows.kept["declared",]
 
 
 def _declare(rows: Rows) -> Declared:
