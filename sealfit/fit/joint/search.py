@@ -25,9 +25,6 @@ ROWS_FOR_START = 4
 # standard error.
 SETTLED = 1e-4
 
-# Marquardt's number of the first step.
-DAMPING = 1e-4
-
 
 def descend(
     model: Model,
@@ -49,17 +46,23 @@ def descend(
         friction = friction_of(model.at(start), rows)  # held, so that the criterion does not move under the search
     whitening = Whitening(scatter, friction, rows.groups)
 
+    def residual_and_prior(force: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        residual, pull = whitening((rows.force - force)[:, None])[:, 0], precision @ (x - centre)
+        return residual, pull, float(residual @ residual + (x - centre) @ pull)
+
+    def squares(x: np.ndarray, _: np.ndarray) -> np.ndarray:
+        square = residual_and_prior(evaluate(model.at(x[0]), rows, jacobian=False)[0], x[0])[2]
+        return np.array([square if np.isfinite(square) else np.inf])
+
     def compressed(x: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         force, jacobian = evaluate(model.at(x[0]), rows)
-        residual = whitening((rows.force - force)[:, None])[:, 0]
+        residual, pull, square = residual_and_prior(force, x[0])
         normal, gradient = whitening.normal(jacobian, residual)
-        pull = precision @ (x[0] - centre)
-        square = residual @ residual + (x[0] - centre) @ pull
-        products = np.block([[normal + precision, (pull - gradient)[:, None]], [pull - gradient, square]])
-        root = root_of(products)
+        side = pull - gradient
+        root = root_of(np.block([[normal + precision, side[:, None]], [side, square]]))
         return root[None, :, -1], root.T[None, :-1]
 
-    best, _ = levenberg_marquardt(compressed, start[None], low, high, damping=DAMPING, enough=near)
+    best, _ = levenberg_marquardt(compressed, start[None], low, high, enough=near, squares=squares)
     return model.at(best[0])
 
 
@@ -154,7 +157,8 @@ def least_squares_within(normal: np.ndarray, gradient: np.ndarray, low: np.ndarr
     size, axes = np.linalg.eigh(normal * np.outer(scale, scale))
     kept = size > 1e-10 * size[-1]
     root, axes = np.sqrt(size[kept]), axes[:, kept]
-    inside = lsq_linear(root[:, None] * axes.T, (axes.T @ (gradient * scale)) / root, (low / scale, high / scale))
+    ends = (low / scale, high / scale)
+    inside = lsq_linear(root[:, None] * axes.T, (axes.T @ (gradient * scale)) / root, ends, method="bvls")
     return inside.x * scale
 
 
