@@ -10,7 +10,7 @@ from sealfit.fit.joint.model import Model, evaluate, friction_of
 from sealfit.fit.joint.prior import centre_of, precision_of
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter, Whitening
-from sealfit.fit.least_squares import levenberg_marquardt
+from sealfit.fit.least_squares import Steps, levenberg_marquardt
 
 # ---------------------------------------------------------------- descent
 # Levenberg-Marquardt on the whitened residual, and a grid over v_s and b for what lies behind a hill.
@@ -62,7 +62,7 @@ def descend(
         root = root_of(np.block([[normal + precision, side[:, None]], [side, square]]))
         return root[None, :, -1], root.T[None, :-1]
 
-    best, _ = levenberg_marquardt(compressed, start[None], low, high, enough=near, squares=squares)
+    best, _ = levenberg_marquardt(compressed, start[None], low, high, steps=Steps(enough=near), squares=squares)
     return model.at(best[0])
 
 

@@ -31,6 +31,7 @@ from sealfit.units import Units
 SIGNIFICANT = 0.05
 TOGETHER = 250  # conditions whose intervals one process finds at once,
 MANY = 3000  # where there are so many: fewer are done before a process has started
+NUMBERS = ("value", "se", "lo95", "hi95", "u_sys")  # columns of a fit table
 FORCES = {"mu_s": "F_s", "mu_c": "F_c"}  # names without load
 
 
@@ -274,16 +275,17 @@ def _finite(value) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
 
 
-def table_row(
-    *, quantity, parameter, value=None, se=None, lo95=None, hi95=None, u_sys=None, unit, identified, reason=""
-) -> dict:
-    """Return one row of a fit table; None, and an end that is open, become null."""
-    numbers = {"value": value, "se": se, "lo95": lo95, "hi95": hi95, "u_sys": u_sys}
+def table_row(*, quantity: str, parameter: str, unit: str, identified: bool, reason: str = "", **numbers) -> dict:
+    """Return one row of a fit table; None, and an end that is open, become null.
+
+    `numbers` are any of value, se, lo95, hi95 and u_sys.
+    """
+    known = dict.fromkeys(NUMBERS) | numbers
     return {
         "model": "before",
         "quantity": quantity,
         "parameter": parameter,
-        **{name: np.nan if _finite(number) is None else float(number) for name, number in numbers.items()},
+        **{name: np.nan if _finite(known[name]) is None else float(known[name]) for name in NUMBERS},
         "unit": unit,
         "identified": bool(identified),
         "reason": reason,
