@@ -357,10 +357,10 @@ def after_fits(
         return {schema.name: pd.DataFrame(columns=schema.names()) for schema in AFTER}
     free = without_effects(steady, after, config)
     with timed("after: conditions", rows=len(free), of="strokes"):
-        conditions = fit_conditions(free, config, workers=workers)
+        conditions = fit_conditions(free, config)
     with timed("after: laws"):
         law, curves = after_laws(after, conditions, config)
-        laws, master = joint_laws(free, conditions, config, workers=workers)
+        laws, master = joint_laws(free, conditions, config)
     with timed("after: starts", rows=len(free), of="strokes"):
         dynamic = fit_dynamic(traces, free, conditions, config, workers=workers)
     found = {
