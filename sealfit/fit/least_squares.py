@@ -14,45 +14,12 @@ from sealfit.errors import FitError
 # ---------------------------------------------------------------- least squares
 # Nonlinear least squares by Levenberg-Marquardt, of one or many small problems at once, and its covariance.
 
-# Steps of one search, at most.
 STEPS = 2000
-
-# A relative change of the sum of squares below this is rounding.
-SAME = 1e-13
-
-# A step shorter than this share of the last one converges: the sum of squares is flat at its minimum.
-SHRINKS = 0.9
-
-# With a smaller Marquardt's number a step is as good as that of Gauss and Newton.
-LIGHT = 1e-3
-
-# With a larger Marquardt's number there is no way down.
-STUCK = 1e12
-
-# So many steps in a row that gain less than CREEPING times `enough` go along a valley in which the data hold nothing.
-CREPT, CREEPING = 4, 100.0
-
-# Singular values below this share of the largest, columns scaled to length 1, are zero.
-RANK = 1e-11
-
-
-@dataclass(frozen=True)
-class Steps:
-    """How the steps of a search begin and end.
-
-    Attributes
-    ----------
-    damping : float
-        Marquardt's number of the first step; next to none from starts that are nearly there.
-    enough : float
-        A lightly damped step that lowers the sum of squares by less is the last.
-    """
-
-    damping: float = 1e-4
-    enough: float = 0.0
-
-
-USUAL = Steps()
+SAME = 1e-13  # relative change of the sum of squares that is rounding
+SHRINKS = 0.9  # from one step to the next where they converge: the sum of squares is flat at its minimum
+DAMPING = 1e-3  # to begin with; below it a step is one of Gauss and Newton
+STUCK = 1e12  # damping above which there is no way down
+RANK = 1e-11  # singular values this small against the largest, columns scaled to length 1, are zero
 
 
 def levenberg_marquardt(
@@ -61,8 +28,7 @@ def levenberg_marquardt(
     low: np.ndarray,
     high: np.ndarray,
     *,
-    steps: Steps = USUAL,
-    squares: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    damping: float = DAMPING,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the least-squares optima that the starts lead to, and their sums of squares.
 
@@ -75,10 +41,8 @@ def levenberg_marquardt(
         Starting points; moved inside the bounds.
     low, high : ndarray, shape (p,) or (problems, p)
         Closed bounds; infinite where there is none, equal where a number is held.
-    steps : Steps
-        How they begin and end.
-    squares : callable, optional
-        `squares(x, rows)` -> sums of squares, shape (r,), where that takes less time than the derivative.
+    damping : float
+        Of the first step; next to none from starts that are nearly there.
 
     Returns
     -------
@@ -93,11 +57,9 @@ def levenberg_marquardt(
     """
     low, high = np.broadcast_to(low, start.shape), np.broadcast_to(high, start.shape)
     x, todo = np.clip(start, low, high), np.arange(len(start))
-    damping = np.full(len(x), steps.damping)
+    damping = np.full(len(x), damping)
     length = np.full(len(x), np.inf)  # of the last step, in standard errors
-    crept = np.zeros(len(x), int)
     scale = np.zeros(x.shape)
-    squares = squares or (lambda x, rows: _squares(evaluate(x, rows)[0]))
     with np.errstate(all="ignore"):  # a trial step that overflows is a bad step, not an error
         rest, slope = evaluate(x, todo)
         rss = _squares(rest)
@@ -112,20 +74,20 @@ def levenberg_marquardt(
             own_scale = np.where(scale[todo] > 0, scale[todo], 1.0)
             move = _damped(slope[todo] / own_scale[..., None] * free[..., None], rest[todo], damping[todo]) / own_scale
             trial = np.clip(at + move, low[todo], high[todo])
-            gain, step = rss[todo] - squares(trial, todo), np.linalg.norm((trial - at) * size, axis=1)
+            left, bends = evaluate(trial, todo)
+            gain, step = rss[todo] - _squares(left), np.linalg.norm((trial - at) * size, axis=1)
             same, shrinks = np.abs(gain) <= SAME * rss[todo], step < SHRINKS * length[todo]
             better = (gain > 0) | (same & shrinks)
-            light = damping[todo] < LIGHT
-            done = same & ~(shrinks & (step > 0)) & (light | ~better)
-            crept[todo] = np.where(better & (gain < CREEPING * steps.enough), crept[todo] + 1, crept[todo] * ~better)
-            done |= (crept[todo] >= CREPT) | (better & light & (gain < steps.enough))
+            done = same & ~(shrinks & (step > 0)) & ((damping[todo] < DAMPING) | ~better)
             moved = todo[better]
-            x[moved], length[moved] = trial[better], step[better]
+            x[moved], rest[moved], slope[moved], length[moved] = (
+                trial[better],
+                left[better],
+                bends[better],
+                step[better],
+            )
             rss[moved] -= gain[better]
             damping[todo] = np.where(better, damping[todo] / 10, np.maximum(damping[todo], 1e-12) * 10)
-            on = better & ~done
-            if on.any():
-                rest[todo[on]], slope[todo[on]] = evaluate(trial[on], todo[on])
             todo = todo[~done & (damping[todo] < STUCK)]
     return x, rss
 
@@ -201,7 +163,7 @@ DEPENDENT = 1e-13  # share of a column's variance left by the others below which
 CHUNK = 2_000_000  # numbers per temporary array: 16 MB
 CLOSE = 1e-9  # of the nonlinear number, a logarithm as a rule: nearer, the sum of squares is flat to its last digit
 MOST_STEPS = 60
-NEARLY_THERE = Steps(damping=1e-15)  # from where the minimum is already known to half its digits
+NEXT_TO_NONE = 1e-15  # damping of steps from where the minimum is already known to half its digits
 NUDGES = 1e-3 * np.array([-2, -1, 0, 1, 2])  # of the nonlinear number: a derivative of fourth order
 
 
@@ -408,7 +370,7 @@ def _to_all_digits(problems: Separable, start: np.ndarray, ends: np.ndarray) -> 
     linear = np.tile(np.where(problems.nonnegative, 0.0, -np.inf), (len(start), 1))
     low = np.column_stack([linear, ends[:, 0]])
     high = np.column_stack([np.full(linear.shape, np.inf), ends[:, 1]])
-    return levenberg_marquardt(evaluate, start, low, high, steps=NEARLY_THERE)[0][:, -1]
+    return levenberg_marquardt(evaluate, start, low, high, damping=NEXT_TO_NONE)[0][:, -1]
 
 
 def even_grid(low, high, per_decade: int) -> np.ndarray:

@@ -10,20 +10,15 @@ from sealfit.fit.joint.model import Model, evaluate, friction_of
 from sealfit.fit.joint.prior import centre_of, precision_of
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter, Whitening
-from sealfit.fit.least_squares import Steps, levenberg_marquardt
 
 # ---------------------------------------------------------------- descent
-# Levenberg-Marquardt on the whitened residual, and a grid over v_s and b for what lies behind a hill.
+# The way down: Levenberg-Marquardt on the whitened residual, and a grid over v_s and b for what lies behind a hill.
 
-# Points of log v_s and log b that are tried when an effect has come in.
-GRID_POINTS = 12
-
-# Rows of each stroke on which v_s and b are sought: they act on a stroke as a whole.
-ROWS_FOR_START = 4
-
-# A step that lowers the whitened sum of squares by less is the last: the estimates then lie within a hundredth of a
-# standard error.
-SETTLED = 1e-4
+MAX_STEPS = 60
+GRID_POINTS = 12  # points of log v_s and log b tried when an effect has come in
+ROWS_FOR_START = 4  # of each stroke: v_s acts on a stroke as a whole
+CREEPING = 1e-2  # several such steps in a row go along a valley in which the data hold nothing
+SETTLED = 1e-4  # of the whitened sum of squares: the estimates then lie within a hundredth of a standard error
 
 
 def descend(
@@ -35,45 +30,57 @@ def descend(
     *,
     near: float = SETTLED,
 ) -> Model:
-    """Return the model at the least whitened sum of squares, the scatter held fixed.
+    """Return the model at the least whitened sum of squares, by Levenberg-Marquardt with the scatter held fixed.
 
     It ends where a step gains less than `near`.
     """
     precision = precision_of(model)
     low, high = bounds_of(model, rows)
-    start = np.clip(model.vector(), low, high)
+    vector = np.clip(model.vector(), low, high)
+    model = model.at(vector)
+    force, jacobian = evaluate(model, rows)
     if friction is None:
-        friction = friction_of(model.at(start), rows)  # held, so that the criterion does not move under the search
+        friction = friction_of(model, rows)  # held, so that the criterion does not move under the search
+
     whitening = Whitening(scatter, friction, rows.groups)
 
-    def residual_and_prior(force: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        residual, pull = whitening((rows.force - force)[:, None])[:, 0], precision @ (x - centre)
-        return residual, pull, float(residual @ residual + (x - centre) @ pull)
+    def cost_of(residual: np.ndarray, at: np.ndarray) -> float:
+        return float(residual @ residual + (at - centre) @ precision @ (at - centre))
 
-    def squares(x: np.ndarray, _: np.ndarray) -> np.ndarray:
-        square = residual_and_prior(evaluate(model.at(x[0]), rows, jacobian=False)[0], x[0])[2]
-        return np.array([square if np.isfinite(square) else np.inf])
-
-    def compressed(x: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        force, jacobian = evaluate(model.at(x[0]), rows)
-        residual, pull, square = residual_and_prior(force, x[0])
+    residual = whitening((rows.force - force)[:, None])[:, 0]
+    cost = cost_of(residual, vector)
+    damping, crept = 1e-4, 0
+    for _ in range(MAX_STEPS):
         normal, gradient = whitening.normal(jacobian, residual)
-        side = pull - gradient
-        root = root_of(np.block([[normal + precision, side[:, None]], [side, square]]))
-        return root[None, :, -1], root.T[None, :-1]
-
-    best, _ = levenberg_marquardt(compressed, start[None], low, high, steps=Steps(enough=near), squares=squares)
-    return model.at(best[0])
-
-
-def root_of(products: np.ndarray) -> np.ndarray:
-    """Return R with R' R = M for the products of columns with each other, shape (k, k) each.
-
-    As many rows as columns stand for all rows: sums of squares, gradients and least squares are those of the columns.
-    """
-    size = np.sqrt(np.maximum(np.diag(products), 1e-300))
-    square, axes = np.linalg.eigh(products / np.outer(size, size))
-    return np.sqrt(np.maximum(square, 0.0))[:, None] * axes.T * size
+        gradient = gradient - precision @ (vector - centre)
+        normal = normal + precision
+        blocked = ((vector <= low) & (gradient < 0)) | ((vector >= high) & (gradient > 0))
+        free = ~blocked & (np.diag(normal) > 0)
+        scale = np.sqrt(np.diag(normal)[free])
+        scaled = normal[np.ix_(free, free)] / np.outer(scale, scale)
+        for _ in range(12):
+            move = np.zeros_like(vector)
+            move[free] = (
+                np.linalg.solve(scaled + (damping + 1e-12) * np.eye(scale.size), gradient[free] / scale) / scale
+            )
+            trial = np.clip(vector + move, low, high)
+            trial_model = model.at(trial)
+            trial_force, _none = evaluate(trial_model, rows, jacobian=False)
+            trial_residual = whitening((rows.force - trial_force)[:, None])[:, 0]
+            trial_cost = cost_of(trial_residual, trial)
+            if np.isfinite(trial_cost) and trial_cost <= cost:
+                break
+            damping = max(damping, 1e-6) * 8
+        else:
+            return model
+        gain = cost - trial_cost
+        vector, model, residual, cost = trial, trial_model, trial_residual, trial_cost
+        damping /= 10
+        crept = crept + 1 if gain < CREEPING else 0
+        if crept > 3 or (gain < near and damping < 1e-3):  # a step under heavy damping gains little anywhere
+            return model
+        _, jacobian = evaluate(model, rows)
+    return model
 
 
 def search_nonlinear(model: Model, rows: Rows, scatter: Scatter) -> Model:
@@ -157,8 +164,7 @@ def least_squares_within(normal: np.ndarray, gradient: np.ndarray, low: np.ndarr
     size, axes = np.linalg.eigh(normal * np.outer(scale, scale))
     kept = size > 1e-10 * size[-1]
     root, axes = np.sqrt(size[kept]), axes[:, kept]
-    ends = (low / scale, high / scale)
-    inside = lsq_linear(root[:, None] * axes.T, (axes.T @ (gradient * scale)) / root, ends, method="bvls")
+    inside = lsq_linear(root[:, None] * axes.T, (axes.T @ (gradient * scale)) / root, (low / scale, high / scale))
     return inside.x * scale
 
 
