@@ -180,7 +180,7 @@ def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) ->
 
     steady = store.read("steady")
     progress.say(f"fitting {steady['condition'].nunique()} conditions")
-    staged.table("steady_fit", fit_conditions(steady, store.seen_config("fit-steady"), workers=workers))
+    staged.table("steady_fit", fit_conditions(steady, store.seen_config("fit-steady")))
     return len(steady), "strokes"
 
 
@@ -195,7 +195,7 @@ def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> 
         progress.say("no aging_days in the condition: there is no aging law to fit")
     steady_fit = store.read("steady_fit")
     fitted = fit_series(steady_fit, config)
-    laws, curve = joint_laws(store.read("steady"), steady_fit, config, workers=workers)
+    laws, curve = joint_laws(store.read("steady"), steady_fit, config)
     staged.table("aging_laws", laws)
     staged.table("master_curve", curve)
     staged.table("aging_fit", fitted)

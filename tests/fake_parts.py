@@ -86,7 +86,7 @@ class Parts:
         tables |= {"inputs": inputs, "quality": quality}
         return SimpleNamespace(tables=tables, faults=[good, *self.faults], marks=marks, stored={})
 
-    def fit_conditions(self, steady, config, *, workers):
+    def fit_conditions(self, steady, config):
         self._called("fit-steady", config)
         fit = small("steady_fit", 3).assign(condition=["a", "b", "c"], parameter="mu_s", value=[0.7, 0.8, 9.0], unit="")
         return fit.assign(identified=[True, True, False], reason=["", "", "Too few speeds."])
@@ -105,7 +105,7 @@ class Parts:
         )
         return SimpleNamespace(fit=fit, curves=small("dynamic_curves"))
 
-    def joint_laws(self, steady, steady_fit, config, *, workers):
+    def joint_laws(self, steady, steady_fit, config):
         return small("aging_laws"), small("master_curve")
 
     def close_loop(self, bins, traces, config, *, workers=1, on_progress=None):

@@ -137,7 +137,7 @@ def _at_start(model: Model, reference: Model, rows: Rows) -> np.ndarray:
     table, way = rows.table, np.sign(rows.speed)
     origin = table["displacement_mm"] - way * table["distance_mm"].to_numpy(float)
     start = table.assign(displacement_mm=origin, distance_mm=0.0, time_s=0.0)
-    begun = replace(rows, table=start, cache={})
+    begun = replace(rows, table=start)
     return evaluate(model, begun, jacobian=False)[0] - evaluate(reference, begun, jacobian=False)[0]
 
 
@@ -219,22 +219,20 @@ class _Law:
         names = (f"mu_0{end}", f"a_{end}", f"b_{end}")
         number = [int(declared.index[name][self.conditions[0]]) for name in names]
         self.place = number if min(number) >= 0 else None
-        self.curve_of = Curve(series, self.quantity, 0, np.unique(days[self.conditions]))
+        self.curve_of = Curve(series, self.quantity, 0, np.unique(days[self.conditions]), self.unaged, self.unit)
         self.df = law_df(after)
 
     def rows(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
         """Yield the rows of `aging_fit_after`."""
         if self.place is None:
-            yield from without_law(self.curve_of, self.unit, self.unaged)
+            yield from without_law(self.curve_of)
             return
         found = self._estimate()
         words, interval = "; ".join(self._kept_words()), self._interval(found)
-        for row in law_rows(
-            self.curve_of, found, t_quantile(self.df), interval, self.unit, unaged=self.unaged, df=self.df
-        ):
+        for row in law_rows(self.curve_of, found, interval, t_quantile(self.df), self.df):
             yield {**row, "reason": " ".join(part for part in (row["reason"], words) if part)}
         yield from self._statistics(steady_fit)
-        yield from covariance_rows(self.curve_of, found.covariance, self.unit)
+        yield from covariance_rows(self.curve_of, found.covariance)
 
     def _estimate(self) -> Estimate:
         after, at = self.after, self.place
@@ -359,10 +357,10 @@ def after_fits(
         return {schema.name: pd.DataFrame(columns=schema.names()) for schema in AFTER}
     free = without_effects(steady, after, config)
     with timed("after: conditions", rows=len(free), of="strokes"):
-        conditions = fit_conditions(free, config, workers=workers)
+        conditions = fit_conditions(free, config)
     with timed("after: laws"):
         law, curves = after_laws(after, conditions, config)
-        laws, master = joint_laws(free, conditions, config, workers=workers)
+        laws, master = joint_laws(free, conditions, config)
     with timed("after: starts", rows=len(free), of="strokes"):
         dynamic = fit_dynamic(traces, free, conditions, config, workers=workers)
     found = {

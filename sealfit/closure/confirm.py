@@ -326,7 +326,7 @@ def _why_not(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFra
     if proposal.p_value > WEAK and gain.share < LEAST_FALL:
         return f"its p-value is no less than {WEAK:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
     least = max(unseen_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
-    if np.sqrt(np.mean(_added_force(proposal) ** 2)) <= least:
+    if np.sqrt(np.mean(added_force(proposal) ** 2)) <= least:
         return "it is smaller than the recorded force can show"
     if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
         return "it does not predict whole settings that were held out, between those it was fitted to"
@@ -341,7 +341,7 @@ def _bends_the_curve(proposal: Proposal) -> bool:
     return free and (by_speed or term.acts_on not in WHOLE)
 
 
-def _added_force(proposal: Proposal) -> np.ndarray:
+def added_force(proposal: Proposal) -> np.ndarray:
     """Return what a fitted proposal adds to the force of the model without it, shape (n,)."""
     fitted = proposal.fitted
     without = fitted.model.without_term(len(fitted.model.terms) - 1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sealfit.closure.confirm import AcceptedEffect
+from sealfit.closure.confirm import AcceptedEffect, added_force
 from sealfit.closure.criteria import IDENTIFIABLE
 from sealfit.closure.forms import describe, grid_of, reference
 from sealfit.closure.selection import Selection
@@ -181,8 +181,7 @@ def _unseen(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> It
 def _replicates(item: AcceptedEffect, config: Config) -> dict:
     """Return the condition to repeat on a new specimen: where an effect that too few specimens show is largest."""
     fitted = item.proposal.fitted
-    without = evaluate(fitted.model.without_term(len(fitted.model.terms) - 1), fitted.rows, jacobian=False)[0]
-    k = int(np.argmax(np.abs(fitted.force - without)))
+    k = int(np.argmax(np.abs(added_force(item.proposal))))
     count = fitted.rows.groups.starts["specimen"].size
     few = "one specimen is" if count == 1 else f"{count} specimens are"
     return {
@@ -259,7 +258,7 @@ def _moved(rows: Rows, changes: Mapping[str, object]) -> Rows:
         load = np.full_like(rows.load, float(changes["load_N"]))
     if POWER in table and POWER not in changes:
         table[POWER] = sliding_power(load, speed)
-    return replace(rows, table=table, speed=speed, pace=speed, days=days, load=load, cache={})
+    return replace(rows, table=table, speed=speed, pace=speed, days=days, load=load)
 
 
 def _plain(value: object) -> object:

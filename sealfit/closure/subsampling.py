@@ -22,14 +22,29 @@ from sealfit.fit.joint.declared import declare
 from sealfit.fit.joint.estimate import Fitted, fit, fitted_at
 from sealfit.fit.joint.rows import POWER, Rows, make_rows, merge, thin
 
-STROKES = 4_000  # that are searched; of more, whole runs are dealt,
-RUNS = 1_000  # at least so many, as they are the evidence of most channels,
-LEAST_RUNS = 20  # and at least so many for each number of the declared model,
-FURTHER = 4  # and so many times as many strokes where the campaign shows more than they do
-ROWS = 4_000  # that the search works on; more are merged along their strokes,
-PER_STROKE = 8  # to about so many of each stroke,
-MOST_ROWS = 8_000  # unless there are more than so many then.
-LEAST_PER_STROKE = 4  # where even so many of each are more, some files keep `PER_STROKE`, the others one a stroke
+# A campaign of no more strokes is searched whole; of a larger one so many are drawn, by whole runs.
+STROKES = 4_000
+
+# At least so many runs are drawn, as they are the evidence of most variables.
+RUNS = 1_000
+
+# At least so many runs are drawn for each number of the declared model.
+LEAST_RUNS = 20
+
+# So many times as many strokes are drawn next where the campaign shows more than those searched do.
+FURTHER = 4
+
+# The search works on about so many rows; more are merged along their strokes.
+ROWS = 4_000
+
+# So many merged rows are kept of each stroke, where `MOST_ROWS` allow it.
+PER_STROKE = 8
+
+# The search works on at most so many rows.
+MOST_ROWS = 8_000
+
+# Where `MOST_ROWS` leave fewer rows of a stroke, some files keep `PER_STROKE`, the others one a stroke.
+LEAST_PER_STROKE = 4
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,6 @@ def arrhenius_aging_shape(inputs, *, A, E):
     declared model has an a and a b of its own for each series, and where temperature makes series they take all of it
     up: there is something to find only where one series holds several, as with a config whose `condition` leaves it
     out.
-
-    Factor minus one, shape (n,); `temperature_C` of aging in degrees Celsius (NaN at or below absolute zero).
     """
     kelvin = positive(np.asarray(inputs["temperature_C"], dtype=float) + ZERO_C)
     at_reference = reference(inputs, "temperature_C", STANDARD_C) + ZERO_C
@@ -82,8 +80,6 @@ def compression_factor_shape(inputs, *, A):
 
     The declared model has an a and a b of its own for each series, and where compression makes series they take up all
     of a change of a or b: there is something to find on them only where one series holds several heights.
-
-    Factor minus one, shape (n,); `compression_ratio_pct` in per cent of the original height.
     """
     return A * (100.0 - np.asarray(inputs["compression_ratio_pct"], dtype=float)) / 100.0
 
@@ -114,8 +110,6 @@ def aging_floor_shape(inputs, *, A, t_f):
 
     As a change of mu_s or mu_c, A = a stops the fall of :math:`\mu_0 - a \ln(1 + t / b)` altogether for t well beyond
     b, and a smaller A slows it. As a factor on mu, A is relative to mu.
-
-    Change of the coefficient or factor minus one, shape (n,); `aging_days` in days.
     """
     return A * np.log(np.maximum(np.asarray(inputs["aging_days"], dtype=float) / t_f, 1.0))
 
@@ -149,8 +143,6 @@ def aging_induction_shape(inputs, *, A, t_i):
     .. math:: h = A \frac{t}{t_i} e^{1 - t / t_i}
 
     A is that largest lag.
-
-    Factor minus one or change of the coefficient, shape (n,); `aging_days` in days.
     """
     ratio = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0) / t_i
     return A * ratio * np.exp(1 - ratio)
@@ -186,8 +178,6 @@ def aging_delay_shape(inputs, *, A, t_i, b):
     which is zero at day 0 and dies out as :math:`A t_i / t`. Where A is the declared law's a (as a share of mu, for a
     factor) and b its b, the declared law and the effect together are Eq. 15 with :math:`t - t_i` for t.
     `aging_induction` is the smooth lag of a batch whose pieces start one after the other.
-
-    Factor minus one or change of the coefficient, shape (n,); `aging_days` in days.
     """
     days = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0)
     return A * (np.log1p(days / b) - np.log1p(np.maximum(days - t_i, 0.0) / b))
@@ -224,8 +214,6 @@ def stribeck_speed_aging_shape(inputs, *, A, t_0):
     .. math:: h = A \ln(1 + t / t_0)
 
     A is the relative change of v_s per factor e of the aging time, zero for unaged rubber.
-
-    Factor minus one, shape (n,); `aging_days` in days (NaN where negative).
     """
     return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
 
@@ -266,8 +254,6 @@ def viscosity_aging_shape(inputs, *, A, t_0):
     .. math:: h = A \ln(1 + t / t_0)
 
     A is the change of sigma_2 per factor e of the aging time (as a factor: relative to it), zero for unaged rubber.
-
-    Change of sigma_2 or factor minus one, shape (n,); `aging_days` in days (NaN where negative).
     """
     return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
 

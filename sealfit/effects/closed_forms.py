@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from sealfit.effects.contract import (
@@ -17,50 +19,42 @@ from sealfit.effects.contract import (
 )
 from sealfit.effects.free import left_of_wave
 
+# A closed form is of any one channel, acts anywhere and names no mechanism, unless it says otherwise.
+closed_form = partial(Effect, reads=(CHANNEL,), acts_on=ANYWHERE, physical=False)
+
 
 def linear_shape(inputs, *, A):
     r"""Straight line in any channel, zero at its reference.
 
-    .. math:: h = A (x - x_{ref})
-
     Along `run_order` it is the drift along the campaign counted in runs.
-
-    Straight line, shape (n,), in the unit of A times that of the channel.
     """
-    return A * (np.asarray(inputs[CHANNEL], dtype=float) - reference(inputs, CHANNEL, 0.0))
+    return A * (deviation(inputs, CHANNEL))
 
 
-LINEAR = Effect(
+LINEAR = closed_form(
     id="linear",
     label="linear in {x}",
     equation=r"h = A (x - x_{ref})",
     form="A (x - x_ref)",
     reference="{x} = {x_ref}",
-    reads=(CHANNEL,),
-    acts_on=ANYWHERE,
     parameters=(Parameter("A", "{y}/{x}", 0.01, AMPLITUDE, "slope", linear=True),),
     shape=linear_shape,
     source="Form: ours. First order of any smooth dependence.",
     # By hand: 0.5 * (7 - 3).
     worked=({"x": 7.0, "x_ref": 3.0}, {"A": 0.5}, 2.0),
-    physical=False,
 )
 
 
 def linear_each_way_shape(inputs, *, A_f, A_b):
     r"""Straight line in any channel with a slope of its own in each direction: what grows in one direction only.
 
-    .. math:: h = A_f (x - x_{ref}) \text{ forward}, \quad h = A_b (x - x_{ref}) \text{ backward}
-
     A lip that turns over or wears on one side changes the friction one way and leaves the other. A slope whose interval
     holds zero is the direction in which nothing changes.
-
-    Straight line, shape (n,), by the direction, which is +1 or -1.
     """
     return np.where(np.asarray(inputs["direction"]) > 0, A_f, A_b) * deviation(inputs, CHANNEL)
 
 
-LINEAR_EACH_WAY = Effect(
+LINEAR_EACH_WAY = closed_form(
     id="linear_each_way",
     label="linear in {x}, with its own slope in each direction",
     equation=r"h = A_f (x - x_{ref}) \text{ forward}, \; A_b (x - x_{ref}) \text{ backward}",
@@ -76,29 +70,21 @@ LINEAR_EACH_WAY = Effect(
     source="Form: ours. First order of any smooth dependence, in each direction by itself.",
     # By hand: backward, 0.25 * (7 - 3).
     worked=({"x": 7.0, "x_ref": 3.0, "direction": -1.0}, {"A_f": 0.5, "A_b": 0.25}, 1.0),
-    physical=False,
 )
 
 
 def quadratic_shape(inputs, *, A, B):
-    r"""Parabola in any channel, zero at its reference.
-
-    .. math:: h = A (x - x_{ref}) + B (x - x_{ref})^2
-
-    Parabola, shape (n,), in the unit of A times that of the channel.
-    """
-    away = np.asarray(inputs[CHANNEL], dtype=float) - reference(inputs, CHANNEL, 0.0)
+    r"""Parabola in any channel, zero at its reference."""
+    away = deviation(inputs, CHANNEL)
     return A * away + B * away**2
 
 
-QUADRATIC = Effect(
+QUADRATIC = closed_form(
     id="quadratic",
     label="quadratic in {x}",
     equation=r"h = A (x - x_{ref}) + B (x - x_{ref})^2",
     form="A (x - x_ref) + B (x - x_ref)^2",
     reference="{x} = {x_ref}",
-    reads=(CHANNEL,),
-    acts_on=ANYWHERE,
     parameters=(
         Parameter("A", "{y}/{x}", 0.01, AMPLITUDE, "slope at the reference", linear=True),
         Parameter("B", "{y}/{x}^2", 0.001, AMPLITUDE, "curvature, halved", linear=True),
@@ -107,7 +93,6 @@ QUADRATIC = Effect(
     source="Form: ours. Second order of any smooth dependence.",
     # By hand: 2 from the reference: 0.5 * 2 - 0.25 * 4.
     worked=({"x": 5.0, "x_ref": 3.0}, {"A": 0.5, "B": -0.25}, 0.0),
-    physical=False,
     along_calendar=False,
 )
 
@@ -115,52 +100,39 @@ QUADRATIC = Effect(
 def log_shape(inputs, *, A):
     r"""Logarithm of any positive channel, zero at its reference.
 
-    .. math:: h = A \ln(x / x_{ref})
-
     A is the change per factor e of the channel; NaN where the channel is not positive.
-
-    Logarithm, shape (n,), in the unit of A.
     """
     return A * np.log(positive(inputs[CHANNEL]) / positive(reference(inputs, CHANNEL, 1.0)))
 
 
-LOG = Effect(
+LOG = closed_form(
     id="log",
     label="logarithmic in {x}",
     equation=r"h = A \ln(x / x_{ref})",
     form="A ln(x / x_ref)",
     reference="{x} = {x_ref}",
-    reads=(CHANNEL,),
-    acts_on=ANYWHERE,
     parameters=(Parameter("A", "{y}", 0.05, AMPLITUDE, "change per factor e of the channel", linear=True),),
     shape=log_shape,
     source="Form: ours. The dependence that is alike in every decade.",
     # By hand: ten times the reference, ln 10 = 2.302585092994046.
     worked=({"x": 30.0, "x_ref": 3.0}, {"A": 0.5}, 0.5 * 2.302585092994046),
-    physical=False,
 )
 
 
 def log_growth_shape(inputs, *, A, x_0):
     r"""Logarithm of any channel that starts at 0: first in proportion, then alike in every decade.
 
-    .. math:: h = A \ln(1 + x / x_0)
-
     The law of Eq. 15 for channels that have a zero, such as time; NaN where the channel is negative.
-
-    Logarithm from 0, shape (n,), in the unit of A.
     """
     return A * np.log1p(not_negative(inputs[CHANNEL]) / x_0)
 
 
-LOG_GROWTH = Effect(
+LOG_GROWTH = closed_form(
     id="log_growth",
     label="logarithmic growth in {x}",
     equation=r"h = A \ln(1 + x / x_0)",
     form="A ln(1 + x / x_0)",
     reference="{x} = 0",
-    reads=(CHANNEL,),
-    acts_on=ANYWHERE,
     parameters=(
         Parameter("A", "{y}", 0.05, AMPLITUDE, "change per factor e of the channel, well beyond x_0", linear=True),
         Parameter("x_0", "{x}", 1.0, (1e-6, 1e9), "where the logarithm sets in", search="span"),
@@ -169,32 +141,25 @@ LOG_GROWTH = Effect(
     source="Form: ours, after Eq. 15 of Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102.",
     # By hand: x = x_0, ln 2 = 0.6931471805599453.
     worked=({"x": 3.0, "x_ref": 1.0}, {"A": 0.5, "x_0": 3.0}, 0.5 * 0.6931471805599453),
-    physical=False,
 )
 
 
 def power_shape(inputs, *, A, n):
     r"""Power of any positive channel, zero at its reference.
 
-    .. math:: h = A [(x / x_{ref})^n - 1]
-
     n = -1 is a hyperbola, n = 1 the straight line; n towards 0 is the logarithm, with A growing as 1/n. NaN where the
     channel is not positive.
-
-    Power less one, shape (n,), in the unit of A.
     """
     # expm1 keeps all digits where the power is close to one.
     return A * np.expm1(n * np.log(positive(inputs[CHANNEL]) / positive(reference(inputs, CHANNEL, 1.0))))
 
 
-POWER = Effect(
+POWER = closed_form(
     id="power",
     label="power of {x}",
     equation=r"h = A [(x / x_{ref})^n - 1]",
     form="A ((x / x_ref)^n - 1)",
     reference="{x} = {x_ref}",
-    reads=(CHANNEL,),
-    acts_on=ANYWHERE,
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "size at the reference", linear=True),
         Parameter("n", "", 0.5, (-6.0, 6.0), "exponent", search=(-3.0, -2.0, -1.0, -0.5, 0.5, 1.5, 2.0, 3.0)),
@@ -203,30 +168,23 @@ POWER = Effect(
     source="Form: ours. The dependence without a scale of its own.",
     # By hand: four times the reference: 2 * (sqrt(4) - 1).
     worked=({"x": 12.0, "x_ref": 3.0}, {"A": 2.0, "n": 0.5}, 2.0),
-    physical=False,
 )
 
 
 def exponential_approach_shape(inputs, *, A, tau):
     r"""Exponential approach to a limit, from 0, in any channel that is not negative.
 
-    .. math:: h = A (1 - e^{-x / \tau})
-
     NaN where the channel is negative.
-
-    Approach to A, shape (n,), in the unit of A.
     """
     return -A * np.expm1(-not_negative(inputs[CHANNEL]) / tau)
 
 
-EXPONENTIAL_APPROACH = Effect(
+EXPONENTIAL_APPROACH = closed_form(
     id="exponential_approach",
     label="exponential approach in {x}",
     equation=r"h = A (1 - e^{-x / \tau})",
     form="A (1 - exp(-x / tau))",
     reference="{x} = 0",
-    reads=(CHANNEL,),
-    acts_on=ANYWHERE,
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "limit", linear=True),
         Parameter("tau", "{x}", 1.0, (1e-6, 1e9), "scale of the approach", search="span"),
@@ -235,32 +193,25 @@ EXPONENTIAL_APPROACH = Effect(
     source="Form: ours. What decays in proportion to what is left.",
     # By hand: x = tau, 1 - 1/e = 0.6321205588285577.
     worked=({"x": 3.0, "x_ref": 1.0}, {"A": 2.0, "tau": 3.0}, 2.0 * 0.6321205588285577),
-    physical=False,
 )
 
 
 def saturation_shape(inputs, *, A, x_half):
     r"""Saturation by a hyperbola, from 0, in any channel that is not negative.
 
-    .. math:: h = A \frac{x}{x + x_{half}}
-
     Slower than an exponential to reach its limit: half at x_half, nine tenths at nine times that. NaN where the channel
     is negative.
-
-    Saturation to A, shape (n,), in the unit of A.
     """
     x = not_negative(inputs[CHANNEL])
     return A * x / (x + x_half)
 
 
-SATURATION = Effect(
+SATURATION = closed_form(
     id="saturation",
     label="saturation in {x}",
     equation=r"h = A x / (x + x_{half})",
     form="A x / (x + x_half)",
     reference="{x} = 0",
-    reads=(CHANNEL,),
-    acts_on=ANYWHERE,
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "limit", linear=True),
         Parameter("x_half", "{x}", 1.0, (1e-6, 1e9), "where half of the limit is reached", search="span"),
@@ -269,14 +220,11 @@ SATURATION = Effect(
     source="Form: Langmuir 1918, J. Am. Chem. Soc. 40(9), 1361-1403, doi:10.1021/ja02242a004: places that fill up.",
     # By hand: x = 3 x_half is three quarters of 2.
     worked=({"x": 6.0, "x_ref": 1.0}, {"A": 2.0, "x_half": 2.0}, 1.5),
-    physical=False,
 )
 
 
 def hyperbolic_shape(inputs, *, A, x_half):
     r"""Hyperbolic decay from A to 0, in any channel that is not negative.
-
-    .. math:: h = \frac{A}{1 + x / x_{half}}
 
     What is off at the start and settles slowly: half is left at x_half, a tenth at nine times that. NaN where the
     channel is negative.
@@ -285,19 +233,16 @@ def hyperbolic_shape(inputs, *, A, x_half):
     constant of their own, so on them the two are one form, and `saturation` has it. A force that is added has none: one
     that starts off by A and settles at zero is this form alone, and a zero offset and a saturation otherwise. Hence it
     acts there only. The hyperbola without a start, A (x_ref / x - 1), is `power` with n = -1.
-
-    Decay from A, shape (n,), in the unit of A.
     """
     return A / (1 + not_negative(inputs[CHANNEL]) / x_half)
 
 
-HYPERBOLIC = Effect(
+HYPERBOLIC = closed_form(
     id="hyperbolic",
     label="hyperbolic decay in {x}",
     equation=r"h = A / (1 + x / x_{half})",
     form="A / (1 + x / x_half)",
     reference="limit of large {x}",
-    reads=(CHANNEL,),
     acts_on=(("force", "add"),),
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "size at 0", linear=True),
@@ -307,31 +252,24 @@ HYPERBOLIC = Effect(
     source="Form: ours. What decays in proportion to the square of what is left.",
     # By hand: x = 3 x_half leaves a quarter of 2.
     worked=({"x": 6.0, "x_ref": 1.0}, {"A": 2.0, "x_half": 2.0}, 0.5),
-    physical=False,
 )
 
 
 def step_shape(inputs, *, A, x_0):
     r"""Step in any channel: something was changed, repaired or knocked.
 
-    .. math:: h = A \quad (x \ge x_0), \qquad h = 0 \quad (x < x_0)
-
     Only the interval between two neighbouring values of the channel is determined for x_0.
-
-    Step of height A, shape (n,), in the unit of A; NaN where the channel is.
     """
     x = np.asarray(inputs[CHANNEL], dtype=float)
     return A * np.where(np.isnan(x), np.nan, x >= x_0)
 
 
-STEP = Effect(
+STEP = closed_form(
     id="step",
     label="step in {x}",
     equation=r"h = A\,[x \ge x_0]",
     form="A if x >= x_0, else 0",
     reference="{x} below {x_0}",
-    reads=(CHANNEL,),
-    acts_on=ANYWHERE,
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "height of the step", linear=True),
         Parameter("x_0", "{x}", 0.0, (-1e12, 1e12), "where it steps", search="between"),
@@ -340,28 +278,20 @@ STEP = Effect(
     source="Form: ours. Definition of a step.",
     # By hand: at the step itself, the full height.
     worked=({"x": 3.0, "x_ref": 1.0}, {"A": -0.5, "x_0": 3.0}, -0.5),
-    physical=False,
 )
 
 
 def bump_shape(inputs, *, A, x_0, w):
-    r"""Local bump in any channel: a worn place, a joint in the track, an hour when the door stood open.
-
-    .. math:: h = A e^{-((x - x_0) / w)^2}
-
-    Bell of height A, shape (n,), in the unit of A.
-    """
+    r"""Local bump in any channel: a worn place, a joint in the track, an hour when the door stood open."""
     return A * np.exp(-(((np.asarray(inputs[CHANNEL], dtype=float) - x_0) / w) ** 2))
 
 
-BUMP = Effect(
+BUMP = closed_form(
     id="bump",
     label="local bump in {x}",
     equation=r"h = A e^{-((x - x_0) / w)^2}",
     form="A exp(-((x - x_0) / w)^2)",
     reference="away from {x} = {x_0}",
-    reads=(CHANNEL,),
-    acts_on=ANYWHERE,
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "height", linear=True),
         Parameter("x_0", "{x}", 0.0, (-1e12, 1e12), "middle", search="inside"),
@@ -371,7 +301,6 @@ BUMP = Effect(
     source="Form: ours. A Gaussian bell, smooth and local.",
     # By hand: one half-width from the middle, 1/e = 0.36787944117144233.
     worked=({"x": 1.0, "x_ref": 0.0}, {"A": 2.0, "x_0": 3.0, "w": 2.0}, 2.0 * 0.36787944117144233),
-    physical=False,
     narrow=True,
     along_calendar=False,
 )
@@ -380,23 +309,18 @@ BUMP = Effect(
 def sinusoid_shape(inputs, *, A, lambda_, phi):
     r"""Sine of any channel: along time it is what the mains, a servo or a pump adds.
 
-    .. math:: h = A \sin(2 \pi x / \lambda + \varphi)
-
     Along position the same form is a ripple, which has a mechanism and a file of its own.
-
-    Sine of the channel, shape (n,), in the unit of A.
     """
     angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_ + phi
     return A * np.sin(angle) * left_of_wave(inputs, CHANNEL, lambda_)
 
 
-SINUSOID = Effect(
+SINUSOID = closed_form(
     id="sinusoid",
     label="periodic in {x}",
     equation=r"h = A \sin(2 \pi x / \lambda + \varphi)",
     form="A sin(2 pi x / lambda + phi)",
     reference="mean over a wavelength",
-    reads=(CHANNEL,),
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude", linear=True),
@@ -407,7 +331,6 @@ SINUSOID = Effect(
     source="Form: ours. The first Fourier term of anything periodic.",
     # By hand: 0.02 of a period of 0.04 is half a turn, and sin(pi + pi/6) = -sin(pi/6) = -1/2.
     worked=({"x": 0.02}, {"A": 4.0, "lambda_": 0.04, "phi": np.pi / 6}, -2.0),
-    physical=False,
     periodic=True,
 )
 
@@ -418,26 +341,21 @@ TURN = 4 * np.pi  # two turns either way: a phase may pass its end
 def sinusoid_harmonics_shape(inputs, *, A, B, lambda_, phi, phi_2):
     r"""Sine of any channel with its second harmonic: what repeats in each period but is no pure sine.
 
-    .. math:: h = A \sin(2 \pi x / \lambda + \varphi) + B \sin(4 \pi x / \lambda + \varphi_2)
-
     A shaft that is bent and joined askew, or a motor's torque with its pole pairs, gives once and twice per turn. The
     loop finds harmonics one at a time, as a ripple or a sine each with a period of its own, and does not try this form;
     it is for simulated campaigns and for effects of one's own.
-
-    Sum of two sines of the channel, shape (n,), in the unit of A and B.
     """
     angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_
     once, twice = (left_of_wave(inputs, CHANNEL, lambda_ / k) for k in (1, 2))
     return A * np.sin(angle + phi) * once + B * np.sin(2 * angle + phi_2) * twice
 
 
-SINUSOID_HARMONICS = Effect(
+SINUSOID_HARMONICS = closed_form(
     id="sinusoid_harmonics",
     label="periodic in {x}, with a second harmonic",
     equation=r"h = A \sin(2 \pi x / \lambda + \varphi) + B \sin(4 \pi x / \lambda + \varphi_2)",
     form="A sin(2 pi x / lambda + phi) + B sin(4 pi x / lambda + phi_2)",
     reference="mean over a wavelength",
-    reads=(CHANNEL,),
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude once per period", linear=True),
@@ -452,6 +370,5 @@ SINUSOID_HARMONICS = Effect(
     source="Form: ours. The first two Fourier terms of anything periodic.",
     # By hand: 0.02 of a period of 0.04 is half a turn: 4 sin(pi + pi/6) = -2; a whole one: 1.5 sin(2 pi + pi/2) = 1.5.
     worked=({"x": 0.02}, {"A": 4.0, "B": 1.5, "lambda_": 0.04, "phi": np.pi / 6, "phi_2": np.pi / 2}, -0.5),
-    physical=False,
     periodic=True,
 )

@@ -19,8 +19,6 @@ def conditioning_shape(inputs, *, A, n_0):
     with n the repeat. A is the relative change once conditioned. The approach to a limit is chosen before a logarithm,
     which would go on for ever, because conditioning ends; with three repeats the data can hardly tell, and `log` is in
     the list.
-
-    Factor minus one, shape (n,); `repeat` counts from 1.
     """
     before = np.maximum(np.asarray(inputs["repeat"], dtype=float) - 1, 0.0)
     return -A * np.expm1(-before / n_0)
@@ -56,8 +54,6 @@ def run_in_shape(inputs, *, A, n_0):
 
     with n the stroke in its file. A is the relative change once run in. It starts anew in every file: what lasts from
     file to file is a drift along the campaign, and what lasts from repeat to repeat is conditioning.
-
-    Factor minus one, shape (n,); `stroke` counts from 1.
     """
     before = np.maximum(np.asarray(inputs["stroke"], dtype=float) - 1, 0.0)
     return -A * np.expm1(-before / n_0)
@@ -94,8 +90,6 @@ def rest_strengthening_shape(inputs, *, A, t_0):
 
     A is the relative growth per factor e of the rest, some 0.01 to 0.05 for most solids; t_0 is the rest below which
     nothing shows. Only where the campaign holds a column `rest_s`.
-
-    Factor minus one, shape (n,); `rest_s` in s, not negative (NaN where it is).
     """
     return A * np.log1p(not_negative(inputs["rest_s"]) / t_0)
 

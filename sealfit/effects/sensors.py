@@ -17,11 +17,7 @@ def ripple_shape(inputs, *, A, lambda_, phi):
     friction when the contact's pressure or surface repeats along the track. A harmonic is a further ripple of half or a
     third of the wavelength.
 
-    .. math:: h = A \sin(2 \pi x / \lambda + \varphi)
-
     The wavelength holds within the run that it was fitted to; positions beyond it are extrapolated in phase.
-
-    Sine of the position, shape (n,), in the unit of A; `displacement_mm` in its slot's unit.
     """
     angle = 2 * np.pi * np.asarray(inputs["displacement_mm"], dtype=float) / lambda_ + phi
     return A * np.sin(angle) * left_of_wave(inputs, "displacement_mm", lambda_)
@@ -55,13 +51,9 @@ RIPPLE = Effect(
 def drift_shape(inputs, *, A):
     r"""Drift of the force channel along a record: a strain-gauge bridge or its amplifier warming up.
 
-    .. math:: h = A t
-
     A is the rate. The force is added as it stands, with no regard to the direction of motion: an instrument does not
     know which way the sample slides. Time is the file's own clock, so the drift starts anew with every file that is
     zeroed.
-
-    Added force, shape (n,), in the force slot's unit; `time_s` in its slot's unit.
     """
     return A * np.asarray(inputs["time_s"], dtype=float)
 
@@ -85,13 +77,9 @@ DRIFT = Effect(
 def zero_offset_shape(inputs, *, A):
     r"""Zero offset of the force channel: a constant added force, the same both ways.
 
-    .. math:: h = A
-
     Seen as the half-sum of forward and backward force; with one direction only it cannot be told from friction that
     does not depend on speed. It reads the direction because only that tells it from mu. Below the sensor's accuracy it
     says nothing.
-
-    Added force, shape (n,), in the force slot's unit.
     """
     return A * np.ones_like(np.asarray(inputs["direction"], dtype=float))
 
@@ -115,13 +103,9 @@ ZERO_OFFSET = Effect(
 def offset_slope_shape(inputs, *, A, B):
     r"""Zero offset of the force that changes with a channel, the same both ways.
 
-    .. math:: h = A (x - x_{ref}) + B
-
     The force on a piston is the pressure times its area, so an area that is wrong by dA leaves dA p in what is taken
     for friction: A is then the error of the area, and B that error times the reference pressure. An amplifier whose
     zero moves with the temperature of the room does the same.
-
-    Added force, shape (n,), whichever way the sample moves.
     """
     return A * deviation(inputs, CHANNEL) + B
 
@@ -155,8 +139,6 @@ def asymmetry_shape(inputs, *, A):
 
     so that A is the forward value minus the backward one, relative to (or, for a change that is added, in the unit of)
     the mean of both, and the mean keeps its meaning.
-
-    Factor minus one or change of the parameter, shape (n,); `direction` is +1 or -1.
     """
     return A * np.asarray(inputs["direction"], dtype=float) / 2
 
@@ -198,8 +180,6 @@ def campaign_drift_shape(inputs, *, A):
     with t the time since the campaign's first file. A is the change per time: of friction, relative, or of the zero.
     Along the order of runs instead of the clock it is `linear` in `run_order`. Where tests follow the calendar of aging
     it cannot be told from the aging law.
-
-    Factor minus one or added force, shape (n,); `elapsed_h` in h.
     """
     return A * np.asarray(inputs["elapsed_h"], dtype=float)
 

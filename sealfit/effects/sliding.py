@@ -21,8 +21,6 @@ def load_exponent_shape(inputs, *, A):
 
     Where the local coefficient goes with the local pressure, :math:`\mu(p) \propto p^{n - 1}`, the load still enters by
     the same exponent, and the pressure distribution by a constant factor that mu takes up.
-
-    Factor minus one, shape (n,); `load_N` in its slot's unit, positive (NaN where it is not).
     """
     return A * np.log(positive(inputs["load_N"]) / reference(inputs, "load_N", 1.0))
 
@@ -60,8 +58,6 @@ def stribeck_exponent_shape(inputs, *, A, v_s, n):
     Three numbers here and four of the declared curve need seven speeds in one direction, several on either side of v_s.
     Near n = 2 the shape is :math:`A (2 - n) r^2 \ln r\, e^{-r^2}` with :math:`r = |v| / v_s`: there only the product
     A (2 - n) is determined, and A and n apart only well off 2, or with A held to mu_s - mu_c.
-
-    Added coefficient or factor minus one, shape (n,); signed `speed_mm_s` in its slot's unit; 0 at rest.
     """
     ratio = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / v_s
     return A * (np.exp(-(ratio**n)) - np.exp(-(ratio**2)))
@@ -101,8 +97,6 @@ def log_rate_shape(inputs, *, A):
 
     A is the relative change per factor e of the speed: positive where breaking bonds decides (strengthening with rate),
     negative where the age of the contacts does. Steady sliding only; at rest it says nothing.
-
-    Factor minus one or change, shape (n,); signed `speed_mm_s` in its slot's unit, NaN at rest.
     """
     return A * np.log(positive(np.abs(inputs["speed_mm_s"])) / reference(inputs, "speed_mm_s", 1.0))
 
@@ -130,11 +124,7 @@ def power_viscous_shape(inputs, *, A, n):
     film drags as :math:`|v|^n` with n < 1; one that the speed itself drags in, as under a hydrodynamic seal lip, grows
     as the root of the speed and drags with n near 1/2.
 
-    .. math:: h = A\, \mathrm{sgn}(v)\, (|v| / v_{ref})^n
-
     A is the force at the reference speed. At n = 1 it is sigma_2 v and cannot be told from it.
-
-    Added force, shape (n,), in the force slot's unit, odd in the speed; 0 at rest.
     """
     speed = np.asarray(inputs["speed_mm_s"], dtype=float)
     return A * np.sign(speed) * (np.abs(speed) / reference(inputs, "speed_mm_s", 1.0)) ** n
@@ -170,8 +160,6 @@ def grosch_peak_shape(inputs, *, A, v_p, w):
 
     A is the height of the bell, relative to the Stribeck curve or as a coefficient of friction that is added to it. A
     peak beyond the tested speeds is a slope, and its height is not determined.
-
-    Factor minus one or added coefficient, shape (n,); signed `speed_mm_s` in its slot's unit; 0 at rest.
     """
     decades = np.log10(positive(np.abs(inputs["speed_mm_s"])) / v_p)
     return A * np.nan_to_num(np.exp(-((decades / w) ** 2)), nan=0.0)
@@ -208,8 +196,6 @@ def humidity_shape(inputs, *, A):
 
     A is the relative change per per cent of relative humidity. Only where the campaign holds a column `humidity_pct`; a
     column of another name is found as `linear` in it.
-
-    Factor minus one or added force, shape (n,); `humidity_pct` in per cent.
     """
     return A * (np.asarray(inputs["humidity_pct"], dtype=float) - reference(inputs, "humidity_pct", 0.0))
 

@@ -19,8 +19,6 @@ def warming_time_shape(inputs, *, A, tau):
     A is the share of friction lost when warm; it is negative where friction rises with temperature. Time counts from
     the stroke's or the file's first row (design: the file's own clock); before 0 the contact is cold. The power is
     taken as the same in every run; `warming_power` lets it follow speed and load.
-
-    Factor minus one, shape (n,); `time_s` in its slot's unit.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
     return A * np.expm1(-time / tau)
@@ -57,8 +55,6 @@ def warming_distance_shape(inputs, *, A, s_0):
 
     A is the share of friction lost when warm. At one speed it cannot be told from `warming_time`; two speeds separate
     them.
-
-    Factor minus one, shape (n,); `distance_mm` in its slot's unit, from the stroke's start.
     """
     distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0)
     return A * np.expm1(-distance / s_0)
@@ -95,8 +91,6 @@ def warming_power_shape(inputs, *, A, tau):
     A is the share lost when warm at the reference load and speed. For a loss that is small against 1: the form is
     linear in the temperature and takes P without the fall of mu itself. Needs several speeds or loads to be told from
     `warming_time`.
-
-    Factor minus one, shape (n,); time, speed and load in their slots' units.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
     speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
@@ -142,8 +136,6 @@ def warming_conduction_shape(inputs, *, A):
     A is the share of friction lost at the reference speed and distance. At one load; with several, the flux follows the
     load: `warming_conduction_load`. Holds until the warm layer reaches the back of the sample, and for a loss that is
     small against 1.
-
-    Factor minus one, shape (n,); distance (from the stroke's start) and speed in their slots' units.
     """
     distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(inputs, "distance_mm", 1.0)
     speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
@@ -185,8 +177,6 @@ def warming_conduction_load_shape(inputs, *, A):
     .. math:: h = -A \frac{N}{N_{ref}} \sqrt{\frac{|v| s}{v_{ref} s_{ref}}}
 
     A is the share of friction lost at the reference load, speed and distance; small against 1.
-
-    Factor minus one, shape (n,); distance (from the stroke's start), speed and load in their slots' units.
     """
     distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(inputs, "distance_mm", 1.0)
     speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
@@ -237,8 +227,6 @@ def lab_temperature_shape(inputs, *, A):
 
     A is the relative change per degree. Only where the campaign holds a column `lab_temperature_C`; a column of another
     name is found as `linear` in it. The aging temperature is another thing.
-
-    Factor minus one or added force, shape (n,); `lab_temperature_C` in degrees Celsius.
     """
     temperature = np.asarray(inputs["lab_temperature_C"], dtype=float)
     return A * (temperature - reference(inputs, "lab_temperature_C", 0.0))

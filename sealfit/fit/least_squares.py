@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -254,22 +254,39 @@ class BatchFit:
     rss: np.ndarray  # (problems,), weighted
 
 
-Basis = Callable[[np.ndarray, np.ndarray], np.ndarray]
+@dataclass(frozen=True)
+class Separable:
+    """Least-squares problems that are linear in all but one number each.
 
-
-def profile(basis: Basis, y, weight, u, nonnegative, *, refine: int = 0):
-    """Return the best weighted sum of squares and the coefficients at given nonlinear numbers.
-
-    Parameters
+    Attributes
     ----------
     basis : callable
         `basis(u, rows)` -> columns, shape (r, g, n, p), for the problems `rows`, shape (r,), at u, shape (r, g).
     y, weight : ndarray, shape (problems, n)
         Measured values and 1/variance; weight 0 for padding.
-    u : ndarray, shape (problems, g)
-        Where.
     nonnegative : sequence of bool, length p
         Coefficients held at or above zero.
+    """
+
+    basis: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    y: np.ndarray
+    weight: np.ndarray
+    nonnegative: Sequence[bool]
+
+    def some(self, own: np.ndarray) -> Separable:
+        """Return chosen problems, by their numbers, shape (r,)."""
+        return replace(self, basis=lambda u, rows: self.basis(u, own[rows]), y=self.y[own], weight=self.weight[own])
+
+
+def profile(problems: Separable, u: np.ndarray, *, refine: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the best weighted sum of squares and the coefficients at given nonlinear numbers.
+
+    Parameters
+    ----------
+    problems : Separable
+        What is fitted.
+    u : ndarray, shape (problems, g)
+        Where.
     refine : int
         Steps of iterative refinement; 0 is enough for a search, 2 gives all digits.
 
@@ -278,6 +295,7 @@ def profile(basis: Basis, y, weight, u, nonnegative, *, refine: int = 0):
     rss : ndarray, shape (problems, g)
     coefficients : ndarray, shape (problems, g, p)
     """
+    y, weight, nonnegative = problems.y, problems.weight, problems.nonnegative
     root, rows = np.sqrt(weight), np.arange(len(y))
     p = len(nonnegative)
     rss = np.empty(u.shape)
@@ -287,13 +305,13 @@ def profile(basis: Basis, y, weight, u, nonnegative, *, refine: int = 0):
         part = slice(start, start + step)
         chosen = rows[part]
         weights = root[chosen][:, None, :, None]
-        columns = basis(u[part], chosen)
+        columns = problems.basis(u[part], chosen)
         measured = np.broadcast_to((y[chosen] * root[chosen])[:, None, :], columns.shape[:-1])
         coefficients[part], rss[part] = project(columns * weights, measured, nonnegative, refine)
     return rss, coefficients
 
 
-def global_optimum(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
+def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     """Return the least-squares optimum of each problem over its whole grid.
 
     Every local minimum of the sum of squares along the grid is refined; the best of them, or an end of the grid, is the
@@ -301,8 +319,8 @@ def global_optimum(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
 
     Parameters
     ----------
-    basis, y, weight, nonnegative
-        As `profile`.
+    problems : Separable
+        What is fitted.
     grid : ndarray, shape (problems, g)
         Rising nonlinear numbers, close enough that no minimum hides between two of them.
 
@@ -311,14 +329,13 @@ def global_optimum(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
     FitError
         If a measured value or weight is not finite, or a weight is negative.
     """
-    check(y, weight)
-    rss, _ = profile(basis, y, weight, grid, nonnegative)
+    check(problems.y, problems.weight)
+    rss, _ = profile(problems, grid)
     inner = rss[:, 1:-1]
     problem, k = np.nonzero((inner <= rss[:, :-2]) & (inner <= rss[:, 2:]))
 
     def solved(u, problem):
-        own = problem.astype(int)
-        return profile(lambda u, rows: basis(u, own[rows]), y[own], weight[own], u[:, None], nonnegative, refine=2)
+        return profile(problems.some(problem.astype(int)), u[:, None], refine=2)
 
     bracket = tuple(grid[problem, k + step] for step in range(3))
     stops = {"xatol": CLOSE, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0}
@@ -326,9 +343,8 @@ def global_optimum(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
         lambda u, problem: solved(u, problem)[0][:, 0], bracket, args=(problem,), tolerances=stops, maxiter=MOST_STEPS
     ).x
     start = np.column_stack([solved(valley, problem)[1][:, 0], valley])
-    ends = grid[problem][:, [0, -1]]
-    valley = _to_all_digits(basis, y[problem], weight[problem], problem, start, ends, nonnegative)
-    every = np.arange(len(y))
+    valley = _to_all_digits(problems.some(problem), start, grid[problem][:, [0, -1]])
+    every = np.arange(len(problems.y))
     problem = np.concatenate([problem, every])
     u = np.concatenate([valley, grid[every, np.argmin(rss, axis=1)]])
     left, coefficients = (found[:, 0] for found in solved(u, problem))
@@ -337,21 +353,21 @@ def global_optimum(basis: Basis, y, weight, grid, nonnegative) -> BatchFit:
     return BatchFit(u[best], coefficients[best], left[best])
 
 
-def _to_all_digits(basis: Basis, y, weight, problem, start, ends, nonnegative) -> np.ndarray:
-    """Return the nonlinear numbers, shape (r,), that starts near an optimum lead to.
+def _to_all_digits(problems: Separable, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Return the nonlinear numbers, shape (r,), that starts near an optimum lead to, shape (r, p + 1).
 
     Along the nonlinear number alone, the sum of squares is flat where half of its digits are known.
     """
-    root = np.sqrt(weight)
+    root = np.sqrt(problems.weight)
 
     def evaluate(x, own):
-        columns = basis(x[:, -1:] + NUDGES, problem[own]) * root[own][:, None, :, None]
+        columns = problems.basis(x[:, -1:] + NUDGES, own) * root[own][:, None, :, None]
         below2, below, here, above, above2 = np.moveaxis(np.einsum("rgnp,rp->rgn", columns, x[:, :-1]), 1, 0)
         along = (below2 - 8 * below + 8 * above - above2) / (12 * NUDGES[-2])
         slope = np.concatenate([np.swapaxes(columns[:, 2], 1, 2), along[:, None]], axis=1)
-        return here - y[own] * root[own], slope
+        return here - problems.y[own] * root[own], slope
 
-    linear = np.tile(np.where(nonnegative, 0.0, -np.inf), (len(start), 1))
+    linear = np.tile(np.where(problems.nonnegative, 0.0, -np.inf), (len(start), 1))
     low = np.column_stack([linear, ends[:, 0]])
     high = np.column_stack([np.full(linear.shape, np.inf), ends[:, 1]])
     return levenberg_marquardt(evaluate, start, low, high, damping=NEXT_TO_NONE)[0][:, -1]

@@ -1,21 +1,20 @@
 """Equations as pure array functions; they know nothing of tables."""
 
 from sealfit.physics.aging_laws import aging_constant, aging_law, aging_law_as_printed
-from sealfit.physics.lugre import Bristles, bristle_limit, lugre_force
-from sealfit.physics.pressure import PRESSURES, Contact, distributed_force, total_load
+from sealfit.physics.lugre import Bristles, LuGre, bristle_limit, lugre_force
+from sealfit.physics.pressure import PRESSURES, Contact
 from sealfit.physics.stribeck import stribeck_decay, stribeck_force
 
 __all__ = [
     "PRESSURES",
     "Bristles",
     "Contact",
+    "LuGre",
     "aging_constant",
     "aging_law",
     "aging_law_as_printed",
     "bristle_limit",
-    "distributed_force",
     "lugre_force",
     "stribeck_decay",
     "stribeck_force",
-    "total_load",
 ]

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import accumulate
 
 import numpy as np
@@ -82,20 +83,39 @@ def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
     )
 
 
-def lugre_force(
-    time_s,
-    speed_mm_s,
-    load_N: float,
-    *,
-    mu_s: float,
-    mu_c: float,
-    v_s: float,
-    sigma_0: float,
-    sigma_1: float = 0.0,
-    sigma_2: float = 0.0,
-    deflection_mm: float = 0.0,
-    contact: Contact | None = None,
-) -> Bristles:
+@dataclass(frozen=True)
+class LuGre:
+    """The numbers of the dynamic LuGre model.
+
+    Attributes
+    ----------
+    mu_s, mu_c, v_s : float
+        Static and Coulomb coefficients, Stribeck speed in mm/s.
+    sigma_0, sigma_1, sigma_2 : float
+        Stiffness in N/mm, damping of the bristles in N s/mm, viscous coefficient in N s/mm.
+    contact : Contact, optional
+        Where friction depends on the local pressure.
+    """
+
+    mu_s: float
+    mu_c: float
+    v_s: float
+    sigma_0: float
+    sigma_1: float = 0.0
+    sigma_2: float = 0.0
+    contact: Contact | None = None
+
+    def limit_mm(self, speed_mm_s, load_N: float) -> np.ndarray:
+        """Return every element's deflection in steady sliding, shape (..., elements), as `bristle_limit`."""
+        numbers = {"mu_s": self.mu_s, "mu_c": self.mu_c, "v_s": self.v_s, "sigma_0": self.sigma_0}
+        return np.asarray(bristle_limit(speed_mm_s, load_N, **numbers))[..., None] * self.elements(load_N)[1]
+
+    def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return each element's share of the load and its mu over that at the reference, as `Contact.elements`."""
+        return (np.ones(1), np.ones(1)) if self.contact is None else self.contact.elements(load_N)
+
+
+def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_mm: float = 0.0) -> Bristles:
     """Friction force of the dynamic LuGre model along a history of the speed (Eqs. 1 to 7), in N.
 
     A speed given as numbers is constant between two times, and each step is then exact; one given as a function is
@@ -109,14 +129,10 @@ def lugre_force(
         Speed in mm/s, signed: number k holds until time k, the first at the first time. Or a function of the time.
     load_N : float
         Normal load in N.
-    mu_s, mu_c, v_s : float
-        Static and Coulomb coefficients, Stribeck speed in mm/s.
-    sigma_0, sigma_1, sigma_2 : float
-        Stiffness in N/mm, damping of the bristles in N s/mm, viscous coefficient in N s/mm.
+    model : LuGre
+        Its numbers.
     deflection_mm : float
         Of all bristles at the first time; 0: relaxed.
-    contact : Contact, optional
-        Where friction depends on the local pressure.
 
     Returns
     -------
@@ -139,22 +155,18 @@ def lugre_force(
     From rest at 2 mm/s: the force comes up over 0.25 mm, here half of it in one step.
 
     >>> import numpy as np
-    >>> model = {"mu_s": 0.5, "mu_c": 0.5, "v_s": 5.0, "sigma_0": 100.0}
-    >>> found = lugre_force([0.0, 0.125 * np.log(2), 10.0], [0.0, 2.0, 2.0], 50.0, **model)
+    >>> model = LuGre(mu_s=0.5, mu_c=0.5, v_s=5.0, sigma_0=100.0)
+    >>> found = lugre_force([0.0, 0.125 * np.log(2), 10.0], [0.0, 2.0, 2.0], 50.0, model)
     >>> [round(float(f), 6) for f in found.force_N]
     [0.0, 12.5, 25.0]
     """
     time = np.asarray(time_s, float)
     if time.ndim != 1 or not time.size or not (np.diff(time) > 0).all():
         raise ParameterError("time_s must be one row of rising times.", fix="Sort the rows and drop repeated times.")
-    if not (sigma_1 >= 0 and sigma_2 >= 0):
-        raise ParameterError(f"sigma_1 = {sigma_1:g}, sigma_2 = {sigma_2:g}: neither can be negative.")
-    share, factor = (np.ones(1), np.ones(1)) if contact is None else contact.elements(load_N)
-
-    def limit(speed):  # (..., elements), in mm
-        whole = bristle_limit(speed, load_N, mu_s=mu_s, mu_c=mu_c, v_s=v_s, sigma_0=sigma_0)
-        return np.asarray(whole)[..., None] * factor
-
+    if not (model.sigma_1 >= 0 and model.sigma_2 >= 0):
+        raise ParameterError(f"sigma_1 = {model.sigma_1:g}, sigma_2 = {model.sigma_2:g}: neither can be negative.")
+    share = model.elements(load_N)[0]
+    limit = partial(model.limit_mm, load_N=load_N)
     start = np.full(share.size, float(deflection_mm))
     if callable(speed_mm_s):
         speed = np.array([float(speed_mm_s(t)) for t in time])
@@ -165,8 +177,8 @@ def lugre_force(
             raise ParameterError(f"speed_mm_s has shape {speed.shape}, time_s {time.shape}: give one speed a time.")
         z = _stepped(time, speed, limit(speed), start)
     rate = speed[:, None] - np.abs(speed)[:, None] * z / limit(speed)
-    force = (sigma_0 * z + sigma_1 * rate) @ share + sigma_2 * speed
-    return Bristles(force, z @ share, force * speed - sigma_0 * (z * rate) @ share)
+    force = (model.sigma_0 * z + model.sigma_1 * rate) @ share + model.sigma_2 * speed
+    return Bristles(force, z @ share, force * speed - model.sigma_0 * (z * rate) @ share)
 
 
 def _stepped(time: np.ndarray, speed: np.ndarray, limit: np.ndarray, start: np.ndarray) -> np.ndarray:

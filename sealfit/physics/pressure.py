@@ -1,4 +1,4 @@
-"""Pressure along the contact: the four distributions of Eqs. 8 to 11, and Eq. 14 summed over them."""
+"""Pressure along the contact: the four distributions of Eqs. 8 to 11."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sealfit.errors import ParameterError
-from sealfit.physics.stribeck import stribeck_decay
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)  # 64: exact to rounding for all four, up to decay of about 50
 
@@ -146,62 +145,3 @@ class Contact:
         local = self.pressure(self.width_mm / 2 * (1 + _NODES), load_N, width_mm=self.width_mm, **self.shape)
         share = _WEIGHTS * local
         return share / share.sum(), (local / reference) ** (self.exponent - 1)
-
-
-def total_load(pressure: Callable, load_N: float, *, width_mm: float, **shape) -> float:
-    """Integral of a pressure distribution over the contact, in N, by Gauss-Legendre quadrature.
-
-    Parameters
-    ----------
-    pressure : callable
-        One of `PRESSURES`, or another of the same arguments, in N/mm.
-    load_N, width_mm : float
-        As the distribution takes them.
-    **shape
-        Further arguments of the distribution, such as `decay`.
-
-    Examples
-    --------
-    >>> round(total_load(sine, 50.0, width_mm=2.0), 9)
-    50.0
-    """
-    zeta = width_mm / 2 * (1 + _NODES)
-    return float(width_mm / 2 * np.sum(_WEIGHTS * pressure(zeta, load_N, width_mm=width_mm, **shape)))
-
-
-def distributed_force(
-    speed_mm_s, load_N: float, *, pressure: Callable, width_mm: float, mu_s, mu_c, v_s, sigma_2, **shape
-):
-    r"""Steady friction force as the sum over the elements of the contact (Eq. 14 before its integral is taken), in N.
-
-    .. math:: F = \int_0^L [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}] f_n(\zeta)\,d\zeta\;\mathrm{sgn}\,v + \sigma_2 v
-
-    The elements share one speed, so the bracket does not depend on zeta and the distribution cancels: friction depends
-    on the pressure's shape only if mu depends on the local pressure, which `mu_s` and `mu_c` may here: a callable gets
-    the local load per width in N/mm and returns the coefficient.
-
-    Parameters
-    ----------
-    speed_mm_s : float or ndarray, shape (n,)
-        Sliding speed in mm/s, signed.
-    load_N : float
-        Total load in N.
-    pressure, width_mm, **shape
-        Distribution and its arguments, see `PRESSURES`.
-    mu_s, mu_c : float or callable
-        Coefficients, or functions of the local load per width.
-    v_s, sigma_2 : float
-        Stribeck speed in mm/s, viscous coefficient in N s/mm.
-
-    Raises
-    ------
-    ParameterError
-        If `v_s` or the width is not positive.
-    """
-    speed = np.asarray(speed_mm_s, float)
-    zeta = width_mm / 2 * (1 + _NODES)
-    local = pressure(zeta, load_N, width_mm=width_mm, **shape)
-    static, coulomb = (mu(local) if callable(mu) else np.full_like(local, mu) for mu in (mu_s, mu_c))
-    decay = stribeck_decay(speed, v_s)[..., None]
-    elements = (coulomb + (static - coulomb) * decay) * local * _WEIGHTS * width_mm / 2
-    return elements.sum(axis=-1) * np.sign(speed) + sigma_2 * speed

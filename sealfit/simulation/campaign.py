@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -170,6 +171,16 @@ CRAWL = 1e-3  # of the speed: slow enough for break-away; at zero itself a law i
 RMS_ROWS = 64  # rows per file on which an effect's RMS is taken; the rest would not change its second digit
 
 
+@dataclass(frozen=True)
+class SetUp:
+    """How the rig was set up for one file: its number, real speed, gain and offset of the force."""
+
+    number: int
+    speed_mm_s: float
+    gain: float
+    offset_N: float
+
+
 def simulate(spec: Spec, out: Path) -> None:
     """Write the campaign folder `out` and, beside it, `<out>.truth.json`.
 
@@ -240,9 +251,8 @@ def _write(spec: Spec, folder: Path) -> dict:
         motion = move(spec.design, speed, record["direction"], starts[number])
         along = {c.name: _along(c, motion, number, draws) for c in spec.channels if isinstance(c, TraceChannel)}
         channels = _channels(record, motion, along)
-        force = _force(
-            spec, law, motion, channels, scatter.gain[number], scatter.offset_N[number], speed, number, draws
-        )
+        setup = SetUp(number, speed, scatter.gain[number], scatter.offset_N[number])
+        force = _force(spec, law, motion, channels, setup, draws)
         noise = displacement_noise_mm(spec.noise, len(force), number, draws)
         columns = {
             "time_s": motion.time_s,
@@ -304,14 +314,11 @@ def _force(
     law: SteadyLaw,
     motion: Motion,
     channels: dict[str, np.ndarray],
-    gain: float,
-    offset_N: float,
-    speed: float,
-    number: int,
+    setup: SetUp,
     draws: Draws,
 ) -> np.ndarray:
     """Return a trace's measured force in N, shape (n,)."""
-    parts = law.parts({**channels, **_begun(spec, motion, speed)})
+    parts = law.parts({**channels, **_begun(spec, motion, setup.speed_mm_s)})
     limit, viscous, added = (np.broadcast_to(part, motion.time_s.shape) for part in parts)
     if not (np.isfinite(limit + viscous).all() and np.isfinite(added).all()):
         raise ConfigError(
@@ -320,9 +327,10 @@ def _force(
     if spec.physics.sigma_0 is None:  # all that friction is comes up over one length
         friction = with_presliding(limit + viscous, motion, np.full(motion.time_s.size, spec.design.stiffness_mm))
     else:
-        friction = _dynamic(spec, law, motion, channels, speed) + viscous
-    clean = gain * friction + added + offset_N
-    noisy = clean + sample_noise_N(spec.noise, clean, motion.time_s, speed, number, draws)
+        friction = _dynamic(spec, law, motion, channels, setup.speed_mm_s) + viscous
+    clean = setup.gain * friction + added + setup.offset_N
+    noise = sample_noise_N(spec.noise, clean, motion.time_s, setup.speed_mm_s, setup.number, draws)
+    noisy = clean + noise
     return np.round(quantised(spec.noise, noisy), spec.force_decimals)
 
 

@@ -15,7 +15,7 @@ from sealfit.fit.dynamic.stiffness import fit_stiffness
 from sealfit.fit.steady.fit import fit_conditions
 from sealfit.ingest import partitions
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.physics import lugre_force
+from sealfit.physics import LuGre, lugre_force
 from sealfit.pipeline import STEPS, run
 from sealfit.simulation import Spec, simulate
 from sealfit.store.out_folder import Store
@@ -40,7 +40,7 @@ def start(file, speed, *, ramp=0.1, gain=1.0, deflection=0.0, rows=80, noise=0.0
         return speed * min(max(t / ramp, 0.0), 1.0)
 
     model = {**MODEL, **other}
-    force = gain * lugre_force(time, along, LOAD, deflection_mm=deflection, **model).force_N
+    force = gain * lugre_force(time, along, LOAD, LuGre(**model), deflection_mm=deflection).force_N
     share = np.clip(time / ramp, 0, 1)
     distance = speed * np.where(time < ramp, 0.5 * ramp * share**2, time - 0.5 * ramp)
     force = force + noise * np.random.default_rng([seed, file]).standard_normal(rows)

@@ -94,7 +94,7 @@ def test_a_straight_line_through_three_speeds_is_mostly_left_one():
     for seed in range(10):
         files = np.random.default_rng(seed).normal(1, 0.01, rows.groups.starts["file"].size)[rows.codes("file")]
         line = rows.load * (0.5 + 0.002 * np.abs(rows.speed)) * np.sign(rows.speed) * files
-        forms += declare(replace(rows, force=line, cache={})).stribeck.values()
+        forms += declare(replace(rows, force=line)).stribeck.values()
     assert forms.count("viscous") > 0.7 * len(forms)  # Akaike's criterion prefers a needless number one time in six
 
 
@@ -105,9 +105,9 @@ def test_law_needs_three_days():
 
 
 def test_levels_of_measured_speeds():
-    npt.assert_allclose(speed_clusters(np.array([6.7, 7.0, 7.9])), [7.2])
-    npt.assert_allclose(speed_clusters(np.array([6.7, 7.9, 14.0, 16.0])), [7.3, 15.0])
-    assert speed_clusters(np.empty(0)).size == 0
+    assert [part.tolist() for part in speed_clusters(np.array([6.7, 7.0, 7.9]))] == [[6.7, 7.0, 7.9]]
+    assert [len(part) for part in speed_clusters(np.array([6.7, 7.9, 14.0, 16.0]))] == [2, 2]
+    assert speed_clusters(np.empty(0)) == []
 
 
 def test_subset_keeps_conditions_and_fits_the_same_numbers():

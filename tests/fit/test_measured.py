@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from sealfit.fit.aging.law import solve_law
-from sealfit.fit.least_squares import global_optimum
+from sealfit.fit.least_squares import Separable, global_optimum
 from sealfit.fit.steady.stribeck import solve_stribeck
 
 MEASURED = os.environ.get("SEALFIT_MEASURED")
@@ -53,7 +53,7 @@ def test_screw_drive(number, files, symmetric, with_offset, expected):
         return np.stack([way * (1 - decay), way * decay, *steady], axis=-1)
 
     grid = np.log(np.geomspace(speed.min() / 5, speed.max() * 20, 500))[None]
-    fit = global_optimum(basis, torque[None], one, grid, [True, True, True, False])
+    fit = global_optimum(Separable(basis, torque[None], one, [True, True, True, False]), grid)
     npt.assert_allclose(np.sqrt(fit.rss[0] / files), with_offset, atol=6e-4)
     found = [*fit.coefficients[0, :2], np.exp(fit.u[0]), *fit.coefficients[0, 2:]]
     printed = [0.005, 0.005, {1: 0.05, 3: 0.005}[number], 5e-5, 5e-4]  # half of the last digit there

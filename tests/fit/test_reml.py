@@ -4,7 +4,7 @@ import pytest
 
 from sealfit.fit.joint.rows import Groups
 from sealfit.fit.joint.tangent import Tangent
-from sealfit.fit.joint.variance_components import RestrictedLikelihood, orthonormal, reml
+from sealfit.fit.joint.variance_components import GroupMeans, RestrictedLikelihood, orthonormal, reml
 
 
 def nested(files_per_run, runs_per_specimen, specimens):
@@ -23,7 +23,9 @@ def test_the_likelihood_is_that_of_the_dense_covariance_and_its_gradient_is_exac
     residual, variance = rng.normal(size=72), rng.uniform(0.1, 0.3, 72)
     kinds = [(level, kind) for level in codes for kind in ("offset", "gain")]
     sizes = rng.uniform(0.5, 2.0, 8) * np.tile([0.1, 1e-4], 4)
-    likelihood = RestrictedLikelihood(residual, Tangent.dense(tangent), variance, force, Groups.of(codes), kinds)
+    likelihood = RestrictedLikelihood(
+        GroupMeans(residual, variance, force, Groups.of(codes)), Tangent.dense(tangent), kinds
+    )
 
     def dense(at):
         covariance = np.diag(variance)
@@ -56,7 +58,9 @@ def test_reml_recovers_scatter_of_files_runs_and_specimens():
         )
         tangent = np.column_stack([np.ones(force.size), force])
         kinds = [("file", "gain"), ("run", "offset"), ("specimen", "gain")]
-        parts = reml(residual, Tangent.dense(tangent), np.full(force.size, 0.05**2), force, Groups.of(codes), kinds)
+        parts = reml(
+            GroupMeans(residual, np.full(force.size, 0.05**2), force, Groups.of(codes)), Tangent.dense(tangent), kinds
+        )
         found.append([np.sqrt(p.variance) for p in parts])
     npt.assert_allclose(np.mean(found, axis=0), [0.01, 0.2, 0.02], rtol=0.15)
 
@@ -71,7 +75,9 @@ def test_reml_counts_the_degrees_of_freedom_that_the_model_took():
         error = rng.normal(0, 1.0, 40)
         residual = error - tangent @ np.linalg.lstsq(tangent, error, rcond=None)[0]
         (part,) = reml(
-            residual, Tangent.dense(tangent), np.full(40, 1e-6), np.ones(40), Groups.of(codes), [("file", "offset")]
+            GroupMeans(residual, np.full(40, 1e-6), np.ones(40), Groups.of(codes)),
+            Tangent.dense(tangent),
+            [("file", "offset")],
         )
         found.append(part.variance)
     assert np.mean(found) == pytest.approx(1.0, abs=0.08)  # SE of the mean: sqrt(2/20/200) = 0.022
@@ -88,7 +94,12 @@ def test_rounding_moves_no_variance_and_scatter_that_is_not_there_is_nothing():
         residual = rng.normal(0, 0.05, force.size) + rng.normal(0, 0.2, 200)[codes["run"]]
         near = residual * (1 + 1e-12 * rng.normal(size=residual.size))
         one, other = (
-            np.array([p.variance for p in reml(r, tangent, np.full(600, 0.05**2), force, Groups.of(codes), kinds)])
+            np.array(
+                [
+                    p.variance
+                    for p in reml(GroupMeans(r, np.full(600, 0.05**2), force, Groups.of(codes)), tangent, kinds)
+                ]
+            )
             for r in (residual, near)
         )
         npt.assert_array_equal(one > 0, other > 0)
@@ -106,5 +117,5 @@ def test_next_to_no_noise_beside_the_scatter_of_files_with_one_stroke_is_no_erro
     kinds = [("file", "offset"), ("file", "gain"), ("specimen", "gain")]
     for _ in range(20):
         residual = force * rng.normal(0, 0.05, 96)
-        parts = reml(residual, Tangent.dense(tangent), np.full(96, 2e-8), force, Groups.of(codes), kinds)
+        parts = reml(GroupMeans(residual, np.full(96, 2e-8), force, Groups.of(codes)), Tangent.dense(tangent), kinds)
         assert all(np.isfinite(part.variance) for part in parts)

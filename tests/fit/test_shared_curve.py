@@ -7,7 +7,6 @@ from scipy.optimize import least_squares
 from steady_tables import MU_C, MU_S
 
 from sealfit.config import Config, Quantity
-from sealfit.fit.aging import all_series
 from sealfit.fit.aging.all_series import aged_values, joint_laws
 from sealfit.fit.aging.joint_law import fit_joint_law
 from sealfit.fit.steady import fit
@@ -45,15 +44,11 @@ def run_table(table):
     return run_means(table).merge(about, on="condition")
 
 
-def test_several_processes_give_the_same_tables(campaign, monkeypatch):
+def test_intervals_do_not_depend_on_which_conditions_are_done_together(campaign, monkeypatch):
     table, config = campaign(noise=0.01, series=SERIES, laws=arrhenius(), days=DAYS, ways=(1,)), Config()
     one = fit_conditions(table, config)
     monkeypatch.setattr(fit, "TOGETHER", 10)
-    monkeypatch.setattr(fit, "MANY", 0)
-    monkeypatch.setattr(all_series, "MANY", 0)
-    pdt.assert_frame_equal(fit_conditions(table, config, workers=2), one)
-    for alone, shared in zip(joint_laws(table, one, config), joint_laws(table, one, config, workers=2), strict=True):
-        pdt.assert_frame_equal(shared, alone)
+    pdt.assert_frame_equal(fit_conditions(table, config), one)
 
 
 def test_exact_forces_give_the_coefficients_back(campaign):

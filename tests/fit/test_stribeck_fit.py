@@ -195,7 +195,7 @@ def test_no_stribeck_is_rejected_as_often_as_its_level_says(df):
     variance = np.ones(runs) if np.isinf(df) else rng.chisquare(df, runs) / df
     grid = fit.grid[0]
     p = [
-        flat_p_value(SPEEDS, np.full(9, LOAD), weight[0], grid, gain / s2, df)
+        flat_p_value(SPEEDS, base, weight[0], grid, gain / s2, df)
         for gain, s2 in zip(flat - fit.rss, variance, strict=True)
     ]
     assert 0.03 < np.mean(np.array(p) < 0.05) < 0.065

@@ -6,7 +6,7 @@ import pytest
 
 from sealfit.fit.joint.rows import Groups
 from sealfit.fit.joint.tangent import Layout, OwnColumns, Tangent, blocks_of
-from sealfit.fit.joint.variance_components import RestrictedLikelihood, orthonormal
+from sealfit.fit.joint.variance_components import GroupMeans, RestrictedLikelihood, orthonormal
 from sealfit.fit.joint.whitening import Component, Scatter, Whitening
 
 SETS = [frozenset({0, 2, 3}), frozenset({0}), frozenset({0, 1, 4, 5}), frozenset({0, 6, 7, 8}), frozenset({0, 4, 5})]
@@ -92,7 +92,7 @@ def test_whitening_and_restricted_likelihood_by_blocks_are_those_of_the_whole():
     at = np.array([0.1, 1e-4, 0.2, 1e-4, 2e-4])
     answers = []
     for basis in (means.orthonormal(1e-9), Tangent.dense(orthonormal(means.toarray()))):
-        answers.append(RestrictedLikelihood(given[0], basis, *given[1:], groups().at("stroke"), kinds)(at))
+        answers.append(RestrictedLikelihood(GroupMeans(*given, groups().at("stroke")), basis, kinds)(at))
     npt.assert_allclose(answers[0][0], answers[1][0], rtol=1e-11)
     npt.assert_allclose(answers[0][1], answers[1][1], rtol=1e-8)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.engine.run_map import run_map
 from sealfit.errors import FitError, RequestError
 from sealfit.fit.aging.joint_law import Aged, JointLaw, fit_laws, left_out, reference_of, rivals_of
 from sealfit.fit.aging.law import Values, fit_law, law_model
@@ -19,7 +18,6 @@ from sealfit.tables import AGING_LAWS, MASTER_CURVE
 
 TEMPERATURE, COMPRESSION = "temperature_C", "compression_ratio_pct"
 SEPARATE = "separate"  # Eq. 15 with a and b of its own for every series
-MANY = 600  # values of a quantity from which a process of its own is worth its start
 LIKELY = 3  # laws held against data they were not fitted to
 CURVE_POINTS = 61
 START_POINTS = 20  # more, between day 0 and a third of the first day
@@ -50,9 +48,7 @@ def aged_values(levels: Levels, rubber: str, quantity: str) -> Aged:
     )
 
 
-def joint_laws(
-    steady: pd.DataFrame, steady_fit: pd.DataFrame, config: Config, *, workers: int = 1
-) -> tuple[pd.DataFrame, pd.DataFrame]:
+def joint_laws(steady: pd.DataFrame, steady_fit: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return tables `aging_laws` and `master_curve`; empty without aging or with too few conditions.
 
     Parameters
@@ -63,39 +59,24 @@ def joint_laws(
         Table `steady_fit` with the condition columns.
     config : Config
         Says whether rubber is aged, and gives the units.
-    workers : int
-        Processes for the quantities of many conditions.
     """
     rows, curves = [], []
     if config.aging and "aging_days" in steady_fit.columns:
         levels = shared_levels(steady, steady_fit)
-        quantities = _quantities(levels)
-        asked = [
-            (aged_values(levels, rubber, quantity), parameter_units(config.units, quantity in FORCES)["mu_s"])
-            for rubber, quantity in quantities
-        ]
-        many = len(levels.table) > MANY * len(quantities)
-        found = run_map(_told, asked, workers=workers if many else 1, together=1)
-        for (rubber, quantity), told in zip(quantities, found, strict=True):
-            if told is not None:
-                at = {"rubber": rubber, "quantity": quantity}
-                rows += [{**at, **row} for row in told[0]]
-                curves.append(told[1].assign(**at))
+        for rubber, quantity in _quantities(levels):
+            try:
+                laws = fit_laws(aged_values(levels, rubber, quantity))
+            except FitError:  # no law can be fitted
+                continue
+            unit = parameter_units(config.units, quantity in FORCES)["mu_s"]
+            at = {"rubber": rubber, "quantity": quantity}
+            rows += [{**at, **row} for row in _law_rows(laws, unit)]
+            curves.append(_master_curve(laws[0]).assign(**at))
     curves = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
     return (
         pd.DataFrame(rows).assign(model="before").reindex(columns=AGING_LAWS.names()),
         curves.reindex(columns=MASTER_CURVE.names()),
     )
-
-
-def _told(given: tuple[Aged, str]) -> tuple[list[dict], pd.DataFrame] | None:
-    """Return the rows of both tables on one quantity, given its values and unit; None where no law can be fitted."""
-    aged, unit = given
-    try:
-        laws = fit_laws(aged)
-    except FitError:
-        return None
-    return list(_law_rows(laws, unit)), _master_curve(laws[0])
 
 
 def _quantities(levels: Levels) -> list[tuple[str, str]]:

@@ -14,7 +14,14 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.sparse import csr_array
 
-from sealfit.fit.least_squares import BatchFit, covariance_of, even_grid, global_optimum, levenberg_marquardt
+from sealfit.fit.least_squares import (
+    BatchFit,
+    Separable,
+    covariance_of,
+    even_grid,
+    global_optimum,
+    levenberg_marquardt,
+)
 
 SOONEST, LATEST = 1e-9, 1e3  # b is sought from 1e-9 of the first aged day to 1000 times the last
 PER_DECADE = 8  # points of the search along b; ln(1 + t/b) changes over a decade of b
@@ -55,7 +62,7 @@ def solve_law(days, value, weight) -> BatchFit:
         ratio = days[rows][:, None, :] * np.exp(-u)[..., None]
         return np.stack([np.ones_like(ratio), -np.log1p(ratio)], axis=-1)
 
-    return global_optimum(basis, value, weight, even_grid(low, high, PER_DECADE), (False, False))
+    return global_optimum(Separable(basis, value, weight, (False, False)), even_grid(low, high, PER_DECADE))
 
 
 @dataclass(frozen=True)

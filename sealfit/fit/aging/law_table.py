@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, ndtri, stdtrit
 
 from sealfit.fit.aging.law import LawFit
 from sealfit.fit.aging.law_profiles import CurveInterval
@@ -21,12 +21,34 @@ NO_SCATTER = "as many parameters as days: the interval leaves out how specimens 
 
 @dataclass(frozen=True)
 class Curve:
-    """One quantity of one series: its place in the joint fit (-1 without a law) and the days tested."""
+    """One quantity of one series: its place in the joint fit (-1 without a law) and what was tested."""
 
     series: str
     quantity: str
     place: int
     days: np.ndarray  # aged days tested, rising
+    unaged: bool  # whether unaged rubber was tested
+    unit: str
+
+
+@dataclass(frozen=True)
+class OneQuantity:
+    """The law fitted to one quantity of all series by itself, and how specimens scatter about it."""
+
+    alone: LawFit
+    part: np.ndarray  # numbers of its values among those of the joint fit
+    tau: float  # relative standard deviation between specimens beyond the steady fits
+    series: int  # that have a law
+
+    @property
+    def df(self) -> int:
+        """Degrees of freedom of the intervals."""
+        return self.alone.df
+
+    @property
+    def t(self) -> float:
+        """Student's quantile of 95 % intervals."""
+        return float(stdtrit(self.df, 0.975) if self.df > 0 else ndtri(0.975))
 
 
 @dataclass(frozen=True)
@@ -59,16 +81,15 @@ class Estimate:
             return float(np.sqrt(gradient @ self.covariance @ gradient))
 
 
-def law_rows(
-    curve: Curve, found: Estimate, t: float, ends: CurveInterval, unit: str, *, unaged: bool, df: float
-) -> Iterator[dict]:
-    """Return the rows of mu_0, a, b and c."""
+def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, t: float, df: float) -> Iterator[dict]:
+    """Return the rows of mu_0, a, b and c; `t` is Student's quantile, of `df` degrees of freedom."""
     mu_0, a, u = found.x
+    unit = curve.unit
     se = np.sqrt(np.diag(found.covariance))
     b, se_c = np.exp(u), found.error_of_c()
     beside = "" if df > 0 else NO_SCATTER
     move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # less is rounding
-    judged = _judge(curve, a, b, ends, unaged)
+    judged = _judge(curve, a, b, ends)
     limits = {"mu_0": (mu_0 - t * se[0], mu_0 + t * se[0]), "a": ends.a, "b": ends.b, "c": ends.c}
     numbers = {
         "mu_0": (mu_0, se[0], move[0], unit),
@@ -93,7 +114,7 @@ def law_rows(
         ) | {"series": curve.series}
 
 
-def _judge(curve: Curve, a: float, b: float, ends: CurveInterval, unaged: bool) -> dict[str, tuple[bool, str]]:
+def _judge(curve: Curve, a: float, b: float, ends: CurveInterval) -> dict[str, tuple[bool, str]]:
     verdict = dict.fromkeys(LAW, (True, ""))
     first, last = curve.days[0], curve.days[-1]
     low, high = ends.b
@@ -110,32 +131,38 @@ def _judge(curve: Curve, a: float, b: float, ends: CurveInterval, unaged: bool) 
         )
     else:
         why = ""
-        if b < first and unaged:
+        if b < first and curve.unaged:
             verdict["b"] = (True, f"below the first day tested ({first:g} d): it rests on the unaged rubber's value.")
         elif b > last:
             verdict["b"] = (True, f"beyond the last day tested ({last:g} d): it rests on how little the loss bends.")
     if why:
         verdict["b"] = (False, why)
         verdict["c"] = (False, f"c = -a ln b, and b is not determined: {why}")
-    if not unaged:
+    if not curve.unaged:
         verdict["mu_0"] = (not why, "no unaged rubber was tested: mu_0 is extrapolated to day 0 by the law.")
     return verdict
 
 
-def without_law(curve: Curve, unit: str, unaged: bool) -> Iterator[dict]:
+def without_law(curve: Curve) -> Iterator[dict]:
     """Return empty rows that say how many days are missing."""
-    days = ", ".join(f"{day:g}" for day in ([0.0, *curve.days] if unaged else curve.days)) or "none"
+    days = ", ".join(f"{day:g}" for day in ([0.0, *curve.days] if curve.unaged else curve.days)) or "none"
     reason = f"the law needs {DAYS_FOR_LAW} distinct days where {curve.quantity} is determined; there are: {days}."
     for name in LAW:
         yield table_row(
-            quantity=curve.quantity, parameter=name, unit="d" if name == "b" else unit, identified=False, reason=reason
+            quantity=curve.quantity,
+            parameter=name,
+            unit="d" if name == "b" else curve.unit,
+            identified=False,
+            reason=reason,
         ) | {"series": curve.series}
 
 
-def statistics_rows(curve, joint, plain, values, q, tau, df, share, unit) -> Iterator[dict]:
+def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Iterator[dict]:
     """Return how well the law fits the days of this curve."""
-    part, alone = plain
+    part, alone, share, tau = quantity.part, quantity.alone, quantity.series, quantity.tau
+    values = joint.values
     own = values.curve == curve.place
+    q = values.origin[own][0]
     unaged = (values.curve < 0) & (values.origin == q)
     left = (alone.values.whitening @ (alone.values.value - alone.model)) ** 2
     chi2 = float(left[own[part]].sum() + left[unaged[part]].sum() / share)
@@ -157,9 +184,9 @@ def statistics_rows(curve, joint, plain, values, q, tau, df, share, unit) -> Ite
         ("df", own_df, "", "this series' share, mu_0 being shared"),
         ("lack_of_fit_p", p, "", reason),
         ("specimen_sd_pct", 100 * tau, "%", "scatter between specimens beyond the steady fits, all series together"),
-        ("error_df", df, "", "degrees of freedom of the intervals' Student t, all series together"),
+        ("error_df", quantity.df, "", "degrees of freedom of the intervals' Student t, all series together"),
         ("max_error_pct", 100 * np.abs(error).max(), "%", "largest error of the law over the days tested"),
-        ("rmse", np.sqrt(np.mean((joint.model - values.value)[shown] ** 2)), unit, ""),
+        ("rmse", np.sqrt(np.mean((joint.model - values.value)[shown] ** 2)), curve.unit, ""),
         ("n_days", shown.sum(), "", "days tested, day 0 included"),
         ("last_day", curve.days[-1], "d", ""),
     ):
@@ -173,9 +200,9 @@ def statistics_rows(curve, joint, plain, values, q, tau, df, share, unit) -> Ite
         ) | {"series": curve.series}
 
 
-def covariance_rows(curve: Curve, covariance: np.ndarray, unit: str) -> Iterator[dict]:
+def covariance_rows(curve: Curve, covariance: np.ndarray) -> Iterator[dict]:
     """Return the covariance of mu_0, a and ln b, shape (3, 3)."""
-    names, units = ("mu_0", "a", "ln b"), (unit, unit, "")
+    names, units = ("mu_0", "a", "ln b"), (curve.unit, curve.unit, "")
     for i in range(3):
         for j in range(i + 1):
             yield table_row(

@@ -15,6 +15,7 @@ from sealfit.fit.aging.law_table import (
     DAYS_FOR_LAW,
     Curve,
     Estimate,
+    OneQuantity,
     covariance_rows,
     law_rows,
     statistics_rows,
@@ -86,8 +87,8 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
     found = found.assign(quantity=found["parameter"]).sort_values(["condition", "quantity"], kind="stable")
     aged = own[own["aging_days"].to_numpy(float) > 0]
     quantities = [name for name in pair if (found["quantity"] == name).any()]
-    unaged = set(found.loc[found["aging_days"] == 0, "quantity"])
-    curves = _curves(found, list(dict.fromkeys(aged["series"])), quantities, unaged)
+    unit = str(found["unit"].iloc[0])
+    curves = _curves(found, list(dict.fromkeys(aged["series"])), quantities, unit)
     place = {(c.series, c.quantity): c.place for c in curves}
     number = np.array(
         [
@@ -100,9 +101,8 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
     fitted = [name for name in quantities if any(c.place >= 0 and c.quantity == name for c in curves)]
     used = used[used["quantity"].isin(fitted)]
     number = number[(number >= -1) & found["quantity"].isin(fitted).to_numpy()]
-    unit = str(found["unit"].iloc[0])
     if not fitted:
-        return [row for curve in curves for row in without_law(curve, unit, curve.quantity in unaged)]
+        return [row for curve in curves for row in without_law(curve)]
     values = Values(
         used["aging_days"].to_numpy(float),
         used["value"].to_numpy(float),
@@ -110,7 +110,7 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
         number,
         steady_covariance(used, values_of(own, "covariance")),
     )
-    return list(_rubber_rows(values, curves, fitted, used, own, unit, unaged))
+    return list(_rubber_rows(values, curves, fitted, used, own))
 
 
 def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
@@ -126,7 +126,8 @@ def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str
     return found[~((found["parameter"] == pair[1]) & found["condition"].isin(few))]
 
 
-def _curves(found: pd.DataFrame, series: list[str], quantities: list[str], unaged: set[str]) -> list[Curve]:
+def _curves(found: pd.DataFrame, series: list[str], quantities: list[str], unit: str) -> list[Curve]:
+    unaged = set(found.loc[found["aging_days"] == 0, "quantity"])
     aged = found[found["aging_days"] > 0]
     tested = dict(aged["aging_days"].astype(float).groupby([aged["series"], aged["quantity"]], sort=False).unique())
     curves, place = [], 0
@@ -134,7 +135,7 @@ def _curves(found: pd.DataFrame, series: list[str], quantities: list[str], unage
         for quantity in quantities:
             days = np.sort(tested.get((name, quantity), np.zeros(0)))
             enough = days.size + (quantity in unaged) >= DAYS_FOR_LAW
-            curves.append(Curve(name, quantity, place if enough else -1, days))
+            curves.append(Curve(name, quantity, place if enough else -1, days, quantity in unaged, unit))
             place += enough
     return curves
 
@@ -181,33 +182,30 @@ def _with_specimens(values: Values, taus: list[float], model: np.ndarray) -> Val
 
 
 # ---------------------------------------------------------------- what the table says
-def _rubber_rows(values, curves, fitted, used, own, unit, unaged) -> Iterator[dict]:
-    taus, plain, dfs = [], {}, []
+def _rubber_rows(
+    values: Values, curves: list[Curve], fitted: list[str], used: pd.DataFrame, own: pd.DataFrame
+) -> Iterator[dict]:
+    """Yield the rows of a rubber: `used` are the fitted values, `own` all rows of its steady fits."""
+    quantities = {}
+    model = np.empty(values.value.size)
     for q, name in enumerate(fitted):
         part = np.flatnonzero(values.origin == q)
-        tau, fit = between_scatter(values.part(part))
-        taus.append(tau)
-        plain[name] = (part, fit)
-        dfs.append(fit.df)
-    model = np.empty(values.value.size)
-    for part, fit in plain.values():
-        model[part] = fit.model
-    joint = fit_law(_with_specimens(values, taus, model))
-    t = np.array([stdtrit(df, 0.975) if df > 0 else ndtri(0.975) for df in dfs])
-    intervals = curve_intervals(joint, t**2)
+        tau, alone = between_scatter(values.part(part))
+        series = len({c.series for c in curves if c.place >= 0 and c.quantity == name})
+        quantities[name] = OneQuantity(alone, part, tau, series)
+        model[part] = alone.model
+    joint = fit_law(_with_specimens(values, [one.tau for one in quantities.values()], model))
+    intervals = curve_intervals(joint, np.array([one.t**2 for one in quantities.values()]))
     shift = _shift(joint, used, own)
     for curve in curves:
         if curve.place < 0:
-            yield from without_law(curve, unit, curve.quantity in unaged)
+            yield from without_law(curve)
             continue
-        q = fitted.index(curve.quantity)
-        found = Estimate.of(joint, curve, q, shift)
-        yield from law_rows(
-            curve, found, t[q], intervals[curve.place], unit, unaged=curve.quantity in unaged, df=dfs[q]
-        )
-        share = len({c.series for c in curves if c.place >= 0 and c.quantity == curve.quantity})
-        yield from statistics_rows(curve, joint, plain[curve.quantity], values, q, taus[q], dfs[q], share, unit)
-        yield from covariance_rows(curve, found.covariance, unit)
+        one = quantities[curve.quantity]
+        found = Estimate.of(joint, curve, fitted.index(curve.quantity), shift)
+        yield from law_rows(curve, found, intervals[curve.place], one.t, one.df)
+        yield from statistics_rows(curve, joint, one)
+        yield from covariance_rows(curve, found.covariance)
 
 
 def _shift(joint: LawFit, used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:

@@ -10,24 +10,25 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from sealfit.fit.least_squares import levenberg_marquardt
 from sealfit.ingest.segments import median
 from sealfit.ingest.stored_parts import noise_from_bends, stroke_index, strokes_of
 
 # ---------------------------------------------------------------- ramps
 # The motion of platforms that start along a ramp of two numbers, fitted to many strokes together.
 
-RAMPS = np.geomspace(0.5, 200.0, 12)  # steps in time that a ramp may take, to begin with
-PADDED = (
-    64  # rows, of which every stroke's are made a multiple: sums do not depend on which strokes are fitted together
-)
-TOGETHER = 16_384  # rows of strokes at once: what is held of them stays in the cache
-TRIALS = 100  # of steps, at most
-SETTLED = 1e-18  # of the sum of squares: a step that would change it by less
-UNSEEN = (
-    1e-13  # of the sum of squares: a step that would change it by less is taken, as rounding hides whether it falls
-)
-TOO_SHORT = 1e-13  # of the step in time: a step that moves the beginning by less is rounding
-DAMPED = (1e-4, 1e-10, 1e12)  # Marquardt's number: to begin with, and where it makes steps those of Newton, or none
+# Steps in time that a ramp may take, to begin with.
+RAMPS = np.geomspace(0.5, 200.0, 12)
+
+# The rows of every stroke are padded to a multiple of this, so that its sums do not depend on which strokes are fitted
+# together.
+PADDED = 64
+
+# Rows of strokes that are fitted together, at most.
+TOGETHER = 16_384
+
+# The logarithm of a ramp's length in s stays within this of 0.
+LONGEST = 50.0
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,8 @@ def fit_ramps(
 
     Noise of the displacement makes a local speed of little use where the speed changes most; a ramp of two numbers,
     its beginning and its length, does not care. Place and final speed are linear and solved for exactly (variable
-    projection: Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995), the other two by Levenberg and Marquardt's steps
-    from the best of a grid of lengths.
+    projection: Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995), the other two by Levenberg-Marquardt from the best
+    of a grid of lengths.
 
     Parameters
     ----------
@@ -133,64 +134,27 @@ def _fit_shape(rows: _Rows, shape: Shape, lagged: np.ndarray, lag: float, step: 
     grid = [np.stack([lagged - lag * ramp * step, np.log(ramp * step)], axis=1) for ramp in RAMPS]
     squares = [_solved(rows, rows.centred(_moved(rows, shape, at)[0]))[2] for at in grid]
     at = np.choose(np.argmin(squares, axis=0)[:, None], grid)
-    at = _descended(rows, shape, at, np.stack([step, np.ones(len(step))], axis=1))
+
+    def evaluate(at: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        own = rows.some(strokes)
+        distance, rate, by_ramp = _moved(own, shape, at)
+        distance = own.centred(distance)
+        speed, residual, _ = _solved(own, distance)
+        # residual = along - speed * distance(time - at[0], ramp): its slopes, free of what place and speed take up
+        slopes = speed[:, None, None] * np.stack([own.centred(rate), -own.centred(by_ramp)], axis=1)
+        square = np.einsum("kr,kr->k", distance, distance)
+        shared = np.einsum("kir,kr->ki", slopes, distance) / np.maximum(square, 1e-300)[:, None]
+        return residual, slopes - shared[..., None] * distance[:, None]
+
+    ends = np.array([np.inf, LONGEST])
+    at, _ = levenberg_marquardt(evaluate, at, -ends, ends)
     distance, rate, _ = _moved(rows, shape, at)
     speed, _, squares = _solved(rows, rows.centred(distance))
     return distance, rate, speed, squares
 
 
-def _descended(rows: _Rows, shape: Shape, at: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return the beginnings and log lengths, shape (strokes, 2), that least squares lead to from a start.
-
-    Steps are counted in `unit`, (strokes, 2); a stroke whose steps have become small is let be.
-    """
-    at, damping = at.copy(), np.full(len(at), DAMPED[0])
-    alive = np.arange(len(at))
-    squares, pull, normal = _tangent(rows, shape, at, unit)
-    own = rows
-    for _ in range(TRIALS):
-        diagonal = np.einsum("kii->ki", normal)
-        damped = normal.copy()
-        np.einsum("kii->ki", damped)[:] += damping[alive, None] * diagonal + 1e-300
-        move = -_solve(damped, pull)
-        gain = np.einsum("ki,kij,kj->k", move, normal, move)
-        # Where one direction is hardly seen (a ramp within a step), the other is what tells.
-        reestimated = (gain <= SETTLED * squares) | (np.abs(move).max(axis=1) <= TOO_SHORT)
-        reestimated |= damping[alive] > DAMPED[2]
-        if reestimated.any():
-            alive, own = alive[~reestimated], own.some(~reestimated)
-            squares, pull, normal, move, gain = (values[~reestimated] for values in (squares, pull, normal, move, gain))
-            if not len(alive):
-                break
-        trial = at[alive] + move * unit[alive]
-        new_squares, new_pull, new_normal = _tangent(own, shape, trial, unit[alive])
-        better = (new_squares < squares) | (gain <= UNSEEN * squares)
-        damping[alive] = np.where(better, np.maximum(damping[alive] / 10, DAMPED[1]), damping[alive] * 10)
-        at[alive[better]] = trial[better]
-        squares, pull, normal = (
-            np.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-            for new, old in ((new_squares, squares), (new_pull, pull), (new_normal, normal))
-        )
-    return at
-
-
-def _tangent(rows: _Rows, shape: Shape, at: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the sum of squares, (strokes,), J'r, (strokes, 2), and J'J, (strokes, 2, 2), of steps in `unit`."""
-    distance, rate, by_ramp = _moved(rows, shape, at)
-    distance = rows.centred(distance)
-    speed, residual, squares = _solved(rows, distance)
-    # residual = along - speed * distance(time - at[0], ramp): its slopes, free of what place and speed take up
-    slopes = np.stack([distance, rows.centred(rate), rows.centred(by_ramp)], axis=1)
-    products = np.einsum("kir,kjr->kij", slopes, slopes)
-    by = np.stack([speed, -speed], axis=1) * unit
-    shared = products[:, 0, 1:] / np.maximum(products[:, 0, :1], 1e-300)
-    normal = products[:, 1:, 1:] - shared[:, :, None] * products[:, :1, 1:]
-    pull = np.einsum("kir,kr->ki", slopes[:, 1:], residual)  # the residual is free of the distance already
-    return squares, by * pull, by[:, :, None] * by[:, None, :] * normal
-
-
 def _moved(rows: _Rows, shape: Shape, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return shape(rows.time - at[:, :1], np.exp(np.clip(at[:, 1:], -50.0, 50.0)))
+    return shape(rows.time - at[:, :1], np.exp(at[:, 1:]))
 
 
 def _solved(rows: _Rows, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -199,15 +163,6 @@ def _solved(rows: _Rows, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     slope = np.einsum("kr,kr->k", distance, rows.along) / np.maximum(square, 1e-300)
     residual = rows.along - slope[:, None] * distance
     return slope, residual, np.einsum("kr,kr->k", residual, residual)
-
-
-def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solution of two linear equations each, shape (k, 2); 0 where they are one."""
-    determinant = matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] ** 2
-    safe = np.where(determinant > 0, determinant, np.inf)
-    one = matrix[:, 1, 1] * right[:, 0] - matrix[:, 0, 1] * right[:, 1]
-    other = matrix[:, 0, 0] * right[:, 1] - matrix[:, 0, 1] * right[:, 0]
-    return np.stack([one / safe, other / safe], axis=1)
 
 
 def _straight(since: np.ndarray, ramp: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -330,7 +285,7 @@ class Along:
     @cached_property
     def noise_mm(self) -> float:
         """Noise of the displacement."""
-        return noise_from_bends(_bends(self.along_mm))
+        return noise_from_bends(np.diff(self.along_mm, 2))
 
     @property
     def noisy(self) -> bool:
@@ -433,9 +388,3 @@ def _half_width(stroke: Along) -> int:
     half = np.arange(1, max(2, len(stroke.time_s) // 16))
     enough = stroke.noise_mm * np.sqrt(3.0 / (half * (half + 1) * (2 * half + 1))) <= ROUGH * step
     return int(half[enough.argmax()] if enough.any() else half[-1])
-
-
-def _bends(values: np.ndarray) -> np.ndarray:
-    """Return the second differences of neighbours, as `np.diff` does."""
-    steps = values[1:] - values[:-1]
-    return steps[1:] - steps[:-1]

@@ -23,15 +23,11 @@ import numpy as np
 from scipy.special import stdtrit
 
 from sealfit.fit.dynamic.bristle_model import Curve, Rises, Stroke, Tangent
-from sealfit.fit.least_squares import SHRINKS
+from sealfit.fit.least_squares import levenberg_marquardt
 
 LEAST = 3  # such samples below which nothing can be said
 RISES = 30.0  # residual variances by which a rise must do better than none
 MISSED_NOISE, MISSED_LEVEL = 2.0, 0.03  # of the noise and of the sliding force: what a fit leaves that has missed
-STEPS = 200  # of Gauss and Newton, at most
-SETTLED = 1e-11  # of the residual: a step that moves the model by less
-UNSEEN = 1e-7  # of the residual: a step that moves the model by less changes the sum of squares by rounding only
-SHORTEST = 1e-6  # of a step: the sum of squares does not fall along it
 OPEN = np.log(3.0)  # of log sigma_0: an interval that reaches further each way is no estimate
 
 
@@ -124,7 +120,13 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
     rises = Rises(strokes, curve)
     x, (least, most) = rises.best_of_grid()
     bounds = np.array([[least - 1.0, 0.0], [most + 1.0, np.inf]])
-    x, found = _descended(rises, x, bounds)
+
+    def evaluate(x: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        at = rises.tangent(x[0])
+        return at.residual.reshape(1, -1), at.jacobian.reshape(1, 2, -1)
+
+    x = levenberg_marquardt(evaluate, x[None], *bounds)[0][0]
+    found = rises.tangent(x)
     level = rises.run_levels(found.level)
     inverse = np.linalg.pinv(found.normal.sum(axis=0), rcond=1e-12, hermitian=True)
     shifts = []
@@ -147,28 +149,6 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
         noise_N=rises.noise_N(),
         rmse_N=float(np.sqrt(found.rss / rises.there.sum())),
     )
-
-
-def _descended(rises: Rises, x: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, Tangent]:
-    """Return the least-squares optimum that (log sigma_0, tau) leads to, shape (2,), and the tangent there.
-
-    Gauss-Newton steps within the bounds, halved until the sum of squares falls, until they move the model no more.
-    """
-    x, last = np.clip(x, *bounds), np.inf
-    found = rises.tangent(x)
-    for _ in range(STEPS):
-        step, share = _step(found.normal.sum(axis=0), found.pull.sum(axis=0), x, bounds), 1.0
-        moved = float(np.sqrt(max(step @ found.normal.sum(axis=0) @ step, 0.0) / max(found.rss, 1e-300)))
-        if moved <= SETTLED or UNSEEN > moved > SHRINKS * last:
-            break
-        trial = rises.tangent(x + step)
-        while moved > UNSEEN and not trial.rss < found.rss and share > SHORTEST:
-            share /= 2
-            trial = rises.tangent(x + share * step)
-        if share <= SHORTEST:
-            break
-        x, found, last = x + share * step, trial, moved
-    return x, found
 
 
 def _step(normal: np.ndarray, pull: np.ndarray, x: np.ndarray, bounds: np.ndarray) -> np.ndarray:

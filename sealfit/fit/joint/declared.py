@@ -59,9 +59,9 @@ def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
     otherwise pass for a Stribeck curve. Made once for the same rows. Rows that are a part of a campaign, with its
     conditions, may carry its model: `as_in` is the campaign.
     """
-    if ("declared",) not in rows.cache:
-        rows.cache["declared",] = _declare(rows) if as_in is None else declare(as_in)
-    return rows.cache["declared",]
+    if ("declared",) not in rows.kept:
+        rows.kept["declared",] = _declare(rows) if as_in is None else declare(as_in)
+    return rows.kept["declared",]
 
 
 def _declare(rows: Rows) -> Declared:
@@ -173,14 +173,15 @@ def tested_speeds(rows: Rows, chosen: np.ndarray) -> np.ndarray:
     if np.isfinite(commanded).all():
         return np.unique(np.round(commanded, 9))
     _, stroke = np.unique(rows.codes("stroke")[chosen], return_inverse=True)
-    return speed_clusters(np.sort(np.bincount(stroke, np.abs(rows.speed[chosen])) / np.bincount(stroke)))
+    means = np.sort(np.bincount(stroke, np.abs(rows.speed[chosen])) / np.bincount(stroke))
+    return np.array([part.mean() for part in speed_clusters(means)])
 
 
-def speed_clusters(speeds: np.ndarray) -> np.ndarray:
-    """Return the means of clusters of sorted positive speeds, each within 25 % of its slowest."""
+def speed_clusters(speeds: np.ndarray) -> list[np.ndarray]:
+    """Return clusters of sorted positive speeds, each within 25 % of its slowest."""
     cuts, base = [], 0.0
     for place, speed in enumerate(speeds):
         if place == 0 or speed > SAME_SPEED * base:
             base = speed
             cuts.append(place)
-    return np.array([part.mean() for part in np.split(speeds, cuts[1:])]) if speeds.size else speeds
+    return np.split(speeds, cuts[1:]) if speeds.size else []

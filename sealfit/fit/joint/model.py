@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -39,11 +40,19 @@ class Term:
     fixed: Mapping[str, object] = field(default_factory=dict)
     smoothness: float | None = None
 
+    @cached_property
+    def shape_key(self) -> tuple:
+        """What the shape depends on, besides the rows and its parameters."""
+        return (self.effect.id, self.channels, _hashable(self.fixed))
+
     def inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         """Return what the effect's shape reads, from the rows' channels."""
-        key = (self.key(), id(self.fixed))
-        if key in rows.cache:
-            return rows.cache[key][1]
+        key = ("inputs", self.shape_key)
+        if key not in rows.kept:
+            rows.kept[key] = self._inputs(rows)
+        return rows.kept[key]
+
+    def _inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         given = {}
         for name, channel in zip(self.effect.reads, self.channels, strict=True):
             values = rows.values(channel)
@@ -53,8 +62,7 @@ class Term:
         shift = self.fixed.get("shift")
         if shift is not None:  # each pass has its own origin, NaN where that is unknown
             given[self.effect.reads[0]] = given[self.effect.reads[0]] + passes(rows.table).map(shift).to_numpy(float)
-        rows.cache[key] = (self.fixed, {**given, **self.fixed})  # holding `fixed` keeps its id its own
-        return rows.cache[key][1]
+        return {**given, **self.fixed}
 
     def nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
         """Return (weight, inputs) at the points of each row where the shape is averaged.
@@ -63,27 +71,35 @@ class Term:
         averaged by Gauss-Legendre quadrature along it (over an even spread with the variance of n samples), more
         closely where it may be as fine as the bin. The rest is taken in the middle.
         """
+        key = ("nodes", self.shape_key)
+        if key not in rows.kept:
+            rows.kept[key] = self._nodes(rows)
+        return rows.kept[key]
+
+    def _nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
         inputs = self.inputs(rows)
         along = [(n, c) for n, c in zip(self.effect.reads, self.channels, strict=True) if c in ALONG]
         if not self.effect.nonlinear or not along:
             return [(1.0, inputs)]
-        key = ("nodes", self.key(), id(self.fixed))
-        if key not in rows.cache:
-            if self.effect.periodic:
-                widths = {width_of(name): rows.bin_width(channel) for name, channel in along}
-                found = [(1.0, {**inputs, SAMPLES: rows.samples, **widths})]
-            else:
-                spread = np.sqrt(1 - 1 / np.maximum(rows.samples, 1.0) ** 2)
-                found = [
-                    (weight, {**inputs, **{n: inputs[n] + 0.5 * place * spread * rows.bin_width(c) for n, c in along}})
-                    for place, weight in (MANY if self.effect.narrow else FEW_SAMPLES)
-                ]
-            rows.cache[key] = (self.fixed, found)
-        return rows.cache[key][1]
+        if self.effect.periodic:
+            widths = {width_of(name): rows.bin_width(channel) for name, channel in along}
+            return [(1.0, {**inputs, SAMPLES: rows.samples, **widths})]
+        spread = np.sqrt(1 - 1 / np.maximum(rows.samples, 1.0) ** 2)
+        return [
+            (weight, {**inputs, **{n: inputs[n] + 0.5 * place * spread * rows.bin_width(c) for n, c in along}})
+            for place, weight in (MANY if self.effect.narrow else FEW_SAMPLES)
+        ]
 
     def key(self) -> tuple:
         """Return what makes two terms the same effect."""
         return (self.effect.id, self.channels, self.acts_on, self.operation)
+
+
+def _hashable(value: object) -> object:
+    """Return fixed values, mappings and sequences among them, as what a dictionary can have as a key."""
+    if isinstance(value, Mapping):
+        return tuple(sorted((name, _hashable(own)) for name, own in value.items()))
+    return tuple(value) if isinstance(value, (list, np.ndarray)) else value
 
 
 def passes(table: pd.DataFrame) -> pd.Series:
@@ -159,18 +175,17 @@ def derivatives_of(term: Term, values: Mapping[str, float], rows: Rows) -> list[
 
 def _kept(what: str, term: Term, values: Mapping[str, float], rows: Rows, make: Callable):
     """Return what was made last for a term at the same values, or make it: a fit moves some terms and not others."""
-    key = (what, term.key(), id(term.fixed))
-    at = tuple(values.values())
-    if key not in rows.cache or rows.cache[key][1] != at:
-        rows.cache[key] = (term.fixed, at, make())  # holding `fixed` keeps its id its own
-    return rows.cache[key][2]
+    key, at = (what, term.shape_key), tuple(values.values())
+    if key not in rows.kept or rows.kept[key][0] != at:
+        rows.kept[key] = (at, make())
+    return rows.kept[key][1]
 
 
 def _columns_of(term: Term, rows: Rows) -> np.ndarray:
-    key = ("columns", term.key(), id(term.fixed))
-    if key not in rows.cache:
-        rows.cache[key] = (term.fixed, _linear_columns(term, term.inputs(rows)))
-    return rows.cache[key][1]
+    key = ("columns", term.shape_key)
+    if key not in rows.kept:
+        rows.kept[key] = _linear_columns(term, term.inputs(rows))
+    return rows.kept[key]
 
 
 # ---------------------------------------------------------------- joint
@@ -274,9 +289,9 @@ def _layout(model: Model, rows: Rows) -> Layout:
     """Return the blocks of the model's tangent: the numbers of a specimen's conditions, then those of all terms."""
     declared, size = model.declared, model.theta.size
     key, made = ("blocks",), ("layout", model.size)
-    if made in rows.cache and rows.cache[made][0] is declared:
-        return rows.cache[made][1]
-    if key not in rows.cache or rows.cache[key][0] is not declared:
+    if made in rows.kept and rows.kept[made][0] is declared:
+        return rows.kept[made][1]
+    if key not in rows.kept or rows.kept[key][0] is not declared:
         used = np.stack([declared.index[quantity] for quantity in QUANTITIES], axis=1)
         of_condition = [frozenset(numbers[numbers >= 0].tolist()) for numbers in used]
         specimen, conditions = rows.codes("specimen"), len(used)
@@ -286,12 +301,12 @@ def _layout(model: Model, rows: Rows) -> Layout:
             touched[number] = touched.get(number, frozenset()) | of_condition[condition]
         whole = [frozenset(range(size))]
         index, block = blocks_of(whole * len(touched) if size <= FEW else list(touched.values()), size)
-        rows.cache[key] = (declared, index, block[specimen])
-    _, index, block = rows.cache[key]
+        rows.kept[key] = (declared, index, block[specimen])
+    _, index, block = rows.kept[key]
     added = np.arange(size, model.size)
     index = np.column_stack([np.where(index == size, model.size, index), np.tile(added, (len(index), 1))])
-    rows.cache[made] = (declared, Layout(model.size, index, block))
-    return rows.cache[made][1]
+    rows.kept[made] = (declared, Layout(model.size, index, block))
+    return rows.kept[made][1]
 
 
 def friction_of(model: Model, rows: Rows) -> np.ndarray:

@@ -160,7 +160,8 @@ class Rows:
     has_aging: bool
     weight: np.ndarray  # (n,) sums to 1; each file weighs the same
     filled: dict[str, np.ndarray] = field(default_factory=dict)  # channels that some files lack: `fill_missing`
-    cache: dict = field(default_factory=dict, compare=False, repr=False)  # arrays derived from the table, once
+    kept: dict = field(default_factory=dict, init=False, compare=False, repr=False)
+    """What follows from these rows and was computed once, by what it depends on besides them."""
 
     @property
     def channels(self) -> list[str]:
@@ -171,13 +172,13 @@ class Rows:
         """Return one channel as floats, or as strings if it is a category; with what stands for missing values."""
         if channel in self.filled:
             return self.filled[channel]
-        if channel not in self.cache:
+        if channel not in self.kept:
             column = self.table[channel]
             if pd.api.types.is_numeric_dtype(column):
-                self.cache[channel] = column.to_numpy(dtype=float, na_value=np.nan)
+                self.kept[channel] = column.to_numpy(dtype=float, na_value=np.nan)
             else:
-                self.cache[channel] = column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
-        return self.cache[channel]
+                self.kept[channel] = column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
+        return self.kept[channel]
 
     def bin_width(self, channel: str) -> np.ndarray:
         """Return how far a channel goes within each row's bin, shape (n,): its samples times the step between them.
@@ -186,14 +187,14 @@ class Rows:
         both.
         """
         key = ("width", channel)
-        if key not in self.cache:
+        if key not in self.kept:
             values, code, samples = self.values(channel), self.codes("stroke"), self.samples
             inside = np.diff(code) == 0
             step = np.where(inside, np.diff(values) / ((samples[1:] + samples[:-1]) / 2), 0.0)
             left, right = np.r_[0.0, step], np.r_[step, 0.0]
             own = np.where(left == 0, right, np.where(right == 0, left, (left + right) / 2))
-            self.cache[key] = samples * own
-        return self.cache[key]
+            self.kept[key] = samples * own
+        return self.kept[key]
 
     @property
     def samples(self) -> np.ndarray:
@@ -207,19 +208,19 @@ class Rows:
     def sparse(self, most: int) -> Rows:
         """Return at most about `most` rows of each stroke, evenly spread: enough for what acts on whole strokes."""
         key = ("sparse", most)
-        if key not in self.cache:
+        if key not in self.kept:
             start, code = self.groups.starts["stroke"], self.codes("stroke")
             for channel in (name for name in ALONG if name in self.table):
                 self.bin_width(channel)  # of the bins as they are, not from one kept row to the next
             place = np.arange(code.size) - start[code]
             step = -(-np.bincount(code) // most)[code]  # rounded up
-            self.cache[key] = self.subset(place % step == step // 2)
-        return self.cache[key]
+            self.kept[key] = self.subset(place % step == step // 2)
+        return self.kept[key]
 
     def subset(self, mask: np.ndarray) -> Rows:
         """Return the rows where `mask` is true; conditions keep their numbers, so that a model fits both."""
         weight = self.weight[mask]
-        return replace(
+        part = replace(
             self,
             table=self.table[mask].reset_index(drop=True),
             order=self.order[mask],
@@ -232,10 +233,11 @@ class Rows:
             condition=self.condition[mask],
             weight=weight / weight.sum(),
             filled={name: values[mask] for name, values in self.filled.items()},
-            cache={
-                name: values[mask] for name, values in self.cache.items() if isinstance(name, str) or name[0] == "width"
-            },
         )
+        for name, values in self.kept.items():
+            if isinstance(name, str) or name[0] == "width":  # channels, and bins as they are
+                part.kept[name] = values[mask]
+        return part
 
 
 def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame | None = None) -> Rows:

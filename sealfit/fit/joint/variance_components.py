@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -37,12 +37,29 @@ MOST_SHARE = 30.0  # of the residual, of which the model has taken much where it
 KINDS = ("offset", "gain")
 
 
+@dataclass(frozen=True)
+class GroupMeans:
+    """Means over the finest groups, m of them.
+
+    Attributes
+    ----------
+    residual, force : ndarray, shape (m,)
+        Of the residual at the fitted model, and of the model's force, signed.
+    variance : ndarray, shape (m,)
+        Variance of each mean from the rows' own noise.
+    groups : Groups
+        Of the m means.
+    """
+
+    residual: np.ndarray
+    variance: np.ndarray
+    force: np.ndarray
+    groups: Groups
+
+
 def reml(
-    residual: np.ndarray,
+    means: GroupMeans,
     jacobian: Tangent,
-    variance: np.ndarray,
-    force: np.ndarray,
-    groups: Groups,
     kinds: Sequence[tuple[str, str]],
     start: Sequence[float] | None = None,
 ) -> tuple[Component, ...]:
@@ -50,16 +67,10 @@ def reml(
 
     Parameters
     ----------
-    residual : ndarray, shape (m,)
-        Mean residual of each finest group, at the fitted model.
+    means : GroupMeans
+        What scatters.
     jacobian : Tangent, shape (m, p)
         Mean tangent of the model; the degrees of freedom it takes are accounted for.
-    variance : ndarray, shape (m,)
-        Variance of each mean from the rows' own noise.
-    force : ndarray, shape (m,)
-        Mean force of the model, signed.
-    groups : Groups
-        Groups of the m means.
     kinds : sequence of (level, kind)
         Components sought, finest level first.
     start : sequence of float, optional
@@ -67,12 +78,12 @@ def reml(
     """
     if not kinds:
         return ()
-    scale_force = max(float(np.sqrt(np.mean(force**2))), 1e-12)
-    total = max(float(np.var(residual)), float(np.mean(variance)), 1e-20)
+    scale_force = max(float(np.sqrt(np.mean(means.force**2))), 1e-12)
+    total = max(float(np.var(means.residual)), float(np.mean(means.variance)), 1e-20)
     unit = np.array([total / (scale_force**2 if kind == "gain" else 1.0) for _, kind in kinds])
-    basis = jacobian.orthonormal(1e-9)
-    variance = np.maximum(variance, LEAST * total)  # less is nothing beside the scatter, and rounding would be more
-    likelihood = RestrictedLikelihood(residual, basis, variance, force, groups, kinds)
+    # A variance that is nothing beside the scatter would leave rounding to decide.
+    means = replace(means, variance=np.maximum(means.variance, LEAST * total))
+    likelihood = RestrictedLikelihood(means, jacobian.orthonormal(1e-9), kinds)
 
     def objective(sd: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = likelihood(unit * sd**2)
@@ -100,29 +111,19 @@ class RestrictedLikelihood:
 
     Parameters
     ----------
-    residual, variance, force : ndarray, shape (m,)
+    means : GroupMeans
         As for `reml`.
     basis : Tangent, shape (m, p)
         Orthonormal columns that span the model's tangent.
-    groups : Groups
-        Groups of the m means.
     kinds : sequence of (level, kind)
         Components, finest level first.
     """
 
-    def __init__(
-        self,
-        residual: np.ndarray,
-        basis: Tangent,
-        variance: np.ndarray,
-        force: np.ndarray,
-        groups: Groups,
-        kinds: Sequence[tuple[str, str]],
-    ) -> None:
-        self.variance = variance
-        every = basis.beside(residual)
+    def __init__(self, means: GroupMeans, basis: Tangent, kinds: Sequence[tuple[str, str]]) -> None:
+        groups, self.variance = means.groups, means.variance
+        every = basis.beside(means.residual)
         self.columns = every.values
-        self.loads = np.column_stack([np.ones_like(force), force])
+        self.loads = np.column_stack([np.ones_like(means.force), means.force])
         self.places = [(level, KINDS.index(kind)) for level, kind in kinds]
         self.finest = next(iter(groups.starts))
         self.above = list(dict.fromkeys(level for level, _ in kinds if level != self.finest))
@@ -305,11 +306,8 @@ def estimate_components(
     kinds = usable_components(rows)
     known = {(c.level, c.kind): c.variance for c in scatter.components}
     components = reml(
-        means[:, 0],
+        GroupMeans(means[:, 0], noise * scatter.alike / count, means[:, 1], groups.at(level)),
         jacobian.means(groups, level),
-        noise * scatter.alike / count,
-        means[:, 1],
-        groups.at(level),
         kinds,
         [known.get(kind, 0.0) for kind in kinds] if known else None,
     )

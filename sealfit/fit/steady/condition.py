@@ -144,14 +144,13 @@ def _solve_linear(condition: Condition) -> None:
 
 def drop_flat_curve(condition: Condition, unit: float, df: float) -> None:
     """Fall back to mu_c and sigma_2 where mu_s = mu_c is not rejected."""
-    speed, load, _, weight = condition.arrays
+    speed, _, _, weight = condition.arrays
     full, chi2 = condition.values, condition.chi2
     condition.model = VISCOUS
     _solve_linear(condition)
     if np.isfinite(unit) and unit > 0:
-        condition.flat_p = flat_p_value(
-            speed, load, weight, condition.grid, (condition.chi2 - chi2) / unit, df, viscous=condition.values[1] > 0
-        )
+        columns = condition.columns()[:, : 2 if condition.values[1] > 0 else 1]
+        condition.flat_p = flat_p_value(speed, columns, weight, condition.grid, (condition.chi2 - chi2) / unit, df)
     if not condition.flat_p >= SIGNIFICANT:
         condition.model, condition.values, condition.chi2 = FULL, full, chi2
 

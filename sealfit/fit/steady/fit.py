@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
 
 from sealfit.config import Config
-from sealfit.engine.run_map import run_map
 from sealfit.fit.joint.rows import both_ways_together
 from sealfit.fit.steady.condition import FULL, Condition, bound, drop_flat_curve, judge, make_condition, solve
 from sealfit.fit.steady.stribeck import NAMES, linearised
@@ -29,12 +27,12 @@ from sealfit.tables import STEADY_FIT
 from sealfit.units import Units
 
 SIGNIFICANT = 0.05
-TOGETHER = 250  # conditions whose intervals one process finds at once,
-MANY = 3000  # where there are so many: fewer are done before a process has started
+TOGETHER = 250  # conditions whose intervals are found at once, which bounds the memory
+NUMBERS = ("value", "se", "lo95", "hi95", "u_sys")  # columns of a fit table
 FORCES = {"mu_s": "F_s", "mu_c": "F_c"}  # names without load
 
 
-def fit_conditions(steady: pd.DataFrame, config: Config, *, workers: int = 1) -> pd.DataFrame:
+def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     r"""Fit Eq. 14 to every condition and say what its speeds determine.
 
     .. math:: F\,\mathrm{sgn}\,v = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}] + \sigma_2 |v|
@@ -48,8 +46,6 @@ def fit_conditions(steady: pd.DataFrame, config: Config, *, workers: int = 1) ->
         Table `steady`; rows with `used` false are left out.
     config : Config
         Names the condition columns, the units and the sensor's accuracy.
-    workers : int
-        Processes for the intervals of many conditions.
 
     Returns
     -------
@@ -74,9 +70,7 @@ def fit_conditions(steady: pd.DataFrame, config: Config, *, workers: int = 1) ->
     conditions, scatter, variance = solve_conditions(steady)
     keys = condition_keys(steady, config)
     blocks = [slice(start, start + TOGETHER) for start in range(0, len(conditions), TOGETHER)]
-    asked = [(conditions[block], variance.of(block)) for block in blocks]
-    workers = workers if len(conditions) >= MANY else 1
-    found = run_map(partial(_told, scatter=scatter, config=config), asked, workers=workers, together=1)
+    found = [_told(conditions[block], variance.of(block), scatter, config) for block in blocks]
     table = pd.concat(found, ignore_index=True).merge(keys, on="condition", how="left", validate="many_to_one")
     fixed = STEADY_FIT.names()
     return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
@@ -142,9 +136,8 @@ def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
 
 # ---------------------------------------------------------------- what the table says
-def _told(given: tuple[list[Condition], UnitVariance], scatter: Scatter, config: Config) -> pd.DataFrame:
+def _told(conditions: list[Condition], variance: UnitVariance, scatter: Scatter, config: Config) -> pd.DataFrame:
     """Return the rows of some conditions, their intervals found."""
-    conditions, variance = given
     bound(conditions, variance.rise())
     return pd.DataFrame(
         [
@@ -274,16 +267,17 @@ def _finite(value) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
 
 
-def table_row(
-    *, quantity, parameter, value=None, se=None, lo95=None, hi95=None, u_sys=None, unit, identified, reason=""
-) -> dict:
-    """Return one row of a fit table; None, and an end that is open, become null."""
-    numbers = {"value": value, "se": se, "lo95": lo95, "hi95": hi95, "u_sys": u_sys}
+def table_row(*, quantity: str, parameter: str, unit: str, identified: bool, reason: str = "", **numbers) -> dict:
+    """Return one row of a fit table; None, and an end that is open, become null.
+
+    `numbers` are any of value, se, lo95, hi95 and u_sys.
+    """
+    known = dict.fromkeys(NUMBERS) | numbers
     return {
         "model": "before",
         "quantity": quantity,
         "parameter": parameter,
-        **{name: np.nan if _finite(number) is None else float(number) for name, number in numbers.items()},
+        **{name: np.nan if _finite(known[name]) is None else float(known[name]) for name in NUMBERS},
         "unit": unit,
         "identified": bool(identified),
         "reason": reason,

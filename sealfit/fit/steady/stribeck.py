@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 from scipy.special import stdtr
 
-from sealfit.fit.least_squares import covariance_of, even_grid, global_optimum, profile, solve_kept
+from sealfit.fit.least_squares import Separable, covariance_of, even_grid, global_optimum, profile, solve_kept
 
 # ---------------------------------------------------------------- interval
 # Exact intervals of coefficients that must not be negative, from the sum of squares alone.
@@ -189,13 +189,14 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
     """
     speed, load, force, weight = np.broadcast_arrays(*(np.asarray(x, float) for x in (speed, load, force, weight)))
     limits = search_limits(speed, weight)
-    found = global_optimum(stribeck_basis(speed, load), force, weight, even_grid(*limits, PER_DECADE), nonnegative)
+    problems = Separable(stribeck_basis(speed, load), force, weight, nonnegative)
+    found = global_optimum(problems, even_grid(*limits, PER_DECADE))
     mu_s, mu_c, sigma_2 = found.coefficients.T
     return StribeckFit(mu_s, mu_c, np.exp(found.u), sigma_2, found.rss, limits)
 
 
 # ---------------------------------------------------------------- intervals
-def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise, *, nonnegative=PHYSICAL):
+def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
     """Ends of the profile-likelihood intervals of mu_s, mu_c, v_s, sigma_2.
 
     For v_s: where the best sum of squares exceeds the optimum's by no more than `rise`. For the others: the union, over
@@ -216,17 +217,17 @@ def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise, *, no
     low, high : ndarray, shape (problems, 4)
         v_s: 0 or inf where the interval reaches a limit of the search.
     """
-    basis = stribeck_basis(speed, load)
+    problems = Separable(stribeck_basis(speed, load), force, weight, PHYSICAL)
     limit = fit.rss + rise
     u_best = np.log(fit.v_s)
-    rss, _ = profile(basis, force, weight, fit.grid, nonnegative)
+    rss, _ = profile(problems, fit.grid)
     inside = rss <= limit[:, None]
     (u_low, open_low), (u_high, open_high) = (
-        _crossing(basis, force, weight, nonnegative, fit.grid, u_best, inside, limit, sign) for sign in (-1, 1)
+        _crossing(problems, fit.grid, u_best, inside, limit, sign) for sign in (-1, 1)
     )
     fine = u_low[:, None] + (u_high - u_low)[:, None] * np.linspace(0, 1, FINE)
     fine = np.concatenate([fine, u_best[:, None]], axis=1)
-    low, high = conditional_ends(basis, force, weight, fine, limit, nonnegative)
+    low, high = conditional_ends(problems, fine, limit)
     estimate = np.stack([fit.mu_s, fit.mu_c, fit.sigma_2], axis=1)
     low, high = np.fmin(low, estimate), np.fmax(high, estimate)
     v_low, v_high = np.where(open_low, 0.0, np.exp(u_low)), np.where(open_high, np.inf, np.exp(u_high))
@@ -236,7 +237,7 @@ def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise, *, no
     )
 
 
-def _crossing(basis, force, weight, nonnegative, grid, u_best, inside, limit, sign):
+def _crossing(problems: Separable, grid, u_best, inside, limit, sign):
     """Outermost u below (sign -1) or above (+1) the optimum within the limit, and whether the search saw no end."""
     along = sign * grid
     near = np.maximum(np.max(np.where(inside, along, -np.inf), axis=1), sign * u_best)
@@ -245,20 +246,18 @@ def _crossing(basis, force, weight, nonnegative, grid, u_best, inside, limit, si
     far = np.where(open_, near, far)
     for _ in range(HALVINGS):
         middle = (near + far) / 2
-        value, _ = profile(basis, force, weight, sign * middle[:, None], nonnegative)
+        value, _ = profile(problems, sign * middle[:, None])
         ok = value[:, 0] <= limit
         near, far = np.where(ok, middle, near), np.where(ok, far, middle)
     return sign * near, open_
 
 
-def conditional_ends(basis, force, weight, u, limit, nonnegative):
+def conditional_ends(problems: Separable, u, limit):
     """Union over u of the constrained intervals of the coefficients, shape (problems, p) each."""
-    rows = np.arange(len(u))
-    root = np.sqrt(weight)[:, None, :]
-    columns = basis(u, rows)
-    low, high = constrained_ends(
-        columns * root[..., None], np.broadcast_to((force[:, None, :] * root), columns.shape[:-1]), limit, nonnegative
-    )
+    root = np.sqrt(problems.weight)[:, None, :]
+    columns = problems.basis(u, np.arange(len(u)))
+    y = np.broadcast_to(problems.y[:, None, :] * root, columns.shape[:-1])
+    low, high = constrained_ends(columns * root[..., None], y, limit, problems.nonnegative)
     with np.errstate(all="ignore"):
         return np.fmin.reduce(low, axis=1), np.fmax.reduce(high, axis=1)
 
@@ -286,7 +285,7 @@ def linearised(jacobian, weight, values, names, moved=None):
     return covariance, known @ (jacobian.T @ (weight if moved is None else weight[:, None] * moved))
 
 
-def flat_p_value(speed, load, weight, grid, statistic, df, *, viscous: bool = True) -> float:
+def flat_p_value(speed, columns, weight, grid, statistic, df) -> float:
     r"""Chance of so large a gain from mu_s != mu_c where in truth the two are equal, v_s being free to gain most.
 
     Under mu_s = mu_c no v_s exists, so the gain is a maximum over v_s, not one chi-square. The unit vector that the
@@ -297,16 +296,16 @@ def flat_p_value(speed, load, weight, grid, statistic, df, *, viscous: bool = Tr
 
     Parameters
     ----------
-    speed, load, weight : ndarray, shape (n,)
+    speed, weight : ndarray, shape (n,)
         One condition.
+    columns : ndarray, shape (n, 1) or (n, 2)
+        Those of the model without Stribeck curve that are free: the load, and the speed unless sigma_2 is held.
     grid : ndarray, shape (g,)
         ln v_s that was searched.
     statistic : float
         c^2: fall of the sum of squares over the variance of unit weight.
     df : float
         Degrees of freedom of that variance; inf where it is known.
-    viscous : bool
-        Whether sigma_2 is free in the model without Stribeck.
 
     Notes
     -----
@@ -314,10 +313,10 @@ def flat_p_value(speed, load, weight, grid, statistic, df, *, viscous: bool = Tr
     with estimated variance: Knowles and Siegmund 1989, Int. Stat. Rev. 57(3), 205-220, doi:10.2307/1403794.
     """
     root = np.sqrt(weight)
-    base = np.stack([load, speed] if viscous else [load], axis=1) * root[:, None]
+    base = columns * root[:, None]
     q, r = np.linalg.qr(base / np.linalg.norm(base, axis=0))
     q = q[:, np.abs(np.diag(r)) > 1e-10]
-    curve = np.exp(-((speed * np.exp(-grid)[:, None]) ** 2)) * load * root
+    curve = np.exp(-((speed * np.exp(-grid)[:, None]) ** 2)) * columns[:, 0] * root
     size = np.linalg.norm(curve, axis=1)
     left = curve - (curve @ q) @ q.T
     length = np.linalg.norm(left, axis=1)

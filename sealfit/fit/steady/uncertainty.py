@@ -16,7 +16,8 @@ import pandas as pd
 from scipy.special import fdtrc, stdtrit
 
 from sealfit.errors import FitError
-from sealfit.fit.joint.rows import BOTH, SAME_SPEED, both_ways_together
+from sealfit.fit.joint.declared import speed_clusters
+from sealfit.fit.joint.rows import BOTH, both_ways_together
 from sealfit.ingest.scatter import Scatter
 
 POOLING_P = 0.25  # Bancroft's level for "is there set-up scatter at all": at 5 % it would too often be missed
@@ -212,9 +213,6 @@ def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
         if np.all(np.isfinite(speeds)) and np.all(speeds > 0):
             codes = [float(f"{speed:.6g}") for speed in np.unique(speeds)]
         else:
-            codes, start = [], -np.inf
-            for value in np.sort(measured[own].astype(float)):
-                start = value if value > SAME_SPEED * start or start < 0 else start
-                codes.append(start)
+            codes = [part[0] for part in speed_clusters(np.sort(measured[own].astype(float)))]
         levels[direction] = np.unique(codes)
     return levels
