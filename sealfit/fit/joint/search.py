@@ -138,9 +138,9 @@ def _parted(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, Rows | No
     if acts.all() or not acts.any():
         return rows, None
     key = ("parted", acts.tobytes())
-    if key not in rows.cache:
-        rows.cache[key] = (rows.subset(acts), rows.subset(~acts))
-    return rows.cache[key]
+    if key not in rows.kept:
+        rows.kept[key] = (rows.subset(acts), rows.subset(~acts))
+    return rows.kept[key]
 
 
 def linear_solved(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
