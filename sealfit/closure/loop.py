@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, silent, varies_within
-from sealfit.closure.criteria import JACKKNIFE_UNITS, PARTLY
+from sealfit.closure.criteria import ALIKE, JACKKNIFE_UNITS, PARTLY
 from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import covered, folds, heldout_level
@@ -22,7 +22,7 @@ from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.engine.run_map import run_map
 from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
-from sealfit.fit.joint.model import Model
+from sealfit.fit.joint.model import Model, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows, make_rows
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import timed
@@ -94,9 +94,12 @@ def close_loop(
             continue
         say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
         with timed("held out", rows=len(heldout.masks), of="folds"):
-            held_before, held_after = heldout.forces(grown, say)
+            held_before, held_after, found = heldout.forces(grown, say)
+            grown, after, unconfirmed = _found_again(grown, before, after, found, say)
+            held_after = held_after if grown.added else held_before
             ends = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
             grown, ends = _no_worse(grown, ends, heldout, say)
+            grown = replace(grown, refused=(*grown.refused, *unconfirmed))
         break
     before, after, held_before, held_after = ends.before, ends.after, ends.held_before, ends.held_after
     drawn = _drawn_tables(grown, before, after, config)
@@ -150,28 +153,32 @@ class _HeldOut:
         """
         return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
 
-    def forces(self, grown: Selection, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
+    def forces(self, grown: Selection, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray, list[Model] | None]:
         """Return each row's force, before and after, by fits that did not see its group; NaN if never held out.
+
+        With them comes what each repeated search ended with; None where no search is repeated.
 
         Where the search is repeated, a fold searches for as many rounds as the whole campaign took to find its last
         effect. It has less to see by: it would go on for many rounds after small effects that it refuses.
         """
         if not (grown.added and self.repeats):
             before = self.refitted(grown.before)
-            return before, self.refitted(grown.after) if grown.added else before
+            return before, self.refitted(grown.after) if grown.added else before, None
         rounds = max(a.round for a in grown.added)
         parts = run_map(_held_out, _Folds(self, grown.before, rounds), workers=self.context.workers)
         before, after = np.full(self.rows.force.size, np.nan), np.full(self.rows.force.size, np.nan)
-        for k, (out, forces) in enumerate(zip(self.masks, parts, strict=True)):
+        models = []
+        for k, (out, (*forces, model)) in enumerate(zip(self.masks, parts, strict=True)):
             say(f"  fold {k + 1} of {len(self.masks)}")
             before[out], after[out] = forces
-        return before, after
+            models.append(model)
+        return before, after, models
 
     def refitted(self, fitted: Fitted) -> np.ndarray:
         """Return each row's force by a model's fits to the other folds, shape (n,); NaN if never held out."""
         force = np.full(self.rows.force.size, np.nan)
         folds = _Folds(self, fitted, rounds=0)
-        for out, (own, _) in zip(self.masks, map(_held_out, folds), strict=True):
+        for out, (own, *_) in zip(self.masks, map(_held_out, folds), strict=True):
             force[out] = own
         return force
 
@@ -226,8 +233,8 @@ class _Folds(Sequence):
         return _Fold(kept(part.coarse), fine, every, seen, test, quiet, self.start, self.rounds)
 
 
-def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
-    """Return the forces before and after at a fold's rows; before twice where the whole campaign lacks nothing."""
+def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
+    """Return the forces before and after at a fold's rows, and the model after; before twice without a search."""
     if fold.rounds:
         part = grow(fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds)
         before, after = part.before, part.after
@@ -239,7 +246,46 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
         return predict_rows(own, fold.test)
 
     first = force(before)
-    return first, first if after is before else force(after)
+    return first, first if after is before else force(after), after.model
+
+
+def _found_again(
+    grown: Selection, before: Fitted, after: Fitted, found: Sequence[Model] | None, say: Callable[[str], None]
+) -> tuple[Selection, Fitted, list[RefusedEffect]]:
+    """Return the selection and its fit without effects of weak evidence that no fold found again, and these.
+
+    A fold that finds nothing predicts as the declared model does: its error is equal, and says nothing for the effect.
+    """
+    if found is None:
+        return grown, after, []
+    known = [(t, model.values[k]) for model in found for k, t in enumerate(model.terms) if "shift" not in t.fixed]
+    refused = []
+    for number in reversed(range(len(grown.added))):
+        item, rows = grown.added[number], grown.after.rows
+        own = shape_of(item.proposal.term, grown.after.model.values[number], rows) if item.weak else None
+        if own is None or any(_alike(own, shape_of(term, values, rows)) for term, values in known):
+            continue
+        say(f"left out, as no fold found it again: {describe(item.proposal.term)}")
+        reason = "its evidence is weak, and the search found it in no fold that lacked a part of the data"
+        refused.append(RefusedEffect(item.proposal.term, item.proposal.p_value, reason))
+        grown = _without(grown, number)
+    if refused:
+        after = _on_all(before.rows, grown)[1]
+    return grown, after, refused
+
+
+def _alike(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two shapes are correlated, or the same constant."""
+    one, other = one - one.mean(), other - other.mean()
+    size = np.linalg.norm(one) * np.linalg.norm(other)
+    return size == 0 or abs(one @ other) > ALIKE * size
+
+
+def _without(grown: Selection, number: int) -> Selection:
+    """Return a selection without one of its effects, the others fitted again."""
+    model = grown.after.model.without_term(number)
+    own = fit(model, grown.after.rows, grown.after.scatter, turns=2) if model.terms else grown.before
+    return replace(grown, after=own, added=(*grown.added[:number], *grown.added[number + 1 :]))
 
 
 def _no_worse(
@@ -256,10 +302,8 @@ def _no_worse(
         say(f"left out, as the error is no lower with it: {describe(last.term)}")
         reason = "with it the error is no lower, in sample or held out"
         refused.append(RefusedEffect(last.term, last.p_value, reason))
-        model = grown.after.model.without_term(len(grown.added) - 1)
-        own = fit(model, grown.after.rows, grown.after.scatter, turns=2) if model.terms else grown.before
-        grown = replace(grown, after=own, added=grown.added[:-1])
-        _, after = _on_all(ends.before.rows, grown)
+        grown = _without(grown, len(grown.added) - 1)
+        own, (_, after) = grown.after, _on_all(ends.before.rows, grown)
         if not grown.added:
             ends = replace(ends, after=ends.before, held_after=ends.held_before)
         else:
