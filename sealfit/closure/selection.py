@@ -182,8 +182,12 @@ class _Growth:
         awaited = _awaited([two], self.shown.claimable)
         both = _both(self.fitted, awaited, self.channels, self.context.effects, self.ask, number)
         if both:
-            self.added = [*self.added, *both]
-            self.fitted = fit(both[-1].proposal.fitted.model, self.rows, self.fitted.scatter, turns=2)
+            later, earlier = both
+            own = earlier.proposal.fitted
+            without = own.model.without_term(len(own.model.terms) - 1)
+            self.fitted = fit(without, self.rows, own.scatter, turns=0, friction=own.friction)
+            self.added = [*self.added, later]
+            self.add(earlier)
         return bool(both)
 
     def open_candidates(self) -> list[Candidate]:
