@@ -339,26 +339,28 @@ def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> 
 
 
 def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-    """Return the fit without effects that a later one has made needless, by Schwarz's price.
+    """Return the fit without effects that a later one has made needless, by Schwarz's price; the weakest goes first.
 
-    A ripple was judged on the raw samples, which bins cannot overrule.
+    What one of two alike leaves may be needless too, so each is asked again when another has gone. A ripple was judged
+    on the raw samples, which bins cannot overrule.
     """
-    k = 0
-    while k < len(added) - 1:
-        bic_penalty = added[k].proposal.bic_penalty
-        periodic = added[k].proposal.term.effect.periodic
-        if (
-            periodic or _wald_statistic(fitted, k) > 2 * bic_penalty
-        ):  # far from needless: no refit is wanted to see that
-            k += 1
-            continue
+    asked: set[int] = set()
+    while True:
+        # Far from needless: no refit is wanted to see that.
+        size = {
+            k: _wald_statistic(fitted, k) - 2 * a.proposal.bic_penalty
+            for k, a in enumerate(added[:-1])
+            if not a.proposal.term.effect.periodic
+        }
+        k = min((k for k in size if size[k] <= 0 and k not in asked), key=size.__getitem__, default=None)
+        if k is None:
+            return fitted, added
         without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
-        if without.deviance - fitted.deviance < bic_penalty:
+        if without.deviance - fitted.deviance < added[k].proposal.bic_penalty:
             fitted = fit(without.model, fitted.rows, fitted.scatter, turns=1)
-            added = [a for j, a in enumerate(added) if j != k]
+            added, asked = [*added[:k], *added[k + 1 :]], set()
         else:
-            k += 1
-    return fitted, added
+            asked.add(k)
 
 
 def _wald_statistic(fitted: Fitted, number: int) -> float:
