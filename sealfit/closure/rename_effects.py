@@ -45,7 +45,11 @@ class Renaming:
     context: Context
 
     def all_but_last(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-        """Return a fit and its effects with each but the last named anew beside all the others."""
+        """Return a fit and its effects with each but the last named anew beside all the others.
+
+        One that keeps its name was confirmed while others were missing: it goes if beside them it gains nothing on
+        held-out data.
+        """
         for item in added[:-1]:
             number = next(k for k, a in enumerate(added) if a is item)
             name = self._channel(item)
@@ -53,16 +57,24 @@ class Renaming:
                 continue
             without = self._without(fitted, number)
             proposals = self._anew(fitted, number, without, [name], item.proposal.p_value)
-            if not proposals or proposals[0].term.key() == item.proposal.term.key():
-                continue
             # While it is missing, what stood for most of the residual may rank too low on a grid to be refitted.
-            if proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL:
+            if not proposals or proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL:
                 continue
-            better = self._confirmed(without, proposals, item.round)
-            if better is not None and better.proposal.term.key() != item.proposal.term.key():
+            same = proposals[0].term.key() == item.proposal.term.key()
+            better = self._confirmed(without, proposals[:1] if same else proposals, item.round)
+            others = [*added[:number], *added[number + 1 :]]
+            if better is None and self._as_it_is(without, fitted, number, item) is None:
+                fitted, added = fit(without.model, fitted.rows, fitted.scatter, turns=2), others
+            elif better is not None and better.proposal.term.key() != item.proposal.term.key():
                 fitted = fit(better.proposal.fitted.model, fitted.rows, fitted.scatter, turns=2)
-                added = [*added[:number], *added[number + 1 :], better]
+                added = [*others, better]
         return fitted, added
+
+    def _as_it_is(self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect) -> AcceptedEffect | None:
+        """Return an effect of a fit with its own name and numbers, confirmed beside the others; None if it is not."""
+        model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
+        own = fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
+        return self._confirmed(without, [replace(item.proposal, fitted=own)], item.round)
 
     def one_for_two(
         self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect

@@ -207,7 +207,12 @@ class _Growth:
             return False
         self.renamed, before = True, self.added
         self.fitted, self.added = self.renaming.all_but_last(self.fitted, self.added)
-        return self.added is not before
+        if self.added is before:
+            return False
+        self.fitted, self.added = _drop_needless(self.fitted, self.added)
+        rounds = {a.round for a in self.added}
+        self.refused |= {a.proposal.source for a in before if a.round not in rounds}
+        return True
 
     def add(self, accepted: AcceptedEffect) -> None:
         """Add an effect; drop what it makes needless."""

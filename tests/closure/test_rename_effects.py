@@ -175,3 +175,27 @@ def test_a_product_told_as_a_sum_of_two_is_one_effect():
     two = (Term(EFFECTS["linear"], (name,), "mu", "multiply", {"x_ref": 5.0}) for name in channels)
     (term,) = in_place_of_two(bins, *((t, {"A": 0.01}) for t in two))
     assert set(term.channels) == set(channels)
+
+
+def test_an_effect_that_gains_nothing_beside_the_others_goes():
+    def oil_only(table, force):
+        return force * (1 + 1e-3 * (table["oil_ppm"].to_numpy() - 50))
+
+    rows = make_rows(numbered(make_bins(5, repeats=2, bins=4, effect=oil_only, run_channels=OIL)), has_aging=True)
+    slow = Term(EFFECTS["linear"], ("time_s",), "mu", "multiply", {"x_ref": 10.0})
+    oil = Term(EFFECTS["linear"], ("oil_ppm",), "mu", "multiply", {"x_ref": 50.0})
+    model = fit_declared(rows).model.with_term(slow, {"A": 1e-3}).with_term(oil, {"A": 1e-3})
+    fitted = fit(model, rows, turns=2)
+    added = [
+        AcceptedEffect(
+            Proposal(t, v, "run", 72, 1e3, 1e-9, np.empty(0), (t.channels, "mu", "multiply")), 1.0, 1.0, (), (), k
+        )
+        for k, (t, v) in enumerate(zip(fitted.model.terms, fitted.model.values, strict=True))
+    ]
+    channels = {c.name: c for c in find_channels(rows)}
+    again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
+    after, kept = again.all_but_last(fitted, added)
+    assert [a.proposal.term.channels for a in kept] == [("oil_ppm",)]
+    assert [t.channels for t in after.model.terms] == [("oil_ppm",)]
+    held, _ = again.all_but_last(after, kept)
+    assert held is after
