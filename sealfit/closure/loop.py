@@ -95,11 +95,10 @@ def close_loop(
         say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
         with timed("held out", rows=len(heldout.masks), of="folds"):
             held_before, held_after, found = heldout.forces(grown, say)
-            grown, after, unconfirmed = _found_again(grown, before, after, found, say)
-            held_after = held_after if grown.added else held_before
+            if found is not None and not _found_again(grown, found):
+                grown, after, held_after = _all_refused(grown, say), before, held_before
             ends = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
             grown, ends = _no_worse(grown, ends, heldout, say)
-            grown = replace(grown, refused=(*grown.refused, *unconfirmed))
         break
     before, after, held_before, held_after = ends.before, ends.after, ends.held_before, ends.held_after
     drawn = _drawn_tables(grown, before, after, config)
@@ -249,29 +248,27 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
     return first, first if after is before else force(after), after.model
 
 
-def _found_again(
-    grown: Selection, before: Fitted, after: Fitted, found: Sequence[Model] | None, say: Callable[[str], None]
-) -> tuple[Selection, Fitted, list[RefusedEffect]]:
-    """Return the selection and its fit without effects of weak evidence that no fold found again, and these.
+def _found_again(grown: Selection, found: Sequence[Model]) -> bool:
+    """Whether a fold found one of the effects again, or the evidence for one is not weak.
 
-    A fold that finds nothing predicts as the declared model does: its error is equal, and says nothing for the effect.
+    A fold that finds nothing predicts as the declared model does: its error is equal, and says nothing for an effect.
     """
-    if found is None:
-        return grown, after, []
+    if not all(item.weak for item in grown.added):
+        return True
+    rows = grown.after.rows
     known = [(t, model.values[k]) for model in found for k, t in enumerate(model.terms) if "shift" not in t.fixed]
-    refused = []
-    for number in reversed(range(len(grown.added))):
-        item, rows = grown.added[number], grown.after.rows
-        own = shape_of(item.proposal.term, grown.after.model.values[number], rows) if item.weak else None
-        if own is None or any(_alike(own, shape_of(term, values, rows)) for term, values in known):
-            continue
-        say(f"left out, as no fold found it again: {describe(item.proposal.term)}")
-        reason = "its evidence is weak, and the search found it in no fold that lacked a part of the data"
-        refused.append(RefusedEffect(item.proposal.term, item.proposal.p_value, reason))
-        grown = _without(grown, number)
-    if refused:
-        after = _on_all(before.rows, grown)[1]
-    return grown, after, refused
+    shapes = [shape_of(term, values, rows) for term, values in known]
+    terms = [item.proposal.term for item in grown.added]
+    own = [shape_of(term, values, rows) for term, values in zip(terms, grown.after.model.values, strict=True)]
+    return any(_alike(one, other) for one in own for other in shapes)
+
+
+def _all_refused(grown: Selection, say: Callable[[str], None]) -> Selection:
+    """Return a selection without effects: those of weak evidence that no fold found again."""
+    say("left out, as no fold found them again: " + "; ".join(describe(a.proposal.term) for a in grown.added))
+    reason = "its evidence is weak, and the search finds it in no fold that lacks a part of the data"
+    refused = [RefusedEffect(a.proposal.term, a.proposal.p_value, reason) for a in grown.added]
+    return replace(grown, after=grown.before, added=(), refused=(*grown.refused, *refused))
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> bool:
@@ -279,13 +276,6 @@ def _alike(one: np.ndarray, other: np.ndarray) -> bool:
     one, other = one - one.mean(), other - other.mean()
     size = np.linalg.norm(one) * np.linalg.norm(other)
     return size == 0 or abs(one @ other) > ALIKE * size
-
-
-def _without(grown: Selection, number: int) -> Selection:
-    """Return a selection without one of its effects, the others fitted again."""
-    model = grown.after.model.without_term(number)
-    own = fit(model, grown.after.rows, grown.after.scatter, turns=2) if model.terms else grown.before
-    return replace(grown, after=own, added=(*grown.added[:number], *grown.added[number + 1 :]))
 
 
 def _no_worse(
@@ -302,8 +292,10 @@ def _no_worse(
         say(f"left out, as the error is no lower with it: {describe(last.term)}")
         reason = "with it the error is no lower, in sample or held out"
         refused.append(RefusedEffect(last.term, last.p_value, reason))
-        grown = _without(grown, len(grown.added) - 1)
-        own, (_, after) = grown.after, _on_all(ends.before.rows, grown)
+        model = grown.after.model.without_term(len(grown.added) - 1)
+        own = fit(model, grown.after.rows, grown.after.scatter, turns=2) if model.terms else grown.before
+        grown = replace(grown, after=own, added=grown.added[:-1])
+        _, after = _on_all(ends.before.rows, grown)
         if not grown.added:
             ends = replace(ends, after=ends.before, held_after=ends.held_before)
         else:

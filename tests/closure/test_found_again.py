@@ -6,7 +6,7 @@ from bins_helpers import make_bins
 
 from sealfit.closure.confirm import AcceptedEffect, silent
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.loop import _found_again
+from sealfit.closure.loop import _all_refused, _found_again
 from sealfit.closure.selection import Selection
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit, fit_declared
@@ -22,7 +22,7 @@ def term_of(name, target="mu"):
 
 @pytest.fixture(scope="module")
 def grown():
-    """A selection with an effect of sure and one of weak evidence."""
+    """A selection with two effects of weak evidence."""
     rows = make_rows(make_bins(5, repeats=1, bins=3, run_channels=OIL), has_aging=True)
     before = fit_declared(rows)
     model = before.model
@@ -31,38 +31,36 @@ def grown():
     after = fit(model, rows, before.scatter, turns=0)
     added = tuple(
         AcceptedEffect(
-            Proposal(t, v, "run", 72, 1e3, p, np.empty(0), (t.channels, "mu", "multiply")), 1.0, 1.0, (), (), 1
+            Proposal(t, v, "run", 72, 1e3, 1e-3, np.empty(0), (t.channels, "mu", "multiply")), 1, 1, (), (), 1
         )
-        for t, v, p in zip(after.model.terms, after.model.values, (1e-9, 1e-3), strict=True)
+        for t, v in zip(after.model.terms, after.model.values, strict=True)
     )
     return Selection(before, after, added, (), (), None, None)
 
 
-def kept(grown, found):
-    own, after, refused = _found_again(grown, grown.before, grown.after, found, silent)
-    assert [t.channels for t in after.model.terms] == [a.proposal.term.channels for a in own.added]
-    return [a.proposal.term.channels[0] for a in own.added], [r.term.channels[0] for r in refused]
-
-
-def test_weak_evidence_that_no_fold_finds_again_is_refused(grown):
+def test_effects_of_weak_evidence_are_not_found_again_where_no_fold_has_their_shape(grown):
     nothing = grown.before.model
-    other = nothing.with_term(term_of("oil_ppm"), {"A": 1e-3})
-    assert kept(grown, [nothing] * 5) == (["oil_ppm"], ["humidity_pct"])  # the other is sure
-    assert kept(grown, [other] * 5) == (["oil_ppm"], ["humidity_pct"])
+    other = nothing.with_term(term_of("time_s"), {"A": 1e-3})
+    assert not _found_again(grown, [nothing] * 5)
+    assert not _found_again(grown, [other] * 5)
 
 
-def test_weak_evidence_stays_where_a_fold_finds_its_shape_on_any_quantity(grown):
+def test_one_fold_that_finds_one_of_them_on_any_quantity_is_enough(grown):
     nothing = grown.before.model
     again = nothing.with_term(term_of("humidity_pct", "mu_c"), {"A": -1e-3})
-    assert kept(grown, [nothing, again]) == (["oil_ppm", "humidity_pct"], [])
-    assert kept(grown, None) == (["oil_ppm", "humidity_pct"], [])  # no search was repeated
+    assert _found_again(grown, [nothing, again])
 
 
-def test_a_lone_effect_that_no_fold_finds_again_leaves_the_declared_model(grown):
-    model = grown.before.model.with_term(term_of("humidity_pct"), {"A": 1e-3})
-    alone = replace(grown, added=grown.added[1:], after=fit(model, grown.before.rows, grown.before.scatter, turns=0))
-    own, after, refused = _found_again(alone, alone.before, alone.after, [alone.before.model], silent)
+def test_evidence_that_is_not_weak_needs_no_fold_to_find_it_again(grown):
+    first = grown.added[0]
+    sure = replace(first, proposal=replace(first.proposal, p_value=1e-9))
+    assert _found_again(replace(grown, added=(sure, *grown.added[1:])), [grown.before.model])
+
+
+def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(grown):
+    own = _all_refused(grown, silent)
     assert own.added == ()
-    assert after is alone.before
-    assert "in no fold" in refused[0].reason
-    assert refused[0].weak
+    assert own.after is grown.before
+    assert [r.term.channels[0] for r in own.refused] == list(OIL)
+    assert all(r.weak and "no fold" in r.reason for r in own.refused)
+    assert own.worse == ()
