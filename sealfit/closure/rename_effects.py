@@ -77,14 +77,17 @@ class Renaming:
         return self._confirmed(without, [replace(item.proposal, fitted=own)], item.round)
 
     def one_for_two(
-        self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect
+        self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect, *, awaited: bool = False
     ) -> tuple[list[AcceptedEffect], AcceptedEffect]:
         """Return earlier effects and a new one that is not in `fitted` yet.
 
         An earlier effect goes where one alone does as well as it and the new one: a shape of the same channel or of one
-        that moves along with it, or a product of two channels.
+        that moves along with it, or a product of two channels. While another is `awaited`, beside which alone the new
+        one shows, only effects of its own channel are asked.
         """
         for number, earlier in enumerate(added):
+            if awaited and self._channel(earlier) != self._channel(new):
+                continue
             one = self._instead(fitted, number, earlier, new)
             if one is not None:
                 return [*added[:number], *added[number + 1 :]], one

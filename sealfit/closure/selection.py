@@ -218,7 +218,8 @@ class _Growth:
         """Add an effect; drop what it makes needless."""
         source = accepted.proposal.source
         self.hidden = [pair.without(source) for pair in self.hidden if source in pair.keys]
-        earlier, accepted = self.renaming.one_for_two(self.fitted, self.added, accepted)
+        awaited = any(pair.keys for pair in self.hidden)
+        earlier, accepted = self.renaming.one_for_two(self.fitted, self.added, accepted, awaited=awaited)
         added = [*earlier, accepted]
         own = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
         self.fitted, self.added = _drop_needless(fit(own.model, self.rows, own.scatter, turns=2), added)

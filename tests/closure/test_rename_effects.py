@@ -114,7 +114,7 @@ def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
     assert after is fitted
 
 
-def in_place_of_two(bins, first, second):
+def in_place_of_two(bins, first, second, **options):
     """Return what stands in place of two terms with their starts, each accepted beside the other."""
     rows = make_rows(numbered(bins), has_aging=True)
     model = fit_declared(rows).model.with_term(*first)
@@ -130,7 +130,7 @@ def in_place_of_two(bins, first, second):
     one, two = (accepted(t, v, f) for (t, v), f in zip((first, second), (base, after), strict=True))
     channels = {c.name: c for c in find_channels(rows)}
     again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
-    earlier, new = again.one_for_two(base, [one], two)
+    earlier, new = again.one_for_two(base, [one], two, **options)
     return [a.proposal.term for a in (*earlier, new)]
 
 
@@ -172,9 +172,10 @@ def test_a_product_told_as_a_sum_of_two_is_one_effect():
         return force * (1 + 0.002 * table["oil_ppm"].to_numpy() * table["humidity_pct"].to_numpy())
 
     bins = make_bins(3, repeats=2, bins=3, noise_N=0.1, effect=product, run_channels=channels)
-    two = (Term(EFFECTS["linear"], (name,), "mu", "multiply", {"x_ref": 5.0}) for name in channels)
-    (term,) = in_place_of_two(bins, *((t, {"A": 0.01}) for t in two))
+    two = [(Term(EFFECTS["linear"], (n,), "mu", "multiply", {"x_ref": 5.0}), {"A": 0.01}) for n in channels]
+    (term,) = in_place_of_two(bins, *two)
     assert set(term.channels) == set(channels)
+    assert len(in_place_of_two(bins, *two, awaited=True)) == 2  # a third is to come, beside which alone one shows
 
 
 def test_an_effect_that_gains_nothing_beside_the_others_goes():
