@@ -152,7 +152,9 @@ class _HeldOut:
         """
         return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
 
-    def forces(self, grown: Selection, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray, list[Model] | None]:
+    def forces(
+        self, grown: Selection, say: Callable[[str], None]
+    ) -> tuple[np.ndarray, np.ndarray, Sequence[Model] | None]:
         """Return each row's force, before and after, by fits that did not see its group; NaN if never held out.
 
         With them comes what each repeated search ended with; None where no search is repeated.
@@ -233,7 +235,7 @@ class _Folds(Sequence):
 
 
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
-    """Return the forces before and after at a fold's rows, and the model after; before twice without a search."""
+    """Return the forces before and after at a fold's rows, the same without a search, and the model after."""
     if fold.rounds:
         part = grow(fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds)
         before, after = part.before, part.after
@@ -251,13 +253,13 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
 def _found_again(grown: Selection, found: Sequence[Model]) -> bool:
     """Whether a fold found one of the effects again, or the evidence for one is not weak.
 
-    A fold that finds nothing predicts as the declared model does: its error is equal, and says nothing for an effect.
+    A fold that finds nothing predicts as the declared model does: its error is equal, and says nothing for one.
     """
     if not all(item.weak for item in grown.added):
         return True
     rows = grown.after.rows
-    known = [(t, model.values[k]) for model in found for k, t in enumerate(model.terms) if "shift" not in t.fixed]
-    shapes = [shape_of(term, values, rows) for term, values in known]
+    known = [pair for model in found for pair in zip(model.terms, model.values, strict=True)]
+    shapes = [shape_of(term, values, rows) for term, values in known if "shift" not in term.fixed]
     terms = [item.proposal.term for item in grown.added]
     own = [shape_of(term, values, rows) for term, values in zip(terms, grown.after.model.values, strict=True)]
     return any(_alike(one, other) for one in own for other in shapes)

@@ -47,8 +47,8 @@ class Renaming:
     def all_but_last(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
         """Return a fit and its effects with each but the last named anew beside all the others.
 
-        One that keeps its name was confirmed while others were missing: it goes if beside them it gains nothing on
-        held-out data.
+        One that keeps its name was confirmed while others were missing: it goes if beside them it gains nothing
+        on held-out data.
         """
         for item in added[:-1]:
             number = next(k for k, a in enumerate(added) if a is item)
@@ -71,7 +71,7 @@ class Renaming:
         return fitted, added
 
     def _as_it_is(self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect) -> AcceptedEffect | None:
-        """Return an effect of a fit with its own name and numbers, confirmed beside the others; None if it is not."""
+        """Return an effect of a fit with its own name, confirmed beside the others; None where it is not."""
         model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
         own = fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
         return self._confirmed(without, [replace(item.proposal, fitted=own)], item.round)
@@ -81,9 +81,9 @@ class Renaming:
     ) -> tuple[list[AcceptedEffect], AcceptedEffect]:
         """Return earlier effects and a new one that is not in `fitted` yet.
 
-        An earlier effect goes where one alone does as well as it and the new one: a shape of the same channel or of one
-        that moves along with it, or a product of two channels. While another is `awaited`, beside which alone the new
-        one shows, only effects of its own channel are asked.
+        An earlier effect goes where one alone does as well as it and the new one: a shape of the same channel or of
+        one that moves along with it, or a product of two channels. While another is `awaited`, beside which alone
+        the new one shows, only effects of its own channel are asked.
         """
         for number, earlier in enumerate(added):
             if awaited and self._channel(earlier) != self._channel(new):
@@ -98,8 +98,8 @@ class Renaming:
     ) -> AcceptedEffect | None:
         """Return one effect that does as well as an earlier and a new one; None where there is none.
 
-        Two forms of one channel that are no mechanism are one shape in two pieces: then it is enough that the one fits
-        as well, whatever the number of its knots.
+        Two forms of one channel that are no mechanism are one shape in two pieces: then it is enough that the one
+        fits as well, whatever the number of its knots.
         """
         names = self._channel(earlier), self._channel(new)
         if None in names:
@@ -118,7 +118,7 @@ class Renaming:
         return self._confirmed(without, better, new.round) if better else None
 
     def _near(self, *names: str) -> list[str]:
-        """Return the channels of two effects and, where both vary along strokes, those that every stroke runs along."""
+        """Return the channels of two effects and, where both vary along strokes, those of every stroke."""
         found = list(dict.fromkeys(names))
         if all(self.channels[name].unit == "sample" for name in names):
             found += [name for name in ALONG_STROKES if name in self.channels and name not in found]

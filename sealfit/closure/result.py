@@ -55,8 +55,8 @@ class BeforeAfter:
         """Whether after has no higher errors than before, in sample and held out.
 
         Weak evidence needs a lower error held out: an equal one says nothing for it. Where a level is named, this
-        is asked of the errors about the means of its groups, and the whole ones are not higher by much: `HARMLESS`.
-        That needs evidence that is not weak, or a held-out error about these means that is halved.
+        is asked of the errors about the means of its groups, and the whole ones are not higher by much:
+        `HARMLESS`. That needs evidence that is not weak, or a held-out error about these means that is halved.
         """
         whole = self._ratios(None)
         inside = whole if around is None else self._ratios(around)

@@ -345,10 +345,10 @@ def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> 
 
 
 def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-    """Return the fit without effects that a later one has made needless, by Schwarz's price; the weakest goes first.
+    """Return the fit without effects that a later one has made needless, by Schwarz's price; the weakest first.
 
-    What one of two alike leaves may be needless too, so each is asked again when another has gone. A ripple was judged
-    on the raw samples, which bins cannot overrule.
+    What one of two alike leaves may be needless too, so each is asked again when another has gone. A ripple was
+    judged on the raw samples, which bins cannot overrule.
     """
     asked: set[int] = set()
     while True:
