@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, silent, varies_within
-from sealfit.closure.criteria import JACKKNIFE_UNITS, PARTLY
+from sealfit.closure.criteria import ALIKE, JACKKNIFE_UNITS, PARTLY
 from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import covered, folds, heldout_level
@@ -22,7 +22,7 @@ from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.engine.run_map import run_map
 from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
-from sealfit.fit.joint.model import Model
+from sealfit.fit.joint.model import Model, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows, make_rows
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import timed
@@ -94,7 +94,9 @@ def close_loop(
             continue
         say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
         with timed("held out", rows=len(heldout.masks), of="folds"):
-            held_before, held_after = heldout.forces(grown, say)
+            held_before, held_after, found = heldout.forces(grown, say)
+            if found is not None and not _found_again(grown, found):
+                grown, after, held_after = _all_refused(grown, say), before, held_before
             ends = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
             grown, ends = _no_worse(grown, ends, heldout, say)
         break
@@ -150,28 +152,34 @@ class _HeldOut:
         """
         return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
 
-    def forces(self, grown: Selection, say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
+    def forces(
+        self, grown: Selection, say: Callable[[str], None]
+    ) -> tuple[np.ndarray, np.ndarray, Sequence[Model] | None]:
         """Return each row's force, before and after, by fits that did not see its group; NaN if never held out.
+
+        With them comes what each repeated search ended with; None where no search is repeated.
 
         Where the search is repeated, a fold searches for as many rounds as the whole campaign took to find its last
         effect. It has less to see by: it would go on for many rounds after small effects that it refuses.
         """
         if not (grown.added and self.repeats):
             before = self.refitted(grown.before)
-            return before, self.refitted(grown.after) if grown.added else before
+            return before, self.refitted(grown.after) if grown.added else before, None
         rounds = max(a.round for a in grown.added)
         parts = run_map(_held_out, _Folds(self, grown.before, rounds), workers=self.context.workers)
         before, after = np.full(self.rows.force.size, np.nan), np.full(self.rows.force.size, np.nan)
-        for k, (out, forces) in enumerate(zip(self.masks, parts, strict=True)):
+        models = []
+        for k, (out, (*forces, model)) in enumerate(zip(self.masks, parts, strict=True)):
             say(f"  fold {k + 1} of {len(self.masks)}")
             before[out], after[out] = forces
-        return before, after
+            models.append(model)
+        return before, after, models
 
     def refitted(self, fitted: Fitted) -> np.ndarray:
         """Return each row's force by a model's fits to the other folds, shape (n,); NaN if never held out."""
         force = np.full(self.rows.force.size, np.nan)
         folds = _Folds(self, fitted, rounds=0)
-        for out, (own, _) in zip(self.masks, map(_held_out, folds), strict=True):
+        for out, (own, *_) in zip(self.masks, map(_held_out, folds), strict=True):
             force[out] = own
         return force
 
@@ -226,8 +234,8 @@ class _Folds(Sequence):
         return _Fold(kept(part.coarse), fine, every, seen, test, quiet, self.start, self.rounds)
 
 
-def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
-    """Return the forces before and after at a fold's rows; before twice where the whole campaign lacks nothing."""
+def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
+    """Return the forces before and after at a fold's rows, the same without a search, and the model after."""
     if fold.rounds:
         part = grow(fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds)
         before, after = part.before, part.after
@@ -239,7 +247,37 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray]:
         return predict_rows(own, fold.test)
 
     first = force(before)
-    return first, first if after is before else force(after)
+    return first, first if after is before else force(after), after.model
+
+
+def _found_again(grown: Selection, found: Sequence[Model]) -> bool:
+    """Whether a fold found one of the effects again, or the evidence for one is not weak.
+
+    A fold that finds nothing predicts as the declared model does: its error is equal, and says nothing for one.
+    """
+    if not all(item.weak for item in grown.added):
+        return True
+    rows = grown.after.rows
+    known = [pair for model in found for pair in zip(model.terms, model.values, strict=True)]
+    shapes = [shape_of(term, values, rows) for term, values in known if "shift" not in term.fixed]
+    terms = [item.proposal.term for item in grown.added]
+    own = [shape_of(term, values, rows) for term, values in zip(terms, grown.after.model.values, strict=True)]
+    return any(_alike(one, other) for one in own for other in shapes)
+
+
+def _all_refused(grown: Selection, say: Callable[[str], None]) -> Selection:
+    """Return a selection without effects: those of weak evidence that no fold found again."""
+    say("left out, as no fold found them again: " + "; ".join(describe(a.proposal.term) for a in grown.added))
+    reason = "its evidence is weak, and the search finds it in no fold that lacks a part of the data"
+    refused = [RefusedEffect(a.proposal.term, a.proposal.p_value, reason) for a in grown.added]
+    return replace(grown, after=grown.before, added=(), refused=(*grown.refused, *refused))
+
+
+def _alike(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two shapes are correlated, or the same constant."""
+    one, other = one - one.mean(), other - other.mean()
+    size = np.linalg.norm(one) * np.linalg.norm(other)
+    return size == 0 or abs(one @ other) > ALIKE * size
 
 
 def _no_worse(

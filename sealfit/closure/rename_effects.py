@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import Channel
@@ -18,8 +19,11 @@ from sealfit.closure.criteria import RIVAL, TIED
 from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.naming import propose
 from sealfit.closure.score_test import Candidate, ScoreTests
-from sealfit.closure.search import of_channel
+from sealfit.closure.search import of_channel, search_pairs
 from sealfit.fit.joint.estimate import Fitted, fit
+
+ALONG_STROKES = ("time_s", "distance_mm", "displacement_mm")
+"""Channels that move together along every stroke, one a multiple of the other where the speed is steady."""
 
 
 @dataclass(frozen=True)
@@ -41,60 +45,113 @@ class Renaming:
     context: Context
 
     def all_but_last(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-        """Return a fit and its effects with each but the last named anew beside all the others."""
+        """Return a fit and its effects with each but the last named anew beside all the others.
+
+        One that keeps its name was confirmed while others were missing: it goes if beside them it gains nothing
+        on held-out data.
+        """
         for item in added[:-1]:
             number = next(k for k, a in enumerate(added) if a is item)
-            without, proposals = self._anew(fitted, number, item)
-            if not proposals or proposals[0].term.key() == item.proposal.term.key():
+            name = self._channel(item)
+            if name is None:
                 continue
+            without = self._without(fitted, number)
+            proposals = self._anew(fitted, number, without, [name], item.proposal.p_value)
             # While it is missing, what stood for most of the residual may rank too low on a grid to be refitted.
-            if proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL:
+            if not proposals or proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL:
                 continue
-            better = self._confirmed(without, proposals, item.round)
-            if better is not None and better.proposal.term.key() != item.proposal.term.key():
+            same = proposals[0].term.key() == item.proposal.term.key()
+            better = self._confirmed(without, proposals[:1] if same else proposals, item.round)
+            others = [*added[:number], *added[number + 1 :]]
+            if better is None and self._as_it_is(without, fitted, number, item) is None:
+                fitted, added = fit(without.model, fitted.rows, fitted.scatter, turns=2), others
+            elif better is not None and better.proposal.term.key() != item.proposal.term.key():
                 fitted = fit(better.proposal.fitted.model, fitted.rows, fitted.scatter, turns=2)
-                added = [*added[:number], *added[number + 1 :], better]
+                added = [*others, better]
         return fitted, added
 
+    def _as_it_is(self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect) -> AcceptedEffect | None:
+        """Return an effect of a fit with its own name, confirmed beside the others; None where it is not."""
+        model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
+        own = fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
+        return self._confirmed(without, [replace(item.proposal, fitted=own)], item.round)
+
     def one_for_two(
-        self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect
+        self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect, *, awaited: bool = False
     ) -> tuple[list[AcceptedEffect], AcceptedEffect]:
         """Return earlier effects and a new one that is not in `fitted` yet.
 
-        An earlier effect of the same channel goes where one alone, of another shape, does as well as the two. Two forms
-        that are no mechanism are one shape in two pieces: then it is enough that the one fits as well, whatever the
-        number of its knots.
+        An earlier effect goes where one alone does as well as it and the new one: a shape of the same channel or of
+        one that moves along with it, or a product of two channels. While another is `awaited`, beside which alone
+        the new one shows, only effects of its own channel are asked.
         """
-        name = self._channel(new)
-        number = next((k for k, a in enumerate(added) if name is not None and self._channel(a) == name), None)
-        if number is None or name == "direction":
-            return added, new
-        without, proposals = self._anew(fitted, number, new)
-        two = new.proposal.bic + added[number].proposal.bic_penalty
-        better = [p for p in proposals[:1] if p.bic < two + TIED]
-        if not (better or any(a.proposal.term.effect.physical for a in (added[number], new))):
-            pieces = new.proposal.bic_penalty + added[number].proposal.bic_penalty
-            fitting = [p for p in proposals if p.bic - p.bic_penalty < two - pieces + RIVAL]
-            better = sorted(fitting, key=lambda p: p.bic)[:1]
-        one = self._confirmed(without, better, new.round) if better else None
-        return (added, new) if one is None else ([*added[:number], *added[number + 1 :]], one)
+        for number, earlier in enumerate(added):
+            if awaited and self._channel(earlier) != self._channel(new):
+                continue
+            one = self._instead(fitted, number, earlier, new)
+            if one is not None:
+                return [*added[:number], *added[number + 1 :]], one
+        return added, new
 
-    def _anew(self, fitted: Fitted, number: int, item: AcceptedEffect) -> tuple[Fitted, Sequence[Proposal]]:
-        """Return the fit without a term, and what may stand in its place on the channel of `item`."""
-        name = self._channel(item)
-        if name is None:
-            return fitted, ()
-        without = fit(fitted.model.without_term(number), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
+    def _instead(
+        self, fitted: Fitted, number: int, earlier: AcceptedEffect, new: AcceptedEffect
+    ) -> AcceptedEffect | None:
+        """Return one effect that does as well as an earlier and a new one; None where there is none.
+
+        Two forms of one channel that are no mechanism are one shape in two pieces: then it is enough that the one
+        fits as well, whatever the number of its knots.
+        """
+        names = self._channel(earlier), self._channel(new)
+        if None in names:
+            return None
+        without = self._without(fitted, number)
+        p_value = min(earlier.proposal.p_value, new.proposal.p_value)
+        proposals = self._anew(fitted, number, without, self._near(*names), p_value)
+        proposals = sorted([*proposals, *self._products(without, names, p_value)], key=lambda p: p.bic)
+        two = new.proposal.bic + earlier.proposal.bic_penalty
+        better = [p for p in proposals[:1] if p.bic < two + TIED]
+        pieces = names[0] == names[1] and not any(a.proposal.term.effect.physical for a in (earlier, new))
+        if pieces and not better:
+            penalties = new.proposal.bic_penalty + earlier.proposal.bic_penalty
+            fitting = [p for p in proposals if p.bic - p.bic_penalty < two - penalties + RIVAL]
+            better = sorted(fitting, key=lambda p: p.bic)[:1]
+        return self._confirmed(without, better, new.round) if better else None
+
+    def _near(self, *names: str) -> list[str]:
+        """Return the channels of two effects and, where both vary along strokes, those of every stroke."""
+        found = list(dict.fromkeys(names))
+        if all(self.channels[name].unit == "sample" for name in names):
+            found += [name for name in ALONG_STROKES if name in self.channels and name not in found]
+        return found
+
+    def _products(self, without: Fitted, names: tuple[str, str], p_value: float) -> Sequence[Proposal]:
+        """Return forms of two channels together; none for one channel."""
+        if names[0] == names[1]:
+            return ()
+        rng = np.random.default_rng(self.context.config.loop.seed)
+        found = search_pairs(ScoreTests(without), [self.channels[name] for name in names], [], rng)
+        found = sorted((replace(c, p_value=p_value) for c in found), key=lambda c: -c.chi2)
+        return propose(without, found, self.channels, self.context.effects)
+
+    def _without(self, fitted: Fitted, number: int) -> Fitted:
+        model = fitted.model.without_term(number)
+        return fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
+
+    def _anew(
+        self, fitted: Fitted, number: int, without: Fitted, names: Sequence[str], p_value: float
+    ) -> Sequence[Proposal]:
+        """Return what may stand in the place of a term on some channels, from the fit `without` it."""
         finest: dict[tuple, Candidate] = {}
-        for c in of_channel(ScoreTests(without), self.channels[name]):
+        judge = ScoreTests(without)
+        for c in (c for name in names for c in of_channel(judge, self.channels[name])):
             if c.key not in finest or c.test_result.df > finest[c.key].test_result.df:
-                finest[c.key] = replace(c, p_value=item.proposal.p_value)
+                finest[c.key] = replace(c, p_value=p_value)
         found = sorted(finest.values(), key=lambda c: -c.chi2)
         own, values = fitted.model.terms[number], fitted.model.values[number]
         there = {p.name: (values[p.name],) for p in own.effect.nonlinear}
         alike = next((c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None)
         as_it_is = Linearised(without)(own, there, alike) if alike is not None else ()
-        return without, propose(without, found, self.channels, self.context.effects, as_it_is)
+        return propose(without, found, self.channels, self.context.effects, as_it_is)
 
     def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> AcceptedEffect | None:
         self.context.say(f"  round {number} again:")

@@ -54,15 +54,16 @@ class BeforeAfter:
     def gains(self, around: str | None, *, weak: bool) -> bool:
         """Whether after has no higher errors than before, in sample and held out.
 
-        Where a level is named, the errors about the means of its groups are no higher, and the whole ones not by much:
+        Weak evidence needs a lower error held out: an equal one says nothing for it. Where a level is named, this
+        is asked of the errors about the means of its groups, and the whole ones are not higher by much:
         `HARMLESS`. That needs evidence that is not weak, or a held-out error about these means that is halved.
         """
-        whole = max(self._ratios(None))
-        if around is None:
-            return whole <= SAME_ERROR
-        inside = self._ratios(around)
+        whole = self._ratios(None)
+        inside = whole if around is None else self._ratios(around)
+        if max(inside) > SAME_ERROR or (weak and inside[1] >= 1):
+            return False
         sure = not weak or inside[1] < HALVED
-        return max(inside) <= SAME_ERROR and whole <= (HARMLESS if sure else SAME_ERROR)
+        return max(whole) <= (HARMLESS if sure else SAME_ERROR)
 
     def _ratios(self, around: str | None) -> tuple[float, float]:
         """Return after's error over before's, in sample and held out; 1 for the second where nothing was held out."""

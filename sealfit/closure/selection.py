@@ -182,8 +182,12 @@ class _Growth:
         awaited = _awaited([two], self.shown.claimable)
         both = _both(self.fitted, awaited, self.channels, self.context.effects, self.ask, number)
         if both:
-            self.added = [*self.added, *both]
-            self.fitted = fit(both[-1].proposal.fitted.model, self.rows, self.fitted.scatter, turns=2)
+            later, earlier = both
+            own = earlier.proposal.fitted
+            without = own.model.without_term(len(own.model.terms) - 1)
+            self.fitted = fit(without, self.rows, own.scatter, turns=0, friction=own.friction)
+            self.added = [*self.added, later]
+            self.add(earlier)
         return bool(both)
 
     def open_candidates(self) -> list[Candidate]:
@@ -203,13 +207,19 @@ class _Growth:
             return False
         self.renamed, before = True, self.added
         self.fitted, self.added = self.renaming.all_but_last(self.fitted, self.added)
-        return self.added is not before
+        if self.added is before:
+            return False
+        self.fitted, self.added = _drop_needless(self.fitted, self.added)
+        rounds = {a.round for a in self.added}
+        self.refused |= {a.proposal.source for a in before if a.round not in rounds}
+        return True
 
     def add(self, accepted: AcceptedEffect) -> None:
         """Add an effect; drop what it makes needless."""
         source = accepted.proposal.source
         self.hidden = [pair.without(source) for pair in self.hidden if source in pair.keys]
-        earlier, accepted = self.renaming.one_for_two(self.fitted, self.added, accepted)
+        awaited = any(pair.keys for pair in self.hidden)
+        earlier, accepted = self.renaming.one_for_two(self.fitted, self.added, accepted, awaited=awaited)
         added = [*earlier, accepted]
         own = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
         self.fitted, self.added = _drop_needless(fit(own.model, self.rows, own.scatter, turns=2), added)
@@ -335,26 +345,28 @@ def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> 
 
 
 def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-    """Return the fit without effects that a later one has made needless, by Schwarz's price.
+    """Return the fit without effects that a later one has made needless, by Schwarz's price; the weakest first.
 
-    A ripple was judged on the raw samples, which bins cannot overrule.
+    What one of two alike leaves may be needless too, so each is asked again when another has gone. A ripple was
+    judged on the raw samples, which bins cannot overrule.
     """
-    k = 0
-    while k < len(added) - 1:
-        bic_penalty = added[k].proposal.bic_penalty
-        periodic = added[k].proposal.term.effect.periodic
-        if (
-            periodic or _wald_statistic(fitted, k) > 2 * bic_penalty
-        ):  # far from needless: no refit is wanted to see that
-            k += 1
-            continue
+    asked: set[int] = set()
+    while True:
+        # Far from needless: no refit is wanted to see that.
+        size = {
+            k: _wald_statistic(fitted, k) - 2 * a.proposal.bic_penalty
+            for k, a in enumerate(added[:-1])
+            if not a.proposal.term.effect.periodic
+        }
+        k = min((k for k in size if size[k] <= 0 and k not in asked), key=size.__getitem__, default=None)
+        if k is None:
+            return fitted, added
         without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
-        if without.deviance - fitted.deviance < bic_penalty:
+        if without.deviance - fitted.deviance < added[k].proposal.bic_penalty:
             fitted = fit(without.model, fitted.rows, fitted.scatter, turns=1)
-            added = [a for j, a in enumerate(added) if j != k]
+            added, asked = [*added[:k], *added[k + 1 :]], set()
         else:
-            k += 1
-    return fitted, added
+            asked.add(k)
 
 
 def _wald_statistic(fitted: Fitted, number: int) -> float:

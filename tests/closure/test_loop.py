@@ -193,3 +193,17 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     assert ends(1.1).gains("stroke", weak=True)
     assert ends(1.1, left=0.8).gains("stroke", weak=False)
     assert not ends(1.1, left=0.8).gains("stroke", weak=True)
+
+
+def test_weak_evidence_needs_a_lower_error_on_what_was_held_out():
+    rows = make_rows(make_bins(0), has_aging=True)
+    fitted = fit_declared(rows)
+    noise = np.random.default_rng(0).normal(0, 1, rows.force.size)
+
+    def ends(left):
+        return BeforeAfter(fitted, fitted, rows.force - noise, rows.force - left * noise, np.ones(noise.size, bool))
+
+    assert ends(1.0).gains(None, weak=False)
+    assert not ends(1.0).gains(None, weak=True)
+    assert ends(0.999).gains(None, weak=True)
+    assert not ends(1.0).gains("stroke", weak=True)

@@ -112,3 +112,91 @@ def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
     assert refitted
     assert kept is added
     assert after is fitted
+
+
+def in_place_of_two(bins, first, second, **options):
+    """Return what stands in place of two terms with their starts, each accepted beside the other."""
+    rows = make_rows(numbered(bins), has_aging=True)
+    model = fit_declared(rows).model.with_term(*first)
+    base = fit(model, rows, turns=2)
+    after = fit(base.model.with_term(*second), rows, base.scatter, turns=2)
+
+    def accepted(term, values, fitted):
+        source = (term.channels, term.acts_on, term.operation)
+        units = rows.groups.starts["run"].size
+        proposal = Proposal(term, values, "run", units, 1e3, 1e-9, np.empty(0), source, fitted=fitted)
+        return AcceptedEffect(proposal, 1.0, 1.0, (), (), 1)
+
+    one, two = (accepted(t, v, f) for (t, v), f in zip((first, second), (base, after), strict=True))
+    channels = {c.name: c for c in find_channels(rows)}
+    again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
+    earlier, new = again.one_for_two(base, [one], two, **options)
+    return [a.proposal.term for a in (*earlier, new)]
+
+
+def test_an_asymmetry_of_mu_told_as_two_of_its_ends_is_one_effect():
+    def asymmetric(table, force):
+        return force * (1 + 0.02 * table["direction"].to_numpy())
+
+    bins = make_bins(3, directions=(1, -1), repeats=2, bins=4, noise_N=0.1, effect=asymmetric)
+    ends = [(Term(EFFECTS["asymmetry"], ("direction",), q, "multiply"), {"A": 0.04}) for q in ("mu_s", "mu_c")]
+    (term,) = in_place_of_two(bins, *ends)
+    assert (term.effect.id, term.acts_on) == ("asymmetry", "mu")
+
+
+def test_an_offset_and_an_asymmetry_that_are_both_there_stay_two():
+    def both(table, force):
+        return force * (1 + 0.02 * table["direction"].to_numpy()) + 0.5
+
+    bins = make_bins(3, directions=(1, -1), repeats=2, bins=4, noise_N=0.1, effect=both)
+    offset = Term(EFFECTS["zero_offset"], ("direction",), "force", "add"), {"A": 0.5}
+    terms = in_place_of_two(bins, offset, (Term(EFFECTS["asymmetry"], ("direction",), "mu", "multiply"), {"A": 0.04}))
+    assert [t.effect.id for t in terms] == ["zero_offset", "asymmetry"]
+
+
+def test_a_change_with_time_told_by_distance_and_by_displacement_is_one_effect():
+    def growing(table, force):
+        return force * (1 + 0.004 * table["time_s"].to_numpy())
+
+    bins = make_bins(3, repeats=2, bins=6, noise_N=0.1, effect=growing)
+    forms = (EFFECTS["linear"], "distance_mm"), (EFFECTS["log"], "displacement_mm")
+    two = (Term(effect, (name,), "mu", "multiply", {"x_ref": 20.0}) for effect, name in forms)
+    (term,) = in_place_of_two(bins, *((t, {"A": 1e-3}) for t in two))
+    assert term.channels == ("time_s",)
+
+
+def test_a_product_told_as_a_sum_of_two_is_one_effect():
+    channels = {name: lambda rng: rng.uniform(0, 10) for name in ("oil_ppm", "humidity_pct")}
+
+    def product(table, force):
+        return force * (1 + 0.002 * table["oil_ppm"].to_numpy() * table["humidity_pct"].to_numpy())
+
+    bins = make_bins(3, repeats=2, bins=3, noise_N=0.1, effect=product, run_channels=channels)
+    two = [(Term(EFFECTS["linear"], (n,), "mu", "multiply", {"x_ref": 5.0}), {"A": 0.01}) for n in channels]
+    (term,) = in_place_of_two(bins, *two)
+    assert set(term.channels) == set(channels)
+    assert len(in_place_of_two(bins, *two, awaited=True)) == 2  # a third is to come, beside which alone one shows
+
+
+def test_an_effect_that_gains_nothing_beside_the_others_goes():
+    def oil_only(table, force):
+        return force * (1 + 1e-3 * (table["oil_ppm"].to_numpy() - 50))
+
+    rows = make_rows(numbered(make_bins(5, repeats=2, bins=4, effect=oil_only, run_channels=OIL)), has_aging=True)
+    slow = Term(EFFECTS["linear"], ("time_s",), "mu", "multiply", {"x_ref": 10.0})
+    oil = Term(EFFECTS["linear"], ("oil_ppm",), "mu", "multiply", {"x_ref": 50.0})
+    model = fit_declared(rows).model.with_term(slow, {"A": 1e-3}).with_term(oil, {"A": 1e-3})
+    fitted = fit(model, rows, turns=2)
+    added = [
+        AcceptedEffect(
+            Proposal(t, v, "run", 72, 1e3, 1e-9, np.empty(0), (t.channels, "mu", "multiply")), 1.0, 1.0, (), (), k
+        )
+        for k, (t, v) in enumerate(zip(fitted.model.terms, fitted.model.values, strict=True))
+    ]
+    channels = {c.name: c for c in find_channels(rows)}
+    again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
+    after, kept = again.all_but_last(fitted, added)
+    assert [a.proposal.term.channels for a in kept] == [("oil_ppm",)]
+    assert [t.channels for t in after.model.terms] == [("oil_ppm",)]
+    held, _ = again.all_but_last(after, kept)
+    assert held is after
