@@ -53,6 +53,7 @@ def terms_of(
     if candidate.pair:
         pair = [channels[name] for name in candidate.channels]
         alone = fitted.scatter.knows("specimen") or all(c.unit != "specimen" for c in pair)
+        alone = alone and all(room_along(c, fitted) > 0 for c in pair)
         yield from _terms_of_pair(*pair, target, effects, alone=alone)
         return
     name = candidate.channels[-1]
@@ -138,7 +139,8 @@ def _terms_of_pair(
 ) -> Iterator[tuple[Term, dict]]:
     """Yield the forms of a pair of channels: products, or a slope for each category.
 
-    Forms that also hold what each channel does `alone` would be given the specimens' scatter where that is not known.
+    Forms that also hold what each channel does `alone` would be given the specimens' scatter where that is not known,
+    and the Stribeck curve where few speeds leave no room beside it.
     """
     if not (one.numeric and other.numeric):
         number, category = (one, other) if one.numeric else (other, one)

@@ -2,12 +2,17 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins, make_traces
 
-from sealfit.closure.channels import Channel
+from sealfit.closure.channels import Channel, find_channels
+from sealfit.closure.forms import terms_of
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
+from sealfit.closure.score_test import Candidate, ScoreTestResult
 from sealfit.closure.search import mixed_columns
 from sealfit.config import Config
+from sealfit.effects import EFFECTS
 from sealfit.engine.run_map import cores
+from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint.rows import make_rows
 
 COLUMNS = {
     "oil_ppm": lambda rng: rng.normal(50, 10),
@@ -65,3 +70,16 @@ def test_products_of_logarithms_are_tried_where_a_channel_spans_enough():
     product = np.log(speed.values / 5) * (np.log(days.values + 1) - np.log(days.values + 1).mean())
     best = max(abs(np.corrcoef(product, block[:, 0])[0, 1]) for block in mixed_columns(speed, days)[:-1])
     assert best == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("speeds", "alone"), [((1.0, 8.0, 32.0, 100.0), False), ((1.0, 4.0, 16.0, 32.0, 64.0), True)])
+def test_a_product_holds_the_speed_alone_only_where_the_curve_leaves_room(speeds, alone):
+    fitted = fit_declared(make_rows(make_bins(1, speeds=speeds, repeats=1, bins=6), has_aging=True))
+    channels = {c.name: c for c in find_channels(fitted.rows)}
+    test_result = ScoreTestResult(0.0, 1, 20, 0.0)
+    candidate = Candidate(
+        ("distance_mm", "speed_mm_s"), "mu", "multiply", "run", np.empty((0, 0)), test_result, pair=True
+    )
+    terms = [term for term, _ in terms_of(candidate, channels, fitted, EFFECTS)]
+    assert any(term.effect.id == "product" for term in terms)
+    assert any(len(term.effect.linear) > 1 and not term.effect.id.startswith("surface") for term in terms) == alone
