@@ -15,7 +15,7 @@ from worlds.priors import PRIORS
 from worlds.run import command, copies, read_closure, true_effects
 from worlds.score import NONE, RIGHT, SAME_AT_DESIGN, Target, explained_by, grade, named_rightly, on_variables, scored
 from worlds.summary import alarmed, summarise
-from worlds.true_form import make_rows, z_values
+from worlds.true_form import candidates, make_rows, p_units, z_values
 from worlds.world import draw_world
 
 SEED = "tests"
@@ -151,6 +151,21 @@ def test_a_strong_ripple_is_seen_and_an_absent_one_is_not():
     assert z[0.2] > 8 > 1 > z[1e-6]
 
 
+def test_what_can_be_told_is_counted_by_units_and_by_candidates():
+    z = {"z": 9.0, "z_specimens": 2.0}
+    npt.assert_allclose([p_units(z, scatters=True), p_units(z, scatters=False)], [0.0455, 2.257e-19], rtol=1e-3)
+    world = quiet(5)
+    variables = len(world.ranges) + (world.rig["directions"] != "one") + ("batch" in world.files)
+    aged = 9 if (world.days > 0).any() else 7
+    assert candidates(world) == variables * aged + variables * (variables - 1)
+    ripple = Effect("ripple", ("ripple",), ("displacement_mm",), "force", "add", "sine",
+                    {"period": world.rig["stroke_mm"] / 5, "phase": 0.3})  # fmt: skip
+    world.effects = [replace(ripple, amplitude=1e-6 * world.rig["mean_N"])]
+    found = z_values(make_rows(world), world)[0]
+    assert found["p_units"] >= 2e-3
+    assert not found["told"]
+
+
 def test_variables_of_a_claim():
     assert on_variables(RIPPLE, ["displacement_mm"])
     assert on_variables(RIPPLE, ["displacement_mm", "direction"])
@@ -249,6 +264,7 @@ def test_the_summary_counts_what_the_records_say(tmp_path):
     text = summarise(records)
     assert "| nothing hidden: claimed or unexplained | 1/2 = 50.0 %" in text
     assert "| clear effects found | 1/2 = 50.0 %" in text
+    assert "tells among all candidates | - |" in text
     assert "| predict: error after above before by more than 5 % | 1/5 = 20.0 %" in text
     assert "cannot_tell 1" in text
     assert "traceback: KeyError: 'x'" in text

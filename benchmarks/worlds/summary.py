@@ -97,6 +97,7 @@ def figures(records: list[dict], fine: list[dict]) -> str:
     """Return the table of figures over all worlds."""
     nulls, clear = [r for r in fine if is_null(r)], clear_effects(fine)
     by_specimens = [e for e in clear if abs(e.get("z_specimens", 0.0)) >= BY_SPECIMENS]
+    told = [e for e in clear if e.get("told")]
     before, true_form = ratios(fine, "before"), ratios(fine, "true_form")
     pooled = sum(r.get("inside", 0) for r in fine), sum(r.get("with_interval", 0) for r in fine)
     noted = [r["of_tested_specimens"] for r in fine if r.get("of_tested_specimens")]
@@ -120,7 +121,12 @@ def figures(records: list[dict], fine: list[dict]) -> str:
             f"... of those with z by specimens >= {BY_SPECIMENS:g}",
             share(sum(e["grade"] > 0 for e in by_specimens), len(by_specimens)),
         ),
-        ("... and named or honestly unnamed", share(sum(e["named_rightly"] for e in clear), len(clear))),
+        (
+            "clear effects that a test of the true form by units tells among all candidates",
+            share(len(told), sum("told" in e for e in clear)),
+        ),
+        ("... of these found", share(sum(e["grade"] > 0 for e in told), len(told))),
+        ("clear effects named or honestly unnamed", share(sum(e["named_rightly"] for e in clear), len(clear))),
         ("predict: error after above before by more than 5 %", share(int((before > WORSE).sum()), before.size)),
         ("predict: after over the true form, median, 95th percentile", _quantiles(true_form)),
         ("points inside the 95 % interval of the mean", share(*pooled)),

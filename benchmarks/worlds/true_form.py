@@ -15,6 +15,12 @@ one; the smaller counts. So z is conservative: what demeaning takes away is not 
 z by specimens: the same with specimens as the clusters, and one degree of freedom less than specimens. Nobody who does
 not know whether specimens differ in their slope along a channel can claim more from them than this.
 
+p by units: the two-sided p of z by the units that may scatter without any effect: specimens where the effect varies
+inside strokes, with the speed or with the direction, else the clusters of z. A tester who knows the form and the
+quantity, but not where to look, must hold it against as many tests as the campaign has candidates (`candidates`):
+every quantity along every variable, and friction and force along every pair. The effect can be told where p by units
+times their number is at most 0.005.
+
 The true form's error at new points: d of the same generalised least squares, and the derivatives at the points.
 """
 
@@ -41,6 +47,9 @@ VAGUE = 2.0  # relative standard deviation of what is known of a declared quanti
 LEAST_RUNS = 12  # with fewer, files are the clusters of an effect inside files
 MOST_ROWS = 1200  # of a specimen whose scatter is taken as one block: more are cut between files, for time
 WRONG_GAIN = 0.15  # of files that went wrong, about
+TOLD = 0.005  # family error of a search
+QUANTITIES_TRIED = 7  # force added and by a factor, mu, mu_s, mu_c, v_s, sigma_2; a and b where rubber is aged
+TRIED_OF_PAIRS = 2
 GAIN = ("mu_0s", "mu_0c", "a_s", "a_c", "sigma_2")  # quantities that a gain of the whole friction multiplies
 UNIT = {"repeat": "file", "run": "run_id", "specimen": "specimen_id"}
 LEVELS = ("stroke", "file", "run_id", "specimen_id")  # nesting, fine to coarse
@@ -186,8 +195,23 @@ def z_values(rows: Rows, world: World) -> list[dict]:
         se = float(np.sqrt(covariance[place, place]))
         whole = {"z": (1 + float(d[place])) / se, "z_expected": 1 / se}
         both = {name: min(own[name], value, key=abs) for name, value in whole.items()}
-        found.append({"unit": unit, "level": CLAIM_LEVEL[unit], **own, **both})
+        p = p_units(own | both, scatters=unit == "sample" or bool({"speed_mm_s", "direction"} & set(names)))
+        told = p * candidates(world) <= TOLD
+        found.append({"unit": unit, "level": CLAIM_LEVEL[unit], **own, **both, "p_units": p, "told": told})
     return found
+
+
+def p_units(z: dict, *, scatters: bool) -> float:
+    """Return the p of an effect by the units whose slopes `scatters` says may differ without it: specimens, or runs."""
+    size = min(abs(z["z"]), abs(z["z_specimens"])) if scatters else abs(z["z"])
+    return float(2 * stats.norm.sf(size))
+
+
+def candidates(world: World) -> int:
+    """Return how many tests of an unknown effect a campaign has: quantities along variables, and pairs of these."""
+    variables = len(world.ranges) + (world.rig["directions"] != "one") + ("batch" in world.files)
+    quantities = QUANTITIES_TRIED + 2 * (np.count_nonzero(world.days > 0) > 0)
+    return variables * quantities + TRIED_OF_PAIRS * variables * (variables - 1) // 2
 
 
 def _setting(rows: Rows, name: str) -> np.ndarray:
