@@ -8,6 +8,7 @@ from scipy.optimize import lsq_linear
 
 import sealfit.fit.joint.search as joint_search
 from sealfit.effects import EFFECTS
+from sealfit.fit.joint import search
 from sealfit.fit.joint.estimate import fitted_at
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
@@ -49,6 +50,19 @@ def test_series_that_lost_their_stribeck_speed_find_it(one_specimen, aging):
     found = search_nonlinear(model, rows, SCATTER)
     assert np.abs(found.vector()[curved] - model.vector()[curved]).max() > 0.3
     npt.assert_allclose(np.exp(found.vector()[curved]), bins_helpers.TRUE["v_s"], rtol=0.4)  # a grid of twelve
+
+
+@pytest.mark.parametrize(("gained", "moves"), [(0.1, False), (50.0, True)])
+def test_a_stribeck_speed_moves_only_for_what_its_prior_costs(gained, moves, monkeypatch):
+    model, rows, curved = astray(one_specimen=False, aging=False)
+    stands = model.vector()
+
+    def solved(at, *_):
+        return 100.0 - gained * float(np.abs(at.vector() - stands).max() > 1.0), at
+
+    monkeypatch.setattr(search, "_linear_solved", solved)
+    found = search_nonlinear(model, rows, SCATTER).vector()
+    assert np.array_equal(found[curved], stands[curved]) != moves
 
 
 @pytest.mark.parametrize("gain", [0.0, 1e-5, 3e-4])

@@ -109,6 +109,7 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
     """
     low, high = bounds_of(model, rows)
     prior = _linear_prior(model)
+    held = np.diag(precision_of(model))[group]  # where the data hold nothing, v_s stays where it stands
     moving, still = _parted(model, rows, group)
     whitening = Whitening(scatter, moving.force, moving.groups)
     rest = None if still is None else _equations(model, still, Whitening(scatter, still.force, still.groups))
@@ -120,8 +121,11 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
     best, chosen = solved_at(model)
     for value in np.linspace(low[group[0]], high[group[0]], GRID_POINTS):
         vector = model.vector()
+        away = value - vector[group]
         vector[group] = value
-        cost, solved = solved_at(model.at(vector), best)
+        pull = float(held @ away**2)
+        cost, solved = solved_at(model.at(vector), best - pull)
+        cost += pull
         if cost < best - 1e-9:
             best, chosen = cost, solved
     return model.at(np.clip(chosen.vector(), low, high))
