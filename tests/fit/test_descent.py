@@ -57,7 +57,7 @@ def test_a_stribeck_speed_moves_only_for_what_its_prior_costs(gained, moves, mon
     model, rows, curved = astray(one_specimen=False, aging=False)
     stands = model.vector()
 
-    def solved(at, *_):
+    def solved(at, *_, most=np.inf):
         return 100.0 - gained * float(np.abs(at.vector() - stands).max() > 1.0), at
 
     monkeypatch.setattr(search, "_linear_solved", solved)

@@ -165,7 +165,7 @@ def test_unaged_rubbers_are_told_apart():
         ("60,80,8", "60,80,", "empty_cell", 4, "aging_days", "Fill it"),
         ("60,80,8", "60,80,-8", "out_of_range", 4, "aging_days", "below 0"),
         ("8,49.03", "8,0", "out_of_range", 4, "load_N", "above 0"),
-        ("8,49.03,5", "8,49.03,0", "out_of_range", 4, "speed_mm_s", "slide"),
+        ("8,49.03,5", "8,49.03,0", "out_of_range", 4, "speed_mm_s", "sliding speed"),
         ("8,49.03,5", "8,inf,5", "not_a_number", 4, "load_N", "inf"),
         ("b.csv,r1,2", "b.csv,r1,1", "duplicate_repeat", 3, "repeat", "line 2"),
         ("b.csv,r1,2", "b.csv,r1,two", "not_a_number", 3, "repeat", "two"),
