@@ -221,7 +221,7 @@ def _version(package: str) -> str | None:
 # What OUT knows of itself: its campaign, its config, its inputs, and the key under which each step was made.
 
 STATE = "state.json"
-FORMAT = 5
+FORMAT = 6
 DEFAULT = "default"
 
 
