@@ -1,1 +1,28 @@
+"""From a friction rig's files to the LuGre model of an aging rubber seal, and to what that model lacks.
+
+`sealfit.run` does what the command of the same name does and returns a `Results`; `sealfit.open` returns those that are
+there. Both are loaded when they are first asked for, so that the command line starts at once.
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sealfit.notebook.results import Lifetime, Results, run
+    from sealfit.notebook.results import open as open
+
 __version__ = "0.1.0"
+__all__ = ["Lifetime", "Results", "run"]  # without `open`: `from sealfit import *` is not to hide Python's own
+
+_LOADED = (*__all__, "open")
+
+
+def __getattr__(name: str) -> object:
+    if name in _LOADED:
+        from sealfit.notebook import results
+
+        return getattr(results, name)
+    raise AttributeError(f"module 'sealfit' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_LOADED])

@@ -81,7 +81,6 @@ def predict(
         If the points cannot be read, lack a column that the model needs, the answers cannot be written, or the model
         needs the user's own effects and no folder of them is given.
     """
-    from sealfit.closure.predict import predict as answer
     from sealfit.closure.prediction_csv import read_points, write_answers
 
     store = Store.open(existing_out(out), effects_folder)
@@ -89,8 +88,15 @@ def predict(
         (progress or Silent()).warn(warning)
     store.require("close-loop")
     asked = read_points(points)
-    answers = answer(store.read_json("model"), asked.values, _own_effects(store.effects))
+    answers = answers_to(asked.values, store)
     return {"out": str(store.out), "output": str(output), **write_answers(asked, answers, output)}
+
+
+def answers_to(points: pd.DataFrame, store: Store) -> pd.DataFrame:
+    """Return points with their answers, by the model that the loop of `store` recorded; errors as `predict`."""
+    from sealfit.closure.predict import predict as answer
+
+    return answer(store.read_json("model"), points, _own_effects(store.effects))
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,10 +152,12 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
 
 
 def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame], list[dict]]:
-    """Return tables `steady` and `steady_fit` of a model, and the effects that were taken out of them."""
+    """Return table `steady` and the fit of its conditions of a model, and the effects that were taken out of them."""
+    from sealfit.fit.stored_tables import whole_steady_fit
+
     if model == "before":
         store.require("fit-steady")
-        return (store.read("steady"), store.read("steady_fit")), []
+        return (store.read("steady"), whole_steady_fit(store.read)), []
     try:
         store.require("close-loop")
     except StaleError as error:
@@ -158,7 +166,7 @@ def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame
     added = [effect for effect in store.read_json("closure")["effects"] if not effect["candidate"]]
     suffix = "_after" if added else ""
     taken_out = [{key: effect[key] for key in ("id", "label", "reference")} for effect in added]
-    return (store.read(f"steady{suffix}"), store.read(f"steady_fit{suffix}")), taken_out
+    return (store.read(f"steady{suffix}"), whole_steady_fit(store.read, suffix)), taken_out
 
 
 def _own_effects(folder: Path | None) -> dict:

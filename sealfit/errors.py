@@ -67,6 +67,10 @@ class SealfitError(Exception):
         head = ": ".join([p for p in (place, f"column '{column}'" if column else "") if p])
         super().__init__(" ".join(p for p in (f"{head}: {message}" if head else message, fix) if p))
 
+    def _render_traceback_(self) -> list[str]:
+        """Return what a notebook shows in place of a traceback: the program is not at fault, and the fix is said."""
+        return [f"{type(self).__name__}: {self}"]
+
     def as_dicts(self) -> list[dict]:
         """Return `[{file, line, column, value, fix, reason}]`, the `errors` of `--json`."""
         place = {"file": self.file, "line": self.line, "column": self.column, "value": None}

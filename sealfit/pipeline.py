@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,10 +22,21 @@ INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bin
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
 AFTER = (
     "steady_after", "steady_fit_after", "aging_fit_after", "aging_curves_after", "aging_laws_after",
-    "master_curve_after", "dynamic_fit_after", "dynamic_curves_after",
+    "master_curve_after", "dynamic_fit_after", "dynamic_curves_after", "steady_covariance_after", "steady_shift_after",
+    "aging_covariance_after",
 )  # fmt: skip
-FITTED = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
-UNREPORTED = ("traces", "bins", "steady_after")  # of many rows, and nothing in the report needs them
+FITS = {
+    "fit-steady": ("steady_fit", "steady_covariance", "steady_shift"),
+    "fit-aging": ("aging_fit", "aging_covariance", "aging_curves", "aging_laws", "master_curve"),
+    "fit-dynamic": ("dynamic_fit", "dynamic_curves"),
+}
+FITTED = tuple(name for names in FITS.values() for name in names)
+MADE = {"ingest": INGESTED, **FITS, "close-loop": (*CLOSED, *AFTER)}  # tables by the step that makes them
+TABLES = tuple(name for names in MADE.values() for name in names)
+BESIDE = ("steady_covariance", "steady_shift", "aging_covariance")  # of the parameters of a fit
+UNREPORTED = (  # of many rows, and nothing in the report needs them
+    "traces", "bins", "steady_after", *BESIDE, *(f"{name}_after" for name in BESIDE),
+)  # fmt: skip
 TRACE = ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"]
 REPORTED = {  # of tables with a row per bin, what the report looks at
     f"residuals_{stage}": ["condition", "run_id", "file", "residual_N", "heldout_residual_N"]
@@ -180,34 +191,34 @@ def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) ->
 
     steady = store.read("steady")
     progress.say(f"fitting {steady['condition'].nunique()} conditions")
-    staged.table("steady_fit", fit_conditions(steady, store.seen_config("fit-steady")))
+    _write(staged, {"steady_fit": fit_conditions(steady, store.seen_config("fit-steady"))})
     return len(steady), "strokes"
 
 
 def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     from sealfit.fit.aging.all_series import joint_laws
     from sealfit.fit.aging.series import aging_curves, fit_series
+    from sealfit.fit.stored_tables import whole_steady_fit
 
     config = store.seen_config("fit-aging")
     if config.aging:
         progress.say("fitting the aging law")
     else:
         progress.say("no aging_days in the condition: there is no aging law to fit")
-    steady_fit = store.read("steady_fit")
+    steady_fit = whole_steady_fit(store.read)
     fitted = fit_series(steady_fit, config)
     laws, curve = joint_laws(store.read("steady"), steady_fit, config)
-    staged.table("aging_laws", laws)
-    staged.table("master_curve", curve)
-    staged.table("aging_fit", fitted)
-    staged.table("aging_curves", aging_curves(fitted))
+    curves = aging_curves(fitted)
+    _write(staged, {"aging_laws": laws, "master_curve": curve, "aging_fit": fitted, "aging_curves": curves})
     return int(steady_fit["condition"].nunique()), "conditions"
 
 
 def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     from sealfit.fit.dynamic.fit import fit_dynamic
+    from sealfit.fit.stored_tables import whole_steady_fit
 
     progress.say("fitting the pre-sliding part")
-    tables, config = (store.read("steady"), store.read("steady_fit")), store.seen_config("fit-dynamic")
+    tables, config = (store.read("steady"), whole_steady_fit(store.read)), store.seen_config("fit-dynamic")
     found = fit_dynamic(store.traces(), *tables, config, workers=workers)
     staged.table("dynamic_fit", found.fit)
     staged.table("dynamic_curves", found.curves)
@@ -225,12 +236,20 @@ def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) ->
         progress.say("the fits with the effects taken out")
     after = after_fits(closure.after, store.read("steady"), store.traces(), config, workers=workers)
     with timed("writing tables"):
-        for name, table in {**closure.tables, **after}.items():
-            staged.table(name, table)
+        _write(staged, {**closure.tables, **after})
     started = store.read("runs", ["started_at"])["started_at"].dropna()
     staged.json("model", {**closure.model, "first_started_at": min(started) if len(started) else None})
     staged.json("closure", closure.document)
     return len(closure.tables["residuals_before"]), "bins"
+
+
+def _write(staged: Staged, tables: Mapping[str, pd.DataFrame]) -> None:
+    """Write tables, those of a fit in the parts in which it is stored."""
+    from sealfit.fit.stored_tables import stored
+
+    for name, table in tables.items():
+        for part, rows in stored(name, table).items():
+            staged.table(part, rows)
 
 
 def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
@@ -238,7 +257,7 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
 
     progress.say("drawing the report")
     with timed("reading tables"):
-        tables = _reported(store, (*INGESTED, *FITTED, *CLOSED, *AFTER))
+        tables = report_tables(store)
     with timed("page"):
         about = store.read_json("closure"), store.provenance(), store.seen_config("report")
         report = build_report(tables, *about)
@@ -249,11 +268,11 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
     return sum(len(table) for table in tables.values()), "rows of tables"
 
 
-def _reported(store: Store, names: tuple[str, ...]) -> dict[str, pd.DataFrame]:
-    """Return of these tables what the report draws."""
-    read = [name for name in names if name not in (*UNREPORTED, "traces_mean")]
-    tables = {name: store.read(name, REPORTED.get(name)) for name in read}
-    return {**tables, "traces_mean": _example_traces(store, tables["runs"])} if "traces_mean" in names else tables
+def report_tables(store: Store) -> dict[str, pd.DataFrame]:
+    """Return by name what the report shows and draws of the tables in OUT."""
+    names = [name for name in TABLES if name not in (*UNREPORTED, "traces_mean")]
+    tables = {name: store.read(name, REPORTED.get(name)) for name in names}
+    return {**tables, "traces_mean": _example_traces(store, tables["runs"])}
 
 
 def _example_traces(store: Store, runs: pd.DataFrame) -> pd.DataFrame:
@@ -263,7 +282,7 @@ def _example_traces(store: Store, runs: pd.DataFrame) -> pd.DataFrame:
     names = ["run_id", "condition"]
     places = store.read("traces_mean", names, coded=names).drop_duplicates("run_id").astype(object)
     chosen = example_runs(places, runs)["run_id"].tolist()
-    traces = store.read("traces_mean", TRACE, runs=chosen)
+    traces = store.read("traces_mean", TRACE, where={"run_id": chosen})
     return traces.sort_values("run_id", key=lambda names: names.map(chosen.index), kind="stable")
 
 

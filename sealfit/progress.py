@@ -105,6 +105,13 @@ def to_stderr() -> Lines:
     return Terminal() if sys.stderr.isatty() else Lines()
 
 
+def for_notebook() -> Lines:
+    """Return the progress that fits a notebook: lines among its results, not in red; else that which fits stderr."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython else None
+    return Lines(sys.stdout) if hasattr(shell, "kernel") else to_stderr()
+
+
 # ---------------------------------------------------------------- profiling
 # Where a command's time goes: seconds and rows of every step, and of the parts of a step that take long.
 

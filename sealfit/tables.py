@@ -192,6 +192,44 @@ _FIT = (
 )
 STEADY_FIT = Schema("steady_fit", (CONDITION, SERIES, RUBBER, *_FIT), open_=True)
 AGING_FIT = Schema("aging_fit", (SERIES, RUBBER, *_FIT), open_=True)
+_OTHER = Column("other", "", TEXT, "the other parameter; the parameter itself for a variance")
+_COVARIANCE = (
+    Column("value", "", FLOAT, "covariance of the two estimates (type A)"),
+    Column("unit", "", TEXT, "unit of value"),
+    Column("identified", "", BOOL, "false where these data do not determine one of the two"),
+)
+_PARAMETER = Column("parameter", "", TEXT, "parameter, in the field's symbol")
+STEADY_COVARIANCE = Schema(
+    "steady_covariance", (CONDITION, SERIES, RUBBER, MODEL, _PARAMETER, _OTHER, *_COVARIANCE), open_=True
+)
+AGING_COVARIANCE = Schema(
+    "aging_covariance",
+    (
+        SERIES,
+        RUBBER,
+        MODEL,
+        Column("quantity", "", TEXT, "what the law is of: mu_s, mu_c, F_s or F_c"),
+        replace(_PARAMETER, meaning="mu_0, a or ln b"),
+        _OTHER,
+        *_COVARIANCE,
+    ),
+    open_=True,
+)
+STEADY_SHIFT = Schema(
+    "steady_shift",
+    (
+        CONDITION,
+        SERIES,
+        RUBBER,
+        MODEL,
+        Column("source", "", TEXT, "sensor: it reads one standard uncertainty too high | 1, 2, ...: of the effects"),
+        _PARAMETER,
+        Column("value", "", FLOAT, "change of the parameter, common to all conditions in sign"),
+        Column("unit", "", TEXT, "unit of value"),
+        Column("identified", "", BOOL, "false where these data do not determine the parameter"),
+    ),
+    open_=True,
+)
 DYNAMIC_FIT = Schema("dynamic_fit", (CONDITION, SERIES, RUBBER, DIRECTION, SPEED_SET, *_FIT), open_=True)
 
 STEADY_AFTER = Schema(
@@ -357,7 +395,9 @@ AGING_CURVES = Schema(
 )
 
 _FITTED = (STEADY_FIT, AGING_FIT, AGING_CURVES, AGING_LAWS, MASTER_CURVE, DYNAMIC_FIT, DYNAMIC_CURVES)
+_BESIDE = (STEADY_COVARIANCE, STEADY_SHIFT, AGING_COVARIANCE)  # of the parameters of a fit
 AFTER = (STEADY_AFTER, *(replace(fitted, name=f"{fitted.name}_after") for fitted in _FITTED))
+BESIDE_AFTER = tuple(replace(beside, name=f"{beside.name}_after") for beside in _BESIDE)
 
 SCHEMAS = {
     schema.name: schema
@@ -383,6 +423,8 @@ SCHEMAS = {
         MASTER_CURVE,
         DYNAMIC_FIT,
         DYNAMIC_CURVES,
+        *_BESIDE,
         *AFTER,
+        *BESIDE_AFTER,
     )
 }

@@ -63,6 +63,16 @@ def test_more_items_go_to_other_processes():
     assert 1 <= len(used) <= 2
 
 
+def test_a_script_that_calls_it_is_not_run_again_in_each_process(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from math import sqrt\nfrom sealfit.engine.run_map import run_map\n"
+        "print(list(run_map(sqrt, [1, 4, 9, 16], workers=2, together=1)))\n"
+    )
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    assert ended.stdout == "[1.0, 2.0, 3.0, 4.0]\n"
+
+
 def test_no_items_give_nothing():
     assert list(run_map(square, [], workers=3)) == []
 

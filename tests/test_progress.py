@@ -1,9 +1,11 @@
 import io
+import sys
+from types import SimpleNamespace
 
 import pytest
 
 from sealfit.errors import Fault
-from sealfit.progress import LINE_EVERY_S, Lines, Silent, Terminal
+from sealfit.progress import LINE_EVERY_S, Lines, Silent, Terminal, for_notebook
 
 
 @pytest.fixture
@@ -31,6 +33,15 @@ def test_a_terminal_keeps_one_line_of_what_was_counted():
         on_file(1, 2)
         on_file(2, 2)
     assert stream.getvalue().endswith("reading: 2\n")
+
+
+@pytest.mark.parametrize(
+    ("shell", "stream"), [(SimpleNamespace(kernel=1), "out"), (SimpleNamespace(), "err"), (None, "err")]
+)
+def test_a_notebook_has_progress_among_its_results(monkeypatch, capsys, shell, stream):
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    for_notebook().say("fitting")
+    assert getattr(capsys.readouterr(), stream) == "fitting\n"
 
 
 def test_faults_are_said_with_what_was_done_and_remarks_are_not():

@@ -120,14 +120,14 @@ def test_columns_come_in_the_order_of_the_schema_and_channels_after_them(tmp_pat
 
 
 @pytest.mark.parametrize("coded", [[], ["run_id"]])
-def test_of_some_runs_only_their_rows_are_read(tmp_path, coded):
+def test_only_the_rows_asked_for_are_read(tmp_path, coded):
     paths = [tmp_path / name for name in ("one.parquet", "two.parquet")]
     for path, runs in zip(paths, (["a", "b", "a"], ["c", "d", "b"]), strict=True):
         parquet.write(small("bins", 3).assign(run_id=runs, load_N=[1.0, 2.0, 3.0]), BINS, Units(), path)
-    rows = parquet.read(paths, ["run_id", "load_N"], coded, runs=["b", "d"])
+    rows = parquet.read(paths, ["run_id", "load_N"], coded, where={"run_id": ["b", "d"]})
     assert rows["run_id"].tolist() == ["b", "d", "b"]
     assert rows["load_N"].tolist() == [2.0, 2.0, 3.0]
-    assert parquet.read(paths, ["run_id"], runs=[]).empty
+    assert parquet.read(paths, ["run_id"], where={"run_id": []}).empty
 
 
 def test_types_are_those_of_the_schema(tmp_path):

@@ -75,13 +75,44 @@ def _names_of_points(names: list[str], path: Path) -> list[str]:
         raise RequestError("is empty.", file=path, fix="Give a line of column names, then one row per point.")
     if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
         raise RequestError("is not separated by commas.", file=path, line=1, fix="Save it with commas and points.")
+    _refuse_names(names, file=path, line=1)
+    return names
+
+
+def _refuse_names(names: list[str], **place: object) -> None:
+    """Raise RequestError for columns that are there twice or are those of the answer."""
     doubled = sorted({name for name in names if names.count(name) > 1})
     if doubled:
-        raise RequestError("appears twice.", file=path, line=1, column=doubled[0], fix="Keep one of the two.")
+        raise RequestError("appears twice.", column=doubled[0], fix="Keep one of the two.", **place)
     taken = [name for name in ANSWERS if name in names]
     if taken:
-        raise RequestError("is a column of the answer.", file=path, line=1, column=taken[0], fix="Rename it.")
-    return names
+        raise RequestError("is a column of the answer.", column=taken[0], fix="Rename it.", **place)
+
+
+def points_of(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the points of a DataFrame as `predict` takes them: those that a CSV of them would give.
+
+    Raises
+    ------
+    RequestError
+        If it has no rows, a column twice, or a column of the answer.
+
+    Examples
+    --------
+    >>> points_of(pd.DataFrame({"aging_days": [1, 4], "speed_mm_s": ["2", "5"]})).dtypes.tolist()
+    [dtype('float64'), dtype('float64')]
+    """
+    _refuse_names([str(name) for name in frame])
+    if frame.empty:
+        raise RequestError("the table of points has no rows.", fix="Give one row per point.")
+    return frame.reset_index(drop=True).apply(_as_read)
+
+
+def _as_read(column: pd.Series) -> pd.Series:
+    """Return a column as it would come from a CSV: numbers as float, words without spaces around them."""
+    if pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
+        return column.astype(float)
+    return _numbers(column.astype(object).where(column.notna(), "").map(str))
 
 
 def _numbers(cells: pd.Series) -> pd.Series:

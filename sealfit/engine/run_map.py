@@ -16,6 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextvars import ContextVar
 from itertools import islice
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, TypeVar
 
 from sealfit.engine import one_thread
@@ -163,7 +164,7 @@ def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], worker
     sent: deque[Future[list]] = deque()
 
     def send(count: int) -> None:
-        with _no_interrupt_for_children():
+        with _no_interrupt_for_children(), _main_out_of_sight():
             sent.extend(executor.submit(apply, chunk) for chunk in islice(chunks, count))
 
     finished = False
@@ -209,6 +210,20 @@ def _no_interrupt_for_children() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def _main_out_of_sight() -> Iterator[None]:
+    """Start processes that do not load the script that runs: one that calls `sealfit.run` would be run again in each.
+
+    They need nothing of it: what they do is found in modules.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _start_worker() -> None:

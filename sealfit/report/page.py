@@ -201,9 +201,7 @@ def build_report(
     Report
         The page asks for nothing outside itself. Figures are drawn once; the page shows their panels.
     """
-    tables = with_answer(tables)
-    if closure is not None:
-        closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
+    tables, closure = answered(tables, closure)
     plots = draw_all(tables, closure, config)
     with timed("plots", rows=len(plots), of="plots"):
         figures = {name: draw(plot) for name, plot in plots.items()}
@@ -212,6 +210,16 @@ def build_report(
         style=Markup(_text("style.css")), plots=images, **_content(tables, closure, provenance, config)
     )  # fmt: skip
     return Report(html, figures)
+
+
+def answered(
+    tables: Mapping[str, pd.DataFrame], closure: Mapping | None
+) -> tuple[dict[str, pd.DataFrame], Mapping | None]:
+    """Return tables and closure.json as the figures and the page take them: see `with_answer`, `with_left_channels`."""
+    tables = with_answer(tables)
+    if closure is not None:
+        closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
+    return tables, closure
 
 
 def with_answer(tables: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:

@@ -297,8 +297,8 @@ def shades(n: int) -> list[str]:
     return [to_hex(scale(0.82 * k / max(n - 1, 1))) for k in range(n)]
 
 
-def compose(plot: Plot) -> Figure:
-    """Return all panels of a plot in one figure, up to four a row, below its title and its legend."""
+def compose(plot: Plot, kind: type[Figure] = Figure) -> Figure:
+    """Return all panels of a plot in one figure of a `kind`, up to four a row, below its title and its legend."""
     columns = min(len(plot.panels), 4 if len(plot.panels) > 6 else 3)
     rows = [plot.panels[k : k + columns] for k in range(0, len(plot.panels), columns)]
     heights = [max(panel.height for panel in row) for row in rows]
@@ -306,7 +306,7 @@ def compose(plot: Plot) -> Figure:
     lines = _legend_lines(plot.legend, width)
     total = sum(heights) + 0.36 + 0.19 * lines
     with look():
-        figure = Figure(figsize=(width, total), dpi=DPI)
+        figure = kind(figsize=(width, total), dpi=DPI)
         figure.text(_EDGE / width, 1 - 0.1 / total, plot.title, va="top", weight="bold", size=10)
         if plot.legend:
             figure.legend(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -218,7 +218,7 @@ class Store:
         return f"sealfit ingest {shlex.quote(str(self.state.campaign))} --out {out}{config}"
 
     # ------------------------------------------------------------ reading
-    def read(self, table: str, columns: list[str] | None = None, **which: Sequence[str]) -> pd.DataFrame:
+    def read(self, table: str, columns: list[str] | None = None, **which: object) -> pd.DataFrame:
         """Return a table, or those columns of it; `which` as `parquet.read`."""
         from sealfit.store import parquet
 

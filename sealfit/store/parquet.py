@@ -136,12 +136,12 @@ def read(
     path: Path | Sequence[Path],
     columns: list[str] | None = None,
     coded: Sequence[str] = (),
-    runs: Sequence[str] | None = None,
+    where: Mapping[str, Sequence[str]] | None = None,
 ) -> pd.DataFrame:
-    """Return the table at `path`, a file or its parts in their order, or those columns of it, or the rows of some runs.
+    """Return the table at `path`, a file or its parts in their order, or those columns of it, or some of its rows.
 
-    Columns of words in `coded` come as categories: no word is spelled out for every row. With `runs` one of the
-    columns is run_id.
+    Columns of words in `coded` come as categories: no word is spelled out for every row. `where` names columns that are
+    read, and the values of the rows that are kept.
     """
     paths = [path] if isinstance(path, Path) else path
     parts = []
@@ -150,7 +150,9 @@ def read(
             one, read_dictionary=list(coded)
         ) as file:  # a tenth of what read_table takes for a small file
             part = file.read(columns=columns)
-        parts.append(part if runs is None else part.filter(pc.is_in(part["run_id"], pa.array(runs, TEXT))))
+        for name, values in (where or {}).items():
+            part = part.filter(pc.is_in(part[name], pa.array(values, TEXT)))
+        parts.append(part)
     return pa.concat_tables(parts).to_pandas(self_destruct=True)
 
 

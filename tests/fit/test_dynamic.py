@@ -13,6 +13,7 @@ from sealfit.fit.dynamic.fit import fit_dynamic
 from sealfit.fit.dynamic.starts import starts_of, strokes_along
 from sealfit.fit.dynamic.stiffness import fit_stiffness
 from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.stored_tables import whole_steady_fit
 from sealfit.ingest import partitions
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.physics import LuGre, lugre_force
@@ -218,7 +219,7 @@ def test_traces_that_are_read_condition_by_condition_give_the_same(tmp_path, mon
     run(SIMULATED, tmp_path, steps=STEPS[:2])
     store = Store.open(tmp_path)
     assert len(store.traces()) > 3
-    tables, config = (store.read("steady"), store.read("steady_fit")), store.config
+    tables, config = (store.read("steady"), whole_steady_fit(store.read)), store.config
     whole = fit_dynamic(store.read("traces"), *tables, config)
     split = fit_dynamic(store.traces(), *tables, config, workers=workers)
     pdt.assert_frame_equal(whole.fit, split.fit, check_exact=True)

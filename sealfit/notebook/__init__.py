@@ -1,0 +1,1 @@
+"""Results as a notebook reads them: tables, plots, predictions and lifetimes, each when it is asked for."""

@@ -1,0 +1,194 @@
+"""The tables of a notebook: one meaning each, a row per key, true units in `attrs`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import pandas as pd
+
+from sealfit.config import Config
+from sealfit.tables import Schema
+from sealfit.units import Units
+
+OF_CONDITIONS = ("steady", "dynamic")  # `quantity` of the rows that are parameters of a condition
+OF_LAWS = ("mu_s", "mu_c", "F_s", "F_c")  # and of those that are parameters of an aging law
+PARAMETERS = ("mu_s", "mu_c", "F_s", "F_c", "v_s", "sigma_2", "sigma_0", "sigma_1")  # in the order of the equations
+ESTIMATE = ("value", "se", "lo95", "hi95", "u_sys", "unit", "before", "identified", "reason", "model")
+ERRORS = {
+    "rmse_N": "rms error of the bins, in sample",
+    "rmse_runs_N": "rms error of the run means, in sample",
+    "heldout_rmse_N": "rms error on {held}s that the fit did not see",
+    "heldout_extrapolated_rmse_N": "the same where a {held} lies beyond what the others cover",
+    "max_abs_N": "largest error of a bin, in sample",
+    "mean_abs_pct": "mean absolute error, of the measured run mean",
+}
+FLOORED = ("rmse_N", "heldout_rmse_N")  # errors that the noise floor is compared with
+EFFECT = (
+    "id", "label", "level", "acts_on", "operation", "form", "named", "candidate", "p_value", "heldout_gain_N",
+    "heldout_rmse_N", "reference",
+)  # fmt: skip
+SCATTER = ("level", "sd_rel", "sd_N", "df")
+SENSITIVITY = ("variable", "level", "acts_on", "smallest_N", "smallest_pct", "files_needed", "cannot_tell")
+
+
+def with_units(frame: pd.DataFrame, units: Units, schema: Schema | None = None) -> pd.DataFrame:
+    """Return the frame with `attrs["units"]`, the true unit by column, and with a schema `attrs["meaning"]`.
+
+    Examples
+    --------
+    >>> with_units(pd.DataFrame({"force_N": [1.0], "n": [2]}), Units({"force": ("torque", "mN m")})).attrs
+    {'units': {'force_N': 'mN m'}}
+    """
+    columns = {column.name: column for column in schema.columns} if schema else {}
+    found = {name: units.of(name) or (columns[name].unit if name in columns else "") for name in map(str, frame)}
+    frame.attrs = {"units": {name: unit for name, unit in found.items() if unit}}
+    if schema:
+        frame.attrs["meaning"] = {name: columns[name].meaning for name in map(str, frame) if name in columns}
+    return frame
+
+
+# ---------------------------------------------------------------- what the loop found
+def verdict(closure: Mapping, sentence: str) -> pd.DataFrame:
+    """Return one row: the verdict, its sentence, how good the fit is, and what is left."""
+    quality, left = closure["fit_quality"], closure["left"]
+    row = {
+        "verdict": closure["verdict"],
+        "sentence": sentence,
+        "effects": sum(not effect["candidate"] for effect in closure["effects"]),
+        "fit_quality": quality["state"],
+        "error_over_scatter": quality["ratio"],
+        "lack_of_fit_p": quality["p_value"],
+        "left_rmse_N": left["rmse_N"],
+        "left_level": left["level"],
+        "left_channel": left["channel"],
+        "left_p": left["p_value"],
+    }
+    return pd.DataFrame([row])
+
+
+def errors(closure: Mapping, units: Units) -> pd.DataFrame:
+    """Return a row per error: before, after, the noise floor where it compares with it, unit and meaning."""
+    held, floor = closure["heldout_unit"] or "run", closure["noise_floor_N"]
+    rows = [
+        {
+            "error": name,
+            "before": closure["before"].get(name),
+            "after": closure["after"].get(name),
+            "noise_floor": floor if name in FLOORED else None,
+            "unit": units.of(name),
+            "meaning": meaning.format(held=held),
+        }
+        for name, meaning in ERRORS.items()
+    ]
+    return _numbers(pd.DataFrame(rows), ("before", "after", "noise_floor"))
+
+
+def effects(closure: Mapping) -> pd.DataFrame:
+    """Return a row per effect, added or candidate; `effect` is its number, from 0."""
+    rows = [
+        {"effect": k, **{name: effect.get(name) for name in EFFECT}, "channels": " ".join(effect["channels"])}
+        for k, effect in enumerate(closure["effects"])
+    ]
+    frame = pd.DataFrame(rows, columns=["effect", "id", "label", "channels", *EFFECT[2:]])
+    return _numbers(frame, ("p_value", "heldout_gain_N", "heldout_rmse_N"))
+
+
+def effect_parameters(closure: Mapping) -> pd.DataFrame:
+    """Return a row per effect and parameter, with the ends of its 95 % interval."""
+    rows = [
+        {
+            "effect": k,
+            "id": effect["id"],
+            "parameter": parameter["name"],
+            "value": parameter["value"],
+            "lo95": parameter["ci95"][0],
+            "hi95": parameter["ci95"][1],
+            "unit": parameter["unit"],
+        }
+        for k, effect in enumerate(closure["effects"])
+        for parameter in effect["parameters"]
+    ]
+    frame = pd.DataFrame(rows, columns=["effect", "id", "parameter", "value", "lo95", "hi95", "unit"])
+    return _numbers(frame, ("value", "lo95", "hi95"))
+
+
+def scatter(closure: Mapping) -> pd.DataFrame:
+    """Return a row per level of scatter: file, run, specimen."""
+    return _listed(closure["scatter"], SCATTER, SCATTER[1:])
+
+
+def sensitivity(closure: Mapping) -> pd.DataFrame:
+    """Return a row per variable, level and target: the smallest effect that would have been found with 80 % chance."""
+    return _listed(closure["sensitivity"], SENSITIVITY, ("smallest_N", "smallest_pct", "files_needed"))
+
+
+def _listed(entries: Iterable[Mapping], names: Sequence[str], numbers: Sequence[str]) -> pd.DataFrame:
+    rows = [{name: entry.get(name) for name in names} for entry in entries]
+    return _numbers(pd.DataFrame(rows, columns=list(names)), numbers)
+
+
+def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
+    """Return the frame with these columns as numbers: an unavailable value (null) is NaN."""
+    return frame.assign(**{name: pd.to_numeric(frame[name]).astype(float) for name in names})
+
+
+# ---------------------------------------------------------------- fits
+def parameters(fits: Sequence[pd.DataFrame], before: Sequence[pd.DataFrame], config: Config) -> pd.DataFrame:
+    """Return a row per condition and parameter of Eqs. 1 to 14; unaged rubber has such rows in each of its series.
+
+    Parameters
+    ----------
+    fits, before : sequence of DataFrame
+        Tables `steady_fit` and `dynamic_fit` of the answer, and the same without effects, for column `before`.
+    config : Config
+        Names the condition columns.
+    """
+    rows = _with_before(_of(fits, OF_CONDITIONS), _of(before, OF_CONDITIONS), ["condition", "parameter"])
+    if config.aging and "aging_days" in rows:
+        rows = _starting_series(rows, config)
+    keys = [name for name in (*config.condition, *config.rubber) if name in rows]
+    order = ["series", *(["aging_days"] if "aging_days" in rows else []), "condition"]
+    rank = rows["parameter"].map({name: k for k, name in enumerate(PARAMETERS)})
+    rows = rows.assign(rank=rank).sort_values([*order, "rank"], kind="stable")
+    columns = dict.fromkeys(["series", "rubber", "condition", *keys, "parameter", *ESTIMATE])
+    return rows[list(columns)].reset_index(drop=True)
+
+
+def laws(fit: pd.DataFrame, before: pd.DataFrame, config: Config) -> pd.DataFrame:
+    """Return a row per series, quantity and parameter of Eq. 15: mu_0, a, b and c of mu_s and of mu_c.
+
+    Parameters
+    ----------
+    fit, before : DataFrame
+        Table `aging_fit` of the answer, and the same without effects, for column `before`.
+    config : Config
+        Names the columns that tell series apart.
+    """
+    rows = _with_before(_of([fit], OF_LAWS), _of([before], OF_LAWS), ["series", "quantity", "parameter"])
+    keys = [name for name in (*config.series_columns, *config.rubber) if name in rows]
+    columns = dict.fromkeys(["series", "rubber", *keys, "quantity", "parameter", *ESTIMATE])
+    return rows[list(columns)].reset_index(drop=True)
+
+
+def _of(fits: Sequence[pd.DataFrame], quantities: Sequence[str]) -> pd.DataFrame:
+    """Return the rows of parameters, whatever else a fit has: statistics, break-aways."""
+    kept = [fit[fit["quantity"].isin(quantities)] for fit in fits]
+    return pd.concat([part for part in kept if len(part)] or kept[:1], ignore_index=True)
+
+
+def _with_before(rows: pd.DataFrame, before: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
+    earlier = before[[*keys, "value"]].rename(columns={"value": "before"})
+    return rows.merge(earlier, on=keys, how="left", validate="one_to_one")
+
+
+def _starting_series(rows: pd.DataFrame, config: Config) -> pd.DataFrame:
+    """Return the rows with those of unaged rubber once in every series of that rubber, under the series' columns."""
+    days = rows["aging_days"].to_numpy(float)
+    aged, unaged = rows[days > 0], rows[~(days > 0)]
+    columns = [name for name in ("series", *config.series_columns, *config.rubber) if name in rows]
+    series = aged[list(dict.fromkeys(["rubber", *columns]))].drop_duplicates("series")
+    own = [name for name in columns if name != "rubber"]
+    starts = unaged.drop(columns=own).merge(series, on="rubber", how="inner")
+    alone = unaged[~unaged["rubber"].isin(set(series["rubber"]))]
+    parts = [part for part in (starts, aged, alone) if len(part)]
+    return pd.concat(parts, ignore_index=True)[rows.columns] if parts else rows

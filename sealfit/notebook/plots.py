@@ -1,0 +1,88 @@
+"""Every figure of the report, as a function that a notebook calls."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Callable
+
+from matplotlib.figure import Figure
+
+from sealfit.errors import RequestError
+from sealfit.pipeline import report_tables
+from sealfit.report.figures import draw_all
+from sealfit.report.page import answered
+from sealfit.report.style import compose, look
+from sealfit.store.out_folder import Store
+
+
+class ShownFigure(Figure):
+    """A figure that a notebook shows as it is, without pyplot; its axes are there to be changed."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        with look(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Glyph .* missing from font")  # drawn as a box
+            self.savefig(buffer, format="png")
+        return buffer.getvalue()
+
+
+class Plots:
+    """The report's figures by name: each method returns a matplotlib Figure in the report's look.
+
+    Raises
+    ------
+    StaleError
+        If the results are missing or stale, when a figure is asked for.
+    RequestError
+        If these results have nothing to draw in it.
+    """
+
+    def __init__(self, current: Callable[[str], Store]):
+        self._current = current  # gives the store if a step is current, else raises
+
+    def before_after(self) -> Figure:
+        """Return the errors before and after with the noise floor, and how the errors of the run means are spread."""
+        return self._drawn("before_after")
+
+    def effect_shapes(self) -> Figure:
+        """Return the shape of every effect along its channels, with its 95 % band."""
+        return self._drawn("effect_shapes")
+
+    def residual_channels(self) -> Figure:
+        """Return the mean residual along every channel, before and after."""
+        return self._drawn("residual_channels")
+
+    def variance_levels(self) -> Figure:
+        """Return the variance of the residual at every level, before and after."""
+        return self._drawn("variance_levels")
+
+    def force_speed(self) -> Figure:
+        """Return force against speed of every condition: the model and the run means."""
+        return self._drawn("force_speed")
+
+    def aging(self) -> Figure:
+        """Return the coefficients over aging time, a panel per series: the law with its band, and each condition."""
+        return self._drawn("aging")
+
+    def master_curve(self) -> Figure:
+        """Return the values of all series over aging time at one temperature, with the law for all of them."""
+        return self._drawn("master_curve")
+
+    def starts(self) -> Figure:
+        """Return how strokes begin: the mean force over the distance slid, and the model's."""
+        return self._drawn("starts")
+
+    def traces_mean(self) -> Figure:
+        """Return some of the averaged traces, spread over conditions and speeds."""
+        return self._drawn("traces_mean")
+
+    def _drawn(self, name: str) -> Figure:
+        store = self._current("close-loop")
+        tables, closure = answered(report_tables(store), store.read_json("closure"))
+        plots = draw_all(tables, closure, store.config)
+        if name not in plots:
+            raise RequestError(
+                f"these results have nothing to draw in the figure '{name}'.", fix=f"They have: {', '.join(plots)}."
+            )
+        return compose(plots[name], ShownFigure)
