@@ -152,7 +152,8 @@ def _findings(quality: pd.DataFrame) -> list[list]:
 
 def _predicted(out: Path, bins: pd.DataFrame) -> list[list]:
     """Return the answers of `predict` at bins spread over the campaign: before, after, standard error, extrapolated."""
-    chosen = bins.iloc[np.linspace(0, len(bins) - 1, POINTS).round().astype(int)]
+    ordered = bins.sort_values(["file", "stroke", "bin"])  # which of its files a table was stored in does not matter
+    chosen = ordered.iloc[np.linspace(0, len(bins) - 1, POINTS).round().astype(int)]
     points = chosen.drop(columns=[c for c in chosen if c.startswith("force") or c == "presliding_N"])
     points.to_csv(out.parent / "points.csv", index=False)
     _sealfit("predict", str(out), "--points", str(out.parent / "points.csv"), "--output", str(out.parent / "said.csv"))
