@@ -118,7 +118,8 @@ def _same_signal(one: Column, other: Column) -> bool:
 def find_roles(columns: Sequence[Column]) -> Roles:
     """Return which column is what."""
     time = _best(columns, "time", _as_time)
-    rest = [column for column in columns if column is not time]
+    counters = [c for c in columns if c.role != "displacement" and all(map(motion.is_counter, c.values))]
+    rest = [column for column in columns if column is not time and column not in counters]
     speed_named = [c for c in rest if c.role == "speed" or (c.unit and c.unit.dimension in DIMENSION["speed"])]
     speed = speed_named[0] if speed_named else None
     rest = [column for column in rest if column not in speed_named]
@@ -187,7 +188,8 @@ def _load(rest: Sequence[Column]) -> Column | None:
 def _with_sign(roles: Roles, velocities: Sequence[np.ndarray]) -> Roles:
     found = [motion.follows(v, speed) for v, speed in zip(roles.force.values, velocities, strict=True)]
     signs = [one.sign for one in found if one.sign]
-    sign = -1 if sum(signs) < 0 else 1
+    told = max((one.strength for one in found), default=0.0) > BY_BEHAVIOUR / 2
+    sign = -1 if told and sum(signs) < 0 else 1
     agree = signs.count(sign)
     return replace(
         roles,

@@ -84,12 +84,15 @@ def sniff(text: str, *, whole: bool = True, likely: str | None = None) -> Dialec
     elif len(lines) > 2 * ENDS:
         lines = lines[:ENDS] + lines[-ENDS:]
     sample = lines[:SAMPLE_LINES]
+    mixed = None  # with columns of text: right only where no other separator leaves nothing but numbers
     for delimiter in _in_turn(sample, likely):
         found = [_block(sample, delimiter, decimal) for decimal in (".", ",") if decimal != delimiter]
         best = max(found, key=lambda block: block.score)  # the first, a point, where there are whole numbers only
         if best.rows >= MIN_ROWS and len(best.numbers) >= 2:
-            return _dialect(lines, delimiter, best, whole)
-    return None
+            if best.pure:
+                return _dialect(lines, delimiter, best, whole)
+            mixed = mixed or (delimiter, best)
+    return _dialect(lines, *mixed, whole) if mixed else None
 
 
 def sniffed_delimiter(lines: Sequence[str]) -> str | None:
@@ -125,6 +128,7 @@ class _Block:
     start: int
     rows: int
     numbers: tuple[int, ...]
+    pure: bool = False  # nothing but numbers in its lines
 
     @property
     def score(self) -> int:
@@ -145,7 +149,9 @@ def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block:
     if start is None:
         return _Block(decimal, 0, 0, ())
     rows = sum(is_data for _, is_data in data[start:])
-    return _Block(decimal, data[start][0], rows, tuple(sorted(core)))
+    cells = [sum(bool(cell.strip()) for cell in split_line(lines[i], delimiter)) for i, good in data[start:] if good]
+    pure = sum(count == len(core) for count in cells) > 0.9 * len(cells)
+    return _Block(decimal, data[start][0], rows, tuple(sorted(core)), pure)
 
 
 def _numeric(line: str, delimiter: str, decimal: str) -> frozenset[int] | None:

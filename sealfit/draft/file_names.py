@@ -171,7 +171,7 @@ def _with_bare_numbers(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -
         elif not has_repeat and _repeats(part, known, rows):
             has_repeat = True
             made.append(replace(part, ours="repeat", why=f"{part.why}, few values, each once per setting"))
-        elif len(part.texts) == len(rows):
+        elif len(part.texts) == len(rows) and _counts(part):
             made.append(replace(part, why=f"{part.why} that counts the files"))
         else:
             doubt = "what this number stands for is not known; it is kept as a channel"
@@ -179,11 +179,17 @@ def _with_bare_numbers(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -
     return made
 
 
+def _counts(part: Part) -> bool:
+    numbers = [as_float(text) for text in part.texts]
+    return max(numbers) - min(numbers) < 2 * len(numbers)
+
+
 def _repeats(part: Part, known: Sequence[Part], rows: Sequence[Sequence[Token]]) -> bool:
-    """Whether a number is small and whole, and differs between files of the same settings."""
+    """Whether a number counts from 0 or 1 and differs between files of the same settings."""
     if len(part.texts) > FEW or len(part.texts) == len(rows) > COUNTED:
         return False
-    if not all(text.isdecimal() and int(text) <= FEW for text in part.texts):
+    numbers = sorted({int(text) for text in part.texts}) if all(text.isdecimal() for text in part.texts) else []
+    if not numbers or numbers[0] > 1 or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         return False
     seen = Counter(tuple(row[other.at].text for other in (*known, part)) for row in rows)
     settings = {tuple(row[other.at].text for other in known) for row in rows}
@@ -198,7 +204,7 @@ def _without_doubles(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -> 
         if later is None:
             made.append(part)
         elif part.ours == "started_at":
-            made.append(replace(part, ours="", group="", pattern=r"[\dTh:_.\- ]+", why="a date before another one"))
+            made.append(replace(part, ours="", group="", pattern=r"[\dTh:_. -]+", why="a date before another one"))
         elif all(row[part.at].text == row[later.at].text for row in rows):
             made.append(replace(part, ours="", why=f"{part.why}, said again later in the path"))
         else:
