@@ -44,7 +44,8 @@ class Dialect:
 
     `header` are the lines above the data; `names` and `units` have one entry per column, or none; `names_back` and
     `units_back` count their lines back from the header's end, 1 the last. `numbers` are the positions (from 0) that
-    hold numbers, `first` is the first line of data, `odd_lines` counts lines between the data that are none, `footer` are the lines below.
+    hold numbers, `first` is the first line of data, `odd_lines` counts lines between the data that are none, `footer`
+    are the lines below.
     """
 
     delimiter: str

@@ -137,7 +137,9 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
     if repeat is None:
         return names
     said = values_by_file(names, found.traces)
-    keys = Counter(tuple(sorted((k, v) for k, v in one.items() if k != "started_at")) for one in said.values() if one)
+    aging = names.given & set(AGING_CONDITION)
+    of_run = {*aging, "rubber", "specimen_id", "speed_mm_s", "repeat"} if aging else names.given - {"started_at"}
+    keys = Counter(tuple((name, one.get(name)) for name in sorted(of_run)) for one in said.values() if one)
     if not keys or max(keys.values()) == 1:
         return names
     count = sum(number for number in keys.values() if number > 1)
