@@ -93,7 +93,7 @@ def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
         role, sure = column_role(base)
         if role == "torque":
             role = "force"
-        by_name = bool(label) and dialect.names.count(label) == 1
+        by_name = bool(label) and dialect.names.count(label) == 1 and dialect.names_are_cells
         values = tuple(table[:, i] for table in tables)
         found.append(Column(i + 1, label, role, sure, unit, values, by_name))
     return _copies_marked(found)

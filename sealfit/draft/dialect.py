@@ -8,6 +8,7 @@ plain rule: the data are the lines that hold numbers where the last lines of the
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -43,9 +44,10 @@ class Dialect:
     """How one file is written.
 
     `header` are the lines above the data; `names` and `units` have one entry per column, or none; `names_back` and
-    `units_back` count their lines back from the header's end, 1 the last. `numbers` are the positions (from 0) that
-    hold numbers, `first` is the first line of data, `odd_lines` counts lines between the data that are none, `footer`
-    are the lines below.
+    `units_back` count their lines back from the header's end, 1 the last; `names_are_cells` is False where the reader
+    cuts the line of names in another way, as names hold the separator. `numbers` are the positions (from 0) that hold
+    numbers, `first` is the first line of data, `odd_lines` counts lines between the data that are none, `footer` are
+    the lines below.
     """
 
     delimiter: str
@@ -60,6 +62,7 @@ class Dialect:
     trailing: bool
     rows: int
     first: str
+    names_are_cells: bool = True
     odd_lines: int = 0
     footer: tuple[str, ...] = field(default=())
 
@@ -188,7 +191,7 @@ def _dialect(lines: list[str], delimiter: str, block: _Block, whole: bool) -> Di
     trailing = _ends_in_separator(data, delimiter)
     header = lines[:start]
     width = max(len(split_line(line.rstrip(STRAYS), delimiter)) for line in data)
-    rows = [[cell.strip() for cell in split_line(line.rstrip(STRAYS), delimiter)] for line in header]
+    rows = [_header_cells(line, delimiter, width) for line in header]
     units_at = _units_line(rows)
     names_at = _names_line(rows, units_at, max(core), len(core))
     fractions = any(block.decimal in cell for line in data for cell in split_line(line, delimiter))
@@ -205,6 +208,7 @@ def _dialect(lines: list[str], delimiter: str, block: _Block, whole: bool) -> Di
         trailing=trailing,
         rows=sum(is_data),
         first=data[0],
+        names_are_cells=names_at is None or rows[names_at] == _cells_of(header[names_at], delimiter),
         odd_lines=odd,
         footer=tuple(below) if whole else (),
     )
@@ -213,6 +217,25 @@ def _dialect(lines: list[str], delimiter: str, block: _Block, whole: bool) -> Di
 def _ends_in_separator(data: Sequence[str], delimiter: str) -> bool:
     marks = ("\t" if delimiter == "tab" else delimiter, ",", ";")
     return delimiter != "whitespace" and sum(line.rstrip(" ").endswith(marks) for line in data) > 0.5 * len(data)
+
+
+def _header_cells(line: str, delimiter: str, width: int) -> list[str]:
+    """Return the cells of a header line.
+
+    A mark of comment in a cell of its own is left out; names with blanks in them, above columns of blanks, are those
+    that two blanks part.
+    """
+    cells = _cells_of(line, delimiter)
+    if len(cells) == width + 1 and cells[0] in ("#", "%", "//", ";"):
+        return cells[1:]
+    if delimiter == "whitespace" and len(cells) != width:
+        apart = re.split(r"\s{2,}|\t", line.strip())
+        return apart if len(apart) == width else []
+    return cells
+
+
+def _cells_of(line: str, delimiter: str) -> list[str]:
+    return [cell.strip() for cell in split_line(line.rstrip(STRAYS), delimiter)]
 
 
 def _units_line(rows: Sequence[Sequence[str]]) -> int | None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from sealfit.draft.dialect import Dialect, sniff
+from sealfit.draft.dialect import MIN_ROWS, STRAYS, Dialect, sniff
 from sealfit.draft.name_parts import tokens
 from sealfit.errors import BadFile, RequestError
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
@@ -18,6 +18,9 @@ from sealfit.ingest.listing import RUNS_CSV, natural
 
 SNIFFED = 24
 """Files of one kind of name that are looked at, spread evenly: more would show the same."""
+
+MOST = 240
+"""Files that are looked at, however many ways of naming them there are."""
 
 READ = 6
 """Trace files that are read whole, for how their columns behave."""
@@ -88,11 +91,17 @@ def look(folder: Path) -> Found:
     if not tables:
         raise _no_traces(folder, files, formats, unreadable)
     same, otherwise = _by_form(tables)
-    kinds = {_kind(file) for file in same}
-    not_looked_at = [file for file in texts if file not in dialects and file not in unreadable and _kind(file) in kinds]
+    not_looked_at = _like(same, [file for file in texts if file not in dialects and file not in unreadable], dialects)
     others = [file for file, dialect in dialects.items() if dialect is None or file == RUNS_CSV]
     traces = sorted([*same, *not_looked_at], key=natural)
     return Found(folder, tuple(traces), same, otherwise, tuple(others), unreadable, formats)
+
+
+def _like(same: Collection[str], rest: Sequence[str], looked_at: Collection[str]) -> list[str]:
+    """Return those of the files not looked at that are named as the traces are, or have their suffix."""
+    kinds, known = {_kind(file) for file in same}, {_kind(file) for file in looked_at}
+    suffixes = {kind[0] for kind in kinds}
+    return [file for file in rest if (kind := _kind(file)) in kinds or (kind not in known and kind[0] in suffixes)]
 
 
 def _files(folder: Path) -> list[str]:
@@ -125,7 +134,9 @@ def _sniffed(folder: Path, texts: Sequence[str]) -> tuple[dict[str, Dialect | No
         kinds[_kind(file)].append(file)
     dialects: dict[str, Dialect | None] = {}
     unreadable: dict[str, str] = {}
-    for members in kinds.values():
+    for members in sorted(kinds.values(), key=len, reverse=True):
+        if len(dialects) + len(unreadable) >= MOST:
+            break
         likely = None
         for file in evenly(members, SNIFFED):
             try:
@@ -186,7 +197,9 @@ def read_tables(found: Found) -> dict[str, np.ndarray]:
     for file in evenly(list(found.dialects), READ):
         dialect = found.dialects[file]
         text, _ = _text(found.folder, file)
-        tables[file] = _numbers(text.split("\n")[len(dialect.header) :], found.dialect)
+        table = _numbers(text.split("\n")[len(dialect.header) :], found.dialect)
+        if len(table) >= MIN_ROWS:
+            tables[file] = table
     return tables
 
 
@@ -194,7 +207,7 @@ def _numbers(lines: Sequence[str], dialect: Dialect) -> np.ndarray:
     width = max(dialect.numbers) + 1
     rows = []
     for line in lines[:ROWS]:
-        cells = split_line(line, dialect.delimiter)[:width]
+        cells = split_line(line.rstrip(STRAYS), dialect.delimiter)[:width]
         numbers = [as_number(cell, dialect.decimal or ".") for cell in cells]
         if len(numbers) == width and all(numbers[i] is not None for i in dialect.numbers):
             rows.append([np.nan if number is None else number for number in numbers])

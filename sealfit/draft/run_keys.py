@@ -27,6 +27,7 @@ NO_CONDITION = {
     "file", "stroke",
 }  # fmt: skip
 AGREES = 0.2  # as `quality.speed_disagreement`
+MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
 SPEED_UNITS = {
     60.0: ("mm/min", "{} / 60"), 1e-3: ("m/s", "{} * 1000"), 0.1: ("cm/s", "{} * 10"), 1e3: ("um/s", "{} / 1000"),
     60 / 25.4: ("in/min", "{} * 25.4 / 60"), 1 / 25.4: ("in/s", "{} * 25.4"),
@@ -93,13 +94,14 @@ def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Name
 
 
 def _ratio(said: Mapping[str, object], measured: Mapping[str, float]) -> float | None:
-    """Return the named over the measured speed, if it is the same for two different speeds or more."""
+    """Return the named over the measured speed, if most files of two speeds or more have the same."""
     pairs = [(abs(v), measured[f]) for f, v in said.items() if isinstance(v, int | float) and v and measured.get(f)]
     if len({named for named, _ in pairs}) < 2:
         return None
     ratios = sorted(named / speed for named, speed in pairs)
     middle = ratios[len(ratios) // 2]
-    return middle if ratios[-1] <= (1 + AGREES) ** 2 * ratios[0] else None
+    agree = sum(abs(ratio / middle - 1) <= AGREES for ratio in ratios)
+    return middle if agree >= MOSTLY * len(ratios) else None
 
 
 def _speed_in_unit(names: Names, name: str, ratio: float, notes: Notes) -> Names:

@@ -70,9 +70,10 @@ def _a_number(line: str) -> str:
 def _header_keys(found: Found, of: str, notes: Notes) -> None:
     """Add where the header ends and which of its lines holds the names."""
     one, count = found.dialect, len(found.dialect.header)
-    back = one.names_back
+    back = one.names_back if one.names_are_cells else None
     if back is None:
-        notes.guess("trace.names", "none", f"no line of names above the data in {of}: columns go by position")
+        why = "no line of names above the data" if one.names_back is None else "the names hold separators"
+        notes.guess("trace.names", "none", f"{why} in {of}: columns go by position")
     units_row = back == 2 and one.units_back == 1
     if units_row:
         notes.guess("trace.units_row", True, f"the line below the names holds units: {_shown(one.header[-1])}")

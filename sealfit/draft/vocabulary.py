@@ -117,7 +117,8 @@ STRONG, WEAK = 3, 1  # a word that says it, a single letter that may
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
 _COLUMN_WORDS = (
     ("none", r"\bcof\b|\bmue?\b|coefficient|reibwert|reibungszahl|reibzahl|\bindex\b|\bscan\b|\bsample\b|\bnr\b|\bno\b"
-             r"|count|segment|cycle|zyklus|comment|kommentar|alarm|stress|strain|spannung|dehnung|volt|\braw\b"),
+             r"|count|segment|cycle|zyklus|comment|kommentar|alarm"
+             r"|\bsoll|set ?point|command|target|demand|stress|strain|spannung|dehnung|volt|\braw\b"),
     ("temperature", r"temp"),
     ("humidity", r"humid|feucht"),
     ("pressure", r"pressure|druck(?!kraft)"),

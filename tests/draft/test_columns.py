@@ -9,7 +9,9 @@ from sealfit.draft import motion
 from sealfit.draft.dialect import sniff, sniffed_delimiter
 from sealfit.draft.draft import draft
 from sealfit.draft.vocabulary import column_role, name_and_unit
+from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.files import as_utf8
+from sealfit.ingest.reader import read_trace
 
 SPEEDS = (1.0, 5.0)
 
@@ -169,6 +171,36 @@ def test_units_in_names_of_columns(text, name, factor):
     found, unit = name_and_unit(text)
     assert found == name
     assert unit.factor == pytest.approx(factor)
+
+
+def test_names_with_blanks_above_columns_of_blanks_go_by_position(tmp_path):
+    made = campaign(tmp_path, exports.slots, "Elapsed Time (s)   Slide Position (mm)   Force (N)\n", delimiter="   ")
+    assert slots(made) == {"time_s": 1, "displacement_mm": 2, "force_N": 3}
+    assert parse_config(made.text, "rig.toml").trace.header_lines == 1
+    assert [doubt.key for doubt in made.doubts] == ["condition"]  # names say the days only
+
+
+@pytest.mark.parametrize("header", ["# t x F\n", "#t[s] x[mm] F[N]\n", "# made by numpy\n# time position force\n"])
+def test_names_behind_a_mark_of_comment(header, tmp_path):
+    made = campaign(tmp_path, exports.slots, header.replace(" ", "\t"), delimiter="\t")
+    config = parse_config(made.text, "rig.toml")
+    table = read_trace(tmp_path, TraceRef("d4_v5.csv", {}), config).table
+    assert list(table) == ["time_s", "displacement_mm", "force_N"]
+    assert table["displacement_mm"].max() == pytest.approx(30, abs=0.5)
+
+
+def test_the_line_for_spreadsheets_is_header(tmp_path):
+    made = campaign(tmp_path, exports.slots, "sep=;\nZeit s;Weg mm;Kraft N\n", delimiter=";")
+    assert slots(made) == {"time_s": "Zeit s", "displacement_mm": "Weg mm", "force_N": "Kraft N"}
+    assert parse_config(made.text, "rig.toml").trace.header_lines == 2
+
+
+def test_a_set_point_is_left_for_what_was_measured(tmp_path):
+    def columns(one):
+        return [one.time_s, one.displacement_mm, one.displacement_mm, one.force_N]
+
+    made = campaign(tmp_path, columns, "Zeit [s],Istweg [mm],Sollweg [mm],Kraft [N]\n")
+    assert slots(made)["displacement_mm"] == "Istweg [mm]"
 
 
 # ---------------------------------------------------------------- dialect
