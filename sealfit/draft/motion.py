@@ -89,6 +89,12 @@ def velocity(time: np.ndarray, displacement: np.ndarray) -> np.ndarray:
         return smoothed(np.nan_to_num(np.gradient(displacement, time), posinf=0.0, neginf=0.0))
 
 
+def mean_speed(speed: np.ndarray) -> float:
+    """Return the mean magnitude of a column of speeds where it moves; slow ones are steps of their resolution."""
+    size = smoothed(np.abs(speed))
+    return float(np.mean(size[size >= MOVING * np.quantile(size, 0.95)]))
+
+
 @dataclass(frozen=True, slots=True)
 class Follows:
     """How a column follows the motion: `sign` is that of the column where the displacement rises.

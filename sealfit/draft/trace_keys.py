@@ -345,7 +345,7 @@ def motion_keys(roles: Roles, units: Mapping[str, Unit | None], files: Sequence[
     speeds: dict[str, list[float]] = {}
     for i, file in enumerate(files):
         if roles.displacement is None:
-            speeds[file] = [abs(float(np.median(roles.speed.values[i])))]
+            speeds[file] = [motion.mean_speed(roles.speed.values[i])]
             continue
         factors = {role: unit.factor if (unit := units.get(role)) else 1.0 for role in ("time", "displacement")}
         time, way = roles.time.values[i] * factors["time"], roles.displacement.values[i] * factors["displacement"]
