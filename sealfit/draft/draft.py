@@ -16,6 +16,9 @@ from sealfit.draft.file_names import read_names
 from sealfit.draft.files_found import look, read_tables
 from sealfit.draft.runs_table import find_table
 
+SHOWN = ("trace.columns.", "condition", "files.glob", "files.name_pattern", "files.runs_columns")
+"""Guesses that the summary repeats: the others are in the draft."""
+
 
 @dataclass(frozen=True)
 class Draft:
@@ -51,11 +54,11 @@ def draft(folder: Path) -> Draft:
     table = find_table(folder, [*found.others, *found.otherwise], found.traces)
     names = run_keys.improved(read_names(found.traces), speeds, found, notes)
     source = run_keys.Source(run_keys.needs_no_load(names, roles), table)
-    run_keys.source_keys(found, source, notes)
+    header = [one.ours for one in trace_keys.header_keys(found, source.given, notes)]
+    run_keys.source_keys(found, source, header, notes)
     trace_keys.dialect_keys(found, notes)
     trace_keys.column_keys(found, roles, units, len(tables), notes)
-    header = trace_keys.header_keys(found, source.given, notes)
-    run_keys.condition_keys(source, [one.ours for one in header], notes)
+    run_keys.condition_keys(source, header, notes)
     text = config_text(_name(folder), shlex.quote(str(folder)), notes)
     parse_config(text, "the drafted config")  # a draft that is no config is a fault of this module, and raises here
     column = roles.displacement
@@ -70,7 +73,7 @@ def summary_lines(made: dict) -> list[str]:
     lines += [
         f"  {guess['key'].rpartition('.')[2]}: {guess['evidence']}"
         for guess in made["guesses"]
-        if guess["key"].startswith(("trace.columns.", "condition", "files.glob", "files.runs_columns"))
+        if guess["key"].startswith(SHOWN)
     ]
     if made["doubts"]:
         lines.append("could not be told:")

@@ -158,8 +158,8 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
 # ---------------------------------------------------------------- keys
 
 
-def source_keys(found: Found, source: Source, notes: Notes) -> None:
-    """Add where the files are, and what names and the table of runs say."""
+def source_keys(found: Found, source: Source, header: Collection[str], notes: Notes) -> None:
+    """Add where the files are, and what names and the table of runs say; `header` is what header lines give."""
     table = source.table
     if table is not None and table.is_runs_csv:
         _table_keys(table, notes)
@@ -176,7 +176,7 @@ def source_keys(found: Found, source: Source, notes: Notes) -> None:
                 + ("" if table.whole_paths else " Its names of files need their folders and suffixes."),
             )
     if table is None or not set(AGING_CONDITION) <= table.given:
-        _name_keys(source.names, len(found.traces), notes)
+        _name_keys(source.names, len(found.traces), bool(set(header) & set(AGING_CONDITION)), notes)
     for file, dialect in found.otherwise.items():
         if table is None or file != table.file:
             _otherwise(found, dialect, notes)
@@ -249,8 +249,10 @@ def _excluded(surplus: set[str], matched: set[str]) -> list[str]:
     return list(dict.fromkeys(globs))
 
 
-def _name_keys(names: Names, files: int, notes: Notes) -> None:
+def _name_keys(names: Names, files: int, needless: bool, notes: Notes) -> None:
     if names.pattern is None:
+        if needless:
+            return
         reason = "the names of the files say nothing that is known here: temperature, days, speed, repeat."
         notes.doubt("files", reason, f"Write a {RUNS_CSV} with a line for each file, or name_pattern by hand.")
         return
@@ -328,7 +330,8 @@ def condition_keys(source: Source, header: Collection[str], notes: Notes) -> Non
     if "rubber" in given and (source.table is not None or "rubber" in varied):
         notes.guess("rubber", ["rubber"], "a column of its own for each rubber")
     if aging:
-        notes.guess("condition", aging, f"found: {', '.join(aging)}")
+        found = [f"{name} from {_origin(name, source)}" for name in aging]
+        notes.guess("condition", aging, ", ".join(found))
         missing = [name for name in AGING_CONDITION if name not in given]
         if missing:
             reason = f"nothing says {' or '.join(missing)}: the same is assumed for all files."
@@ -346,6 +349,12 @@ def condition_keys(source: Source, header: Collection[str], notes: Notes) -> Non
     notes.guess("files.columns.state", "one", "the same for all files")
     notes.doubt("condition", "nothing says what differs between the files: all are taken as one condition.",
                 f"Write a {RUNS_CSV} with temperature_C, compression_ratio_pct and aging_days.")  # fmt: skip
+
+
+def _origin(name: str, source: Source) -> str:
+    if source.table is not None and name in source.table.given:
+        return source.table.file
+    return "the names of files" if name in source.names.given else "the header"
 
 
 def needs_no_load(names: Names, roles: Roles) -> Names:

@@ -319,7 +319,7 @@ def header_keys(found: Found, given: set[str], notes: Notes) -> list[Setting]:
             notes.guesses.append(guess)
         else:
             reason = f"header line {when.line} gives a date that is not ISO 8601: {_shown(when.text)}."
-            fix = "It is not read yet. These lines would read it:"
+            fix = "It is not read yet; the draft holds the lines that would read it."
             notes.doubt("trace.header_fields", reason, fix, lines)
     settings = [one for one in settings_in(headers, found.dialect.decimal) if one.ours not in given]
     for one in settings:
@@ -333,7 +333,7 @@ def _setting_keys(one: Setting, notes: Notes) -> None:
     if factor == 1.0:
         notes.guess(f"trace.header_fields.{one.ours}", one.pattern, evidence)
         return
-    base = one.ours.rpartition("_")[0]
+    base = one.ours.split("_")[0]
     notes.guess(f"trace.header_fields._{base}", one.pattern, evidence)
     notes.guess(f"trace.compute.{one.ours}", scaled(f"_{base}", factor), f"from {one.unit.name}")
 
@@ -362,5 +362,5 @@ def motion_keys(roles: Roles, units: Mapping[str, Unit | None], files: Sequence[
 
 def motion_words(roles: Roles, strokes: int) -> str:
     """Return what the motion is like, for the summary."""
-    ways = "both ways" if roles.both_ways else "one way"
-    return f"strokes go {ways}, about {strokes} in a file"
+    many = "one stroke" if strokes == 1 else f"about {strokes} strokes"
+    return f"{many} in a file, {'both ways' if roles.both_ways else 'one way'}"

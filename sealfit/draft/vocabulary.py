@@ -164,8 +164,8 @@ def column_role(name: str) -> tuple[str, int]:
 _SETTING_WORDS = (
     ("file", r"\bfile|datei"),
     ("started_at", r"\bstart|date\b|datum|begin|timestamp|zeitstempel|uhrzeit"),
+    ("temperature_C", r"^temp|(aging|ageing|alterungs?|auslagerungs?|lager|ofen|oven) ?temp|temp.*aging"),
     ("aging_days", r"aging|ageing|\bage\b|alter|auslager|lager|\bdays?\b|\btage?\b"),
-    ("temperature_C", r"^temp|temp.*aging|aging temp|ofen|oven"),
     ("compression_ratio_pct", r"compress|verpress|stauch|height|hoehe"),
     ("speed_mm_s", r"speed|velocity|geschwind|vorschub|feed"),
     ("load_N", r"load\b|normal|auflast|\blast\b|anpress"),
@@ -181,8 +181,8 @@ def setting(name: str) -> str:
 
     Examples
     --------
-    >>> setting("Alterungstage"), setting("Geschwindigkeit"), setting("FileName"), setting("Operator")
-    ('aging_days', 'speed_mm_s', 'file', '')
+    >>> setting("Alterungstage"), setting("Alterungstemperatur"), setting("FileName"), setting("Operator")
+    ('aging_days', 'temperature_C', 'file', '')
     """
     words = plain(name)
     return next((ours for ours, pattern in _SETTING_WORDS if re.search(pattern, words)), "")

@@ -157,7 +157,7 @@ def test_a_force_of_the_other_sign_is_turned(tmp_path):
     steady = ingested.tables["steady"]
     assert (np.sign(steady["force_N"]) == steady["direction"]).all()
     assert config.trace.compute == {"force_N": "-force_raw"}
-    assert made.motion == "strokes go both ways, about 4 in a file"
+    assert made.motion == "about 4 strokes in a file, both ways"
 
 
 def test_a_load_counted_downwards_is_turned_and_a_ratio_is_no_channel(tmp_path):
@@ -184,6 +184,41 @@ def test_units_become_factors_and_the_helpers_are_dropped(tmp_path):
         "force_N": "force_kN * 1000",
     }
     assert trace.drop_columns == ["time_ms", "displacement_um", "force_kN"]
+
+
+def test_settings_and_dates_in_the_header_are_enough(tmp_path):
+    written = {}
+    for one in exports.records(temperatures=(60, 80)):
+        head = (
+            f"Test: friction\nDate: {one.started}\nAging temperature: {one.temperature} °C\n"
+            f"Aging time: {24 * one.days} h\nCompression: {one.compression} %\nSpeed: {60 * one.speed:g} mm/min\n"
+            "Normal load: 50 N\n\nt [s]\tx [mm]\tF [N]\n"
+        )
+        file = f"test{one.number:04d}.txt"
+        exports.write(tmp_path, file, head + exports.table(exports.slots(one), "\t", 4))
+        written[file] = one
+    made, config, ingested = read(tmp_path)
+    assert made.doubts == ()
+    assert_values(tmp_path, config, written)
+    assert_settings(ingested, written, (*SPECIMENS, "repeat", "load_N", "started_at"))
+    assert ingested.faults == []
+
+
+def test_rubbers_directions_and_decimal_commas_in_names(tmp_path):
+    written = {}
+    for one in exports.records(speeds=(0.5, 5.0)):
+        for rubber, (word, sign) in (("NBR", ("vor", 1)), ("FKM", ("rueck", -1))):
+            speed = f"{one.speed:g}".replace(".", ",")
+            file = f"{rubber}/{one.days} Tage/{one.temperature}C_v{speed}_{word}_{one.repeat}.txt"
+            columns = [one.time_s, sign * one.displacement_mm, sign * one.force_N]
+            exports.write(tmp_path, file, "Zeit s;Weg mm;Kraft N\n" + exports.table(columns, ";", 4, comma=True))
+            written[file] = one
+    _, config, ingested = read(tmp_path)
+    assert config.rubber == ["rubber"]
+    assert_settings(ingested, written, NO_COMPRESSION)
+    runs = ingested.tables["runs"]
+    assert (runs["direction"] == runs["file"].str.contains("vor").map({True: 1, False: -1})).all()
+    assert (runs["rubber"] == runs["file"].str[:3]).all()
 
 
 @pytest.mark.parametrize("name", exports.EXPORTS)

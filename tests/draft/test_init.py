@@ -56,7 +56,7 @@ def test_a_draft_is_written_here_and_the_next_command_works(sealfit, campaign):
 def test_the_summary_says_what_was_found_and_what_could_not_be_told(sealfit, campaign):
     _, out, _ = sealfit("init", campaign)
     assert "12 trace files" in out
-    assert "strokes go both ways, about 4 in a file" in out
+    assert "about 4 strokes in a file, both ways" in out
     assert "time_s: column 1 'Messzeit [s]': by its name and its unit" in out
     told = out.partition("could not be told:")[2]
     assert "compression_ratio_pct" in told

@@ -49,7 +49,7 @@ def test_the_pneumatic_seal_needs_its_force_computed():
     campaign, file = "measured/pneuseal-repeats", "raw/rerun/1_O-ring257_5bar.csv"
     made, ours, theirs = both(campaign, "pneuseal.toml", pressure_taken_off)
     assert made.files == 20
-    assert made.motion == "strokes go both ways, about 20 in a file"
+    assert made.motion == "about 20 strokes in a file, both ways"
     found, expected = read(campaign, ours, file), read(campaign, theirs, file)
     for name in ("time_s", "displacement_mm", "force_N"):  # that config drops the first 15 rows
         npt.assert_array_equal(found[name][-len(expected) :], expected[name])
