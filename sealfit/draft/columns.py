@@ -170,8 +170,9 @@ def _as_force(column: Column, velocities: Sequence[np.ndarray]) -> float:
 
 
 def _velocities(time: Column | None, displacement: Column | None, speed: Column | None) -> list[np.ndarray]:
-    if time is not None and displacement is not None:
-        return [motion.velocity(t, x) for t, x in zip(time.values, displacement.values, strict=True)]
+    if displacement is not None:  # without a time its direction is known all the same
+        times = time.values if time is not None else [np.arange(len(x)) for x in displacement.values]
+        return [motion.velocity(t, x) for t, x in zip(times, displacement.values, strict=True)]
     return [motion.smoothed(values) for values in speed.values] if speed is not None else []
 
 

@@ -15,6 +15,7 @@ from sealfit.draft.config_text import Doubt, Guess, Notes, config_text
 from sealfit.draft.file_names import read_names
 from sealfit.draft.files_found import look, read_tables
 from sealfit.draft.runs_table import find_table
+from sealfit.errors import RequestError
 
 SHOWN = ("trace.columns.", "condition", "files.glob", "files.name_pattern", "files.runs_columns")
 """Guesses that the summary repeats: the others are in the draft."""
@@ -49,6 +50,12 @@ def draft(folder: Path) -> Draft:
     notes = Notes()
     tables = read_tables(found)
     roles = find_roles(columns_of(found.dialect, list(tables.values())))
+    if roles.time is None and roles.force is None:
+        raise RequestError(
+            f"{len(found.traces)} files hold tables of numbers, such as {found.traces[0]}, but no time and no force.",
+            file=folder,
+            fix="Give the folder that holds traces: time, displacement and force in columns.",
+        )
     units = trace_keys.settled_units(roles, notes)
     speeds = trace_keys.motion_keys(roles, units, list(tables), notes)
     table = find_table(folder, [*found.others, *found.otherwise], found.traces)
@@ -69,7 +76,8 @@ def draft(folder: Path) -> Draft:
 
 def summary_lines(made: dict) -> list[str]:
     """Return what `sealfit init` prints: what was found, what could not be told, the command to run next."""
-    lines = [f"{made['files']} trace files in {made['folder']}; {made['motion']}"]
+    count = f"{made['files']} trace file" + ("s" if made["files"] != 1 else "")
+    lines = [f"{count} in {made['folder']}; {made['motion']}"]
     lines += [
         f"  {guess['key'].rpartition('.')[2]}: {guess['evidence']}"
         for guess in made["guesses"]

@@ -104,7 +104,7 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
     """Return a number with what the letters around it say; without `ours` where they say nothing."""
     pattern = _number_pattern(texts)
     after, before = _around(rows, at)
-    if after and (said := after_number(re.sub(r"[_ /]", "", after))):
+    if after and (said := after_number(re.sub(r"[-_ /]", "", after))):
         ours, factor = said
         return _scaled(Part(at, ours, "", pattern, texts, f"'{after}' stands after the number"), factor, before)
     if before and (ours := before_number(before)):

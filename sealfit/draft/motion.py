@@ -134,13 +134,14 @@ def _share(difference: float, scatter: float) -> float:
 
 
 def plateau_speeds(time: np.ndarray, displacement: np.ndarray) -> list[float]:
-    """Return the steady speeds of every stroke, magnitudes; rests and ramps do not count."""
+    """Return the steady speeds of every stroke, with the sign of the motion; rests and ramps do not count."""
     ends = [0, *turns(displacement), len(time) - 1]
     speeds = []
     for first, last in pairwise(ends):
         if last - first > SMOOTHED:
-            speeds += _steps(time[first : last + 1], displacement[first : last + 1])
-    return [speed for speed in speeds if np.isfinite(speed) and speed > 0]
+            sign = float(np.sign(displacement[last] - displacement[first]))
+            speeds += [sign * speed for speed in _steps(time[first : last + 1], displacement[first : last + 1])]
+    return [speed for speed in speeds if np.isfinite(speed) and speed != 0]
 
 
 def _steps(time: np.ndarray, displacement: np.ndarray) -> list[float]:
@@ -172,13 +173,22 @@ def different_speeds(speeds: list[float]) -> list[float]:
 
 
 def several_speeds(speeds: list[float]) -> list[float]:
-    """Return the speeds of a file that holds several, none otherwise; one stroke that is off is no speed of its own.
+    """Return the speeds of one direction in a file that holds several, none otherwise.
+
+    One stroke that is off is no speed of its own; each direction may have its speed.
 
     Examples
     --------
     >>> several_speeds([5.0, 5.0, 1.0, 1.0]), several_speeds([5.0, 5.0, 5.0, 1.0]), several_speeds([1.0, 2.0, 4.0])
     ([1.0, 5.0], [], [1.0, 2.0, 4.0])
+    >>> several_speeds([5.0, -8.0, 5.0, -8.0])
+    []
     """
+    forward = _several([speed for speed in speeds if speed > 0])
+    return forward or _several([-speed for speed in speeds if speed < 0])
+
+
+def _several(speeds: list[float]) -> list[float]:
     groups = _groups(speeds)
     own = all(len(group) == 1 for group in groups)
     kept = groups if own else [group for group in groups if len(group) > 1]

@@ -200,7 +200,7 @@ def _otherwise(found: Found, dialect, notes: Notes) -> None:
 
 def _glob_keys(found: Found, source: Source, notes: Notes) -> None:
     pattern = glob_of(found.traces)
-    notes.guess("files.glob", pattern, f"finds the {len(found.traces)} trace files")
+    notes.guess("files.glob", pattern, f"finds the trace files: {len(found.traces)}")
     matched = {p.relative_to(found.folder).as_posix() for p in found.folder.glob(pattern) if p.is_file()}
     unmatched = set(source.names.unmatched) if source.names.pattern is not None else set()
     table = {source.table.file} if source.table is not None else set()

@@ -178,8 +178,9 @@ def _column_doubts(column: Column, role: str, key: str, roles: Roles, notes: Not
     named = column.role == role and column.sure
     unit_fits = column.unit is not None and column.unit.dimension in DIMENSION[role]
     if not named and not unit_fits:
-        fix = f"Name the right column of {role} here if it is another."
-        notes.doubt(key, f"neither name nor unit says that {column.place} is the {role}; its behaviour does.", fix)
+        in_unit = f", and {SLOTS[role].rpartition('_')[2]} is assumed" if key.endswith(SLOTS[role]) else ""
+        reason = f"neither name nor unit says that {column.place} is the {role}; its behaviour does{in_unit}."
+        notes.doubt(key, reason, f"Name the right column of {role} here if it is another.")
     if role == "force" and roles.signs_differ:
         reason = f"the sign of {column.place} against the motion is not the same in all files."
         notes.doubt(key, reason, "Check whether the sensor was turned, or the force was exported as a magnitude.")
@@ -298,6 +299,8 @@ def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
             )
             notes.doubt("trace.compute.time_s", reason, "Change the factor if it is another unit.")
             return UNITS["ms"]
+    if column.role != role:
+        return None  # said where it is said that nothing but its behaviour speaks for it
     reason = f"{column.place} has no unit; {default} is assumed."
     fix = f"If it is another, read it under a name such as {role}_raw and compute {slot} from it."
     notes.doubt(f"trace.columns.{slot}", reason, fix)
@@ -354,10 +357,12 @@ def motion_keys(roles: Roles, units: Mapping[str, Unit | None], files: Sequence[
     if several:
         file, found = next(iter(several.items()))
         shown = ", ".join(f"{speed:.3g}" for speed in found[:6])
-        reason = f"{len(several)} of {len(files)} files hold strokes of several speeds: {shown} mm/s in {file}."
-        fix = "Strokes of one direction and other speeds are one run each only if run_id says so; check the runs table."
+        reason = (
+            f"{len(several)} of {len(files)} files read hold several speeds in one direction: {shown} mm/s in {file}."
+        )
+        fix = "The strokes of a file in one direction are one run: write each speed into a file of its own."
         notes.doubt("strokes", reason, fix)
-    return {file: float(np.median(found)) for file, found in speeds.items() if found and file not in several}
+    return {file: float(np.median(np.abs(found))) for file, found in speeds.items() if found and file not in several}
 
 
 def motion_words(roles: Roles, strokes: int) -> str:

@@ -150,6 +150,10 @@ def empty_files(folder):
     (folder / "d1.csv").write_bytes(b"")
 
 
+def values_over_days(folder):
+    exports.write(folder, "strength.csv", "TempC,TimeH,Response\n" + "50,0,100\n50,72,93.1\n60,0,99\n60,24,95\n" * 5)
+
+
 def only_a_table_of_runs(folder):
     exports.write(folder, "runs.csv", "file,aging_days\n" + "".join(f"{i}.csv,{i}\n" for i in range(20)))
 
@@ -165,6 +169,7 @@ def only_a_table_of_runs(folder):
         (packed, "a zip archive or .xlsx workbook", "export them as text"),
         (tdms, "3 TDMS (LabVIEW) (.tdms), 1 Excel workbooks (.xlsx)", "Export the traces as text"),
         (empty_files, "is empty", "export them as text"),
+        (values_over_days, "but no time and no force", "Give the folder that holds traces"),
         (only_a_table_of_runs, "none of 1 files holds a table of numbers", "export them as text"),
     ],
 )
