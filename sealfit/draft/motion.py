@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from sealfit.ingest.strokes import turning_rows
 from sealfit.ingest.trace_checks import measured_speed
 
 SMOOTHED = 7  # samples, as `strokes.smooth_samples`
@@ -50,30 +51,15 @@ def smoothness(values: np.ndarray) -> float:
     return float((stroke_count(values) * np.ptp(values)) / path) if path else 0.0
 
 
-def turns(values: np.ndarray) -> list[int]:
-    """Return the rows at which a smoothed column turns by more than a fifth of its range."""
+def ends_of_strokes(values: np.ndarray) -> list[int]:
+    """Return the rows where a displacement begins, turns and ends: a fifth of its range apart or more."""
     smooth = smoothed(values)
-    least = STROKE * float(np.ptp(smooth))
-    found: list[int] = []
-    low = high = 0
-    direction = 0
-    for i, value in enumerate(smooth.tolist()):
-        low = i if value < smooth[low] else low
-        high = i if value > smooth[high] else high
-        if direction >= 0 and value < smooth[high] - least:
-            found += [high] if direction else []
-            direction, low = -1, i
-        elif direction <= 0 and value > smooth[low] + least:
-            found += [low] if direction else []
-            direction, high = 1, i
-        if direction > 0:
-            low = i if value >= smooth[high] else low
-    return found
+    return turning_rows(smooth, STROKE * float(np.ptp(smooth)))
 
 
 def stroke_count(values: np.ndarray) -> int:
     """Return how many strokes a displacement has."""
-    return len(turns(values)) + 1
+    return max(len(ends_of_strokes(values)) - 1, 1)
 
 
 def smoothed(values: np.ndarray) -> np.ndarray:
@@ -135,9 +121,8 @@ def _share(difference: float, scatter: float) -> float:
 
 def plateau_speeds(time: np.ndarray, displacement: np.ndarray) -> list[float]:
     """Return the steady speeds of every stroke, with the sign of the motion; rests and ramps do not count."""
-    ends = [0, *turns(displacement), len(time) - 1]
     speeds = []
-    for first, last in pairwise(ends):
+    for first, last in pairwise(ends_of_strokes(displacement)):
         if last - first > SMOOTHED:
             sign = float(np.sign(displacement[last] - displacement[first]))
             speeds += [sign * speed for speed in _steps(time[first : last + 1], displacement[first : last + 1])]

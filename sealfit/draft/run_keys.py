@@ -13,6 +13,7 @@ from pathlib import PurePosixPath
 from sealfit.config import AGING_CONDITION, Files
 from sealfit.draft.columns import Roles
 from sealfit.draft.config_text import Notes
+from sealfit.draft.dialect import Dialect
 from sealfit.draft.file_names import HEIGHT_FROM
 from sealfit.draft.files_found import Found
 from sealfit.draft.name_parts import Names, Part
@@ -175,12 +176,10 @@ def source_keys(found: Found, source: Source, header: Collection[str], notes: No
                 f"Copy it to {RUNS_CSV}; the columns below are those of this table. Without it, only names count."
                 + ("" if table.whole_paths else " Its names of files need their folders and suffixes."),
             )
-    if table is None or not set(AGING_CONDITION) <= table.given:
-        _name_keys(source.names, len(found.traces), bool(set(header) & set(AGING_CONDITION)), notes)
-    for file, dialect in found.otherwise.items():
-        if table is None or file != table.file:
-            _otherwise(found, dialect, notes)
-            break
+    if table is None or not table.is_runs_csv or not set(AGING_CONDITION) <= table.given:
+        told = table is not None or bool(set(header) & set(AGING_CONDITION))
+        _name_keys(source.names, len(found.traces), told, notes)
+    _otherwise({f: one for f, one in found.otherwise.items() if table is None or f != table.file}, notes)
     for file, reason in list(found.unreadable.items())[:3]:
         notes.doubt("files", f"{file} {reason}", "It is in no run.")
     for suffix, count in found.formats.items():
@@ -188,12 +187,14 @@ def source_keys(found: Found, source: Source, header: Collection[str], notes: No
         notes.doubt("files", reason, "Export them as text (CSV) if they hold traces or the list of runs.")
 
 
-def _otherwise(found: Found, dialect, notes: Notes) -> None:
-    others = [file for file in found.otherwise]
+def _otherwise(others: Mapping[str, Dialect], notes: Notes) -> None:
+    if not others:
+        return
+    dialect = next(iter(others.values()))
     delimiter = f"separator '{dialect.delimiter}'"
     decimal = f", decimal '{dialect.decimal}'" if dialect.decimal else ""
     names = f", columns {', '.join(dialect.names[:4])}" if dialect.names else ""
-    reason = f"{len(others)} files are written otherwise ({delimiter}{decimal}{names}): {', '.join(others[:3])}."
+    reason = f"{len(others)} files are written otherwise ({delimiter}{decimal}{names}): {', '.join(list(others)[:3])}."
     fix = "One config reads files of one form. Move them to a folder of their own and draft a config for them, too."
     notes.doubt("files", reason, fix)
 
@@ -249,9 +250,10 @@ def _excluded(surplus: set[str], matched: set[str]) -> list[str]:
     return list(dict.fromkeys(globs))
 
 
-def _name_keys(names: Names, files: int, needless: bool, notes: Notes) -> None:
+def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
+    """Add what names say; that they say nothing matters only where nothing else has `told` the conditions."""
     if names.pattern is None:
-        if needless:
+        if told:
             return
         reason = "the names of the files say nothing that is known here: temperature, days, speed, repeat."
         notes.doubt("files", reason, f"Write a {RUNS_CSV} with a line for each file, or name_pattern by hand.")
