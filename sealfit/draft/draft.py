@@ -61,7 +61,7 @@ def draft(folder: Path) -> Draft:
     table = find_table(folder, [*found.others, *found.otherwise], found.traces)
     names = run_keys.improved(read_names(found.traces), speeds, found, notes)
     source = run_keys.Source(run_keys.needs_no_load(names, roles), table)
-    header = [one.ours for one in trace_keys.header_keys(found, source.given, notes)]
+    header = [one.ours for one in trace_keys.header_keys(found, source.given, roles.load is not None, notes)]
     run_keys.source_keys(found, source, header, notes)
     trace_keys.dialect_keys(found, notes)
     trace_keys.column_keys(found, roles, units, len(tables), notes)

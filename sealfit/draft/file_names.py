@@ -33,6 +33,9 @@ HEIGHT_FROM = 50.0
 ALIKE = 0.2
 """Share of the names that another way of naming must have for a word to be optional; fewer are slips."""
 
+NO_COUNTS = ("temperature_C", "compression_ratio_pct", "load_N")
+"""What numbers that count up from 1 are not, whatever letter stands before them: T1 and T2 are tests."""
+
 COUNTED = 6
 """Files from which on a number that is another in each of them counts files, not repeats."""
 
@@ -107,9 +110,16 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
     if after and (said := after_number(re.sub(r"[-_ /]", "", after))):
         ours, factor = said
         return _scaled(Part(at, ours, "", pattern, texts, f"'{after}' stands after the number"), factor, before)
-    if before and (ours := before_number(before)):
+    ours = before_number(before) if before else ""
+    if ours and not (ours in NO_COUNTS and _counts_up(texts)):
         return _scaled(Part(at, ours, "", pattern, texts, f"'{before}' stands before the number"), 1.0, before)
     return Part(at, "", "", pattern, texts, f"'{before}' stands before the number" if before else "a bare number")
+
+
+def _counts_up(texts: Sequence[str]) -> bool:
+    """Whether numbers are 1, 2, 3 or 0, 1, 2."""
+    numbers = sorted({int(text) for text in texts}) if all(text.isdecimal() for text in texts) else [2]
+    return numbers[0] <= 1 and len(numbers) > 1 and numbers == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
 def _around(rows: Sequence[Sequence[Token]], at: int) -> tuple[str, str]:
@@ -188,8 +198,7 @@ def _repeats(part: Part, known: Sequence[Part], rows: Sequence[Sequence[Token]])
     """Whether a number counts from 0 or 1 and differs between files of the same settings."""
     if len(part.texts) > FEW or len(part.texts) == len(rows) > COUNTED:
         return False
-    numbers = sorted({int(text) for text in part.texts}) if all(text.isdecimal() for text in part.texts) else []
-    if not numbers or numbers[0] > 1 or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
+    if not _counts_up(part.texts):
         return False
     seen = Counter(tuple(row[other.at].text for other in (*known, part)) for row in rows)
     settings = {tuple(row[other.at].text for other in known) for row in rows}

@@ -14,7 +14,7 @@ from sealfit.draft.config_text import Notes, column_guesses, date_lines, scaled
 from sealfit.draft.dialect import STRAYS, is_unchanged
 from sealfit.draft.files_found import Found
 from sealfit.draft.header_lines import Setting, settings_in, started_in
-from sealfit.draft.vocabulary import UNITS, Unit, plain
+from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
 
 LONG_S = 3600.0
 """A trace without a unit of time is not taken to last longer than an hour at a sample per second or slower."""
@@ -239,8 +239,8 @@ def _other_columns(found: Found, roles: Roles, notes: Notes) -> None:
     kept, ignored = [], []
     taken = {name.partition(".")[2] for name in SLOTS.values()}
     for column in roles.others:
-        name = _channel(column)
-        if name and name not in taken:
+        name = _channel(column, taken)
+        if name:
             taken.add(name)
             kept.append(column)
             notes.guess(f"trace.columns.{name}", column.key, f"{column.place}: kept as a channel")
@@ -260,15 +260,17 @@ def _ignored(column: Column) -> str:
     return column.place + (f", the same signal as column {column.copy_of}" if column.copy_of else "")
 
 
-def _channel(column: Column) -> str:
-    """Return the name of a column as a channel; "" if it is none: a ratio, a counter, a raw signal."""
-    if column.copy_of or not column.label or all(motion.rises(values) for values in column.values):
+def _channel(column: Column, taken: set[str]) -> str:
+    """Return the name of a column as a channel, none of those taken; "" if it is none: a ratio, a counter, a copy."""
+    if column.copy_of or column.role not in CHANNELS or all(motion.rises(values) for values in column.values):
         return ""
-    if column.role in CHANNELS:
-        unit = column.unit.name if column.unit is not None else ""
-        base = "_".join(plain(column.label).split())
-        return f"{column.role}_sensor" + (f"_{unit}" if unit else "") if column.role == "temperature" else base
-    return ""
+    unit = f"_{column.unit.name}" if column.unit is not None else ""
+    bases = [
+        f"{column.role}_sensor",
+        "_".join(plain(name_and_unit(column.label)[0]).split()),
+        f"{column.role}_column_{column.position}",
+    ]
+    return next(name for base in bases if (name := base + unit) not in taken)
 
 
 # ---------------------------------------------------------------- units
@@ -294,9 +296,8 @@ def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
         step = float(np.median(np.diff(column.values[0])))
         long = float(np.ptp(column.values[0]))
         if step >= 1.0 and long > LONG_S:
-            reason = (
-                f"{column.place} has no unit; in seconds a file would last {long / 3600:.1f} h, so it is taken as ms."
-            )
+            hours = f"{long / 3600:.1f} h"
+            reason = f"{column.place} has no unit; in seconds a file would last {hours}, so it is taken as ms."
             notes.doubt("trace.compute.time_s", reason, "Change the factor if it is another unit.")
             return UNITS["ms"]
     if column.role != role:
@@ -310,11 +311,12 @@ def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
 # ---------------------------------------------------------------- header and motion
 
 
-def header_keys(found: Found, given: set[str], notes: Notes) -> list[Setting]:
+def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes) -> list[Setting]:
     """Add the date and the settings that header lines give and nothing else does; return these settings."""
     headers = [one.header for one in found.sniffed]
     if not headers[0]:
         return []
+    given = given | ({"load_N"} if measures_load else set())
     when = started_in(headers)
     if when is not None and "started_at" not in given:
         guess, lines = date_lines(when)

@@ -178,6 +178,29 @@ def test_units_in_names_of_columns(text, name, factor):
     assert unit.factor == pytest.approx(factor)
 
 
+def test_sensors_beside_the_motion_are_channels_with_names_of_their_own(tmp_path):
+    def columns(one):
+        rng = np.random.default_rng(one.number)
+        return [*exports.slots(one), *(20 + rng.normal(size=(4, len(one.time_s))))]
+
+    header = "Zeit s;Weg mm;Kraft N;Temp Probe °C;Temp Luft °C;Feuchte %;Luftdruck mbar\n"
+    named = slots(campaign(tmp_path, columns, header, delimiter=";"))
+    assert named["temperature_sensor_C"] == "Temp Probe °C"
+    assert named["temp_luft_C"] == "Temp Luft °C"
+    assert {"humidity_sensor_pct", "pressure_sensor_mbar"} <= set(named)
+    assert len(named) == 7
+
+
+def test_a_measured_load_goes_before_that_of_the_header(tmp_path):
+    def columns(one):
+        return [one.time_s, one.displacement_mm, one.force_N, one.further["load"]]
+
+    header = "Normal load: 50 N\n\nt [s];x [mm];F [N];Fz [N]\n"
+    config = parse_config(campaign(tmp_path, columns, header, delimiter=";").text, "rig.toml")
+    assert config.trace.columns["load_N"] == "Fz [N]"
+    assert config.trace.header_fields == {}
+
+
 def test_names_with_blanks_above_columns_of_blanks_go_by_position(tmp_path):
     made = campaign(tmp_path, exports.slots, "Elapsed Time (s)   Slide Position (mm)   Force (N)\n", delimiter="   ")
     assert slots(made) == {"time_s": 1, "displacement_mm": 2, "force_N": 3}

@@ -118,6 +118,12 @@ def test_names_that_only_count_say_nothing():
     assert read_names([f"run_{number:03d}.csv" for number in range(1, 10)]).pattern is None
 
 
+@pytest.mark.parametrize("letter", ["T", "C", "N"])
+def test_letters_before_numbers_that_count_are_no_settings(letter):
+    files = made("d{d}_v{v}_" + letter + "{r}.csv", d=(4, 16), v=(5, 10), r=(1, 2))
+    assert told(files) == {"aging_days": 4.0, "speed_mm_s": 5.0, "repeat": 1.0}
+
+
 def test_a_file_named_otherwise_is_listed():
     files = [*made("d{d}_v{v}_r{r}.csv", d=(1, 2), v=(5, 10), r=(1, 2)), "calibration.csv"]
     assert read_names(files).unmatched == ("calibration.csv",)
