@@ -46,14 +46,15 @@ NO_TRACES = ("readme", "license", "licence", "notice", "sha256sums", "changelog"
 class Found:
     """The files of a folder, as paths below it.
 
-    `traces` are those that one config can read, `dialects` how some of them are written; `otherwise` are traces
-    written in another way, `others` text files that are none, `unreadable` files with the reason, `formats` counts
-    the files that are no text by their suffix.
+    `traces` are those that one config can read, `dialects` how some of them are written, `wider` those of them that
+    have further columns; `otherwise` are traces written in another way, `others` text files that are none,
+    `unreadable` files with the reason, `formats` counts the files that are no text by their suffix.
     """
 
     folder: Path
     traces: tuple[str, ...]
     dialects: dict[str, Dialect]
+    wider: dict[str, Dialect]
     otherwise: dict[str, Dialect]
     others: tuple[str, ...]
     unreadable: dict[str, str]
@@ -62,12 +63,13 @@ class Found:
     @property
     def sniffed(self) -> list[Dialect]:
         """How the traces that were looked at are written."""
-        return list(self.dialects.values())
+        return [*self.dialects.values(), *self.wider.values()]
 
     @property
     def dialect(self) -> Dialect:
         """How most of the traces are written; the first with fractions, which show the decimal sign."""
-        return next((one for one in self.sniffed if one.has_fractions), self.sniffed[0])
+        usual = list(self.dialects.values())
+        return next((one for one in usual if one.has_fractions), usual[0])
 
 
 def look(folder: Path) -> Found:
@@ -90,11 +92,12 @@ def look(folder: Path) -> Found:
     tables = {file: dialect for file, dialect in dialects.items() if dialect is not None and file != RUNS_CSV}
     if not tables:
         raise _no_traces(folder, files, formats, unreadable)
-    same, otherwise = _by_form(tables)
-    not_looked_at = _like(same, [file for file in texts if file not in dialects and file not in unreadable], dialects)
+    same, wider, otherwise = _by_form(tables)
+    rest = [file for file in texts if file not in dialects and file not in unreadable]
+    not_looked_at = _like({**same, **wider}, rest, dialects)
     others = [file for file, dialect in dialects.items() if dialect is None or file == RUNS_CSV]
-    traces = sorted([*same, *not_looked_at], key=natural)
-    return Found(folder, tuple(traces), same, otherwise, tuple(others), unreadable, formats)
+    traces = sorted([*same, *wider, *not_looked_at], key=natural)
+    return Found(folder, tuple(traces), same, wider, otherwise, tuple(others), unreadable, formats)
 
 
 def _like(same: Collection[str], rest: Sequence[str], looked_at: Collection[str]) -> list[str]:
@@ -161,15 +164,24 @@ def _text(folder: Path, file: str) -> tuple[str, bool]:
     return as_utf8(raw, "auto", file, head=not whole).decode("utf-8", "replace"), whole
 
 
-def _by_form(tables: dict[str, Dialect]) -> tuple[dict[str, Dialect], dict[str, Dialect]]:
-    """Return the files written as most are, and the others."""
+def _by_form(tables: dict[str, Dialect]) -> tuple[dict[str, Dialect], dict[str, Dialect], dict[str, Dialect]]:
+    """Return the files written as most are, those that have further columns beside the same ones, and the others."""
     forms = Counter((one.delimiter, one.names or one.width) for one in tables.values())
     delimiter, named = forms.most_common(1)[0][0]
     alike = {f: one for f, one in tables.items() if (one.delimiter, one.names or one.width) == (delimiter, named)}
     decimals = Counter(one.decimal for one in alike.values() if one.has_fractions)
     decimal = decimals.most_common(1)[0][0] if decimals else ""
     same = {file: one for file, one in alike.items() if one.decimal in (decimal, "")}
-    return same, {file: one for file, one in tables.items() if file not in same}
+    rest = {file: one for file, one in tables.items() if file not in same}
+    usual = next(iter(same.values()))
+    wider = {file: one for file, one in rest.items() if one.decimal in (decimal, "") and _holds(one, usual)}
+    return same, wider, {file: one for file, one in rest.items() if file not in wider}
+
+
+def _holds(one: Dialect, usual: Dialect) -> bool:
+    """Whether a file has all columns of another one, by their names."""
+    by_name = usual.names_are_cells and one.names_are_cells and len(set(usual.names)) == len(usual.names) > 0
+    return by_name and one.delimiter == usual.delimiter and set(usual.names) <= set(one.names)
 
 
 def _no_traces(folder: Path, files: Sequence[str], formats: Counter, unreadable: dict[str, str]) -> RequestError:

@@ -38,6 +38,10 @@ def dialect_keys(found: Found, notes: Notes) -> None:
     if one.decimal == ",":
         notes.guess("trace.decimal", ",", f"numbers such as {_a_number(one.first)} in {of}")
     _header_keys(found, of, notes)
+    if found.wider:
+        further = sorted({name for other in found.wider.values() for name in other.names} - set(one.names))
+        reason = f"{len(found.wider)} of {len(sniffed)} files have further columns: {', '.join(further)}."
+        notes.doubt("trace", reason, "They are read by the names that all files have.")
     trailing = sum(other.trailing for other in sniffed)
     if trailing:
         evidence = f"lines of data end in separators in {trailing} of {len(sniffed)} files"

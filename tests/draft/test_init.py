@@ -13,6 +13,7 @@ from sealfit import cli
 from sealfit.config import load_config, parse_config
 from sealfit.draft.draft import draft
 from sealfit.errors import RequestError
+from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.runs import list_traces
 
 
@@ -205,6 +206,22 @@ def test_files_written_otherwise_are_left_out_and_said(tmp_path):
     assert "3 files" in doubt.reason
     assert "separator ';', decimal ','" in doubt.reason
     assert parse_config(made.text, "rig.toml").files.exclude == ["old0.csv", "old1.csv", "old2.csv"]
+
+
+def test_files_with_further_columns_are_read_by_the_names_that_all_have(tmp_path):
+    for one in exports.records():
+        columns, header = exports.slots(one), "t [s];x [mm];F [N]\n"
+        if one.repeat == 2 and one.days == 4:
+            columns, header = [one.time_s, one.further["temperature"], *columns[1:]], "t [s];T [°C];x [mm];F [N]\n"
+        file = f"d{one.days}_v{one.speed:g}_r{one.repeat}.csv"
+        exports.write(tmp_path, file, header + exports.table(columns, ";", 4))
+    made = draft(tmp_path)
+    assert made.files == 12
+    (doubt,) = [doubt for doubt in made.doubts if "further columns" in doubt.reason]
+    assert "2 of 12 files have further columns: T [°C]." in doubt.reason
+    ingested = ingest_campaign(tmp_path, parse_config(made.text, "rig.toml"))
+    assert set(ingested.tables["inputs"]["status"]) == {"used"}
+    assert ingested.tables["runs"]["speed_mm_s"].abs().round(2).isin([1.0, 5.0]).all()
 
 
 def test_a_broken_file_among_traces_is_said_and_excluded(tmp_path):
