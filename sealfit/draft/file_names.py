@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from sealfit.draft.name_parts import (
+    SUFFIX,
     Names,
     Part,
     Token,
@@ -42,7 +43,7 @@ COUNTED = 6
 
 def read_names(files: Sequence[str]) -> Names:
     """Return what the names of files, relative paths with forward slashes, say."""
-    stems = {file: re.sub(r"\.[^./]*$", "", file) for file in files}
+    stems = {file: SUFFIX.sub("", file) for file in files}
     cut = {file: tokens(stem) for file, stem in stems.items()}
     groups: dict[tuple, list[str]] = defaultdict(list)
     for file, pieces in cut.items():
@@ -226,10 +227,9 @@ def _named(parts: Sequence[Part]) -> list[Part]:
     """Return the parts with the names of their groups: a leading `_` where the column is made from them."""
     made = []
     for part in parts:
-        helper = part.expression or part.ours in ("direction", "specimen_id") or any("p" in t for t in part.texts)
         if part.group or not part.ours:
             made.append(part)
-        elif helper and not (part.ours == "specimen_id" and "{}" in part.expression):
+        elif part.expression or part.ours == "specimen_id":
             made.append(replace(part, group=f"_{part.ours.split('_')[0]}"))
         else:
             made.append(replace(part, group=part.ours))

@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 
 from sealfit.draft.vocabulary import DIRECTIONS
 
+SUFFIX = re.compile(r"\.(?=[^./]*[^\W\d])[^./]*$")
+"""The ending of a file's name: with a letter, as in `v0.5` the last figure is none."""
+
 _TOKEN = re.compile(
     r"(?P<date>(?<!\d)20\d\d(?P<_d>[-_.]?)(?:0[1-9]|1[0-2])(?P=_d)(?:0[1-9]|[12]\d|3[01])(?!\d)"
     r"(?:[T_\- ](?:[01]\d|2[0-3])(?P<_t>[-:.h]?)[0-5]\d(?:(?P=_t)[0-5]\d)?(?!\d))?)"
@@ -182,7 +185,7 @@ def _signed_speed(parts: Sequence[Part], compute: Mapping[str, str]) -> dict[str
 
 def suffix_pattern(files: Sequence[str]) -> str:
     """Return the pattern of the suffixes of files."""
-    endings = sorted({match.group() for file in files if (match := re.search(r"\.[^./]*$", file))})
+    endings = sorted({match.group() for file in files if (match := SUFFIX.search(file))})
     if len(endings) == 1:
         return re.escape(endings[0])
     return "(?:" + "|".join(re.escape(ending) for ending in endings) + ")" if endings else ""

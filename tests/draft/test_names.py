@@ -114,6 +114,10 @@ def test_a_number_that_counts_files_is_no_repeat():
     assert told(files) == {"aging_days": 1.0}
 
 
+def test_names_without_an_ending_may_end_in_a_decimal():
+    assert told(made("d{d}/v{v}", d=(1, 2), v=("0.5", "1.5"))) == {"aging_days": 1.0, "speed_mm_s": 0.5}
+
+
 def test_names_that_only_count_say_nothing():
     assert read_names([f"run_{number:03d}.csv" for number in range(1, 10)]).pattern is None
 
