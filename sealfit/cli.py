@@ -137,6 +137,20 @@ def _sealfit(
 
 
 @app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with the trace files of a rig.")],
+    output: Annotated[Path, typer.Option("--output", help="Config to write (TOML).")] = Path("rig.toml"),
+    force: Annotated[bool, typer.Option("--force", help="Replace a config that is there.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Draft a rig config from a folder of files."""
+    from sealfit import commands
+    from sealfit.draft.draft import summary_lines
+
+    end("init", commands.init(folder, output, force=force), summary_lines, as_json)
+
+
+@app.command()
 def ingest(
     campaign: Campaign,
     out: Out,

@@ -1,4 +1,4 @@
-"""Commands that keep nothing in OUT: check, predict, lifetime, effects and simulate."""
+"""Commands that keep nothing in OUT: init, check, predict, lifetime, effects and simulate."""
 
 from __future__ import annotations
 
@@ -28,6 +28,38 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MODELS = ("after", "before")  # with the loop's effects taken out at their reference, and without effects
+
+
+def init(folder: Path, output: Path, *, force: bool = False) -> dict:
+    """Write the draft of a config that reads the files in a folder; return the guesses, the doubts and what is next.
+
+    Raises
+    ------
+    OutError
+        If `output` is there already and `force` is not given, is no .toml file, or cannot be written.
+    RequestError
+        If there is no such folder, or no trace file in it that is text.
+    """
+    from sealfit.draft.draft import draft
+
+    if output.suffix.lower() != ".toml":
+        raise OutError("is no name for a config.", file=output, fix="Give --output a name that ends in .toml.")
+    if output.exists() and not force:
+        raise OutError("is there already.", file=output, fix="Choose another --output, or replace it with --force.")
+    made = draft(folder)
+    try:
+        output.write_text(made.text, "utf-8")
+    except OSError as error:
+        raise OutError(f"cannot be written ({error.strerror}).", file=output, fix="Choose another --output.") from error
+    return {
+        "config": str(output),
+        "folder": str(folder),
+        "files": made.files,
+        "motion": made.motion,
+        "guesses": [guess.as_dict() for guess in made.guesses],
+        "doubts": [doubt.as_dict() for doubt in made.doubts],
+        "next": made.next_command(output),
+    }
 
 
 def check(

@@ -1,0 +1,201 @@
+"""Which column of the trace files is time, displacement, force and load: by name, by unit and by behaviour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sealfit.draft import motion
+from sealfit.draft.dialect import Dialect
+from sealfit.draft.vocabulary import Unit, column_role, name_and_unit, unit_of
+
+DIMENSION = {
+    "time": ("time",),
+    "displacement": ("length",),
+    "force": ("force", "torque"),
+    "load": ("force",),
+    "speed": ("speed", "rotation"),
+}
+COPY = 0.9999  # correlation of two columns that are the same signal in two units
+BY_BEHAVIOUR = 0.5  # how well a column must behave to be taken without a name or a unit
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the trace files, and what each of some files holds in it.
+
+    `position` counts from 1; `label` is what the files call it, "" if nothing; `role` is what its name says, with
+    `sure` 3 for a word, 1 for a letter, 0 for nothing. `copy_of` is the position of another column that is the same
+    signal.
+    """
+
+    position: int
+    label: str
+    role: str
+    sure: int
+    unit: Unit | None
+    values: tuple[np.ndarray, ...]
+    by_name: bool
+    copy_of: int | None = None
+
+    @property
+    def place(self) -> str:
+        """The column in words: "column 4 'Weg [mm]'"."""
+        unit = f" [{self.unit.name}]" if self.unit is not None and self.unit.name not in self.label else ""
+        return f"column {self.position} '{self.label}'{unit}" if self.label else f"column {self.position}{unit}"
+
+    @property
+    def key(self) -> str | int:
+        """How a config names it: by its name, or by its position where the name is missing or stands twice."""
+        return self.label if self.by_name else self.position
+
+    def may_be(self, role: str) -> bool:
+        """Whether its unit and its name leave it free to be that."""
+        if self.unit is not None and self.unit.dimension not in ("none", "share", *DIMENSION[role]):
+            return False
+        return not self.sure or self.role == role or (self.sure == 1 and self.unit is not None)
+
+
+@dataclass(frozen=True)
+class Roles:
+    """The columns by what they hold; None where none was found. `others` are all the rest."""
+
+    time: Column | None
+    displacement: Column | None
+    force: Column | None
+    load: Column | None
+    speed: Column | None
+    others: tuple[Column, ...]
+    sign: int = 1
+    both_ways: bool = False
+    signs_differ: bool = False
+    signed_files: int = 0
+
+
+def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
+    """Return the columns that hold numbers.
+
+    Parameters
+    ----------
+    dialect : Dialect
+        How the files are written.
+    tables : sequence of ndarray, shape (rows, width)
+        The numbers of some files, nan where there are none.
+    """
+    found = []
+    for i in dialect.numbers:
+        label = dialect.names[i] if i < len(dialect.names) else ""
+        base, unit = name_and_unit(label)
+        if unit is None and i < len(dialect.units):
+            unit = unit_of(dialect.units[i])
+        role, sure = column_role(base)
+        if role == "torque":
+            role = "force"
+        by_name = bool(label) and dialect.names.count(label) == 1 and dialect.names_are_cells
+        values = tuple(table[:, i] for table in tables)
+        found.append(Column(i + 1, label, role, sure, unit, values, by_name))
+    return _copies_marked(found)
+
+
+def _copies_marked(columns: list[Column]) -> list[Column]:
+    """Return the columns, of each pair that is the same signal the earlier marked: loggers write the raw one first."""
+    marked = []
+    for i, column in enumerate(columns):
+        later = next((other for other in columns[i + 1 :] if _same_signal(column, other)), None)
+        marked.append(replace(column, copy_of=later.position) if later else column)
+    return marked
+
+
+def _same_signal(one: Column, other: Column) -> bool:
+    a, b = one.values[0], other.values[0]
+    if motion.rises(a) or motion.rises(b) or np.ptp(a) == 0 or np.ptp(b) == 0:
+        return False
+    return abs(float(np.corrcoef(a, b)[0, 1])) > COPY
+
+
+def find_roles(columns: Sequence[Column]) -> Roles:
+    """Return which column is what."""
+    time = _best(columns, "time", _as_time)
+    counters = [c for c in columns if c.role != "displacement" and all(map(motion.is_counter, c.values))]
+    rest = [column for column in columns if column is not time and column not in counters]
+    speed_named = [c for c in rest if c.role == "speed" or (c.unit and c.unit.dimension in DIMENSION["speed"])]
+    speed = speed_named[0] if speed_named else None
+    rest = [column for column in rest if column not in speed_named]
+    displacement = _best(rest, "displacement", _as_displacement)
+    rest = [column for column in rest if column is not displacement]
+    velocities = _velocities(time, displacement, speed)
+    force = _best(rest, "force", lambda column: _as_force(column, velocities)) if velocities else None
+    rest = [column for column in rest if column is not force]
+    load = _load(rest) if force is not None else None
+    taken = (time, displacement, force, load, speed)
+    found = Roles(*taken, tuple(column for column in columns if column not in taken))
+    return _with_sign(found, velocities) if force is not None else found
+
+
+def _best(columns: Sequence[Column], role: str, behaves) -> Column | None:
+    """Return the column with the most points: name and unit up to 5, behaviour up to 3; a copy comes last."""
+    points = {}
+    for column in columns:
+        if not column.may_be(role):
+            continue
+        behaviour = behaves(column)
+        named = column.sure if column.role == role else 0
+        unit = 2.0 if column.unit is not None and column.unit.dimension in DIMENSION[role] else 0.0
+        if behaviour <= 0 or (not named and not unit and behaviour < BY_BEHAVIOUR):
+            continue
+        points[column.position] = named + unit + 3.0 * behaviour - (0.5 if column.copy_of else 0.0)
+    return max((c for c in columns if c.position in points), key=lambda c: points[c.position], default=None)
+
+
+def _as_time(column: Column) -> float:
+    if not all(motion.rises(values) for values in column.values):
+        return 0.0
+    even = float(np.median([motion.evenness(values) for values in column.values]))
+    return 0.3 * even if all(motion.is_counter(values) for values in column.values) else max(even, 0.3)
+
+
+def _as_displacement(column: Column) -> float:
+    if all(np.ptp(values) == 0 for values in column.values):
+        return 0.0
+    return float(np.median([motion.spread(v) * motion.smoothness(v) for v in column.values]))
+
+
+def _as_force(column: Column, velocities: Sequence[np.ndarray]) -> float:
+    if all(np.ptp(values) == 0 for values in column.values):
+        return 0.0
+    found = [motion.follows(v, speed).strength for v, speed in zip(column.values, velocities, strict=True)]
+    return max(float(np.median(found)), 0.05)  # a named force may follow badly; it is still the force
+
+
+def _velocities(time: Column | None, displacement: Column | None, speed: Column | None) -> list[np.ndarray]:
+    if displacement is not None:  # without a time its direction is known all the same
+        times = time.values if time is not None else [np.arange(len(x)) for x in displacement.values]
+        return [motion.velocity(t, x) for t, x in zip(times, displacement.values, strict=True)]
+    return [motion.smoothed(values) for values in speed.values] if speed is not None else []
+
+
+def _load(rest: Sequence[Column]) -> Column | None:
+    """Return the column of the normal load: one that is called so, or a second force that hardly varies."""
+    named = [c for c in rest if c.role == "load" and c.may_be("load")]
+    if named:
+        return named[0]
+    forces = [c for c in rest if c.unit is not None and c.unit.dimension == "force" and c.role in ("force", "")]
+    steady = [c for c in forces if all(abs(np.mean(v)) > 5.0 * np.std(v) > 0.0 for v in c.values)]
+    return steady[0] if len(steady) == 1 else None
+
+
+def _with_sign(roles: Roles, velocities: Sequence[np.ndarray]) -> Roles:
+    found = [motion.follows(v, speed) for v, speed in zip(roles.force.values, velocities, strict=True)]
+    signs = [one.sign for one in found if one.sign]
+    told = max((one.strength for one in found), default=0.0) > BY_BEHAVIOUR / 2
+    sign = -1 if told and sum(signs) < 0 else 1
+    agree = signs.count(sign)
+    return replace(
+        roles,
+        sign=sign,
+        both_ways=sum(one.both_ways for one in found) > 0.5 * len(found),
+        signs_differ=agree < len(signs),
+        signed_files=agree,
+    )

@@ -1,0 +1,215 @@
+"""Guesses and doubts as the text of a config: TOML, each key with its evidence above it."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from sealfit.draft.columns import Column
+from sealfit.draft.header_lines import When
+from sealfit.draft.vocabulary import Unit
+
+WIDTH = 110  # characters of a comment's line
+
+SECTIONS = (
+    "",
+    "files",
+    "files.columns",
+    "files.values",
+    "files.compute",
+    "files.runs_columns",
+    "trace",
+    "trace.columns",
+    "trace.header_fields",
+    "trace.compute",
+    "quantities",
+    "column_units",
+    "strokes",
+)
+
+Value = str | int | float | bool | list | dict
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """A key of the config with its value, and what speaks for it."""
+
+    key: str  # with its table: trace.columns.time_s
+    value: Value
+    evidence: str
+
+    def as_dict(self) -> dict:
+        """Return the guess as plain values."""
+        return {"key": self.key, "value": self.value, "evidence": self.evidence}
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What could not be told: about which key, what was found, and what to do."""
+
+    key: str
+    reason: str
+    fix: str
+    lines: tuple[str, ...] = ()  # of config, written as comments: to be switched on by hand
+
+    def as_dict(self) -> dict:
+        """Return the doubt as plain values."""
+        return {"key": self.key, "reason": self.reason, "fix": self.fix}
+
+    def __str__(self) -> str:
+        return f"{self.reason} {self.fix}"
+
+
+@dataclass
+class Notes:
+    """Guesses and doubts, collected in the order in which they are made."""
+
+    guesses: list[Guess] = field(default_factory=list)
+    doubts: list[Doubt] = field(default_factory=list)
+
+    def guess(self, key: str, value: Value, evidence: str) -> None:
+        """Add a guess."""
+        self.guesses.append(Guess(key, value, evidence))
+
+    def doubt(self, key: str, reason: str, fix: str, lines: Sequence[str] = ()) -> None:
+        """Add a doubt."""
+        self.doubts.append(Doubt(key, reason, fix, tuple(lines)))
+
+
+# ---------------------------------------------------------------- lines for a column
+# The one place where a unit or a sign that is not the default, or a date that is not ISO 8601, becomes config lines.
+
+DEFAULT_UNIT = {"time_s": "s", "displacement_mm": "mm", "force_N": "N", "load_N": "N"}
+
+
+def column_guesses(slot: str, column: Column, unit: Unit | None, sign: int, evidence: str) -> tuple[list[Guess], str]:
+    """Return the config lines that bring a column into a slot, and the helper column that they need, "" for none.
+
+    A column in another unit, or of the other sign, is read under a helper's name and computed.
+
+    Parameters
+    ----------
+    slot : str
+        `time_s`, `displacement_mm`, `force_N` or `load_N`.
+    unit : Unit or None
+        Its unit; None for that of the slot.
+    sign : int
+        -1 to change the sign.
+    """
+    factor = 1.0 if unit is None else unit.factor
+    if factor == 1.0 and sign > 0:
+        return [Guess(f"trace.columns.{slot}", column.key, evidence)], ""
+    base = slot.rpartition("_")[0]
+    helper = f"{base}_raw" if factor == 1.0 or unit is None else f"{base}_{unit.name}"
+    why = f"from {unit.name} to {DEFAULT_UNIT[slot]}" if helper != f"{base}_raw" else ""
+    if sign < 0:
+        turned = "with the sign of the motion" if slot == "force_N" else "as a load that presses counts above 0"
+        why = f"{why}, and {turned}" if why else turned
+    expression = ("-" if sign < 0 else "") + scaled(helper, factor)
+    return [
+        Guess(f"trace.columns.{helper}", column.key, evidence),
+        Guess(f"trace.compute.{slot}", expression, why),
+    ], helper
+
+
+def scaled(name: str, factor: float) -> str:
+    """Return the expression of a column times a factor.
+
+    Examples
+    --------
+    >>> scaled("time_ms", 1e-3), scaled("force_kN", 1000.0), scaled("x", 1.0)
+    ('time_ms / 1000', 'force_kN * 1000', 'x')
+    """
+    if factor == 1.0:
+        return name
+    inverse = round(1.0 / factor, 9)
+    if factor < 1.0 and inverse == int(inverse):
+        return f"{name} / {int(inverse)}"
+    return f"{name} * {int(factor) if factor == int(factor) else repr(factor)}"
+
+
+def date_lines(when: When) -> tuple[Guess | None, tuple[str, ...]]:
+    """Return the guess for a date of ISO 8601, or the lines of config that another date needs."""
+    if not when.format:
+        evidence = f"header line {when.line}, in every file looked at: '{when.text}'"
+        return Guess("trace.header_fields.started_at", when.pattern, evidence), ()
+    lines = [f"[trace.header_fields] started_at = {literal(when.pattern)}"]
+    if when.clock:
+        lines.append(f"the time of day is in the line below: {literal(when.clock)}")
+    return None, (*lines, f"date_format = {literal(when.format)}")
+
+
+# ---------------------------------------------------------------- text
+
+
+def literal(text: str) -> str:
+    """Return a string as TOML writes it, without escapes where it can."""
+    return f"'{text}'" if "'" not in text and text.isprintable() else json.dumps(text, ensure_ascii=False)
+
+
+def toml(value: Value) -> str:
+    """Return a value as TOML.
+
+    Examples
+    --------
+    >>> toml({"": 0.0, "a b": "x"}), toml(["*.csv"]), toml(True)
+    ("{ '' = 0.0, 'a b' = 'x' }", "['*.csv']", 'true')
+    """
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str):
+        return literal(value)
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(k)} = {toml(v)}" for k, v in value.items()) + " }"
+    return "[" + ", ".join(toml(one) for one in value) + "]"
+
+
+def _key(name: str) -> str:
+    bare = name.isascii() and name.replace("_", "").replace("-", "").isalnum()
+    return name if bare else literal(name)
+
+
+def config_text(name: str, folder: str, notes: Notes) -> str:
+    """Return the whole config."""
+    lines = _comment(f"Drafted by `sealfit init {folder}`. Each guess has its evidence above it.")
+    lines += _comment(f"{_count(len(notes.doubts))} marked DOUBT. Run `sealfit check` with this file.")
+    lines.append(f"name = {literal(name)}")
+    written: set[int] = set()
+    for section in SECTIONS:
+        guesses = [guess for guess in notes.guesses if guess.key.rpartition(".")[0] == section]
+        doubts = [doubt for doubt in notes.doubts if doubt.key == section and id(doubt) not in written]
+        about = {guess.key for guess in guesses}
+        named = [doubt for doubt in notes.doubts if doubt.key in about]
+        if not guesses and not doubts:
+            continue
+        lines += ["", f"[{section}]"] if section else []
+        for doubt in doubts:
+            lines += _doubt_lines(doubt)
+        for guess in guesses:
+            lines += _comment(guess.evidence)
+            lines += [line for doubt in named if doubt.key == guess.key for line in _doubt_lines(doubt)]
+            lines.append(f"{_key(guess.key.rpartition('.')[2])} = {toml(guess.value)}")
+        written |= {id(doubt) for doubt in (*doubts, *named)}
+    rest = [doubt for doubt in notes.doubts if id(doubt) not in written]
+    if rest:
+        lines.append("")
+    for doubt in rest:
+        lines += _doubt_lines(doubt)
+    return "\n".join(lines) + "\n"
+
+
+def _count(doubts: int) -> str:
+    return {0: "Nothing is", 1: "One thing is"}.get(doubts, f"{doubts} things are")
+
+
+def _doubt_lines(doubt: Doubt) -> list[str]:
+    return [*_comment(f"DOUBT: {doubt}"), *(f"#     {line}" for line in doubt.lines)]
+
+
+def _comment(text: str) -> list[str]:
+    printable = "".join(char if char.isprintable() else " " for char in text)
+    return [f"# {line}" for line in textwrap.wrap(printable, WIDTH - 2)] if printable else []

@@ -1,0 +1,268 @@
+"""How a text file of numbers is written: separator, decimal sign, header, line of names, units, footer.
+
+The separator is found by clevercsv (van den Burg, Nazabal & Sutton 2019, doi:10.1007/s10618-019-00646-y): on 60 lines
+from the top, header included, and on 40 lines of data alone it was right for 14 of the 14 programs in
+`tests/draft/exports.py`. It says nothing of decimal signs, headers of many lines and footers; for these there is a
+plain rule: the data are the lines that hold numbers where the last lines of the sample do.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from sealfit.draft.vocabulary import column_role, unit_of
+from sealfit.ingest.files import as_number, split_line
+
+SAMPLE_LINES = 200
+"""Lines from the top that are looked at: longer than the headers we know of, by five times."""
+
+ENDS = 1000
+"""Lines at either end of a file that are looked at for lines that are no data."""
+
+SNIFFED_LINES = 60
+"""Lines given to clevercsv, whose time grows with the square of their number."""
+
+MIN_ROWS = 8
+"""Fewer rows of numbers are a table of settings or results, not a trace."""
+
+NAMES_ABOVE = 12
+"""Header lines above the data in which names and units are looked for."""
+
+STRAYS = ",;| \t"
+"""What lines end in without meaning: separators of empty columns, and those that a spreadsheet adds."""
+
+DELIMITERS = ("tab", ";", ",", "|", "whitespace")
+_OF_SNIFFER = {"\t": "tab", " ": "whitespace", "": "whitespace"}
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """How one file is written.
+
+    `header` are the lines above the data; `names` and `units` have one entry per column, or none; `names_back` and
+    `units_back` count their lines back from the header's end, 1 the last; `names_are_cells` is False where the reader
+    cuts the line of names in another way, as names hold the separator. `numbers` are the positions (from 0) that hold
+    numbers, `first` is the first line of data, `odd_lines` counts lines between the data that are none, `footer` are
+    the lines below.
+    """
+
+    delimiter: str
+    decimal: str
+    header: tuple[str, ...]
+    names: tuple[str, ...]
+    names_back: int | None
+    units: tuple[str, ...]
+    units_back: int | None
+    numbers: tuple[int, ...]
+    width: int
+    trailing: bool
+    rows: int
+    first: str
+    names_are_cells: bool = True
+    odd_lines: int = 0
+    footer: tuple[str, ...] = field(default=())
+
+    @property
+    def has_fractions(self) -> bool:
+        """Whether the decimal sign was seen; whole numbers do not show it."""
+        return bool(self.decimal)
+
+
+def sniff(text: str, *, whole: bool = True, likely: str | None = None) -> Dialect | None:
+    """Return how a text is written; None if it holds no table of numbers with at least two columns.
+
+    Parameters
+    ----------
+    text : str
+        The file, or with `whole` False its beginning; lines end in a line feed.
+    likely : str, optional
+        The separator of files that are named alike; it is tried first, as clevercsv takes longer than all the rest.
+    """
+    lines = text.split("\n")
+    if not whole:
+        lines = lines[:-1]  # it may be cut
+    elif len(lines) > 2 * ENDS:
+        lines = lines[:ENDS] + lines[-ENDS:]
+    sample = lines[:SAMPLE_LINES]
+    mixed = None  # with columns of text: right only where no other separator leaves nothing but numbers
+    for delimiter in _in_turn(sample, likely):
+        found = [_block(sample, delimiter, decimal) for decimal in (".", ",") if decimal != delimiter]
+        best = max(found, key=lambda block: block.score)  # the first, a point, where there are whole numbers only
+        if best.rows >= MIN_ROWS and len(best.numbers) >= 2:
+            if best.pure:
+                return _dialect(lines, delimiter, best, whole)
+            mixed = mixed or (delimiter, best)
+    return _dialect(lines, *mixed, whole) if mixed else None
+
+
+def sniffed_delimiter(lines: Sequence[str]) -> str | None:
+    """Return the separator that clevercsv finds in some lines; None if it finds none."""
+    import clevercsv  # 0.8 s
+
+    try:
+        found = clevercsv.Sniffer().sniff("\n".join(lines))
+    except clevercsv.Error:
+        return None
+    return None if found is None else _OF_SNIFFER.get(found.delimiter or "", found.delimiter)
+
+
+def _in_turn(sample: Sequence[str], likely: str | None) -> Iterator[str]:
+    """Yield the separators to try, the likeliest first."""
+    if likely is not None:
+        yield likely
+    middle = len(sample) // 2
+    first = sniffed_delimiter([line for line in sample[middle : middle + SNIFFED_LINES] if line.strip()])
+    yield from (first,) if first in DELIMITERS else ()
+    yield from (other for other in DELIMITERS if other not in (first, likely))
+
+
+# ---------------------------------------------------------------- data
+# Where the data are.
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """Lines of data under one separator and decimal sign: where they begin and which positions hold numbers."""
+
+    decimal: str
+    start: int
+    rows: int
+    numbers: tuple[int, ...]
+    pure: bool = False  # nothing but numbers in its lines
+
+    @property
+    def score(self) -> int:
+        """Cells that are numbers."""
+        return self.rows * len(self.numbers)
+
+
+def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block:
+    """Return the data lines: those with numbers at the positions where most lines of the second half have them."""
+    numbers = [_numeric(line, delimiter, decimal) for line in lines]
+    several = [found for found in numbers[len(lines) // 2 :] if found and len(found) >= 2]
+    counts = Counter(i for found in several for i in found)
+    core = frozenset(i for i, count in counts.items() if count >= 0.9 * len(several))
+    if len(core) < 2:
+        return _Block(decimal, 0, 0, ())
+    data = [(i, found is not None and core <= found) for i, found in enumerate(numbers) if found is not None]
+    start = _first_of_many([is_data for _, is_data in data])
+    if start is None:
+        return _Block(decimal, 0, 0, ())
+    rows = sum(is_data for _, is_data in data[start:])
+    cells = [sum(bool(cell.strip()) for cell in split_line(lines[i], delimiter)) for i, good in data[start:] if good]
+    pure = sum(count == len(core) for count in cells) > 0.9 * len(cells)
+    return _Block(decimal, data[start][0], rows, tuple(sorted(core)), pure)
+
+
+def _numeric(line: str, delimiter: str, decimal: str) -> frozenset[int] | None:
+    """Return the positions of numbers in a line; None if it is empty but for separators."""
+    bare = line.rstrip(STRAYS)
+    if not bare.strip(' "'):
+        return None
+    cells = split_line(bare, delimiter)
+    return frozenset(i for i, cell in enumerate(cells) if cell.strip() and as_number(cell, decimal) is not None)
+
+
+def _first_of_many(data: Sequence[bool]) -> int | None:
+    """Return the first line of data that others follow: a table of results above has a few lines only."""
+    for i, is_data in enumerate(data):
+        following = data[i : i + MIN_ROWS]
+        if is_data and sum(following) >= min(MIN_ROWS, len(data) - i) - 1:
+            return i
+    return None
+
+
+# ---------------------------------------------------------------- header
+# What stands above and below the data.
+
+
+def _dialect(lines: list[str], delimiter: str, block: _Block, whole: bool) -> Dialect:
+    core, start = frozenset(block.numbers), block.start
+    numeric = [_numeric(line, delimiter, block.decimal) for line in lines[start:]]
+    is_data = [found is not None and core <= found for found in numeric]
+    last = max(i for i, good in enumerate(is_data) if good)
+    odd = sum(not good and found is not None for good, found in zip(is_data[:last], numeric, strict=False))
+    below = [line for line in lines[start + last + 1 :] if line.strip()]
+    data = [line for line, good in zip(lines[start : start + SAMPLE_LINES], is_data, strict=False) if good]
+    trailing = _ends_in_separator(data, delimiter)
+    header = lines[:start]
+    width = max(len(split_line(line.rstrip(STRAYS), delimiter)) for line in data)
+    rows = [_header_cells(line, delimiter, width) for line in header]
+    units_at = _units_line(rows)
+    names_at = _names_line(rows, units_at, max(core), len(core))
+    fractions = any(block.decimal in cell for line in data for cell in split_line(line, delimiter))
+    return Dialect(
+        delimiter=delimiter,
+        decimal=block.decimal if fractions else "",
+        header=tuple(header),
+        names=tuple(rows[names_at]) if names_at is not None else (),
+        names_back=len(header) - names_at if names_at is not None else None,
+        units=tuple(rows[units_at]) if units_at is not None else (),
+        units_back=len(header) - units_at if units_at is not None else None,
+        numbers=block.numbers,
+        width=width,
+        trailing=trailing,
+        rows=sum(is_data),
+        first=data[0],
+        names_are_cells=names_at is None or rows[names_at] == _cells_of(header[names_at], delimiter),
+        odd_lines=odd,
+        footer=tuple(below) if whole else (),
+    )
+
+
+def _ends_in_separator(data: Sequence[str], delimiter: str) -> bool:
+    marks = ("\t" if delimiter == "tab" else delimiter, ",", ";")
+    return delimiter != "whitespace" and sum(line.rstrip(" ").endswith(marks) for line in data) > 0.5 * len(data)
+
+
+def _header_cells(line: str, delimiter: str, width: int) -> list[str]:
+    """Return the cells of a header line.
+
+    A mark of comment in a cell of its own is left out; names with blanks in them, above columns of blanks, are those
+    that two blanks part.
+    """
+    cells = _cells_of(line, delimiter)
+    if len(cells) == width + 1 and cells[0] in ("#", "%", "//", ";"):
+        return cells[1:]
+    if delimiter == "whitespace" and len(cells) != width:
+        apart = re.split(r"\s{2,}|\t", line.strip())
+        return apart if len(apart) == width else []
+    return cells
+
+
+def _cells_of(line: str, delimiter: str) -> list[str]:
+    return [cell.strip() for cell in split_line(line.rstrip(STRAYS), delimiter)]
+
+
+def _units_line(rows: Sequence[Sequence[str]]) -> int | None:
+    """Return the line of units nearest to the data: two or more, and more than half of the cells."""
+    for i in range(len(rows) - 1, max(-1, len(rows) - 1 - NAMES_ABOVE), -1):
+        full = [cell for cell in rows[i] if cell]
+        units = sum(unit_of(cell) is not None for cell in full)
+        if units >= 2 and units > 0.5 * len(full) and not all(as_number(cell) is not None for cell in full):
+            return i
+    return None
+
+
+def _names_line(rows: Sequence[Sequence[str]], units_at: int | None, last: int, count: int) -> int | None:
+    """Return the line of names: as wide as the data, no numbers, most words that are names of columns."""
+    best, most = None, -1
+    for i in range(len(rows) - 1, max(-1, len(rows) - 1 - NAMES_ABOVE), -1):
+        cells = rows[i]
+        full = [cell for cell in cells if cell]
+        texts = sum(as_number(cell) is None and as_number(cell, ",") is None for cell in full)
+        if i == units_at or len(cells) <= last or texts < max(2, count - 1) or texts < len(full):
+            continue
+        words = sum(column_role(cell)[1] for cell in full)
+        if words > most:
+            best, most = i, words
+    return best
+
+
+def is_unchanged(dialects: Sequence[Dialect]) -> bool:
+    """Return whether the header is as long in all files."""
+    return all(len(a.header) == len(b.header) for a, b in pairwise(dialects))

@@ -1,0 +1,226 @@
+"""Which files of a folder are traces, how they are written, and which others lie there."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter, defaultdict
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from sealfit.draft.dialect import MIN_ROWS, STRAYS, Dialect, sniff
+from sealfit.draft.name_parts import tokens
+from sealfit.errors import BadFile, RequestError
+from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
+from sealfit.ingest.listing import RUNS_CSV, natural
+
+SNIFFED = 24
+"""Files of one kind of name that are looked at, spread evenly: more would show the same."""
+
+MOST = 240
+"""Files that are looked at, however many ways of naming them there are."""
+
+READ = 6
+"""Trace files that are read whole, for how their columns behave."""
+
+WHOLE_BYTES = 8_000_000
+"""Larger files are looked at in their first 64 kB only, and their ends are not known."""
+
+ROWS = 20_000
+"""Rows of a trace that are read: enough for some strokes."""
+
+FORMATS = {
+    ".tdms": "TDMS (LabVIEW)", ".xlsx": "Excel workbooks", ".xls": "Excel workbooks", ".mat": "MATLAB files",
+    ".parquet": "Parquet tables", ".h5": "HDF5 files", ".hdf5": "HDF5 files", ".bin": "binary files",
+}  # fmt: skip
+DOCUMENTS = {
+    ".md", ".rst", ".toml", ".json", ".py", ".ipynb", ".m", ".html", ".htm", ".pdf", ".png", ".jpg", ".svg", ".ini",
+    ".xml", ".yml", ".yaml", ".zip", ".gz", ".docx", ".doc", ".pptx", ".exe", ".tex",
+}  # fmt: skip
+NO_TRACES = ("readme", "license", "licence", "notice", "sha256sums", "changelog")
+
+
+@dataclass(frozen=True)
+class Found:
+    """The files of a folder, as paths below it.
+
+    `traces` are those that one config can read, `dialects` how some of them are written, `wider` those of them that
+    have further columns; `otherwise` are traces written in another way, `others` text files that are none,
+    `unreadable` files with the reason, `formats` counts the files that are no text by their suffix.
+    """
+
+    folder: Path
+    traces: tuple[str, ...]
+    dialects: dict[str, Dialect]
+    wider: dict[str, Dialect]
+    otherwise: dict[str, Dialect]
+    others: tuple[str, ...]
+    unreadable: dict[str, str]
+    formats: Counter
+
+    @property
+    def sniffed(self) -> list[Dialect]:
+        """How the traces that were looked at are written."""
+        return [*self.dialects.values(), *self.wider.values()]
+
+    @property
+    def dialect(self) -> Dialect:
+        """How most of the traces are written; the first with fractions, which show the decimal sign."""
+        usual = list(self.dialects.values())
+        return next((one for one in usual if one.has_fractions), usual[0])
+
+
+def look(folder: Path) -> Found:
+    """Return what lies in a folder.
+
+    Raises
+    ------
+    RequestError
+        If there is no such folder, or no trace file in it that is text.
+    """
+    if not folder.is_dir():
+        reason = "is a file, not a folder." if folder.is_file() else "there is no such folder."
+        raise RequestError(reason, file=folder, fix="Give the folder that holds the trace files.")
+    files = _files(folder)
+    formats = Counter(suffix for file in files if (suffix := PurePosixPath(file).suffix.lower()) in FORMATS)
+    texts = [file for file in files if _may_be_text(file)]
+    dialects, unreadable = _sniffed(folder, texts)
+    if not any(dialects.values()):
+        raise _no_traces(folder, files, formats, unreadable)
+    tables = {file: dialect for file, dialect in dialects.items() if dialect is not None and file != RUNS_CSV}
+    if not tables:
+        raise _no_traces(folder, files, formats, unreadable)
+    same, wider, otherwise = _by_form(tables)
+    rest = [file for file in texts if file not in dialects and file not in unreadable]
+    not_looked_at = _like({**same, **wider}, rest, dialects)
+    others = [file for file, dialect in dialects.items() if dialect is None or file == RUNS_CSV]
+    traces = sorted([*same, *wider, *not_looked_at], key=natural)
+    return Found(folder, tuple(traces), same, wider, otherwise, tuple(others), unreadable, formats)
+
+
+def _like(same: Collection[str], rest: Sequence[str], looked_at: Collection[str]) -> list[str]:
+    """Return those of the files not looked at that are named as the traces are, or have their suffix."""
+    kinds, known = {_kind(file) for file in same}, {_kind(file) for file in looked_at}
+    suffixes = {kind[0] for kind in kinds}
+    return [file for file in rest if (kind := _kind(file)) in kinds or (kind not in known and kind[0] in suffixes)]
+
+
+def _files(folder: Path) -> list[str]:
+    found = []
+    for root, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith((".", "__"))]
+        below = Path(root).relative_to(folder)
+        found += [(below / name).as_posix() for name in names if not name.startswith((".", "~"))]
+    return sorted(found, key=natural)
+
+
+def _may_be_text(file: str) -> bool:
+    path = PurePosixPath(file)
+    if path.suffix.lower() in FORMATS or path.suffix.lower() in DOCUMENTS:
+        return False
+    return not path.name.lower().startswith(NO_TRACES)
+
+
+def _kind(file: str) -> tuple:
+    """Return what files named alike have in common."""
+    path = PurePosixPath(file)
+    pieces = tokens(str(path.with_suffix("")))
+    return path.suffix.lower(), tuple((p.kind, p.text if p.kind == "sep" else "") for p in pieces)
+
+
+def _sniffed(folder: Path, texts: Sequence[str]) -> tuple[dict[str, Dialect | None], dict[str, str]]:
+    """Return how some files of each kind of name are written, None for no table of numbers; and what is unreadable."""
+    kinds = defaultdict(list)
+    for file in texts:
+        kinds[_kind(file)].append(file)
+    dialects: dict[str, Dialect | None] = {}
+    unreadable: dict[str, str] = {}
+    for members in sorted(kinds.values(), key=len, reverse=True):
+        if len(dialects) + len(unreadable) >= MOST:
+            break
+        likely = None
+        for file in evenly(members, SNIFFED):
+            try:
+                text, whole = _text(folder, file)
+                dialects[file] = found = sniff(text, whole=whole, likely=likely)
+                likely = found.delimiter if found is not None else likely
+            except BadFile as error:
+                unreadable[file] = f"{error.fault.reason} {error.fault.fix}".strip()
+    return dialects, unreadable
+
+
+def evenly(items: Sequence[str], count: int) -> list[str]:
+    """Return at most so many of the items, spread evenly, the first and the last among them."""
+    if len(items) <= count:
+        return list(items)
+    return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
+
+
+def _text(folder: Path, file: str) -> tuple[str, bool]:
+    whole = (folder / file).stat().st_size <= WHOLE_BYTES if (folder / file).exists() else True
+    raw = read_bytes(folder, file, head=not whole)
+    return as_utf8(raw, "auto", file, head=not whole).decode("utf-8", "replace"), whole
+
+
+def _by_form(tables: dict[str, Dialect]) -> tuple[dict[str, Dialect], dict[str, Dialect], dict[str, Dialect]]:
+    """Return the files written as most are, those that have further columns beside the same ones, and the others."""
+    forms = Counter((one.delimiter, one.names or one.width) for one in tables.values())
+    delimiter, named = forms.most_common(1)[0][0]
+    alike = {f: one for f, one in tables.items() if (one.delimiter, one.names or one.width) == (delimiter, named)}
+    decimals = Counter(one.decimal for one in alike.values() if one.has_fractions)
+    decimal = decimals.most_common(1)[0][0] if decimals else ""
+    same = {file: one for file, one in alike.items() if one.decimal in (decimal, "")}
+    rest = {file: one for file, one in tables.items() if file not in same}
+    usual = next(iter(same.values()))
+    wider = {file: one for file, one in rest.items() if one.decimal in (decimal, "") and _holds(one, usual)}
+    return same, wider, {file: one for file, one in rest.items() if file not in wider}
+
+
+def _holds(one: Dialect, usual: Dialect) -> bool:
+    """Whether a file has all columns of another one, by their names."""
+    by_name = usual.names_are_cells and one.names_are_cells and len(set(usual.names)) == len(usual.names) > 0
+    return by_name and one.delimiter == usual.delimiter and set(usual.names) <= set(one.names)
+
+
+def _no_traces(folder: Path, files: Sequence[str], formats: Counter, unreadable: dict[str, str]) -> RequestError:
+    fix = "Give the folder that holds the trace files, or export them as text (CSV)."
+    if not files:
+        return RequestError("the folder is empty.", file=folder, fix=fix)
+    if unreadable:
+        file, reason = next(iter(unreadable.items()))
+        return RequestError(f"no trace file can be read: {file} {reason}", file=folder, fix=fix)
+    if formats:
+        what = ", ".join(f"{count} {FORMATS[suffix]} ({suffix})" for suffix, count in formats.most_common())
+        reason = f"holds {what} and no trace file that is text."
+        return RequestError(reason, file=folder, fix="Export the traces as text (CSV), one file each.")
+    shown = ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")
+    reason = f"none of {len(files)} files holds a table of numbers with two columns or more ({shown})."
+    return RequestError(reason, file=folder, fix=fix)
+
+
+# ---------------------------------------------------------------- numbers
+
+
+def read_tables(found: Found) -> dict[str, np.ndarray]:
+    """Return the numbers of some traces, shape (rows, width) each, nan where there are none."""
+    tables = {}
+    for file in evenly(list(found.dialects), READ):
+        dialect = found.dialects[file]
+        text, _ = _text(found.folder, file)
+        table = _numbers(text.split("\n")[len(dialect.header) :], found.dialect)
+        if len(table) >= MIN_ROWS:
+            tables[file] = table
+    return tables
+
+
+def _numbers(lines: Sequence[str], dialect: Dialect) -> np.ndarray:
+    width = max(dialect.numbers) + 1
+    rows = []
+    for line in lines[:ROWS]:
+        cells = split_line(line.rstrip(STRAYS), dialect.delimiter)[:width]
+        numbers = [as_number(cell, dialect.decimal or ".") for cell in cells]
+        if len(numbers) == width and all(numbers[i] is not None for i in dialect.numbers):
+            rows.append([np.nan if number is None else number for number in numbers])
+    return np.array(rows)

@@ -1,0 +1,118 @@
+"""What the header lines of trace files say of the whole file: when it was started, and how the rig was set."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sealfit.draft.vocabulary import Unit, name_and_unit, setting, unit_of
+from sealfit.ingest.files import as_number
+
+SETTINGS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
+UNIT_OF = {"temperature_C": "temperature", "compression_ratio_pct": "share", "aging_days": "time", "load_N": "force"}
+UNIT_OF |= {"speed_mm_s": "speed"}
+
+_LINE = re.compile(r'^"?(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
+_NUMBER = re.compile(r"^[-+]?\d+(?:[.,]\d+)?(?=$|[\s;,\t\"°%A-Za-zµ])")
+_ISO = re.compile(r"20\d\d-[01]\d-[0-3]\d[T ][0-2]\d:[0-5]\d(?::[0-5]\d)?(?!\d)")
+_DAYS = (
+    (re.compile(r"[0-3]?\d\.[01]?\d\.20\d\d"), "%d.%m.%Y"),
+    (re.compile(r"20\d\d-[01]\d-[0-3]\d"), "%Y-%m-%d"),
+    (re.compile(r"20\d\d/[01]\d/[0-3]\d"), "%Y/%m/%d"),
+    (re.compile(r"[0-3]?\d/[0-3]?\d/20\d\d"), "%m/%d/%Y"),
+)
+_CLOCK = re.compile(r"(?P<clock>[0-2]?\d:[0-5]\d(?P<second>:[0-5]\d)?)(?:[.,]\d+)?(?P<half>\s*[AP]M)?", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A setting in a header line: our name of it, the pattern that finds it, its unit and the line."""
+
+    ours: str
+    pattern: str
+    unit: Unit | None
+    line: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class When:
+    """A date in header lines: the pattern that finds it and its format, "" for ISO 8601.
+
+    `clock` is the pattern for the time of day where that stands in a line of its own.
+    """
+
+    pattern: str
+    format: str
+    line: int
+    text: str
+    clock: str = ""
+
+
+def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]:
+    """Return the settings that the header lines of every file give, those that their words name."""
+    found: dict[str, Setting] = {}
+    for number, line in enumerate(headers[0], start=1):
+        match = _LINE.match(line)
+        number_found = _NUMBER.match(match["value"].strip()) if match else None
+        if number_found is None or as_number(number_found.group(), decimal or ".") is None:
+            continue
+        name, unit = name_and_unit(match["key"])
+        rest = match["value"].strip()[number_found.end() :].strip(' ;,\t"')
+        unit = unit or unit_of(rest)
+        ours = setting(name)
+        if ours not in SETTINGS or ours in found or (unit is not None and unit.dimension != UNIT_OF[ours]):
+            continue
+        pattern = rf'^"?{re.escape(match["key"])}"?[\s:=;,"]*([-+]?[\d.,]*\d)'.replace(r"\ ", " ")
+        if all(any(re.search(pattern, other) for other in header) for header in headers):
+            found[ours] = Setting(ours, pattern, unit, number, line.strip())
+    return list(found.values())
+
+
+def started_in(headers: Sequence[Sequence[str]]) -> When | None:
+    """Return the date that the header lines of every file give; None if there is none."""
+    for number, line in enumerate(headers[0], start=1):
+        if match := _ISO.search(line):
+            pattern = _leading(line[: match.start()]) + r"(20\d\d-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d)?)"
+            if _everywhere(pattern, headers):
+                return When(pattern, "", number, line.strip())
+    for number, line in enumerate(headers[0], start=1):
+        for days, spelled in _DAYS:
+            match = days.search(line)
+            if match and (when := _with_clock(headers, number, line, match, spelled)):
+                return when
+    return None
+
+
+def _with_clock(headers, number: int, line: str, match: re.Match, spelled: str) -> When | None:
+    """Return the date with the time of day after it in the same line, or in the next line."""
+    start = _leading(line[: match.start()])
+    clock = _CLOCK.search(line, match.end())
+    if clock is not None:
+        between = line[match.end() : clock.start()]
+        full = f"{spelled}{between.replace('%', '%%')}{_clock_format(clock)}"
+        pattern = start + "(" + re.sub(r"\d+", r"\\d+", re.escape(line[match.start() : clock.end()])) + ")"
+        pattern = re.sub(r"[AP]M\)$", "[AP]M)", pattern).replace(r"\ ", " ")
+        return When(pattern, full, number, line.strip()) if _everywhere(pattern, headers) else None
+    pattern = start + "(" + re.sub(r"\d+", r"\\d+", re.escape(match.group())) + ")"
+    following = headers[0][number] if number < len(headers[0]) else ""
+    beside = _CLOCK.search(following)
+    own = _leading(following[: beside.start()]) + r"(\d+:\d+(?::\d+)?)" if beside else ""
+    if not _everywhere(pattern, headers):
+        return None
+    return When(pattern, f"{spelled} {_clock_format(beside)}" if beside else spelled, number, line.strip(), own)
+
+
+def _clock_format(clock: re.Match) -> str:
+    hours = "%I" if clock["half"] else "%H"
+    return f"{hours}:%M" + (":%S" if clock["second"] else "") + (" %p" if clock["half"] else "")
+
+
+def _leading(text: str) -> str:
+    """Return a pattern for what stands before the date in its line: the words, and whatever numbers."""
+    return "^" + re.sub(r"\d+(?:[.,]\d+)?", r"[\\d.,]+", re.escape(text).replace(r"\ ", " ").replace("\\\t", r"\t"))
+
+
+def _everywhere(pattern: str, headers: Sequence[Sequence[str]]) -> bool:
+    return all(any(re.search(pattern, line) for line in header) for header in headers)

@@ -1,0 +1,370 @@
+"""The `[files]` part of a draft: where the traces are, what names or a table of runs say, what makes a condition."""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+
+from sealfit.config import AGING_CONDITION, Files
+from sealfit.draft.columns import Roles
+from sealfit.draft.config_text import Notes
+from sealfit.draft.dialect import Dialect
+from sealfit.draft.file_names import HEIGHT_FROM
+from sealfit.draft.files_found import Found
+from sealfit.draft.name_parts import Names, Part
+from sealfit.draft.runs_table import RunsTable
+from sealfit.errors import ConfigError
+from sealfit.ingest.file_names import name_parts
+from sealfit.ingest.files import as_number
+from sealfit.ingest.listing import RUNS_CSV, natural
+
+NO_CONDITION = {
+    "repeat", "specimen_id", "speed_mm_s", "load_N", "started_at", "run_id", "direction", "direction_set", "rubber",
+    "file", "stroke",
+}  # fmt: skip
+AGREES = 0.2  # as `quality.speed_disagreement`
+MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
+SPEED_UNITS = {
+    60.0: ("mm/min", "{} / 60"), 1e-3: ("m/s", "{} * 1000"), 0.1: ("cm/s", "{} * 10"), 1e3: ("um/s", "{} / 1000"),
+    60 / 25.4: ("in/min", "{} * 25.4 / 60"), 1 / 25.4: ("in/s", "{} * 25.4"),
+}  # fmt: skip
+MOST_LISTED = 20  # files that are excluded by name; more are said in a sentence
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is known of each file before it is read: names of files, a table of runs, and whether the table counts."""
+
+    names: Names
+    table: RunsTable | None
+
+    @property
+    def given(self) -> set[str]:
+        """Our columns that are given."""
+        return self.names.given | (self.table.given if self.table is not None else set())
+
+
+def settings_of(names: Names) -> Files:
+    """Return the part of a config that reads the names."""
+    return Files(name_pattern=names.pattern, values=names.values, compute=names.compute, columns=names.columns)
+
+
+def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, float | str]]:
+    """Return what the names of files say, by file."""
+    if names.pattern is None:
+        return {file: {} for file in files}
+    settings = settings_of(names)
+    found = {}
+    for file in files:
+        try:
+            found[file] = dict(name_parts(file, settings).channels)
+        except ConfigError:
+            found[file] = {}
+    return found
+
+
+# ---------------------------------------------------------------- names
+
+
+def improved(names: Names, speeds: Mapping[str, float], found: Found, notes: Notes) -> Names:
+    """Return the names with speeds that agree with the measured ones, and repeats that tell files apart."""
+    if names.pattern is None:
+        return names
+    return _told_apart(_with_speed(names, speeds, notes), found, notes)
+
+
+def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Names:
+    """Return the names with the unit of their speed by what was measured, and a number that is the speed as such."""
+    said = values_by_file(names, speeds)
+    if "speed_mm_s" in names.given:
+        ratio = _ratio({f: v.get("speed_mm_s") for f, v in said.items()}, speeds)
+        if ratio is None or abs(ratio - 1) <= AGREES:
+            return names
+        return _speed_in_unit(names, "speed_mm_s", ratio, notes)
+    for part in names.parts:
+        if part.ours.startswith("part_") and len(part.texts) > 1:
+            ratio = _ratio({f: v.get(part.ours) for f, v in said.items()}, speeds)
+            if ratio is not None and abs(ratio - 1) <= AGREES:
+                return _renamed(names, part, "speed_mm_s", "agrees with the measured speed")
+    return names
+
+
+def _ratio(said: Mapping[str, object], measured: Mapping[str, float]) -> float | None:
+    """Return the named over the measured speed, if most files of two speeds or more have the same."""
+    pairs = [(abs(v), measured[f]) for f, v in said.items() if isinstance(v, int | float) and v and measured.get(f)]
+    if len({named for named, _ in pairs}) < 2:
+        return None
+    ratios = sorted(named / speed for named, speed in pairs)
+    middle = ratios[len(ratios) // 2]
+    agree = sum(abs(ratio / middle - 1) <= AGREES for ratio in ratios)
+    return middle if agree >= MOSTLY * len(ratios) else None
+
+
+def _speed_in_unit(names: Names, name: str, ratio: float, notes: Notes) -> Names:
+    """Return the names with the speed converted, where a unit explains the ratio; otherwise a doubt."""
+    part = next(part for part in names.parts if part.ours == name)
+    unit = next((said for factor, said in SPEED_UNITS.items() if abs(ratio / factor - 1) <= AGREES / 2), None)
+    if unit is None or part.expression:
+        reason = f"speeds in names are {ratio:.3g} times those measured."
+        notes.doubt("files.name_pattern", reason, "Check the units of time and displacement, and the speed in names.")
+        return names
+    spelled, expression = unit
+    why = f"{part.why}; {ratio:.3g} times the measured speed in mm/s, so it is in {spelled}"
+    compute = {**names.compute, name: expression.format("_speed")}
+    pattern = names.pattern.replace(f"(?P<{part.group}>", "(?P<_speed>")
+    values = {("_speed" if key == part.group else key): value for key, value in names.values.items()}
+    parts = tuple(replace(p, group="_speed", why=why) if p is part else p for p in names.parts)
+    return replace(names, pattern=pattern, compute=compute, values=values, parts=parts)
+
+
+def _renamed(names: Names, part: Part, ours: str, why: str) -> Names:
+    signed = any(other.ours == "direction" for other in names.parts)
+    group = "_speed" if signed else ours
+    compute = {name: text for name, text in names.compute.items() if name != "direction_set"}
+    compute |= {ours: "_direction * _speed"} if signed else {}
+    made = replace(part, ours=ours, group=group, why=f"{part.why}; {why}", doubt="")
+    parts = tuple(made if p is part else p for p in names.parts)
+    values = {(group if key == part.group else key): value for key, value in names.values.items()}
+    pattern = names.pattern.replace(f"(?P<{part.group}>", f"(?P<{group}>")
+    return replace(names, pattern=pattern, compute=compute, parts=parts, values=values)
+
+
+def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
+    """Return the names without a repeat that does not tell files of the same settings apart."""
+    repeat = next((part for part in names.parts if part.ours == "repeat"), None)
+    if repeat is None:
+        return names
+    said = values_by_file(names, found.traces)
+    aging = names.given & set(AGING_CONDITION)
+    of_run = {*aging, "rubber", "specimen_id", "speed_mm_s", "repeat"} if aging else names.given - {"started_at"}
+    keys = Counter(tuple((name, one.get(name)) for name in sorted(of_run)) for one in said.values() if one)
+    if not keys or max(keys.values()) == 1:
+        return names
+    count = sum(number for number in keys.values() if number > 1)
+    reason = f"the repeat in names does not tell {count} files apart that are named alike otherwise."
+    notes.doubt("files.name_pattern", reason, "It is not used; repeats are numbered in the order of the files.")
+    pattern = names.pattern.replace(f"(?P<{repeat.group}>", "(?:")
+    values = {key: value for key, value in names.values.items() if key != repeat.group}
+    compute = {key: value for key, value in names.compute.items() if key != "repeat"}
+    return replace(
+        names, pattern=pattern, values=values, compute=compute, parts=tuple(p for p in names.parts if p is not repeat)
+    )
+
+
+# ---------------------------------------------------------------- keys
+
+
+def source_keys(found: Found, source: Source, header: Collection[str], notes: Notes) -> None:
+    """Add where the files are, and what names and the table of runs say; `header` is what header lines give."""
+    table = source.table
+    if table is not None and table.is_runs_csv:
+        _table_keys(table, notes)
+        if not table.whole_paths:
+            _paths_doubt(table, found, notes)
+    else:
+        _glob_keys(found, source, notes)
+        if table is not None:
+            _table_keys(table, notes)
+            notes.doubt(
+                "files.runs_columns",
+                f"'{table.file}' lists {table.named} of the trace files, but only {RUNS_CSV} is read.",
+                f"Copy it to {RUNS_CSV}; the columns below are those of this table. Without it, only names count."
+                + ("" if table.whole_paths else " Its names of files need their folders and suffixes."),
+            )
+    if table is None or not table.is_runs_csv or not set(AGING_CONDITION) <= table.given:
+        told = table is not None or bool(set(header) & set(AGING_CONDITION))
+        _name_keys(source.names, len(found.traces), told, notes)
+    _otherwise({f: one for f, one in found.otherwise.items() if table is None or f != table.file}, notes)
+    for file, reason in list(found.unreadable.items())[:3]:
+        notes.doubt("files", f"{file} {reason}", "It is in no run.")
+    for suffix, count in found.formats.items():
+        reason = f"{count} files ({suffix}) are no text and are not read."
+        notes.doubt("files", reason, "Export them as text (CSV) if they hold traces or the list of runs.")
+
+
+def _otherwise(others: Mapping[str, Dialect], notes: Notes) -> None:
+    if not others:
+        return
+    dialect = next(iter(others.values()))
+    delimiter = f"separator '{dialect.delimiter}'"
+    decimal = f", decimal '{dialect.decimal}'" if dialect.decimal else ""
+    names = f", columns {', '.join(dialect.names[:4])}" if dialect.names else ""
+    reason = f"{len(others)} files are written otherwise ({delimiter}{decimal}{names}): {', '.join(list(others)[:3])}."
+    fix = "One config reads files of one form. Move them to a folder of their own and draft a config for them, too."
+    notes.doubt("files", reason, fix)
+
+
+def _glob_keys(found: Found, source: Source, notes: Notes) -> None:
+    pattern = glob_of(found.traces)
+    notes.guess("files.glob", pattern, f"finds the trace files: {len(found.traces)}")
+    matched = {p.relative_to(found.folder).as_posix() for p in found.folder.glob(pattern) if p.is_file()}
+    unmatched = set(source.names.unmatched) if source.names.pattern is not None else set()
+    table = {source.table.file} if source.table is not None else set()
+    surplus = (matched - set(found.traces)) | (unmatched & matched) | (table & matched)
+    if surplus:
+        excluded = _excluded(surplus, matched)
+        notes.guess("files.exclude", excluded[:MOST_LISTED], "no traces, or named or written otherwise than the rest")
+        if len(excluded) > MOST_LISTED:
+            reason = f"{len(excluded) - MOST_LISTED} more files are no traces like the rest."
+            notes.doubt("files.exclude", reason, "Move them away, or add them here.")
+    if unmatched:
+        shown = ", ".join(sorted(unmatched, key=natural)[:3])
+        reason = f"{len(unmatched)} of {len(found.traces)} trace files are named otherwise: {shown}."
+        notes.doubt("files.exclude", reason, "They are left out. Rename them, or widen name_pattern.")
+
+
+def glob_of(files: Sequence[str]) -> str:
+    """Return the glob that finds files.
+
+    Examples
+    --------
+    >>> glob_of(["a.csv", "b.csv"]), glob_of(["raw/x/a.txt", "raw/y/b.txt"]), glob_of(["a.ASC", "b/c.asc"])
+    ('*.csv', 'raw/**/*.txt', '**/*.[aA][sS][cC]')
+    """
+    folders = {PurePosixPath(file).parent.as_posix() for file in files}
+    common = os.path.commonpath(folders) if "." not in folders else ""
+    below = f"{glob.escape(common)}/" if common else ""
+    deep = "**/" if folders != {common or "."} else ""
+    suffixes = {PurePosixPath(file).suffix for file in files}
+    if len(suffixes) == 1:
+        return f"{below}{deep}*{glob.escape(next(iter(suffixes)))}"
+    if len({suffix.lower() for suffix in suffixes}) == 1:
+        letters = next(iter(suffixes))
+        return f"{below}{deep}*" + "".join(f"[{c.lower()}{c.upper()}]" if c.isalpha() else c for c in letters)
+    return f"{below}{deep}*"
+
+
+def _excluded(surplus: set[str], matched: set[str]) -> list[str]:
+    """Return globs of files: of whole folders where nothing else lies there."""
+    kept = {PurePosixPath(file).parent.as_posix() for file in matched - surplus}
+    globs = []
+    for file in sorted(surplus, key=natural):
+        folder = PurePosixPath(file).parent.as_posix()
+        whole = folder not in kept and folder != "."
+        globs.append(f"{glob.escape(folder)}/*" if whole else glob.escape(file))
+    return list(dict.fromkeys(globs))
+
+
+def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
+    """Add what names say; that they say nothing matters only where nothing else has `told` the conditions."""
+    if names.pattern is None:
+        if told:
+            return
+        reason = "the names of the files say nothing that is known here: temperature, days, speed, repeat."
+        notes.doubt("files", reason, f"Write a {RUNS_CSV} with a line for each file, or name_pattern by hand.")
+        return
+    told = [f"{_example(part)} -> {part.ours} ({part.why}: {_values(part)})" for part in names.parts if part.ours]
+    notes.guess("files.name_pattern", names.pattern, f"matches {names.matched} of {files} files. " + "; ".join(told))
+    for part in names.parts:
+        if part.doubt and part.ours:
+            notes.doubt("files.name_pattern", f"'{_example(part)}': {part.doubt}.", "Check what it stands for.")
+    for name, template in names.columns.items():
+        evidence = "made of parts of the name"
+        if name == "specimen_id":
+            evidence = "the number of the piece of rubber, within its condition"
+            fix = "If they are repeats with one piece, call the part `repeat` in name_pattern and delete this line."
+            notes.doubt("files.columns.specimen_id", "files of a condition are taken as different pieces.", fix)
+        notes.guess(f"files.columns.{name}", template, evidence)
+    for group, mapped in names.values.items():
+        notes.guess(f"files.values.{group}", dict(mapped), "how these are written in the names")
+    for name, expression in names.compute.items():
+        notes.guess(f"files.compute.{name}", expression, "from the part of the name to our unit")
+
+
+def _example(part: Part) -> str:
+    return next((text for text in part.texts if text), "")
+
+
+def _values(part: Part) -> str:
+    texts = sorted((text for text in part.texts if text), key=natural)
+    return ", ".join(texts[:5]) + (", ..." if len(texts) > 5 else "")
+
+
+def _table_keys(table: RunsTable, notes: Notes) -> None:
+    for theirs, ours in table.ours.items():
+        if ours != theirs:
+            cell = next((cell for cell in table.cells[theirs] if cell), "")
+            notes.guess(f"files.runs_columns.{ours}", theirs, f"column '{theirs}' of {table.file}, such as '{cell}'")
+    for theirs, unit in table.units.items():
+        ours, wanted = table.ours[theirs], 86400.0 if table.ours[theirs] == "aging_days" else 1.0
+        if unit.factor != wanted and unit.dimension not in ("temperature", "share", "none"):
+            reason = f"column '{theirs}' of {table.file} is in {unit.name}, and {ours} is not."
+            notes.doubt("files.runs_columns", reason, f"Convert it in the table, times {unit.factor / wanted:.6g}.")
+    heights = next((table.cells[theirs] for theirs, ours in table.ours.items() if ours == "compression_ratio_pct"), ())
+    numbers = [n for cell in heights if (n := as_number(cell) or as_number(cell, ",")) is not None]
+    if numbers and max(numbers) < HEIGHT_FROM:
+        reason = f"compressions up to {max(numbers):g} % look like how much the rubber was compressed, not its height."
+        notes.doubt("files.runs_columns", reason, "Write the height in percent of the original into the table.")
+    _dates_doubt(table, notes)
+
+
+def _dates_doubt(table: RunsTable, notes: Notes) -> None:
+    if "started_at" in table.given:
+        return
+    dates = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{2,4}")
+    for name, cells in table.cells.items():
+        full = [cell for cell in cells if cell]
+        if name not in table.ours and full and all(dates.search(cell) for cell in full):
+            reason = f"column '{name}' of {table.file} holds dates that are not ISO 8601, such as '{full[0]}'."
+            notes.doubt("files.runs_columns", reason, "They are not read yet. Write them as 2024-03-01T09:30:00.")
+            return
+
+
+def _paths_doubt(table: RunsTable, found: Found, notes: Notes) -> None:
+    column = next(theirs for theirs, ours in table.ours.items() if ours == "file")
+    reason = f"column '{column}' of {table.file} does not give whole paths, such as '{found.traces[0]}'."
+    notes.doubt("files.runs_columns", reason, "Write paths relative to the folder, with the suffix.")
+
+
+# ---------------------------------------------------------------- condition
+
+
+def condition_keys(source: Source, header: Collection[str], notes: Notes) -> None:
+    """Add which columns make a condition, and which tell rubbers apart."""
+    given = source.given | set(header)
+    aging = [name for name in AGING_CONDITION if name in given]
+    varied = {part.ours for part in source.names.parts if len(part.texts) > 1}
+    if "rubber" in given and (source.table is not None or "rubber" in varied):
+        notes.guess("rubber", ["rubber"], "a column of its own for each rubber")
+    if aging:
+        found = [f"{name} from {_origin(name, source)}" for name in aging]
+        notes.guess("condition", aging, ", ".join(found))
+        missing = [name for name in AGING_CONDITION if name not in given]
+        if missing:
+            reason = f"nothing says {' or '.join(missing)}: the same is assumed for all files."
+            notes.doubt("condition", reason, "Add it to a runs.csv if it differs.")
+        return
+    own = [part.ours for part in source.names.parts if part.ours and part.ours not in NO_CONDITION]
+    if source.table is not None:
+        own += [name for name in source.table.given if name not in NO_CONDITION]
+    if own:
+        notes.guess("condition", own, "what names give besides speed and repeat")
+        fix = "Leave those that change nothing about the sample or the contact out of it."
+        notes.doubt("condition", "nothing says temperature, compression or days: there is no aging to fit.", fix)
+        return
+    notes.guess("condition", ["state"], "nothing tells conditions apart")
+    notes.guess("files.columns.state", "one", "the same for all files")
+    notes.doubt("condition", "nothing says what differs between the files: all are taken as one condition.",
+                f"Write a {RUNS_CSV} with temperature_C, compression_ratio_pct and aging_days.")  # fmt: skip
+
+
+def _origin(name: str, source: Source) -> str:
+    if source.table is not None and name in source.table.given:
+        return source.table.file
+    return "the names of files" if name in source.names.given else "the header"
+
+
+def needs_no_load(names: Names, roles: Roles) -> Names:
+    """Return the names without a load where a torque is measured: torque over load is no coefficient of friction."""
+    if roles.force is None or roles.force.unit is None or roles.force.unit.dimension == "force":
+        return names
+    if "load_N" not in names.compute:
+        return names
+    compute = {name: text for name, text in names.compute.items() if name != "load_N"}
+    parts = tuple(replace(part, ours="") if part.ours == "load_N" else part for part in names.parts)
+    return replace(names, compute=compute, parts=parts)

@@ -1,0 +1,122 @@
+"""A table of runs beside the trace files, runs.csv or one under another name, and what its columns mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path, PurePosixPath
+
+from sealfit.draft.vocabulary import Unit, name_and_unit, setting
+from sealfit.errors import BadFile
+from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
+from sealfit.ingest.listing import RUNS_CSV
+
+NAMING = 0.5
+"""Share of a column's cells that must be names of trace files: a log may list tests that were not kept."""
+
+MAX_BYTES = 4_000_000
+"""A larger file is no list of runs."""
+
+
+@dataclass(frozen=True)
+class RunsTable:
+    """A table with a line for each trace file.
+
+    `ours` is our name of each of its columns, by theirs; `units` the units that their names carry; `whole_paths` is
+    whether its cells are paths of trace files as they stand, which is what the reader needs.
+    """
+
+    file: str
+    names: tuple[str, ...]
+    ours: Mapping[str, str]
+    units: Mapping[str, Unit]
+    cells: Mapping[str, tuple[str, ...]]
+    whole_paths: bool
+    named: int
+
+    @property
+    def is_runs_csv(self) -> bool:
+        """Whether the reader finds it by its name."""
+        return self.file == RUNS_CSV
+
+    @property
+    def given(self) -> set[str]:
+        """Our columns that it gives."""
+        return set(self.ours.values())
+
+
+def find_table(folder: Path, others: Sequence[str], traces: Sequence[str]) -> RunsTable | None:
+    """Return the table of runs among text files that are no traces: runs.csv first, then the one that names most."""
+    tables = [table for file in others if (table := _table(folder, file, traces)) is not None]
+    return max(tables, key=lambda table: (table.is_runs_csv, table.named), default=None)
+
+
+def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
+    try:
+        if (folder / file).stat().st_size > MAX_BYTES:
+            return None
+        text = as_utf8(read_bytes(folder, file), "auto", file).decode()
+    except (BadFile, OSError):
+        return None
+    lines = [line for line in text.split("\n") if line.strip(" \t,;")]
+    if len(lines) < 2:
+        return None
+    delimiter = max((",", ";", "\t"), key=lines[0].count)
+    mark = "tab" if delimiter == "\t" else delimiter
+    names = [cell.strip() for cell in split_line(lines[0], mark)]
+    rows = [[cell.strip() for cell in split_line(line, mark)] for line in lines[1:]]
+    cells = {name: tuple(row[i] if i < len(row) else "" for row in rows) for i, name in enumerate(names) if name}
+    naming = {name: _names_files(column, traces) for name, column in cells.items()}
+    best = max(naming, key=lambda name: naming[name], default=None)
+    if best is None or naming[best][0] < NAMING * len(rows):
+        return None
+    named, whole = naming[best]
+    ours, units = _meanings(names, best, cells)
+    return RunsTable(file, tuple(names), ours, units, cells, whole == named, named)
+
+
+def _names_files(column: Sequence[str], traces: Sequence[str]) -> tuple[int, int]:
+    """Return how many cells name a trace file, with or without folders and suffix, and how many as a whole path."""
+    paths = set(traces)
+    short = {PurePosixPath(file).name for file in traces} | {PurePosixPath(file).stem for file in traces}
+    posix = [cell.replace("\\", "/") for cell in column if cell]
+    whole = sum(cell in paths for cell in posix)
+    return sum(cell in paths or PurePosixPath(cell).name in short for cell in posix), whole
+
+
+def _meanings(
+    names: Sequence[str], file_column: str, cells: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, str], dict[str, Unit]]:
+    """Return our name of each column that has one, the first of those that mean the same, and their units."""
+    ours, units = {file_column: "file"}, {}
+    exact = [name for name in names if setting(name) == name]
+    for name in [*exact, *names]:
+        base, unit = name_and_unit(name)
+        meaning = setting(base) or setting(name)
+        if not meaning or name in ours or meaning in ours.values() or not _fits(meaning, cells.get(name, ())):
+            continue
+        ours[name] = meaning
+        if unit is not None:
+            units[name] = unit
+    return ours, units
+
+
+def _fits(meaning: str, column: Sequence[str]) -> bool:
+    """Whether the cells can be what the name says: numbers, or dates that are ISO 8601."""
+    full = [cell for cell in column if cell]
+    if not full:
+        return False
+    if meaning == "started_at":
+        return all(_is_iso(cell) for cell in full)
+    if meaning in ("specimen_id", "run_id", "rubber", "file"):
+        return True
+    return sum(as_number(cell) is not None or as_number(cell, ",") is not None for cell in full) > 0.8 * len(full)
+
+
+def _is_iso(cell: str) -> bool:
+    try:
+        datetime.fromisoformat(cell)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,377 @@
+"""The `[trace]` part of a draft: how files are written, which column goes where, what the header gives."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sealfit.draft import motion
+from sealfit.draft.columns import BY_BEHAVIOUR, DIMENSION, Column, Roles
+from sealfit.draft.config_text import Notes, column_guesses, date_lines, scaled
+from sealfit.draft.dialect import STRAYS, is_unchanged
+from sealfit.draft.files_found import Found
+from sealfit.draft.header_lines import Setting, settings_in, started_in
+from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
+
+LONG_S = 3600.0
+"""A trace without a unit of time is not taken to last longer than an hour at a sample per second or slower."""
+
+BAD_ROWS = 2
+"""Rows with a missing value that may stand above the first whole row of data."""
+
+SLOTS = {"time": "time_s", "displacement": "displacement_mm", "force": "force_N", "load": "load_N"}
+CHANNELS = ("temperature", "humidity", "pressure")
+
+
+# ---------------------------------------------------------------- dialect
+
+
+def dialect_keys(found: Found, notes: Notes) -> None:
+    """Add the keys of how the files are written."""
+    one, sniffed = found.dialect, found.sniffed
+    of = _of(len(sniffed), len(found.traces))
+    if one.delimiter != ",":
+        notes.guess("trace.delimiter", one.delimiter, f"the separator in {of}")
+    if one.decimal == ",":
+        notes.guess("trace.decimal", ",", f"numbers such as {_a_number(one.first)} in {of}")
+    _header_keys(found, of, notes)
+    if found.wider:
+        further = sorted({name for other in found.wider.values() for name in other.names} - set(one.names))
+        reason = f"{len(found.wider)} of {len(sniffed)} files have further columns: {', '.join(further)}."
+        notes.doubt("trace", reason, "They are read by the names that all files have.")
+    trailing = sum(other.trailing for other in sniffed)
+    if trailing:
+        evidence = f"lines of data end in separators in {trailing} of {len(sniffed)} files"
+        notes.guess("trace.trailing_separator", True, evidence)
+    footers = [other.footer for other in sniffed if other.footer]
+    if footers:
+        notes.doubt(
+            "trace",
+            f"{len(footers)} of {len(sniffed)} files end in lines that are no data, such as '{footers[0][0][:60]}'.",
+            "A config cannot name them: these lines are left out, and `check` lists them. Delete them in the files, or "
+            "leave them out of the export.",
+        )
+    odd = [other.odd_lines for other in sniffed if other.odd_lines]
+    if odd:
+        notes.doubt(
+            "trace",
+            f"in {len(odd)} of {len(sniffed)} files up to {max(odd)} lines between the data are none.",
+            "They are left out, and `check` lists them. If a file holds several recordings, export one file each.",
+        )
+
+
+def _of(looked_at: int, all_files: int) -> str:
+    return f"{looked_at} of {looked_at} files" + (f" looked at, of {all_files}" if all_files > looked_at else "")
+
+
+def _a_number(line: str) -> str:
+    return f"'{re.search(r'[-+]?[0-9]+,[0-9]+', line).group()}'" if re.search(r"\d,\d", line) else "with a comma"
+
+
+def _header_keys(found: Found, of: str, notes: Notes) -> None:
+    """Add where the header ends and which of its lines holds the names."""
+    one, count = found.dialect, len(found.dialect.header)
+    back = one.names_back if one.names_are_cells else None
+    if back is None:
+        why = "no line of names above the data" if one.names_back is None else "the names hold separators"
+        notes.guess("trace.names", "none", f"{why} in {of}: columns go by position")
+    units_row = back == 2 and one.units_back == 1
+    if units_row:
+        notes.guess("trace.units_row", True, f"the line below the names holds units: {_shown(one.header[-1])}")
+    elif back is not None and back > 1:
+        evidence = f"the names are in the header's line {count - back + 1} of {count}: {_shown(one.header[-back])}"
+        notes.guess("trace.names_line", back, evidence)
+    if not is_unchanged(found.sniffed):
+        _varying_header(found, notes)
+    elif count != (1 + units_row if back is not None else 0):
+        notes.guess("trace.header_lines", count, f"lines above the first row of numbers in {of}")
+
+
+def _varying_header(found: Found, notes: Notes) -> None:
+    """Add the pattern of the header's last line, as headers are not of one length."""
+    lengths = Counter(len(one.header) for one in found.sniffed)
+    shown = ", ".join(f"{length} lines in {count} files" for length, count in sorted(lengths.items()))
+    usual = next(one for one in found.sniffed if len(one.header) == lengths.most_common(1)[0][0])
+    last = usual.header[-1].rstrip(STRAYS) if usual.header else ""
+    pattern = "^" + re.escape(last[:80]).replace(r"\ ", " ").replace("\\\t", r"\t")
+    if last and all(_ends_at(one.header, pattern) for one in found.sniffed):
+        notes.guess(
+            "trace.header_ends_at", pattern, f"headers differ in length ({shown}), and this line ends all of them"
+        )
+        return
+    count = lengths.most_common(1)[0][0]
+    notes.guess("trace.header_lines", count, f"the most frequent of {shown}")
+    fix = "Set header_ends_at to a pattern that only the last header line matches, or export all files alike."
+    notes.doubt("trace.header_lines", f"headers differ in length ({shown}), and no one line ends all of them.", fix)
+
+
+def _ends_at(header: Sequence[str], pattern: str) -> bool:
+    """Whether the first line that the pattern matches is the last of the header, or one with bad rows below it."""
+    first = next((i for i, line in enumerate(header, start=1) if re.search(pattern, line)), 0)
+    return first > 0 and len(header) - first <= BAD_ROWS
+
+
+def _shown(line: str) -> str:
+    text = " ".join(line.split())
+    return f"'{text[:70]}...'" if len(text) > 70 else f"'{text}'"
+
+
+# ---------------------------------------------------------------- columns
+
+
+def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit | None], read: int, notes: Notes) -> None:
+    """Add which column goes into which slot, and what is done with the others.
+
+    Parameters
+    ----------
+    units : dict
+        The unit of each role's column, as `settled_units` gives it.
+    read : int
+        Files whose columns were read.
+    """
+    helpers: list[str] = []
+    for role, slot in SLOTS.items():
+        column = getattr(roles, role)
+        if column is None:
+            continue
+        sign = roles.sign if role == "force" else _load_sign(column) if role == "load" else 1
+        evidence = _evidence(column, role, roles, read)
+        guesses, helper = column_guesses(slot, column, units.get(role), sign, evidence)
+        notes.guesses += guesses
+        helpers += [helper] if helper else []
+        _column_doubts(column, role, guesses[0].key, roles, notes)
+    if roles.displacement is None and roles.speed is not None:
+        helpers += _integrated(roles.speed, notes)
+    _missing_slots(roles, notes)
+    if roles.force is not None and roles.force.unit is not None and _is_torque(roles.force):
+        notes.guess("quantities.force", {"quantity": "torque", "unit": roles.force.unit.name.replace("pct", "%")},
+                    f"{roles.force.place} is a torque")  # fmt: skip
+    if helpers:
+        notes.guess("trace.drop_columns", helpers, "read for the columns computed below, no channels of their own")
+    _other_columns(found, roles, notes)
+
+
+def _is_torque(column: Column) -> bool:
+    return column.unit.dimension == "torque" or "torque" in plain(column.label) or "moment" in plain(column.label)
+
+
+def _load_sign(column: Column) -> int:
+    return -1 if np.mean([np.mean(values) for values in column.values]) < 0 else 1
+
+
+def _evidence(column: Column, role: str, roles: Roles, read: int) -> str:
+    by = []
+    if column.role == role and column.sure:
+        by.append("its name")
+    if column.unit is not None and column.unit.dimension in DIMENSION[role]:
+        by.append("its unit")
+    behaves = {
+        "time": "it rises evenly",
+        "displacement": "it goes along strokes",
+        "force": f"it follows the direction of motion in {roles.signed_files} of {read} files"
+        + (", with the other sign" if roles.sign < 0 else ""),
+    }
+    text = f"{column.place}: by {' and '.join(by)}" if by else f"{column.place}: by behaviour"
+    return f"{text}; {behaves[role]}" if role in behaves else text
+
+
+def _column_doubts(column: Column, role: str, key: str, roles: Roles, notes: Notes) -> None:
+    named = column.role == role and column.sure
+    unit_fits = column.unit is not None and column.unit.dimension in DIMENSION[role]
+    if not named and not unit_fits:
+        in_unit = f", and {SLOTS[role].rpartition('_')[2]} is assumed" if key.endswith(SLOTS[role]) else ""
+        reason = f"neither name nor unit says that {column.place} is the {role}; its behaviour does{in_unit}."
+        notes.doubt(key, reason, f"Name the right column of {role} here if it is another.")
+    if role == "force" and roles.signs_differ:
+        reason = f"the sign of {column.place} against the motion is not the same in all files."
+        notes.doubt(key, reason, "Check whether the sensor was turned, or the force was exported as a magnitude.")
+    if role == "force" and not unit_fits and column.unit is not None:
+        reason = f"{column.place} is not in a unit of force."
+        notes.doubt(key, reason, "Give the factor to N under [trace.compute], or declare it under [quantities].")
+    if role == "force" and roles.both_ways and named and _follows_badly(column, roles):
+        reason = f"{column.place} has the same sign in both directions."
+        notes.doubt(key, reason, "It looks like a magnitude: export the force with its sign.")
+
+
+def _follows_badly(column: Column, roles: Roles) -> bool:
+    velocities = [
+        motion.velocity(t, x) for t, x in zip(roles.time.values, roles.displacement.values, strict=True)
+    ] if roles.time is not None and roles.displacement is not None else []  # fmt: skip
+    found = [motion.follows(v, speed) for v, speed in zip(column.values, velocities, strict=False)]
+    return bool(found) and max(one.strength for one in found if one.both_ways) < BY_BEHAVIOUR / 2
+
+
+def _integrated(speed: Column, notes: Notes) -> list[str]:
+    """Add what makes a displacement of a speed; return the helper column."""
+    rotation = speed.unit is not None and speed.unit.dimension == "rotation"
+    helper = "speed_rpm" if rotation else "speed_column"
+    notes.guess(f"trace.columns.{helper}", speed.key, f"{speed.place}: by its name or unit")
+    scale = speed.unit is not None and not rotation and speed.unit.factor != 1.0
+    integrated = "speed_column_mm_s" if scale else helper
+    evidence = "there is no column of displacement: it is the integral of the speed"
+    notes.guess("trace.integrate_displacement", integrated, evidence)
+    if rotation:
+        notes.guess("trace.integrate_per", "min", "rpm")
+        notes.guess("quantities.displacement", {"quantity": "angle", "unit": "turn"}, f"from {speed.place}")
+        notes.guess("quantities.speed", {"quantity": "rotational speed", "unit": "rpm"}, f"from {speed.place}")
+        notes.guess("position_origin", "file", "an integral begins anew in every file")
+    elif scale:
+        notes.guess("trace.compute.speed_column_mm_s", scaled(helper, speed.unit.factor), "to mm/s")
+        return [helper, "speed_column_mm_s"]
+    return [helper]
+
+
+def _missing_slots(roles: Roles, notes: Notes) -> None:
+    wanted = {
+        "time": "no column of numbers rises evenly: there is no time.",
+        "displacement": "no column goes along strokes: there is no displacement, and no speed to make it from.",
+        "force": "no column follows the motion: there is no force.",
+    }
+    for role, reason in wanted.items():
+        if getattr(roles, role) is None and not (role == "displacement" and roles.speed is not None):
+            fix = f"Name it as {SLOTS[role]}, by the file's name of the column or by its position."
+            if role == "time":
+                fix += " A time of day must be exported as seconds."
+            notes.doubt("trace.columns", reason, fix, (f"{SLOTS[role]} = 1",))
+
+
+def _other_columns(found: Found, roles: Roles, notes: Notes) -> None:
+    """Add the columns kept as channels and say which are not used."""
+    kept, ignored = [], []
+    taken = {name.partition(".")[2] for name in SLOTS.values()}
+    for column in roles.others:
+        name = _channel(column, taken)
+        if name:
+            taken.add(name)
+            kept.append(column)
+            notes.guess(f"trace.columns.{name}", column.key, f"{column.place}: kept as a channel")
+        else:
+            ignored.append(column)
+    texts = [name for i, name in enumerate(found.dialect.names) if name and i not in found.dialect.numbers]
+    if roles.speed is not None and roles.displacement is not None:
+        ignored.append(roles.speed)
+    if ignored or texts or found.dialect.width > len(found.dialect.numbers):
+        shown = [_ignored(column) for column in ignored]
+        shown += [f"'{name}' (text)" for name in texts]
+        evidence = f"not used: {'; '.join(shown)}" if shown else "there are empty columns"
+        notes.guess("trace.other_columns", "ignore", evidence)
+
+
+def _ignored(column: Column) -> str:
+    return column.place + (f", the same signal as column {column.copy_of}" if column.copy_of else "")
+
+
+def _channel(column: Column, taken: set[str]) -> str:
+    """Return the name of a column as a channel, none of those taken; "" if it is none: a ratio, a counter, a copy."""
+    if column.copy_of or column.role not in CHANNELS or all(motion.rises(values) for values in column.values):
+        return ""
+    unit = f"_{column.unit.name}" if column.unit is not None else ""
+    bases = [
+        f"{column.role}_sensor",
+        "_".join(plain(name_and_unit(column.label)[0]).split()),
+        f"{column.role}_column_{column.position}",
+    ]
+    return next(name for base in bases if (name := base + unit) not in taken)
+
+
+# ---------------------------------------------------------------- units
+
+
+def settled_units(roles: Roles, notes: Notes) -> dict[str, Unit | None]:
+    """Return the unit of each role's column; what files do not say is assumed, with a doubt."""
+    units: dict[str, Unit | None] = {}
+    for role, slot in SLOTS.items():
+        column = getattr(roles, role)
+        if column is None:
+            continue
+        unit = column.unit if column.unit is not None and column.unit.dimension in DIMENSION[role] else None
+        units[role] = None if unit is not None and unit.dimension == "torque" else unit
+        if column.unit is None:
+            units[role] = _assumed(column, role, slot, notes)
+    return units
+
+
+def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
+    default = slot.rpartition("_")[2]
+    if role == "time":
+        step = float(np.median(np.diff(column.values[0])))
+        long = float(np.ptp(column.values[0]))
+        if step >= 1.0 and long > LONG_S:
+            hours = f"{long / 3600:.1f} h"
+            reason = f"{column.place} has no unit; in seconds a file would last {hours}, so it is taken as ms."
+            notes.doubt("trace.compute.time_s", reason, "Change the factor if it is another unit.")
+            return UNITS["ms"]
+    if column.role != role:
+        return None  # said where it is said that nothing but its behaviour speaks for it
+    reason = f"{column.place} has no unit; {default} is assumed."
+    fix = f"If it is another, read it under a name such as {role}_raw and compute {slot} from it."
+    notes.doubt(f"trace.columns.{slot}", reason, fix)
+    return None
+
+
+# ---------------------------------------------------------------- header and motion
+
+
+def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes) -> list[Setting]:
+    """Add the date and the settings that header lines give and nothing else does; return these settings."""
+    headers = [one.header for one in found.sniffed]
+    if not headers[0]:
+        return []
+    given = given | ({"load_N"} if measures_load else set())
+    when = started_in(headers)
+    if when is not None and "started_at" not in given:
+        guess, lines = date_lines(when)
+        if guess is not None:
+            notes.guesses.append(guess)
+        else:
+            reason = f"header line {when.line} gives a date that is not ISO 8601: {_shown(when.text)}."
+            fix = "It is not read yet; the draft holds the lines that would read it."
+            notes.doubt("trace.header_fields", reason, fix, lines)
+    settings = [one for one in settings_in(headers, found.dialect.decimal) if one.ours not in given]
+    for one in settings:
+        _setting_keys(one, notes)
+    return settings
+
+
+def _setting_keys(one: Setting, notes: Notes) -> None:
+    factor = 1.0 if one.unit is None else one.unit.factor / (86400.0 if one.ours == "aging_days" else 1.0)
+    evidence = f"header line {one.line}, in every file looked at: {_shown(one.text)}"
+    if factor == 1.0:
+        notes.guess(f"trace.header_fields.{one.ours}", one.pattern, evidence)
+        return
+    base = one.ours.split("_")[0]
+    notes.guess(f"trace.header_fields._{base}", one.pattern, evidence)
+    notes.guess(f"trace.compute.{one.ours}", scaled(f"_{base}", factor), f"from {one.unit.name}")
+
+
+def motion_keys(roles: Roles, units: Mapping[str, Unit | None], files: Sequence[str], notes: Notes) -> dict[str, float]:
+    """Say whether strokes go both ways and how many speeds a file has; return the measured speed of each file."""
+    if roles.time is None or (roles.displacement is None and roles.speed is None):
+        return {}
+    speeds: dict[str, list[float]] = {}
+    for i, file in enumerate(files):
+        if roles.displacement is None:
+            speeds[file] = [motion.mean_speed(roles.speed.values[i])]
+            continue
+        factors = {role: unit.factor if (unit := units.get(role)) else 1.0 for role in ("time", "displacement")}
+        time, way = roles.time.values[i] * factors["time"], roles.displacement.values[i] * factors["displacement"]
+        speeds[file] = motion.plateau_speeds(time, way)
+    several = {file: found for file, all_ in speeds.items() if (found := motion.several_speeds(all_))}
+    if several:
+        file, found = next(iter(several.items()))
+        shown = ", ".join(f"{speed:.3g}" for speed in found[:6])
+        reason = (
+            f"{len(several)} of {len(files)} files read hold several speeds in one direction: {shown} mm/s in {file}."
+        )
+        fix = "The strokes of a file in one direction are one run: write each speed into a file of its own."
+        notes.doubt("strokes", reason, fix)
+    return {file: float(np.median(np.abs(found))) for file, found in speeds.items() if found and file not in several}
+
+
+def motion_words(roles: Roles, strokes: int) -> str:
+    """Return what the motion is like, for the summary."""
+    many = "one stroke" if strokes == 1 else f"about {strokes} strokes"
+    return f"{many} in a file, {'both ways' if roles.both_ways else 'one way'}"

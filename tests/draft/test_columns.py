@@ -1,0 +1,281 @@
+"""Which column is what, by name, unit and behaviour; how files are written."""
+
+import exports
+import numpy as np
+import pytest
+
+from sealfit.config import parse_config
+from sealfit.draft import motion
+from sealfit.draft.dialect import sniff, sniffed_delimiter
+from sealfit.draft.draft import draft
+from sealfit.draft.vocabulary import column_role, name_and_unit
+from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.files import as_utf8
+from sealfit.ingest.reader import read_trace
+
+SPEEDS = (1.0, 5.0)
+
+
+def campaign(folder, columns, header="", strokes=1, delimiter=",", decimals=5):
+    """Write two files; `columns` makes the columns of a record."""
+    for one in exports.records(days=(4,), speeds=SPEEDS, repeats=(1,), strokes=strokes):
+        body = exports.table(columns(one), delimiter, decimals)
+        exports.write(folder, f"d{one.days}_v{one.speed:g}.csv", header + body)
+    return draft(folder)
+
+
+def slots(made):
+    return parse_config(made.text, "rig.toml").trace.columns
+
+
+# ---------------------------------------------------------------- columns
+def test_columns_without_names_are_found_by_their_behaviour(tmp_path):
+    made = campaign(tmp_path, lambda one: [one.force_N, one.time_s, one.displacement_mm], strokes=4)
+    assert slots(made) == {"force_N": 1, "time_s": 2, "displacement_mm": 3}
+    reasons = [doubt.reason for doubt in made.doubts if "its behaviour does" in doubt.reason]
+    assert [reason.rpartition(", and ")[2] for reason in reasons] == [
+        "s is assumed.",
+        "mm is assumed.",
+        "N is assumed.",
+    ]
+
+
+def test_a_counter_is_no_time_and_a_later_time_is(tmp_path):
+    def columns(one):
+        return [np.arange(len(one.time_s)), one.displacement_mm, one.force_N, one.time_s]
+
+    made = campaign(tmp_path, columns, "No.,Position,Force,Zeit\n")
+    assert slots(made)["time_s"] == "Zeit"
+
+
+def test_a_counter_without_a_name_is_no_time(tmp_path):
+    made = campaign(tmp_path, lambda one: [np.arange(len(one.time_s)), *exports.slots(one)], strokes=2)
+    assert slots(made) == {"time_s": 2, "displacement_mm": 3, "force_N": 4}
+
+
+def test_the_raw_signal_of_a_sensor_is_left_for_the_scaled_one(tmp_path):
+    made = campaign(tmp_path, lambda one: [one.time_s, 1.2 + one.displacement_mm / 20, *exports.slots(one)[1:]])
+    assert slots(made) == {"time_s": 1, "displacement_mm": 3, "force_N": 4}
+    assert "column 2, the same signal as column 3" in made.text
+
+
+def test_load_and_friction_are_told_apart(tmp_path):
+    def columns(one):
+        return [one.time_s, one.displacement_mm, one.further["load"], one.force_N]
+
+    made = campaign(tmp_path, columns, "Time [s],Stroke [mm],Normal Force [N],Friction Force [N]\n")
+    assert slots(made)["load_N"] == "Normal Force [N]"
+    assert slots(made)["force_N"] == "Friction Force [N]"
+
+
+def test_a_load_cell_along_the_motion_is_the_force_though_it_is_called_load(tmp_path):
+    made = campaign(tmp_path, exports.slots, "Time,Extension,Load\n")
+    assert slots(made)["force_N"] == "Load"
+    assert "load_N" not in slots(made)
+
+
+def test_names_that_stand_twice_go_by_position(tmp_path):
+    made = campaign(tmp_path, exports.slots, "Zeit,Kanal,Kanal\n", strokes=2)
+    assert slots(made) == {"time_s": "Zeit", "displacement_mm": 2, "force_N": 3}
+
+
+def test_a_force_that_is_a_magnitude_is_a_doubt(tmp_path):
+    def columns(one):
+        return [one.time_s, one.displacement_mm, np.abs(one.force_N)]
+
+    made = campaign(tmp_path, columns, "time_s,displacement_mm,force_N\n", strokes=4)
+    (doubt,) = [doubt for doubt in made.doubts if "same sign in both directions" in doubt.reason]
+    assert doubt.key == "trace.columns.force_N"
+
+
+def test_a_displacement_is_integrated_from_a_speed(tmp_path):
+    def columns(one):
+        return [one.time_s, np.gradient(one.displacement_mm, one.time_s) * 60, one.force_N]
+
+    made = campaign(tmp_path, columns, "Zeit [s],Geschwindigkeit [mm/min],Kraft [N]\n")
+    trace = parse_config(made.text, "rig.toml").trace
+    assert trace.integrate_displacement == "speed_column_mm_s"
+    assert trace.compute == {"speed_column_mm_s": "speed_column / 60"}
+
+
+def test_a_time_of_day_is_a_doubt_with_its_fix(tmp_path):
+    for one in exports.records(days=(4,), repeats=(1,)):
+        lines = [f"10:12:{i % 60:02d},{x:.4f},{f:.4f}" for i, (_, x, f) in enumerate(zip(*exports.slots(one)))]  # noqa: B905
+        exports.write(tmp_path, f"d4_v{one.speed:g}.csv", "\n".join(["Clock,Position,Force", *lines]))
+    (doubt,) = [doubt for doubt in draft(tmp_path).doubts if "there is no time" in doubt.reason]
+    assert "exported as seconds" in doubt.fix
+
+
+def test_a_time_in_no_unit_that_would_last_for_hours_is_in_ms(tmp_path):
+    made = campaign(tmp_path, lambda one: [one.time_s * 1000, *exports.slots(one)[1:]], "Time,Position,Force\n")
+    trace = parse_config(made.text, "rig.toml").trace
+    assert trace.compute == {"time_s": "time_ms / 1000"}
+    assert any("taken as ms" in doubt.reason for doubt in made.doubts)
+
+
+def test_a_speed_of_names_in_mm_per_minute_is_seen_in_the_displacement(tmp_path):
+    for one in exports.records(days=(4,), repeats=(1,)):
+        header = "Time_s,Position_mm,Force_N\n"
+        exports.write(tmp_path, f"d4_v{60 * one.speed:g}.csv", header + exports.table(exports.slots(one), ",", 4))
+    config = parse_config(draft(tmp_path).text, "rig.toml")
+    assert config.files.compute == {"speed_mm_s": "_speed / 60"}
+
+
+def test_a_number_in_names_that_is_the_measured_speed_is_the_speed(tmp_path):
+    for one in exports.records(days=(4,), speeds=(1.0, 5.0, 8.0), repeats=(1,)):
+        header = "Time_s,Position_mm,Force_N\n"
+        exports.write(tmp_path, f"d4_X{one.speed:g}.csv", header + exports.table(exports.slots(one), ",", 4))
+    config = parse_config(draft(tmp_path).text, "rig.toml")
+    assert "(?P<speed_mm_s>" in config.files.name_pattern
+
+
+def test_a_file_with_steps_of_speed_is_a_doubt(tmp_path):
+    time = 0.05 * np.arange(400)
+    for number, first in enumerate((1.0, 2.0), start=1):
+        speed = np.where(time < 10, first, 4 * first)
+        way = np.cumsum(speed) * 0.05
+        body = exports.table([time, way, 40 + 0.1 * speed], ",", 4)
+        exports.write(tmp_path, f"d4_r{number}.csv", "time_s,position_mm,force_N\n" + body)
+    (doubt,) = [doubt for doubt in draft(tmp_path).doubts if doubt.key == "strokes"]
+    assert "1, 4 mm/s" in doubt.reason
+
+
+@pytest.mark.parametrize("strokes", [1, 2, 4, 7])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_strokes_are_counted(strokes, sign):
+    (one,) = exports.records(days=(1,), speeds=(5.0,), repeats=(1,), strokes=strokes)
+    assert motion.stroke_count(sign * one.displacement_mm) == strokes
+    expected = [5.0 * sign * (-1) ** i for i in range(strokes)]
+    assert motion.plateau_speeds(one.time_s, sign * one.displacement_mm) == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("Prüfzeit", "time"), ("Elapsed Time", "time"), ("t", "time"), ("Messzeit", "time"),
+        ("Traversenweg", "displacement"), ("Crosshead", "displacement"), ("Verfahrweg", "displacement"),
+        ("x", "displacement"), ("Standardkraft", "force"), ("Fx", "force"), ("Reibkraft", "force"),
+        ("Load Cell", "force"), ("Normalkraft", "load"), ("Fz", "load"), ("Reibungszahl", "none"), ("COF", "none"),
+        ("Probentemperatur", "temperature"), ("Geschwindigkeit", "speed"), ("Drehmoment", "torque"),
+        ("MX440B_CH 1", ""),
+    ],
+)  # fmt: skip
+def test_names_of_columns_in_two_languages(name, role):
+    assert column_role(name)[0] == role
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "factor"),
+    [
+        ("Weg [mm]", "Weg", 1.0), ("Kraft (kN)", "Kraft", 1e3), ("t / ms", "t", 1e-3), ("s in µm", "s", 1e-3),
+        ("Load_lbf", "Load", 4.4482216152605), ("Position, in", "Position", 25.4), ("Force N", "Force", 1.0),
+        ("v_mm_min", "v", 1 / 60),
+    ],
+)  # fmt: skip
+def test_units_in_names_of_columns(text, name, factor):
+    found, unit = name_and_unit(text)
+    assert found == name
+    assert unit.factor == pytest.approx(factor)
+
+
+def test_sensors_beside_the_motion_are_channels_with_names_of_their_own(tmp_path):
+    def columns(one):
+        rng = np.random.default_rng(one.number)
+        return [*exports.slots(one), *(20 + rng.normal(size=(4, len(one.time_s))))]
+
+    header = "Zeit s;Weg mm;Kraft N;Temp Probe °C;Temp Luft °C;Feuchte %;Luftdruck mbar\n"
+    named = slots(campaign(tmp_path, columns, header, delimiter=";"))
+    assert named["temperature_sensor_C"] == "Temp Probe °C"
+    assert named["temp_luft_C"] == "Temp Luft °C"
+    assert {"humidity_sensor_pct", "pressure_sensor_mbar"} <= set(named)
+    assert len(named) == 7
+
+
+def test_a_measured_load_goes_before_that_of_the_header(tmp_path):
+    def columns(one):
+        return [one.time_s, one.displacement_mm, one.force_N, one.further["load"]]
+
+    header = "Normal load: 50 N\n\nt [s];x [mm];F [N];Fz [N]\n"
+    config = parse_config(campaign(tmp_path, columns, header, delimiter=";").text, "rig.toml")
+    assert config.trace.columns["load_N"] == "Fz [N]"
+    assert config.trace.header_fields == {}
+
+
+def test_names_with_blanks_above_columns_of_blanks_go_by_position(tmp_path):
+    made = campaign(tmp_path, exports.slots, "Elapsed Time (s)   Slide Position (mm)   Force (N)\n", delimiter="   ")
+    assert slots(made) == {"time_s": 1, "displacement_mm": 2, "force_N": 3}
+    assert parse_config(made.text, "rig.toml").trace.header_lines == 1
+    assert [doubt.key for doubt in made.doubts] == ["condition"]  # names say the days only
+
+
+@pytest.mark.parametrize("header", ["# t x F\n", "#t[s] x[mm] F[N]\n", "# made by numpy\n# time position force\n"])
+def test_names_behind_a_mark_of_comment(header, tmp_path):
+    made = campaign(tmp_path, exports.slots, header.replace(" ", "\t"), delimiter="\t")
+    config = parse_config(made.text, "rig.toml")
+    table = read_trace(tmp_path, TraceRef("d4_v5.csv", {}), config).table
+    assert list(table) == ["time_s", "displacement_mm", "force_N"]
+    assert table["displacement_mm"].max() == pytest.approx(30, abs=0.5)
+
+
+def test_the_line_for_spreadsheets_is_header(tmp_path):
+    made = campaign(tmp_path, exports.slots, "sep=;\nZeit s;Weg mm;Kraft N\n", delimiter=";")
+    assert slots(made) == {"time_s": "Zeit s", "displacement_mm": "Weg mm", "force_N": "Kraft N"}
+    assert parse_config(made.text, "rig.toml").trace.header_lines == 2
+
+
+def test_a_set_point_is_left_for_what_was_measured(tmp_path):
+    def columns(one):
+        return [one.time_s, one.displacement_mm, one.displacement_mm, one.force_N]
+
+    made = campaign(tmp_path, columns, "Zeit [s],Istweg [mm],Sollweg [mm],Kraft [N]\n")
+    assert slots(made)["displacement_mm"] == "Istweg [mm]"
+
+
+# ---------------------------------------------------------------- dialect
+SEPARATORS = {
+    "german_daq": ";", "nested": "tab", "labview": "tab", "catman": "tab", "dasylab": ";", "hbm": "tab",
+    "instron": ",", "zwick": ";", "mts": "tab", "tribometer": ",", "benchvue": ",", "matlab": ",",
+    "excel_german": ";", "excel_us": ",",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", exports.EXPORTS)
+def test_clevercsv_finds_the_separator_with_the_header_and_without(name, tmp_path):
+    file = min(exports.EXPORTS[name](tmp_path))
+    lines = as_utf8((tmp_path / file).read_bytes(), "auto", file).decode().split("\n")
+    assert sniffed_delimiter(lines[:60]) == SEPARATORS[name]
+    assert sniffed_delimiter(lines[60:100]) == SEPARATORS[name]
+
+
+def text_of(delimiter, comma=False, header="t x F\n"):
+    (one,) = exports.records(days=(1,), speeds=(5.0,), repeats=(1,))
+    return header.replace(" ", delimiter) + exports.table(exports.slots(one), delimiter, 3, comma)
+
+
+@pytest.mark.parametrize(
+    ("delimiter", "comma", "found", "decimal"),
+    [
+        (",", False, ",", "."), (";", False, ";", "."), (";", True, ";", ","), ("\t", True, "tab", ","),
+        ("|", False, "|", "."), ("   ", False, "whitespace", "."), (" ", True, "whitespace", ","),
+    ],
+)  # fmt: skip
+def test_separator_and_decimal_sign(delimiter, comma, found, decimal):
+    dialect = sniff(text_of(delimiter, comma))
+    assert (dialect.delimiter, dialect.decimal, dialect.rows) == (found, decimal, 260)
+    assert dialect.names == ("t", "x", "F")
+
+
+def test_whole_numbers_do_not_show_the_decimal_sign():
+    dialect = sniff("a;b\n" + "\n".join(f"{i};{2 * i}" for i in range(20)))
+    assert (dialect.delimiter, dialect.has_fractions) == (";", False)
+
+
+def test_a_table_of_results_above_the_data_is_header():
+    dialect = sniff("Max;F\n1;2,5\n2;3,5\n\n" + text_of(";", comma=True))
+    assert len(dialect.header) == 5
+    assert dialect.names == ("t", "x", "F")
+
+
+@pytest.mark.parametrize("text", ["", "a\n", "only words\n" * 30, "1\n2\n3\n" * 20, "1,2\n3,4\n"])
+def test_no_table_of_numbers(text):
+    assert sniff(text) is None

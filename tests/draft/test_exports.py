@@ -1,0 +1,232 @@
+"""The draft of a config reads what other people's programs export, with at most one edit; each edit is stated."""
+
+import shutil
+from pathlib import Path
+
+import exports
+import numpy as np
+import numpy.testing as npt
+import pytest
+
+from sealfit.config import parse_config
+from sealfit.draft.draft import draft
+from sealfit.ingest.campaign import ingest_campaign
+from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.reader import read_trace
+
+ROUNDED = 6e-4  # s, mm, N: the coarsest export writes three decimals
+
+ALL = ("temperature_C", "compression_ratio_pct", "aging_days", "speed_set_mm_s", "repeat")
+NO_COMPRESSION = ("temperature_C", "aging_days", "speed_set_mm_s", "repeat")
+SPECIMENS = ("temperature_C", "compression_ratio_pct", "aging_days", "speed_set_mm_s")
+TELLS = {  # what is to be found of each file; all of it where nothing else is said
+    "dasylab": NO_COMPRESSION,
+    "mts": NO_COMPRESSION,
+    "instron": SPECIMENS,
+    "zwick": SPECIMENS,
+    "excel_german": (*ALL, "load_N", "started_at"),
+    "matlab": (*ALL, "started_at"),
+    "german_daq": (*ALL, "load_N"),
+}
+
+
+def copy_the_table(folder: Path) -> None:
+    shutil.copy(folder / "testplan.csv", folder / "runs.csv")
+
+
+EDITS = {"matlab": copy_the_table}  # the only one: only runs.csv is read, as the draft says
+
+
+def wanted(one: exports.Record) -> dict:
+    return {
+        "temperature_C": one.temperature,
+        "compression_ratio_pct": one.compression,
+        "aging_days": one.days,
+        "speed_set_mm_s": one.speed,
+        "repeat": one.repeat,
+        "load_N": 50.0,
+        "started_at": str(one.started),
+    }
+
+
+def read(folder: Path, edit=None):
+    made = draft(folder)
+    if edit is not None:
+        edit(folder)
+    config = parse_config(made.text, "rig.toml")
+    return made, config, ingest_campaign(folder, config)
+
+
+def assert_settings(ingested, written, names):
+    runs = ingested.tables["runs"]
+    assert set(runs["file"]) == set(written)
+    assert runs["used"].all()
+    for row in runs.to_dict("records"):
+        told = wanted(written[row["file"]])
+        for name in names:
+            if isinstance(told[name], str):
+                assert row[name].replace("T", " ") == told[name]
+            else:
+                assert row[name] == pytest.approx(told[name], rel=1e-5), (row["file"], name)
+
+
+def assert_values(folder, config, written):
+    for file in (min(written), max(written)):
+        one = written[file]
+        table = read_trace(folder, TraceRef(file, {}), config).table
+        npt.assert_allclose(table["time_s"], one.time_s, atol=ROUNDED)
+        npt.assert_allclose(table["displacement_mm"], one.displacement_mm, atol=ROUNDED)
+        npt.assert_allclose(table["force_N"], one.force_N, atol=ROUNDED)
+
+
+@pytest.mark.parametrize("name", exports.EXPORTS)
+def test_the_draft_reads_an_export(name, tmp_path):
+    written = exports.EXPORTS[name](tmp_path)
+    _, config, ingested = read(tmp_path, EDITS.get(name))
+    assert_values(tmp_path, config, written)
+    assert_settings(ingested, written, TELLS.get(name, ALL))
+    assert set(ingested.tables["inputs"]["status"]) == {"used"}
+
+
+@pytest.mark.parametrize("name", sorted(set(exports.EXPORTS) - {"excel_german", "excel_us"}))
+def test_the_draft_leads_to_no_fault(name, tmp_path):
+    exports.EXPORTS[name](tmp_path)
+    _, _, ingested = read(tmp_path, EDITS.get(name))
+    assert [str(fault) for fault in ingested.faults] == []
+
+
+@pytest.mark.parametrize("name", ["excel_german", "excel_us"])
+def test_lines_below_the_data_are_a_doubt_as_no_config_can_name_them(name, tmp_path):
+    exports.EXPORTS[name](tmp_path)
+    made, _, ingested = read(tmp_path)
+    assert any("end in lines that are no data" in doubt.reason for doubt in made.doubts)
+    assert {fault.line for fault in ingested.faults} <= {263, 264}  # one line in each file, below the 260 rows
+
+
+# ---------------------------------------------------------------- what single exports need
+def test_dates_in_names_are_read(tmp_path):
+    written = exports.german_daq(tmp_path, dates="names")
+    made, _, ingested = read(tmp_path)
+    assert_settings(ingested, written, (*ALL, "load_N", "started_at"))
+    assert len(written) == 84
+    assert made.doubts == ()
+
+
+def test_a_german_date_in_the_header_is_a_doubt_with_the_lines_that_would_read_it(tmp_path):
+    exports.german_daq(tmp_path)
+    (doubt,) = draft(tmp_path).doubts
+    assert "header line 2" in doubt.reason
+    assert "14.03.2024" in doubt.reason
+    assert any("%d.%m.%Y %H:%M:%S" in line for line in doubt.lines)
+
+
+@pytest.mark.parametrize(
+    ("name", "date_format"),
+    [
+        ("labview", "%Y/%m/%d %H:%M:%S"),
+        ("catman", "%d.%m.%Y %H:%M:%S"),
+        ("dasylab", "%d.%m.%Y %H:%M:%S"),
+        ("mts", "%m/%d/%Y %I:%M:%S %p"),
+        ("benchvue", "%m/%d/%Y %H:%M:%S"),
+    ],
+)
+def test_the_format_of_a_date_in_the_header_is_found(name, date_format, tmp_path):
+    exports.EXPORTS[name](tmp_path)
+    (doubt,) = [doubt for doubt in draft(tmp_path).doubts if "ISO 8601" in doubt.reason]
+    assert doubt.lines[-1] == f"date_format = '{date_format}'"
+
+
+def test_a_compression_of_20_is_taken_as_a_height_of_80_and_said(tmp_path):
+    exports.nested(tmp_path)
+    made = draft(tmp_path)
+    assert "compression_ratio_pct = '100 - _compression'" in made.text
+    assert any("how much the rubber was compressed" in doubt.reason for doubt in made.doubts)
+
+
+def test_pieces_of_rubber_are_numbered_within_their_condition(tmp_path):
+    written = exports.zwick(tmp_path)
+    _, _, ingested = read(tmp_path)
+    runs = ingested.tables["runs"]
+    assert runs["specimen_id"].nunique() == 3 * 2  # days, pieces
+    assert len(runs) == len(written) == 12
+
+
+def test_a_force_of_the_other_sign_is_turned(tmp_path):
+    exports.dasylab(tmp_path)
+    made, config, ingested = read(tmp_path)
+    steady = ingested.tables["steady"]
+    assert (np.sign(steady["force_N"]) == steady["direction"]).all()
+    assert config.trace.compute == {"force_N": "-force_raw"}
+    assert made.motion == "about 4 strokes in a file, both ways"
+
+
+def test_a_load_counted_downwards_is_turned_and_a_ratio_is_no_channel(tmp_path):
+    written = exports.tribometer(tmp_path)
+    _, config, _ = read(tmp_path)
+    table = read_trace(tmp_path, TraceRef(min(written), {}), config).table
+    npt.assert_allclose(table["load_N"], written[min(written)].further["load"], atol=ROUNDED)
+    assert list(table) == ["time_s", "displacement_mm", "force_N", "load_N"]
+
+
+def test_headers_of_different_lengths_end_at_a_line(tmp_path):
+    exports.mts(tmp_path)
+    config = parse_config(draft(tmp_path).text, "rig.toml")
+    assert config.trace.header_ends_at == r"^Sec\tmm\tN\tsegments"
+    assert config.trace.header_lines is None
+
+
+def test_units_become_factors_and_the_helpers_are_dropped(tmp_path):
+    exports.hbm(tmp_path)
+    trace = parse_config(draft(tmp_path).text, "rig.toml").trace
+    assert trace.compute == {
+        "time_s": "time_ms / 1000",
+        "displacement_mm": "displacement_um / 1000",
+        "force_N": "force_kN * 1000",
+    }
+    assert trace.drop_columns == ["time_ms", "displacement_um", "force_kN"]
+
+
+def test_settings_and_dates_in_the_header_are_enough(tmp_path):
+    written = {}
+    for one in exports.records(temperatures=(60, 80)):
+        head = (
+            f"Test: friction\nDate: {one.started}\nAging temperature: {one.temperature} °C\n"
+            f"Aging time: {24 * one.days} h\nCompression: {one.compression} %\nSpeed: {60 * one.speed:g} mm/min\n"
+            "Normal load: 50 N\n\nt [s]\tx [mm]\tF [N]\n"
+        )
+        file = f"test{one.number:04d}.txt"
+        exports.write(tmp_path, file, head + exports.table(exports.slots(one), "\t", 4))
+        written[file] = one
+    made, config, ingested = read(tmp_path)
+    assert made.doubts == ()
+    assert_values(tmp_path, config, written)
+    assert_settings(ingested, written, (*SPECIMENS, "repeat", "load_N", "started_at"))
+    assert ingested.faults == []
+
+
+def test_rubbers_directions_and_decimal_commas_in_names(tmp_path):
+    written = {}
+    for one in exports.records(speeds=(0.5, 5.0)):
+        for rubber, (word, sign) in (("NBR", ("vor", 1)), ("FKM", ("rueck", -1))):
+            speed = f"{one.speed:g}".replace(".", ",")
+            file = f"{rubber}/{one.days} Tage/{one.temperature}C_v{speed}_{word}_{one.repeat}.txt"
+            columns = [one.time_s, sign * one.displacement_mm, sign * one.force_N]
+            exports.write(tmp_path, file, "Zeit s;Weg mm;Kraft N\n" + exports.table(columns, ";", 4, comma=True))
+            written[file] = one
+    _, config, ingested = read(tmp_path)
+    assert config.rubber == ["rubber"]
+    assert_settings(ingested, written, NO_COMPRESSION)
+    runs = ingested.tables["runs"]
+    assert (runs["direction"] == runs["file"].str.contains("vor").map({True: 1, False: -1})).all()
+    assert (runs["rubber"] == runs["file"].str[:3]).all()
+
+
+@pytest.mark.parametrize("name", exports.EXPORTS)
+def test_every_guess_has_its_evidence_above_it(name, tmp_path):
+    exports.EXPORTS[name](tmp_path)
+    made = draft(tmp_path)
+    lines = made.text.splitlines()
+    assert all(guess.evidence for guess in made.guesses)
+    for number, line in enumerate(lines):
+        if " = " in line and not line.startswith(("#", "name =")):
+            assert lines[number - 1].startswith("# "), line

@@ -1,0 +1,306 @@
+"""The command `sealfit init`: what it writes, prints and refuses."""
+
+import json
+import os
+import shlex
+import sys
+from pathlib import Path
+
+import exports
+import pytest
+
+from sealfit import cli
+from sealfit.config import load_config, parse_config
+from sealfit.draft.draft import draft
+from sealfit.errors import RequestError
+from sealfit.ingest.campaign import ingest_campaign
+from sealfit.ingest.runs import list_traces
+
+
+@pytest.fixture
+def sealfit(monkeypatch, capsys, tmp_path):
+    """Call the program in a folder of its own; return exit code, stdout and stderr."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["sealfit", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return ended.value.code or 0, *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    exports.dasylab(tmp_path / "raw data")
+    return tmp_path / "raw data"
+
+
+# ---------------------------------------------------------------- what it writes and prints
+def test_a_draft_is_written_here_and_the_next_command_works(sealfit, campaign):
+    before = {path: path.read_bytes() for path in campaign.rglob("*.asc")}
+    code, out, err = sealfit("init", campaign)
+    assert (code, err) == (0, "")
+    assert load_config("rig.toml").name == "raw data"
+    assert os.listdir() == ["rig.toml"]
+    assert {path: path.read_bytes() for path in campaign.rglob("*") if path.is_file()} == before
+    *_, last = out.splitlines()
+    assert last == f"next: sealfit check '{campaign}' --config rig.toml"
+    code, out, _ = sealfit(*shlex.split(last)[2:])
+    assert code == 0
+    assert out.endswith("No faults found.\n")
+
+
+def test_the_summary_says_what_was_found_and_what_could_not_be_told(sealfit, campaign):
+    _, out, _ = sealfit("init", campaign)
+    assert "12 trace files" in out
+    assert "about 4 strokes in a file, both ways" in out
+    assert "time_s: column 1 'Messzeit [s]': by its name and its unit" in out
+    told = out.partition("could not be told:")[2]
+    assert "compression_ratio_pct" in told
+    assert "%d.%m.%Y" not in told  # lines of config are for the file
+    assert "14.03.2024" in told
+
+
+def test_json_is_one_object(sealfit, campaign):
+    code, out, _ = sealfit("init", campaign, "--output", "mine.toml", "--json")
+    made = json.loads(out)
+    assert code == 0
+    assert made["ok"] is True
+    assert made["command"] == "init"
+    assert made["config"] == "mine.toml"
+    assert made["files"] == 12
+    evidence = "numbers such as '0,0000' in 12 of 12 files"
+    assert {"key": "trace.decimal", "value": ",", "evidence": evidence} in made["guesses"]
+    assert all(set(doubt) == {"key", "reason", "fix"} and doubt["fix"] for doubt in made["doubts"])
+    assert made["next"].startswith("sealfit check ")
+
+
+def test_a_file_that_is_there_is_kept_unless_forced(sealfit, campaign):
+    sealfit("init", campaign)
+    Path("rig.toml").write_text("mine")
+    code, _, err = sealfit("init", campaign)
+    assert code == 1
+    assert err == "sealfit: rig.toml: is there already. Choose another --output, or replace it with --force.\n"
+    assert Path("rig.toml").read_text() == "mine"
+    assert sealfit("init", campaign, "--force")[0] == 0
+    assert load_config("rig.toml")
+
+
+def test_only_toml_files_are_written(sealfit, campaign):
+    trace = next(campaign.rglob("*.asc"))
+    code, _, err = sealfit("init", campaign, "--output", trace, "--force")
+    assert code == 1
+    assert "ends in .toml" in err
+    assert trace.stat().st_size > 1000
+
+
+def test_a_draft_is_never_used_unless_it_is_named(sealfit, campaign):
+    sealfit("init", campaign)
+    code, out, _ = sealfit("check", campaign)
+    assert code == 1
+    assert "no runs.csv" in out
+
+
+def test_a_folder_that_cannot_be_written_is_said(sealfit, campaign):
+    code, _, err = sealfit("init", campaign, "--output", "nowhere/rig.toml")
+    assert code == 1
+    assert "cannot be written" in err
+
+
+# ---------------------------------------------------------------- folders that it cannot draft from
+def nothing(folder):
+    folder.mkdir()
+
+
+def no_folder(folder):
+    pass
+
+
+def a_file(folder):
+    folder.write_text("1,2\n")
+
+
+def words(folder):
+    exports.write(folder, "notes.txt", "only words\n" * 20)
+
+
+def binary(folder):
+    folder.mkdir()
+    for number in range(3):
+        (folder / f"d{number}.dat").write_bytes(bytes(range(256)) * 20)
+
+
+def packed(folder):
+    folder.mkdir()
+    (folder / "d1.csv").write_bytes(b"PK\x03\x04" + bytes(100))
+
+
+def tdms(folder):
+    folder.mkdir()
+    for number in range(3):
+        (folder / f"run{number}.tdms").write_bytes(b"TDSm" + bytes(100))
+    (folder / "log.xlsx").write_bytes(b"PK\x03\x04" + bytes(100))
+
+
+def empty_files(folder):
+    folder.mkdir()
+    (folder / "d1.csv").write_bytes(b"")
+
+
+def values_over_days(folder):
+    exports.write(folder, "strength.csv", "TempC,TimeH,Response\n" + "50,0,100\n50,72,93.1\n60,0,99\n60,24,95\n" * 5)
+
+
+def only_a_table_of_runs(folder):
+    exports.write(folder, "runs.csv", "file,aging_days\n" + "".join(f"{i}.csv,{i}\n" for i in range(20)))
+
+
+@pytest.mark.parametrize(
+    ("make", "reason", "fix"),
+    [
+        (nothing, "the folder is empty", "Give the folder that holds the trace files"),
+        (no_folder, "there is no such folder", "Give the folder that holds the trace files"),
+        (a_file, "is a file, not a folder", "Give the folder that holds the trace files"),
+        (words, "none of 1 files holds a table of numbers", "export them as text"),
+        (binary, "is not text", "export them as text"),
+        (packed, "a zip archive or .xlsx workbook", "export them as text"),
+        (tdms, "3 TDMS (LabVIEW) (.tdms), 1 Excel workbooks (.xlsx)", "Export the traces as text"),
+        (empty_files, "is empty", "export them as text"),
+        (values_over_days, "but no time and no force", "Give the folder that holds traces"),
+        (only_a_table_of_runs, "none of 1 files holds a table of numbers", "export them as text"),
+    ],
+)
+def test_a_folder_without_traces_is_one_line_with_what_to_do(make, reason, fix, sealfit, tmp_path):
+    make(tmp_path / "folder")
+    code, out, err = sealfit("init", tmp_path / "folder")
+    assert (code, out) == (1, "")
+    assert err.count("\n") == 1
+    assert reason in err
+    assert fix in err
+    assert os.listdir() == []
+
+
+def test_json_on_failure(sealfit, tmp_path):
+    code, out, _ = sealfit("init", tmp_path / "nowhere", "--json")
+    (error,) = json.loads(out)["errors"]
+    assert code == 1
+    assert error["fix"]
+
+
+# ---------------------------------------------------------------- folders that hold other things, too
+def plain(one):
+    return "Time_s,Pos_mm,Force_N\n" + exports.table(exports.slots(one), ",", 4)
+
+
+def test_files_written_otherwise_are_left_out_and_said(tmp_path):
+    exports.tribometer(tmp_path)
+    for number in range(3):
+        exports.write(tmp_path, f"old{number}.csv", "t;x;F\n" + "0,1;0,2;0,3\n1,1;1,2;1,4\n" * 20)
+    made = draft(tmp_path)
+    assert made.files == 12
+    (doubt,) = [doubt for doubt in made.doubts if "written otherwise" in doubt.reason]
+    assert "3 files" in doubt.reason
+    assert "separator ';', decimal ','" in doubt.reason
+    assert parse_config(made.text, "rig.toml").files.exclude == ["old0.csv", "old1.csv", "old2.csv"]
+
+
+def test_files_with_further_columns_are_read_by_the_names_that_all_have(tmp_path):
+    for one in exports.records():
+        columns, header = exports.slots(one), "t [s];x [mm];F [N]\n"
+        if one.repeat == 2 and one.days == 4:
+            columns, header = [one.time_s, one.further["temperature"], *columns[1:]], "t [s];T [°C];x [mm];F [N]\n"
+        file = f"d{one.days}_v{one.speed:g}_r{one.repeat}.csv"
+        exports.write(tmp_path, file, header + exports.table(columns, ";", 4))
+    made = draft(tmp_path)
+    assert made.files == 12
+    (doubt,) = [doubt for doubt in made.doubts if "further columns" in doubt.reason]
+    assert "2 of 12 files have further columns: T [°C]." in doubt.reason
+    ingested = ingest_campaign(tmp_path, parse_config(made.text, "rig.toml"))
+    assert set(ingested.tables["inputs"]["status"]) == {"used"}
+    assert ingested.tables["runs"]["speed_mm_s"].abs().round(2).isin([1.0, 5.0]).all()
+
+
+def test_a_broken_file_among_traces_is_said_and_excluded(tmp_path):
+    exports.tribometer(tmp_path)
+    name = "EPDM_90C_80pct_1d_1mms_1.csv"
+    (tmp_path / name).write_bytes(b"\x00\x01\x02" * 500)
+    made = draft(tmp_path)
+    (doubt,) = [doubt for doubt in made.doubts if name in doubt.reason]
+    assert "is not text" in doubt.reason
+    assert parse_config(made.text, "rig.toml").files.exclude == [name]
+
+
+def test_documents_and_other_formats_do_not_disturb(tmp_path):
+    exports.tribometer(tmp_path)
+    exports.write(tmp_path, "README.txt", "1,2,3\n" * 50)
+    exports.write(tmp_path, "rig.toml", "name = 'old'\n")
+    exports.write(tmp_path, ".hidden/a.csv", "1,2,3\n" * 50)
+    (tmp_path / "a.tdms").write_bytes(b"TDSm")
+    made = draft(tmp_path)
+    assert made.files == 12
+    (doubt,) = made.doubts
+    assert "1 files (.tdms) are no text" in doubt.reason
+
+
+def test_a_draft_of_many_files_looks_at_some_and_says_so(tmp_path):
+    exports.german_daq(tmp_path)
+    made = draft(tmp_path)
+    (guess,) = [guess for guess in made.guesses if guess.key == "trace.delimiter"]
+    assert guess.evidence == "the separator in 24 of 24 files looked at, of 84"
+
+
+def test_runs_csv_with_paths_that_are_none_is_a_doubt(tmp_path):
+    for number in (1, 2):
+        (one,) = exports.records(days=(number,), speeds=(5.0,), repeats=(1,))
+        exports.write(tmp_path, f"raw/m{number}.csv", plain(one))
+    exports.write(tmp_path, "runs.csv", "Test,Days\nm1,1\nm2,4\n")
+    made = draft(tmp_path)
+    (doubt,) = [doubt for doubt in made.doubts if "whole paths" in doubt.reason]
+    assert "raw/m1.csv" in doubt.reason
+
+
+def test_units_of_a_table_that_are_not_ours_are_doubts(tmp_path):
+    for number in (1, 2):
+        (one,) = exports.records(days=(number,), speeds=(5.0,), repeats=(1,))
+        exports.write(tmp_path, f"m{number}.csv", plain(one))
+    table = "File,Aging time (h),Normal load (kg),Compression (%),Date\n"
+    table += "m1.csv,24,5,20,3/14/2024\nm2.csv,96,5,20,3/15/2024\n"
+    exports.write(tmp_path, "runs.csv", table)
+    reasons = " ".join(doubt.reason for doubt in draft(tmp_path).doubts)
+    assert "'Aging time (h)' of runs.csv is in h" in reasons
+    assert "'Normal load (kg)' of runs.csv is in kgf" in reasons
+    assert "how much the rubber was compressed" in reasons
+    assert "dates that are not ISO 8601, such as '3/14/2024'" in reasons
+
+
+def test_files_that_nothing_tells_apart_are_one_condition(tmp_path):
+    for number in range(1, 9):
+        (one,) = exports.records(days=(1,), speeds=(5.0,), repeats=(1,))
+        exports.write(tmp_path, f"m{number}.csv", plain(one))
+    made = draft(tmp_path)
+    config = parse_config(made.text, "rig.toml")
+    assert config.condition == ["state"]
+    assert config.files.columns == {"state": "one"}
+    assert any("all are taken as one condition" in doubt.reason for doubt in made.doubts)
+
+
+def test_a_repeat_that_does_not_tell_files_apart_is_not_used(tmp_path):
+    for batch, day, repeat in [("a1", 1, 1), ("a2", 1, 1), ("a1", 4, 1), ("a2", 4, 1), ("a1", 1, 2), ("a2", 1, 2)]:
+        (one,) = exports.records(days=(day,), speeds=(5.0,), repeats=(1,))
+        exports.write(tmp_path, f"{batch}/d{day}_r{repeat}.csv", plain(one))
+    made = draft(tmp_path)
+    config = parse_config(made.text, "rig.toml")
+    assert config.condition == ["aging_days"]
+    assert "<repeat>" not in config.files.name_pattern
+    assert any("does not tell 6 files apart" in doubt.reason for doubt in made.doubts)
+    listing, _ = list_traces(tmp_path, config)
+    assert sorted(ref.channels["repeat"] for ref in listing) == [1, 1, 2, 2, 3, 4]
+
+
+def test_unreadable_folders_raise_what_the_user_can_mend(tmp_path):
+    with pytest.raises(RequestError, match="there is no such folder"):
+        draft(tmp_path / "nowhere")
