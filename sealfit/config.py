@@ -28,6 +28,12 @@ class Strict(BaseModel):
 class TraceFormat(Strict):
     """How one trace file is written."""
 
+    format: Literal["csv", "xlsx", "tdms", "mat", "parquet"] | None = Field(
+        None, description="what the files are; without it their endings say so"
+    )
+    sheet: str | int | None = Field(None, description="xlsx: name or number (from 1) of the sheet with the data")
+    group: str | None = Field(None, description="tdms: group of the channels")
+    variable: str | None = Field(None, description="mat: struct or matrix with the data, or '(vectors)'")
     encoding: str = Field(
         "auto", description="utf-8, latin-1, utf-16, or auto (byte-order mark, then UTF-8, then Latin-1)"
     )

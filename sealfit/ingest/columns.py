@@ -116,7 +116,7 @@ def _missing(theirs: str | int, layout: Layout, width: int, settings: TraceForma
         reason = f"there is no column {theirs}: the lines have {width}."
         fix = "Check delimiter and positions in the rig config."
         return _fault("missing_column", reason, layout, file, theirs, fix)
-    fix = suggestion(theirs, layout.names)
+    fix = suggestion(theirs, layout.names) if layout.names else "Columns without names go by position, from 1."
     if len(layout.names) <= 1 and layout.names_line is not None:
         line = layout.header[layout.names_line - 1]
         for mark, word in ((";", '";"'), ("\t", '"tab"'), (",", '","'), (" ", '"whitespace"')):

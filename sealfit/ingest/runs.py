@@ -41,9 +41,9 @@ from sealfit.ingest.derived_columns import (
     to_values,
 )
 from sealfit.ingest.file_names import TEXT_COLUMNS, Listing, TraceRef, name_parts, names_speak
-from sealfit.ingest.files import as_utf8, find_layout, header_fields, read_bytes
+from sealfit.ingest.formats import require_libraries
 from sealfit.ingest.listing import Entries, list_entries
-from sealfit.ingest.reader import read_trace
+from sealfit.ingest.reader import read_header, read_trace
 from sealfit.ingest.trace_checks import measured_speed, speed_factor
 
 
@@ -70,6 +70,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
         _stop_at_errors(faults)  # nothing can be said of files that are not there, and none outside is opened
     if not entries:
         raise CampaignError([*faults, _nothing_left()])
+    require_libraries(entries.files, config.trace)
     kept, named, found = _named(entries, config)
     faults += found
     entries, cells = _kept(kept, entries, cells)
@@ -211,8 +212,7 @@ def _headers(campaign: Path, entries: Entries, config: Config) -> Columns:
 def _header(campaign: Path, file: str, config: Config) -> Mapping[str, float | str]:
     """Return what the header lines say; nothing of a file that cannot be read: reading it will say why."""
     try:
-        text = as_utf8(read_bytes(campaign, file, head=True), config.trace.encoding, file, head=True)
-        found = header_fields(find_layout(text, config.trace, file).header, config.trace)
+        found = read_header(campaign, file, config)
     except BadFile:
         return {}
     return {name: value for name, value in found.items() if not name.startswith("_") and value != ""}
