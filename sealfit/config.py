@@ -87,6 +87,8 @@ class Files(Strict):
         default_factory=dict, description="column = safe expression over parts, e.g. speed_mm_s = 'sign * rpm'"
     )
     runs_columns: dict[str, str] = Field(default_factory=dict, description="our name = runs.csv's column name")
+    runs_table: str | None = Field(None, description="table to read as runs.csv: .csv, .xlsx or .parquet")
+    runs_sheet: str | int | None = Field(None, description="xlsx: name or number (from 1) of its sheet")
 
 
 class Quantity(Strict):

@@ -302,6 +302,6 @@ def _missing(entries: Entries, columns: Columns, needed: _Needed) -> list[Fault]
         elif len(rows):
             reason = "there is no such column in runs.csv, file names, header lines or traces."
             fix = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."
-            place = {"file": "runs.csv" if entries.lines is not None else None, "column": name, "fix": fix.strip()}
+            place = {"file": entries.table if entries.lines is not None else None, "column": name, "fix": fix.strip()}
             faults.append(Fault("missing_column", reason, **place))
     return faults

@@ -1,4 +1,4 @@
-"""Excel workbooks to text: a sheet as lines of cells between tabs, read as those of any other text file.
+"""Excel workbooks and tables of runs to text: lines of cells between tabs, read as those of any other text file.
 
 The number of a line is that of the sheet's row. Numbers are written without loss, dates in ISO 8601.
 """
@@ -11,10 +11,15 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
+from pathlib import Path
 from xml.etree import ElementTree
 
+from sealfit.config import Config
 from sealfit.ingest.columns import nearest
-from sealfit.ingest.formats import bad, damage_named, library, value_text
+from sealfit.ingest.files import as_utf8, read_bytes
+from sealfit.ingest.formats import CALLED, bad, damage_named, kind_of, library, value_text
+
+# ---------------------------------------------------------------- sheets
 
 HEAD_ROWS = 1000  # a header longer than this is no header
 _OLE = b"\xd0\xcf\x11\xe0"  # of .xls, and of the shell that Excel puts around an encrypted workbook
@@ -205,3 +210,43 @@ def _part(packed: zipfile.ZipFile, title: str) -> str:
     relations = ElementTree.fromstring(packed.read("xl/_rels/workbook.xml.rels"))
     target = next(relation.get("Target") for relation in relations if relation.get("Id") == number)
     return target.removeprefix("/") if target.startswith("/") else f"xl/{target}"
+
+
+# ---------------------------------------------------------------- tables of runs
+
+
+def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]:
+    """Return a table of runs as UTF-8 and the delimiter of its cells, "" where that is to be found out.
+
+    Of a sheet, and of a Parquet file, the names are the first line: rows count from 2.
+
+    Raises
+    ------
+    BadFile
+        If it cannot be read, or is of another format.
+    CampaignError
+        If the library that reads it is not installed.
+    """
+    raw, kind = read_bytes(campaign, file), kind_of(file)
+    if kind == "csv":
+        return as_utf8(raw, "auto", file), ""
+    if kind == "parquet":
+        with damage_named(file, kind):
+            return _parquet_text(raw), "\t"
+    if kind == "xlsx":
+        sheet = read_sheet(raw, file, config.files.runs_sheet, first=True)
+        sheet.check(1, file)
+        return sheet.text, "\t"
+    fix = "Save it as .csv, .xlsx or .parquet."
+    raise bad(file, "binary_file", f"is {CALLED[kind]}, which is no table of runs.", fix)
+
+
+def _parquet_text(raw: bytes) -> bytes:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.ParquetFile(pa.BufferReader(raw)).read(use_threads=False)
+    table = table.select([name for name in table.column_names if not name.startswith("__index_level_")])
+    rows = zip(*(column.to_pylist() for column in table.columns), strict=True)
+    lines = ["\t".join(_cell(value, ".") for value in row) for row in (table.column_names, *rows)]
+    return "\n".join(lines).encode("utf-8", "replace")

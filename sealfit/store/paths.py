@@ -15,6 +15,17 @@ from sealfit.store.manifest import STATE, ConfigCopy, fingerprint
 # The folders and files that a command line names: found, or refused with the likeliest one that is there.
 
 RUNS = "runs.csv"
+RUNS_TABLES = (RUNS, "runs.xlsx", "runs.parquet")
+
+
+def possible_tables(config: Config) -> tuple[str, ...]:
+    """Return where the table of runs may stand in a campaign folder: where the config says, or under a usual name."""
+    return RUNS_TABLES if config.files.runs_table is None else (config.files.runs_table,)
+
+
+def runs_tables(folder: Path, config: Config) -> list[str]:
+    """Return those of `possible_tables` that a campaign folder holds."""
+    return [name for name in possible_tables(config) if (folder / name).exists() or (folder / name).is_symlink()]
 
 
 def campaign_folder(path: Path, config: Config) -> Path:
@@ -23,14 +34,18 @@ def campaign_folder(path: Path, config: Config) -> Path:
     Raises
     ------
     CampaignError
-        If there is no such folder, or no runs.csv in it where the config needs one; the fix names the likeliest.
+        If there is no such folder, or no table of runs in it where the config needs one; the fix names the likeliest.
     """
     if path.is_file():
-        fix = f"Give its folder: {_quoted(path.parent)}" if path.name == RUNS else f"Give the folder that holds {RUNS}."
+        fix = (
+            f"Give its folder: {_quoted(path.parent)}"
+            if path.name in RUNS_TABLES
+            else f"Give the folder that holds {RUNS}."
+        )
         raise CampaignError([Fault("campaign_folder", f"{path} is a file, not a campaign folder.", fix=fix)])
     if not path.is_dir():
         raise CampaignError([Fault("campaign_folder", f"there is no folder {path}.", fix=_did_you_mean(path))])
-    if config.files.glob is None and not (path / RUNS).is_file():
+    if config.files.glob is None and config.files.runs_table is None and not runs_tables(path, config):
         below = sorted(child.parent for child in path.glob(f"*/{RUNS}"))
         fix = f"It lists the trace files; or set files.glob in a config (--config). Files here: {_some_files(path)}"
         if below:
