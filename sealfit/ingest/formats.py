@@ -236,6 +236,7 @@ def _chosen(
 
 def _tdms(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
     nptdms = library("nptdms", file)
+    nptdms.log.log_manager.set_level("ERROR")  # what it warns of is a fault below
     read = nptdms.TdmsFile.read_metadata if head else nptdms.TdmsFile.read
     tdms = read(io.BytesIO(raw))
     if tdms.file_status.incomplete_final_segment:
