@@ -128,10 +128,8 @@ def test_header_fields_come_from_rows_properties_scalars_and_metadata(tmp_path):
     about = {"specimen": "S 12", "load": "49.03"}
     pq.write_table(pa.Table.from_pandas(wanted).replace_schema_metadata(about), tmp_path / "t.parquet")
     for file in ("t.xlsx", "t.mat", "u.mat", "t.tdms", "t.parquet"):
-        text = (
-            "[trace]\nheader_fields = {specimen_id = '(?i)specimen\\t(.*)', load_N = '(?i)load( \\[N\\]\\t)?\\t(.*)'}"
-        )
-        text = text.replace("( \\[N\\]\\t)?\\t", "(?: \\[N\\]\\t)?\\t")
+        fields = "{specimen_id = '(?i)specimen\\t(.*)', load_N = '(?i)load(?: \\[N\\]\\t)?\\t(.*)'}"
+        text = f"[trace]\nheader_fields = {fields}"
         if file == "t.xlsx":
             text += "\nheader_ends_at = '^time_s'"
         assert read_header(tmp_path, file, config(text)) == {"specimen_id": "S 12", "load_N": 49.03}, file
