@@ -349,11 +349,11 @@ def richer_laws(
         return []
     rows = fitted.rows.sparse(ROWS)
     before = reestimated(fit(fitted.model, rows, fitted.scatter, turns=1))
-    found = [_judged(fitted, before, effect, len(laws)) for effect in laws]
+    found = [_law_test(fitted, before, effect, len(laws)) for effect in laws]
     return [f for f in found if f is not None]
 
 
-def _judged(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[Candidate, Proposal] | None:
+def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[Candidate, Proposal] | None:
     """Return one law's candidate and proposal."""
     term = Term(effect, effect.reads, *TARGET, fixed={})
     after = _best(before, term)
@@ -380,7 +380,7 @@ def _judged(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[
     column = project(fitted, (fitted.slope(*TARGET) * shape)[:, None])[:, 0]
     adjusted = float(min(1.0, (SEARCHES + 1) * laws * p_value))
     test = SmallSampleTest(TARGET, np.empty((0, q)), 0.0, gain, float(np.log(max(p_value, 1e-300))), 1.0, error)
-    test_result = ScoreTestResult(gain, q, units, test.log_p, few=test)
+    test_result = ScoreTestResult(gain, q, units, test.log_p, small_sample=test)
     candidate = Candidate((AGING,), *TARGET, "specimen", shape[:, None], test_result, adjusted)
     return candidate, Proposal(term, values, "specimen", units, gain, adjusted, column, candidate.key)
 

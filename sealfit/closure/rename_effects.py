@@ -142,8 +142,8 @@ class Renaming:
     ) -> Sequence[Proposal]:
         """Return what may stand in the place of a term on some channels, from the fit `without` it."""
         finest: dict[tuple, Candidate] = {}
-        judge = ScoreTests(without)
-        for c in (c for name in names for c in of_channel(judge, self.channels[name])):
+        score_tests = ScoreTests(without)
+        for c in (c for name in names for c in of_channel(score_tests, self.channels[name])):
             if c.key not in finest or c.test_result.df > finest[c.key].test_result.df:
                 finest[c.key] = replace(c, p_value=p_value)
         found = sorted(finest.values(), key=lambda c: -c.chi2)

@@ -70,9 +70,9 @@ class ScoreTestResult(NamedTuple):
     log_p: float  # of T by its F distribution, not adjusted
     log_p_jackknife: float = 0.0  # of the estimate against its jackknife over units; 0 where that was not tried
     scores: np.ndarray | None = None  # (units, k)
-    few: SmallSampleTest | None = None  # against the scatter of few specimens; None where that was not tried
+    small_sample: SmallSampleTest | None = None  # against the scatter of few specimens; None where that was not tried
     slopes: tuple[ContrastTest, ...] = ()  # against the slopes of few units, in every variant; empty where not tried
-    agree: bool = True  # whether two to four specimens show the same along strokes, where many runs are the units
+    consistent: bool = True  # whether two to four specimens show the same along strokes, where many runs are the units
 
 
 @dataclass(frozen=True)
@@ -94,15 +94,15 @@ class Candidate:
         return (self.channels, self.acts_on, self.operation)
 
     @property
-    def agrees(self) -> bool:
+    def consistent(self) -> bool:
         """Whether two to four specimens show the same of it."""
-        few = (test.agree[np.argmax(np.abs(test.slope))] for test in self.test_result.slopes)
-        return self.test_result.agree and all(few)
+        strongest = (test.consistent[np.argmax(np.abs(test.slope))] for test in self.test_result.slopes)
+        return self.test_result.consistent and all(strongest)
 
     @property
     def sure(self) -> bool:
         """Whether it may be claimed: too few specimens do not show their own scatter, or show that they differ."""
-        return self.agrees and (self.test_result.few is None or self.test_result.few.sure)
+        return self.consistent and (self.test_result.small_sample is None or self.test_result.small_sample.sure)
 
     @property
     def chi2(self) -> float:
@@ -142,7 +142,7 @@ class ScoreTests:
 
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
-        self.few = {level: ClusterTests(fitted, level) for level in LEVELS}
+        self.cluster_tests = {level: ClusterTests(fitted, level) for level in LEVELS}
         self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
@@ -191,24 +191,26 @@ class ScoreTests:
             (acts_on, operation) of the columns.
         """
         starts = self.fitted.rows.groups.starts
-        few = starts[between].size < JACKKNIFE_UNITS
+        few_units = starts[between].size < JACKKNIFE_UNITS
         found = []
         for left in variants:
-            test_result = self._judge(left, level if few else between, target)
+            test_result = self._score_test(left, level if few_units else between, target)
             if test_result is None:
                 return None
             found.append(test_result)
         weakest = max(found, key=lambda j: max(j.log_p, j.log_p_jackknife))
         weakest = weakest._replace(units=starts[level].size)
-        if not few:
-            return weakest._replace(agree=all(map(self._specimens_agree, variants)))
+        if not few_units:
+            return weakest._replace(consistent=all(map(self._specimens_agree, variants)))
         if level == "specimen":
-            test = self.few[level].test(variants[0], target)
-            return weakest if test is None else weakest._replace(chi2=test.chi2, df=test.basis.shape[1], few=test)
+            test = self.cluster_tests[level].test(variants[0], target)
+            return (
+                weakest if test is None else weakest._replace(chi2=test.chi2, df=test.basis.shape[1], small_sample=test)
+            )
         tests = tuple(contrast_test(self.fitted, left, between) for left in variants)
         if any(test is None for test in tests):
             return None
-        return weakest._replace(slopes=tests, few=self._of_few_runs(variants, between, level, target))
+        return weakest._replace(slopes=tests, small_sample=self._test_of_runs(variants, between, level, target))
 
     def _specimens_agree(self, left: np.ndarray) -> bool:
         """Return whether a few specimens show the same of what columns along strokes explain together."""
@@ -219,7 +221,7 @@ class ScoreTests:
         explained = explained[:, None]
         return not along_strokes(fitted, explained)[0] or bool(specimens_agree(fitted, explained)[0])
 
-    def _of_few_runs(
+    def _test_of_runs(
         self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]
     ) -> SmallSampleTest | None:
         """Return the F test, of all variants that which says least, of columns constant in each of a few runs.
@@ -228,12 +230,12 @@ class ScoreTests:
         """
         if not between == level == "run" or self.fitted.rows.groups.starts["run"].size >= MANY_RUNS:
             return None
-        tests = [self.few["run"].test(left, target) for left in variants]
+        tests = [self.cluster_tests["run"].test(left, target) for left in variants]
         if any(test is None or test.share <= CONSTANT_IN_RUNS for test in tests):
             return None
         return max(tests, key=lambda test: test.log_p)
 
-    def _judge(self, left: np.ndarray, level: str, target: tuple[str, str]) -> ScoreTestResult | None:
+    def _score_test(self, left: np.ndarray, level: str, target: tuple[str, str]) -> ScoreTestResult | None:
         fitted = self.fitted
         units = fitted.rows.groups.starts[level].size
         size = np.sqrt(_squares(left))
@@ -250,7 +252,7 @@ class ScoreTests:
         if units >= JACKKNIFE_UNITS:
             explained = _log(chdtrc(left.shape[1], total @ total))
             if level == "run" and explained < np.log(WORTH_THE_RUNS):
-                test = self.few["run"].test(left, target)
+                test = self.cluster_tests["run"].test(left, target)
                 if test is not None and test.share > CONSTANT_IN_RUNS:
                     explained = min(explained, test.log_p)
             if explained < np.log(PROMISING):
@@ -324,48 +326,54 @@ FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
 MOST_SIGNS = 1 << 22  # drawn at once: 34 MB
 
 
-def judged(judge: ScoreTests, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
+def adjusted_candidates(
+    score_tests: ScoreTests, candidates: Sequence[Candidate], rng: np.random.Generator
+) -> list[Candidate]:
     """Return candidates with p-values adjusted over all of them, strongest evidence first."""
-    judgements = [c.test_result for c in candidates]
+    results = [c.test_result for c in candidates]
     p_values = np.ones(len(candidates))
-    many = [k for k, j in enumerate(judgements) if j.few is None and not j.slopes]
+    many = [k for k, j in enumerate(results) if j.small_sample is None and not j.slopes]
     if many:
-        p_values[many] = adjust([judgements[k] for k in many], rng)
+        p_values[many] = adjust([results[k] for k in many], rng)
     for k in many:
-        if judgements[k].scores.shape[0] >= JACKKNIFE_UNITS:  # of two ways, each has half of the error
-            p_values[k] = 2 * min(p_values[k], len(many) * np.exp(judgements[k].log_p_jackknife))
-    few_p = np.min([adjust_few(units, judgements, rng) for units in judge.few.values()], axis=0)
-    p_values = np.minimum(p_values, np.minimum(few_p, adjust_slopes(judgements)))
-    p_values[[j.few is not None and bool(j.slopes) for j in judgements]] *= 2  # of two ways, each has half of the error
+        if results[k].scores.shape[0] >= JACKKNIFE_UNITS:  # of two ways, each has half of the error
+            p_values[k] = 2 * min(p_values[k], len(many) * np.exp(results[k].log_p_jackknife))
+    small_sample_p = np.min(
+        [adjust_small_sample(units, results, rng) for units in score_tests.cluster_tests.values()], axis=0
+    )
+    p_values = np.minimum(p_values, np.minimum(small_sample_p, adjust_slopes(results)))
+    p_values[[j.small_sample is not None and bool(j.slopes) for j in results]] *= (
+        2  # of two ways, each has half of the error
+    )
     found = [replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)]
     return sorted(found, key=lambda c: -c.evidence)
 
 
-def adjust(judgements: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:
+def adjust(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:
     """Return each p-value adjusted over all judgements, by the maximum over sign flips, shape (m,).
 
     Those of as many units are flipped with the same signs, so that what they share counts once.
     """
-    return _adjusted([j.log_p for j in judgements], _least(judgements, rng, flips))
+    return _adjusted([j.log_p for j in results], _least(results, rng, flips))
 
 
-def critical_many(judgements: Sequence[ScoreTestResult], level: float, rng: np.random.Generator) -> float:
+def critical_many(results: Sequence[ScoreTestResult], level: float, rng: np.random.Generator) -> float:
     """Return the log p-value, not adjusted, that the smallest of all judgements falls below by chance at a level."""
-    return float(np.quantile(_least(judgements, rng, FLIPS), level))
+    return float(np.quantile(_least(results, rng, FLIPS), level))
 
 
-def critical_few(fitted: Fitted, tests: Sequence[SmallSampleTest], level: float) -> float:
+def critical_small_sample(fitted: Fitted, tests: Sequence[SmallSampleTest], level: float) -> float:
     """Return the same for the tests on few units of one level."""
     units = ClusterTests(fitted, tests[0].level)
     for test in tests:
         units.numbers(test.target)
-    return float(np.quantile(_least_few(units, tests, np.random.default_rng(0), FLIPS), level))
+    return float(np.quantile(_least_small_sample(units, tests, np.random.default_rng(0), FLIPS), level))
 
 
-def _least(judgements: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int) -> np.ndarray:
+def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int) -> np.ndarray:
     """Return the smallest log p-value of all judgements under each of many random flips."""
     alike = defaultdict(lambda: defaultdict(list))
-    for test_result in judgements:
+    for test_result in results:
         units, df = test_result.scores.shape
         alike[units][df].append(test_result.scores)
     least = np.zeros(flips)
@@ -393,21 +401,21 @@ def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.nda
     )
 
 
-def adjust_few(
-    units: ClusterTests, judgements: Sequence[ScoreTestResult], rng: np.random.Generator, draws: int = FLIPS
+def adjust_small_sample(
+    units: ClusterTests, results: Sequence[ScoreTestResult], rng: np.random.Generator, draws: int = FLIPS
 ) -> np.ndarray:
     """Return the p-values of the tests on few units of a level, adjusted over all of them, shape (m,); 1 for none."""
-    p_values = np.ones(len(judgements))
-    tried = [k for k, j in enumerate(judgements) if j.few is not None and j.few.level == units.level]
+    p_values = np.ones(len(results))
+    tried = [k for k, j in enumerate(results) if j.small_sample is not None and j.small_sample.level == units.level]
     if tried:
-        tests = [judgements[k].few for k in tried]
+        tests = [results[k].small_sample for k in tried]
         logs = np.array([test.log_p for test in tests])
-        least = _least_few(units, tests, rng, draws)
+        least = _least_small_sample(units, tests, rng, draws)
         p_values[tried] = np.minimum(_adjusted(logs, least), len(tried) * np.exp(logs))  # below what draws resolve
     return p_values
 
 
-def _least_few(
+def _least_small_sample(
     units: ClusterTests, tests: Sequence[SmallSampleTest], rng: np.random.Generator, draws: int
 ) -> np.ndarray:
     """Return the smallest log p-value of all tests on few units of one level in each of many draws."""
@@ -415,17 +423,17 @@ def _least_few(
     return np.min([small_sample_test.log_p_of(drawn[test.target], test.basis, test.known) for test in tests], axis=0)
 
 
-def adjust_slopes(judgements: Sequence[ScoreTestResult]) -> np.ndarray:
+def adjust_slopes(results: Sequence[ScoreTestResult]) -> np.ndarray:
     """Return the p-values of the contrasts in few units, times the number of all contrasts, shape (m,); 1 for none.
 
     A candidate has that of its strongest contrast, by the variant of it that says least.
     """
-    p_values = np.ones(len(judgements))
-    tried = [k for k, j in enumerate(judgements) if j.slopes]
+    p_values = np.ones(len(results))
+    tried = [k for k, j in enumerate(results) if j.slopes]
     if tried:
-        logs = iter(slope_log_p([test for k in tried for test in judgements[k].slopes]))
-        least = [max(float(next(logs).min()) for _ in judgements[k].slopes) for k in tried]
-        count = sum(judgements[k].slopes[0].slope.size for k in tried)
+        logs = iter(slope_log_p([test for k in tried for test in results[k].slopes]))
+        least = [max(float(next(logs).min()) for _ in results[k].slopes) for k in tried]
+        count = sum(results[k].slopes[0].slope.size for k in tried)
         p_values[tried] = np.minimum(count * np.exp(least), 1.0)
     return p_values
 

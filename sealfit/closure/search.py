@@ -35,7 +35,7 @@ from sealfit.closure.criteria import (
     RARE,
     SEARCHES,
 )
-from sealfit.closure.score_test import Candidate, ScoreTests, judged
+from sealfit.closure.score_test import Candidate, ScoreTests, adjusted_candidates
 from sealfit.closure.small_sample_test import log_p_of
 from sealfit.effects.free import BENDS, evenly
 from sealfit.fit.joint.estimate import Fitted
@@ -60,50 +60,52 @@ MOST_NUMBERS = 1 << 22  # of columns on all rows that are projected at once: 34 
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 
 
-def search(judge: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
+def search(score_tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
     """Return every candidate with its adjusted p-value, strongest evidence first.
 
     Parameters
     ----------
-    judge : Judge
+    score_tests : ScoreTests
         Of the current model.
     channels : sequence of Channel
         Where to look.
     rng : Generator
         For the sign flips.
     """
-    candidates = [c for channel in channels for c in of_channel(judge, channel)]
-    return judged(judge, candidates, rng) if candidates else []
+    candidates = [c for channel in channels for c in of_channel(score_tests, channel)]
+    return adjusted_candidates(score_tests, candidates, rng) if candidates else []
 
 
-def of_channel(judge: ScoreTests, channel: Channel) -> Iterator[Candidate]:
+def of_channel(score_tests: ScoreTests, channel: Channel) -> Iterator[Candidate]:
     """Yield the candidates of one channel, not adjusted for any search."""
-    rows = judge.fitted.rows
+    rows = score_tests.fitted.rows
     if channel.name == "direction":
-        yield from _of_shapes(judge, channel, np.ones((rows.force.size, 1)), TARGETS)
+        yield from _of_shapes(score_tests, channel, np.ones((rows.force.size, 1)), TARGETS)
         return
-    few = channel.numeric and channel.unit == "specimen" and rows.groups.starts["specimen"].size < JACKKNIFE_UNITS
-    shapes = free_columns(channel, FEW_DF if few else FREE_DF)
+    few_specimens = (
+        channel.numeric and channel.unit == "specimen" and rows.groups.starts["specimen"].size < JACKKNIFE_UNITS
+    )
+    shapes = free_columns(channel, FEW_DF if few_specimens else FREE_DF)
     widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
-    yield from _of_shapes(judge, channel, shapes, TARGETS, widths)
-    if few:
+    yield from _of_shapes(score_tests, channel, shapes, TARGETS, widths)
+    if few_specimens:
         for kink in kinks(channel).T:
-            yield from _of_shapes(judge, channel, kink[:, None], MAIN_TARGETS)
+            yield from _of_shapes(score_tests, channel, kink[:, None], MAIN_TARGETS)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
     fine = channel.numeric and channel.name not in CALENDAR and units >= FINE_UNITS
     if fine and np.unique(channel.values).size > 2 * FINE_DF:
-        yield from _of_shapes(judge, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
+        yield from _of_shapes(score_tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
 
 
 def _of_shapes(
-    judge: ScoreTests,
+    score_tests: ScoreTests,
     channel: Channel,
     shapes: np.ndarray,
     targets: Sequence[tuple[str, str]],
     widths: Sequence[int] = (),
 ) -> Iterator[Candidate]:
     """Yield the candidates of a channel's columns, by the first so many of them, on every target that may take them."""
-    fitted, rows = judge.fitted, judge.fitted.rows
+    fitted, rows = score_tests.fitted, score_tests.fitted.rows
     if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
         return  # too few speeds to know the Stribeck curve: what depends on speed may be just that
     both_ways = rows.speed.min() < 0 < rows.speed.max()
@@ -120,7 +122,7 @@ def _of_shapes(
     variants: tuple[np.ndarray, ...] = ()
     for number, (acts_on, operation, own) in enumerate(places):
         if number % together == 0:
-            variants = judge.variants(np.column_stack(slopes[number : number + together]), channel.unit)
+            variants = score_tests.variants(np.column_stack(slopes[number : number + together]), channel.unit)
         first = number % together * own.shape[1]
         unit = channel.unit
         names = (channel.name,)
@@ -131,7 +133,9 @@ def _of_shapes(
         level = flip_level(unit, rows)
         between = level if channel.grouping else scatter_level([channel], rows)
         for width in dict.fromkeys(widths or (own.shape[1],)):
-            test_result = judge([v[:, first : first + width] for v in variants], between, level, (acts_on, operation))
+            test_result = score_tests(
+                [v[:, first : first + width] for v in variants], between, level, (acts_on, operation)
+            )
             if test_result is not None:
                 yield Candidate(names, acts_on, operation, level, own[:, :width], test_result)
 
@@ -167,13 +171,13 @@ ALONE = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; 
 
 
 def search_pairs(
-    judge: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
+    score_tests: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
 ) -> list[Candidate]:
     """Return candidates of two channels, adjusted over these and the single ones, strongest evidence first.
 
     Parameters
     ----------
-    judge : Judge
+    score_tests : ScoreTests
         Of the current model.
     channels : sequence of Channel
         Where to look.
@@ -182,15 +186,15 @@ def search_pairs(
     rng : Generator
         For the sign flips.
     """
-    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _of_pair(judge, *pair)]
+    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _of_pair(score_tests, *pair)]
     if not found:
         return []
-    pairs = [c for c in judged(judge, [*found, *singles], rng) if c.pair]
+    pairs = [c for c in adjusted_candidates(score_tests, [*found, *singles], rng) if c.pair]
     return [replace(c, p_value=min(1.0, RARE * c.p_value)) for c in pairs]
 
 
 def pairs_in_disguise(
-    judge: ScoreTests, significant: Sequence[Candidate], channels: Mapping[str, Channel]
+    score_tests: ScoreTests, significant: Sequence[Candidate], channels: Mapping[str, Channel]
 ) -> list[Candidate]:
     """Return the pairs that a channel's change of a or of v_s may stand for.
 
@@ -199,7 +203,7 @@ def pairs_in_disguise(
 
     Parameters
     ----------
-    judge : Judge
+    score_tests : ScoreTests
         Of the current model.
     significant : sequence of Candidate
         What the search has accepted on it.
@@ -212,7 +216,7 @@ def pairs_in_disguise(
         if single.pair or len(pair) != 2 or not pair <= channels.keys() or pair in best:
             continue
         members = _usable([channels[name] for name in sorted(pair)])
-        found = _of_pair(judge, *members) if len(members) == 2 else []
+        found = _of_pair(score_tests, *members) if len(members) == 2 else []
         strongest = [max(own, key=lambda c: c.chi2) for t in MAIN_TARGETS if (own := [c for c in found if _on(c, t)])]
         best[pair] = [
             replace(c, test_result=c.test_result._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value)
@@ -233,11 +237,11 @@ def _usable(channels: Sequence[Channel]) -> list[Channel]:
     ]
 
 
-def _of_pair(judge: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
+def _of_pair(score_tests: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
     blocks = mixed_columns(one, other)
     if not blocks:
         return []
-    fitted, finer = judge.fitted, min(one.unit, other.unit, key=FINER.get)
+    fitted, finer = score_tests.fitted, min(one.unit, other.unit, key=FINER.get)
     between = scatter_level((one, other), fitted.rows)
     level = flip_level(finer, fitted.rows)
     shapes = np.column_stack(blocks)
@@ -246,9 +250,9 @@ def _of_pair(judge: ScoreTests, one: Channel, other: Channel) -> list[Candidate]
     for target in MAIN_TARGETS:
         if "load_N" in (one.name, other.name) and target[0] == "force":
             continue
-        variants = judge.variants(shapes * fitted.slope(*target)[:, None], finer)
+        variants = score_tests.variants(shapes * fitted.slope(*target)[:, None], finer)
         for block, first, last in zip(blocks, ends[:-1], ends[1:], strict=True):
-            test_result = judge([v[:, first:last] for v in variants], between, level, target)
+            test_result = score_tests([v[:, first:last] for v in variants], between, level, target)
             if test_result is not None:
                 names = (one.name, other.name)
                 found.append(Candidate(names, *target, level, block, test_result, pair=True))
@@ -324,13 +328,13 @@ class MaskedPair(NamedTuple):
 
 
 def search_masked_pairs(
-    judge: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate], alpha: float
+    score_tests: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate], alpha: float
 ) -> list[MaskedPair]:
     """Return the pairs that are significant jointly, most significant first.
 
     Parameters
     ----------
-    judge : Judge
+    score_tests : ScoreTests
         Of the current model.
     channels : mapping
         Channels by name.
@@ -339,7 +343,7 @@ def search_masked_pairs(
     alpha : float
         Level of the search, and of each of the two given the other.
     """
-    tested = [(two, _tested(judge, two, level)) for two, level in _pairs(judge, channels, candidates)]
+    tested = [(two, _tested(score_tests, two, level)) for two, level in _pairs(score_tests, channels, candidates)]
     tested = [(two, test) for two, test in tested if test is not None]
     found = [
         MaskedPair(min(1.0, SEARCHES * len(tested) * float(np.exp(joint))), chi2, tuple(c.key for c in two))
@@ -350,10 +354,10 @@ def search_masked_pairs(
 
 
 def _pairs(
-    judge: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate]
+    score_tests: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate]
 ) -> Iterator[tuple[tuple[Candidate, Candidate], str]]:
     """Yield the pairs to be tested and the level of their units."""
-    rows = judge.fitted.rows
+    rows = score_tests.fitted.rows
     straight = [c for c in candidates if c.columns.shape[1] == 1 and c.sure]
     between = {c.channels: [channels[n] for n in c.channels if n != "direction"] for c in straight}
     level = {id(c): scatter_level(between[c.channels] or [channels["direction"]], rows) for c in straight}
@@ -362,8 +366,8 @@ def _pairs(
     products = [c for c in straight if c.pair]
     for one, other in (*itertools.combinations(lines, 2), *itertools.product(lines, products)):
         shared = level[id(one)] == level[id(other)]
-        few = LEAST_UNITS_OF_SLOPES <= rows.groups.starts[level[id(one)]].size < JACKKNIFE_UNITS
-        if shared and few and _together(one, other, channels):
+        few_units = LEAST_UNITS_OF_SLOPES <= rows.groups.starts[level[id(one)]].size < JACKKNIFE_UNITS
+        if shared and few_units and _together(one, other, channels):
             yield (one, other), level[id(one)]
 
 
@@ -382,18 +386,18 @@ def _targets(candidate: Candidate) -> Sequence[tuple[str, str]]:
     return OF_DIRECTION if candidate.channels == ("direction",) else MAIN_TARGETS
 
 
-def _tested(judge: ScoreTests, two: tuple[Candidate, Candidate], level: str) -> tuple[float, float, float] | None:
+def _tested(score_tests: ScoreTests, two: tuple[Candidate, Candidate], level: str) -> tuple[float, float, float] | None:
     """Return log p of two candidates jointly, the larger of each given the other, and what they explain; else None.
 
     None is where they are no pair. Of all variants in which they must hold, what says least.
     """
-    fitted = judge.fitted
+    fitted = score_tests.fitted
     columns = np.column_stack([c.columns * fitted.slope(c.acts_on, c.operation)[:, None] for c in two])
     unit = min((c.unit for c in two), key=lambda name: fitted.rows.groups.starts[name].size)
     white = fitted.whitening(columns)
-    numbers = judge.few[level].along(_larger(white, fitted.rows.groups, level))
+    numbers = score_tests.cluster_tests[level].along(_larger(white, fitted.rows.groups, level))
     found = []
-    for left in judge.variants(columns, unit):
+    for left in score_tests.variants(columns, unit):
         own = fitted.rows.groups.sums(numbers.direction[:, None] * left, level)
         if ((own**2).sum(axis=0) <= CONSTANT_IN_RUNS * (left**2).sum(axis=0)).any() or not left.any(axis=0).all():
             return None

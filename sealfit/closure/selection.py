@@ -115,7 +115,7 @@ class _Growth:
         ripples = Ripples(samples, context)
         self.before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
         self.channels = {c.name: c for c in channels_of(rows, self.context.config)}
-        self.judge = ScoreTests(self.before)
+        self.score_tests = ScoreTests(self.before)
         self.last = self.first = self.searched()
         self.fitted = ripples.added_to(self.before, fine)
         self.added = list(ripples.added)
@@ -134,7 +134,7 @@ class _Growth:
 
     def searched(self) -> tuple[Candidate, ...]:
         """Return every candidate of a single channel on the present model."""
-        return tuple(search(self.judge, list(self.channels.values()), self.rng))
+        return tuple(search(self.score_tests, list(self.channels.values()), self.rng))
 
     def ask(
         self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
@@ -144,8 +144,8 @@ class _Growth:
 
     def has_ended(self, number: int) -> bool:
         """Search, name and confirm once; return whether nothing is left to be done."""
-        if self.fitted is not self.judge.fitted:
-            self.judge, self.shown = ScoreTests(self.fitted), None
+        if self.fitted is not self.score_tests.fitted:
+            self.score_tests, self.shown = ScoreTests(self.fitted), None
             self.last = self.searched()
         if self.shown is None:  # else the last round refused what it was shown, and the model is as it was
             self.shown = self.look(number)
@@ -167,7 +167,7 @@ class _Growth:
 
     def look(self, number: int) -> _Shown:
         """Return what the present model lacks."""
-        shown = _shown(self.judge, self.last, self.channels, self.context.effects, self.alpha, self.rng)
+        shown = _shown(self.score_tests, self.last, self.channels, self.context.effects, self.alpha, self.rng)
         tried = f"{len(self.last)} candidates on {len(self.channels)} channels, {len(shown.pairs)} on pairs of them"
         self.context.say(
             f"round {number}: {tried}; {len(shown.significant)} significant, {len(shown.hidden)} hide each other"
@@ -198,7 +198,7 @@ class _Growth:
         significant = _awaited(self.hidden, (*shown.claimable, *shown.pairs)) or list(shown.significant)
         significant += [c for c, _ in shown.laws if c.p_value <= self.alpha and c.sure]
         self.left = significant[0] if significant else self.ripple
-        significant += pairs_in_disguise(self.judge, significant, self.channels)
+        significant += pairs_in_disguise(self.score_tests, significant, self.channels)
         return [c for c in significant if c.key not in self.refused]
 
     def renames(self) -> bool:
@@ -247,7 +247,7 @@ class _Growth:
 
 
 def _shown(
-    judge: ScoreTests,
+    score_tests: ScoreTests,
     last: Sequence[Candidate],
     channels: Mapping[str, Channel],
     effects: Mapping[str, Effect],
@@ -259,14 +259,14 @@ def _shown(
     claimable = _claimable(last, doubted)
     significant = [c for c in claimable if c.p_value <= alpha]
     aged = not significant or any(c.channels == (AGING,) for c in significant)
-    laws = richer_laws(judge.fitted, channels, effects) if aged else []
+    laws = richer_laws(score_tests.fitted, channels, effects) if aged else []
     if significant and significant[0].p_value <= DOUBTFUL:
         return _Shown(claimable, laws, [], significant, [])
-    pairs = _claimable(search_pairs(judge, list(channels.values()), last, rng), doubted)
+    pairs = _claimable(search_pairs(score_tests, list(channels.values()), last, rng), doubted)
     level = alpha * min((c.p_value for c in significant), default=1.0)
     significant = sorted([*significant, *(c for c in pairs if c.p_value <= level)], key=lambda c: c.p_value)
     level = alpha * min((c.p_value for c in significant), default=1.0)
-    hidden = search_masked_pairs(judge, channels, [*claimable, *pairs], level)
+    hidden = search_masked_pairs(score_tests, channels, [*claimable, *pairs], level)
     return _Shown(claimable, laws, pairs, significant, hidden)
 
 
@@ -301,7 +301,7 @@ def _doubted(candidates: Sequence[Candidate], alpha: float) -> set[str]:
     for c in candidates:  # strongest evidence first
         if c.p_value <= alpha and (c.acts_on, c.operation) in MAIN_TARGETS:
             strongest.setdefault(c.channels[-1], c)
-    return {name for name, c in strongest.items() if not c.agrees} - {"direction"}
+    return {name for name, c in strongest.items() if not c.consistent} - {"direction"}
 
 
 def _claimable(candidates: Sequence[Candidate], doubted: set[str]) -> list[Candidate]:

@@ -33,10 +33,10 @@ from sealfit.closure.criteria import (
     SEARCHES,
     WEAK,
 )
-from sealfit.closure.score_test import Candidate, ScoreTests, critical_few, critical_many, project
+from sealfit.closure.score_test import Candidate, ScoreTests, critical_many, critical_small_sample, project
 from sealfit.closure.selection import Selection
 from sealfit.closure.small_sample_test import (
-    WAYS,
+    N_VARIANCES,
     ClusterTests,
     ContrastTest,
     SmallSampleTest,
@@ -177,11 +177,11 @@ class _Search:
     def __init__(self, grown: Selection, alpha: float) -> None:
         self.fitted, self.channels, self.candidates = grown.after, grown.channels, grown.last
         self.level, self.units = alpha / SEARCHES, {}
-        judgements = [c.test_result for c in grown.last]
-        slopes = [j.slopes for j in judgements if j.slopes]
-        few = [test for c in grown.last if (test := self._few_again(c)) is not None]
-        many = [j for j in judgements if j.few is None and not j.slopes]
-        self.contrasts = WAYS * sum(own[0].slope.size for own in slopes)
+        results = [c.test_result for c in grown.last]
+        slopes = [j.slopes for j in results if j.slopes]
+        small_sample = [test for c in grown.last if (test := self._small_sample_again(c)) is not None]
+        many = [j for j in results if j.small_sample is None and not j.slopes]
+        self.contrasts = N_VARIANCES * sum(own[0].slope.size for own in slopes)
         tests = [test for own in slopes for test in own]
         self.moderated = {id(t): m for t, m in zip(tests, moderated(tests), strict=True)}
         lines = [c for c in grown.last if c.test_result.slopes and not c.pair and (c.acts_on, c.operation) == FRICTION]
@@ -189,14 +189,18 @@ class _Search:
         self.lines = self.lines * grown.after.slope(*FRICTION)[:, None]
         self.many = len(many)
         self.critical_many = critical_many(many, self.level / 2, np.random.default_rng(0)) if many else 0.0
-        self.critical_few = {}
-        for name in {test.level for test in few}:
-            level = self.level / (1 if name == SPECIMENS else WAYS)  # runs are tested in two ways, by slopes as well
-            self.critical_few[name] = critical_few(self.fitted, [t for t in few if t.level == name], level)
+        self.critical_small_sample = {}
+        for name in {test.level for test in small_sample}:
+            level = self.level / (
+                1 if name == SPECIMENS else N_VARIANCES
+            )  # runs are tested in two ways, by slopes as well
+            self.critical_small_sample[name] = critical_small_sample(
+                self.fitted, [t for t in small_sample if t.level == name], level
+            )
 
-    def _few_again(self, candidate: Candidate) -> SmallSampleTest | None:
+    def _small_sample_again(self, candidate: Candidate) -> SmallSampleTest | None:
         """Return a candidate's test on few units at the last model, which may hold fewer effects than were searched."""
-        known, target = candidate.test_result.few, (candidate.acts_on, candidate.operation)
+        known, target = candidate.test_result.small_sample, (candidate.acts_on, candidate.operation)
         if known is None:
             return None
         if known.level not in self.units:
@@ -232,14 +236,14 @@ class _Search:
 
     def margin(self, candidate: Candidate, effect: np.ndarray, fitted: Fitted) -> float:
         """Return how many times as long as needed an effect is."""
-        judge = ScoreTests(fitted)
+        score_tests = ScoreTests(fitted)
         white = fitted.basis.freed(fitted.whitening(np.column_stack([self.fitted.residual, effect])))
         noise, effect = (replace(fitted, white_residual=column) for column in white.T)
         for one in (noise, effect):
             one.__dict__["basis"] = fitted.basis
         channel = self.channels[candidate.channels[-1]]
         columns = candidate.columns * noise.slope(candidate.acts_on, candidate.operation)[:, None]
-        variants = judge.variants(columns, channel.unit)
+        variants = score_tests.variants(columns, channel.unit)
         if all(enough_specimens(noise, left).all() for left in variants):
             return self._by_units(candidate, noise, effect, variants)
         large = min(float(least_share(effect, left).max()) for left in variants) / LARGE
@@ -248,14 +252,18 @@ class _Search:
     def _by_units(self, candidate: Candidate, noise: Fitted, effect: Fitted, variants: Sequence[np.ndarray]) -> float:
         """Return the margin by the units' own scatter."""
         channel, test_result = self.channels[candidate.channels[-1]], candidate.test_result
-        few = test_result.few
-        by_few = 0.0 if few is None else min(self._by_few(noise, effect, left, few) for left in variants)
+        small_sample = test_result.small_sample
+        by_small_sample = (
+            0.0
+            if small_sample is None
+            else min(self._by_small_sample(noise, effect, left, small_sample) for left in variants)
+        )
         if test_result.slopes:
-            tail = self.level / self.contrasts / (1 if few is None else WAYS)
+            tail = self.level / self.contrasts / (1 if small_sample is None else N_VARIANCES)
             pairs = zip(variants, test_result.slopes, strict=True)
-            return max(by_few, min(self._by_slopes(noise, effect, left, test, tail) for left, test in pairs))
-        if few is not None:
-            return by_few
+            return max(by_small_sample, min(self._by_slopes(noise, effect, left, test, tail) for left, test in pairs))
+        if small_sample is not None:
+            return by_small_sample
         level = candidate.unit if channel.grouping else scatter_level([channel], noise.rows)
         return min(self._by_many(noise, effect, left, level, candidate) for left in variants)
 
@@ -282,11 +290,11 @@ class _Search:
         ]
         return float(np.nanmax(margins))
 
-    def _by_few(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: SmallSampleTest) -> float:
-        if known.level not in self.critical_few:
+    def _by_small_sample(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: SmallSampleTest) -> float:
+        if known.level not in self.critical_small_sample:
             return 0.0
         units = (ClusterTests(one, known.level) for one in (noise, effect))
-        return _by_numbers(*units, left, known.target, np.exp(self.critical_few[known.level]))
+        return _by_numbers(*units, left, known.target, np.exp(self.critical_small_sample[known.level]))
 
     def _by_many(self, noise: Fitted, effect: Fitted, left: np.ndarray, level: str, candidate: Candidate) -> float:
         basis = orthonormal(left)
@@ -379,8 +387,8 @@ def cannot_tell(grown: Selection, entries: Sequence[dict], scatter: Sequence[dic
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
         own = [s for s in scatter if channel.unit != "sample" and starts[s["level"]].size == starts[channel.unit].size]
         much = any(s["sd_rel"] > MATERIAL and s["sd_N"] < smallest for s in own)
-        few = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS_OF_SLOPES
-        decisive = channel.unit == "sample" or channel.name == "direction" or few
+        few_specimens = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS_OF_SLOPES
+        decisive = channel.unit == "sample" or channel.name == "direction" or few_specimens
         if much or (decisive and not np.isfinite(smallest)):
             open_.append(channel.name)
     return open_

@@ -51,7 +51,7 @@ from sealfit.fit.joint.whitening import Whitening
 MOST_DF = 1e4
 """Degrees of freedom of a prior that the contrasts' variances do not contradict: as good as known."""
 
-WAYS = 2
+N_VARIANCES = 2
 """Variances that a contrast is held against: moderated, and its own. Each has half of the error."""
 
 
@@ -64,7 +64,7 @@ class ContrastTest(NamedTuple):
     df: np.ndarray  # (m,) Satterthwaite degrees of freedom of the variance
     along: np.ndarray  # (m,) whether the contrast lies inside strokes
     deviations: np.ndarray  # (units, m) of the scores
-    agree: np.ndarray  # (m,) whether the few specimens in which the units lie have the same slope
+    consistent: np.ndarray  # (m,) whether the few specimens in which the units lie have the same slope
 
 
 class Prior(NamedTuple):
@@ -189,7 +189,7 @@ def slope_log_p(tests: Sequence[ContrastTest]) -> list[np.ndarray]:
     found = []
     for test, (variance, df) in zip(tests, moderated(tests), strict=True):
         logs = [log_p_of_t(test.slope / np.sqrt(v), d) for v, d in ((variance, df), (test.variance, test.df))]
-        found.append(np.minimum(np.log(WAYS) + np.minimum(*logs), 0.0))
+        found.append(np.minimum(np.log(N_VARIANCES) + np.minimum(*logs), 0.0))
     return found
 
 
