@@ -19,7 +19,7 @@ from sealfit.closure.criteria import RIVAL, TIED
 from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.naming import propose
 from sealfit.closure.score_test import Candidate, ScoreTests
-from sealfit.closure.search import of_channel, search_pairs
+from sealfit.closure.search import channel_candidates, search_pairs
 from sealfit.fit.joint.estimate import Fitted, fit
 
 ALONG_STROKES = ("time_s", "distance_mm", "displacement_mm")
@@ -143,7 +143,7 @@ class Renaming:
         """Return what may stand in the place of a term on some channels, from the fit `without` it."""
         finest: dict[tuple, Candidate] = {}
         score_tests = ScoreTests(without)
-        for c in (c for name in names for c in of_channel(score_tests, self.channels[name])):
+        for c in (c for name in names for c in channel_candidates(score_tests, self.channels[name])):
             if c.key not in finest or c.test_result.df > finest[c.key].test_result.df:
                 finest[c.key] = replace(c, p_value=p_value)
         found = sorted(finest.values(), key=lambda c: -c.chi2)

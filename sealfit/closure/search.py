@@ -72,32 +72,32 @@ def search(score_tests: ScoreTests, channels: Sequence[Channel], rng: np.random.
     rng : Generator
         For the sign flips.
     """
-    candidates = [c for channel in channels for c in of_channel(score_tests, channel)]
+    candidates = [c for channel in channels for c in channel_candidates(score_tests, channel)]
     return adjusted_candidates(score_tests, candidates, rng) if candidates else []
 
 
-def of_channel(score_tests: ScoreTests, channel: Channel) -> Iterator[Candidate]:
+def channel_candidates(score_tests: ScoreTests, channel: Channel) -> Iterator[Candidate]:
     """Yield the candidates of one channel, not adjusted for any search."""
     rows = score_tests.fitted.rows
     if channel.name == "direction":
-        yield from _of_shapes(score_tests, channel, np.ones((rows.force.size, 1)), TARGETS)
+        yield from _shape_candidates(score_tests, channel, np.ones((rows.force.size, 1)), TARGETS)
         return
     few_specimens = (
         channel.numeric and channel.unit == "specimen" and rows.groups.starts["specimen"].size < JACKKNIFE_UNITS
     )
     shapes = free_columns(channel, FEW_DF if few_specimens else FREE_DF)
     widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
-    yield from _of_shapes(score_tests, channel, shapes, TARGETS, widths)
+    yield from _shape_candidates(score_tests, channel, shapes, TARGETS, widths)
     if few_specimens:
         for kink in kinks(channel).T:
-            yield from _of_shapes(score_tests, channel, kink[:, None], MAIN_TARGETS)
+            yield from _shape_candidates(score_tests, channel, kink[:, None], MAIN_TARGETS)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
     fine = channel.numeric and channel.name not in CALENDAR and units >= FINE_UNITS
     if fine and np.unique(channel.values).size > 2 * FINE_DF:
-        yield from _of_shapes(score_tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
+        yield from _shape_candidates(score_tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
 
 
-def _of_shapes(
+def _shape_candidates(
     score_tests: ScoreTests,
     channel: Channel,
     shapes: np.ndarray,
@@ -166,8 +166,8 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool) ->
 # Looked at where no single channel orders the residual. The columns of a pair are mixed terms alone: what either
 # channel does by itself was tested before and is none of the pair's.
 
-BEHIND = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along it each acts
-ALONE = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; the calendar drifts by itself
+VARIABLE_OF = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along it each acts
+NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; the calendar drifts by itself
 
 
 def search_pairs(
@@ -186,14 +186,14 @@ def search_pairs(
     rng : Generator
         For the sign flips.
     """
-    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _of_pair(score_tests, *pair)]
+    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _pair_candidates(score_tests, *pair)]
     if not found:
         return []
     pairs = [c for c in adjusted_candidates(score_tests, [*found, *singles], rng) if c.pair]
     return [replace(c, p_value=min(1.0, RARE * c.p_value)) for c in pairs]
 
 
-def pairs_in_disguise(
+def equivalent_pairs(
     score_tests: ScoreTests, significant: Sequence[Candidate], channels: Mapping[str, Channel]
 ) -> list[Candidate]:
     """Return the pairs that a channel's change of a or of v_s may stand for.
@@ -212,11 +212,11 @@ def pairs_in_disguise(
     """
     best: dict[frozenset, list[Candidate]] = {}
     for single in significant:
-        pair = frozenset((*single.channels, BEHIND.get(single.acts_on)))
+        pair = frozenset((*single.channels, VARIABLE_OF.get(single.acts_on)))
         if single.pair or len(pair) != 2 or not pair <= channels.keys() or pair in best:
             continue
         members = _usable([channels[name] for name in sorted(pair)])
-        found = _of_pair(score_tests, *members) if len(members) == 2 else []
+        found = _pair_candidates(score_tests, *members) if len(members) == 2 else []
         strongest = [max(own, key=lambda c: c.chi2) for t in MAIN_TARGETS if (own := [c for c in found if _on(c, t)])]
         best[pair] = [
             replace(c, test_result=c.test_result._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value)
@@ -233,11 +233,11 @@ def _usable(channels: Sequence[Channel]) -> list[Channel]:
     return [
         c
         for c in channels
-        if not (c.grouping or c.name in ALONE) and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
+        if not (c.grouping or c.name in NOT_IN_PAIRS) and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
     ]
 
 
-def _of_pair(score_tests: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
+def _pair_candidates(score_tests: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
     blocks = mixed_columns(one, other)
     if not blocks:
         return []
@@ -312,7 +312,7 @@ def _centred(values: np.ndarray) -> np.ndarray:
 # adjusted for the number of pairs (Bonferroni). A pair counts where each of the two is significant given the other.
 
 OF_DIRECTION = (("force", "add"), ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
-SEPARATE = 1e-3  # singular value of two columns of length 1 below which they are one
+LEAST_SINGULAR = 1e-3  # singular value of two columns of length 1 below which they are one
 
 
 class MaskedPair(NamedTuple):
@@ -343,7 +343,7 @@ def search_masked_pairs(
     alpha : float
         Level of the search, and of each of the two given the other.
     """
-    tested = [(two, _tested(score_tests, two, level)) for two, level in _pairs(score_tests, channels, candidates)]
+    tested = [(two, _joint_test(score_tests, two, level)) for two, level in _pairs(score_tests, channels, candidates)]
     tested = [(two, test) for two, test in tested if test is not None]
     found = [
         MaskedPair(min(1.0, SEARCHES * len(tested) * float(np.exp(joint))), chi2, tuple(c.key for c in two))
@@ -367,11 +367,11 @@ def _pairs(
     for one, other in (*itertools.combinations(lines, 2), *itertools.product(lines, products)):
         shared = level[id(one)] == level[id(other)]
         few_units = LEAST_UNITS_OF_SLOPES <= rows.groups.starts[level[id(one)]].size < JACKKNIFE_UNITS
-        if shared and few_units and _together(one, other, channels):
+        if shared and few_units and _is_simple_pair(one, other, channels):
             yield (one, other), level[id(one)]
 
 
-def _together(line: Candidate, other: Candidate, channels: Mapping[str, Channel]) -> bool:
+def _is_simple_pair(line: Candidate, other: Candidate, channels: Mapping[str, Channel]) -> bool:
     """Whether a line and another, or a product, are one of the simple pairs."""
     name = line.channels[-1]
     if not other.pair:
@@ -386,7 +386,9 @@ def _targets(candidate: Candidate) -> Sequence[tuple[str, str]]:
     return OF_DIRECTION if candidate.channels == ("direction",) else MAIN_TARGETS
 
 
-def _tested(score_tests: ScoreTests, two: tuple[Candidate, Candidate], level: str) -> tuple[float, float, float] | None:
+def _joint_test(
+    score_tests: ScoreTests, two: tuple[Candidate, Candidate], level: str
+) -> tuple[float, float, float] | None:
     """Return log p of two candidates jointly, the larger of each given the other, and what they explain; else None.
 
     None is where they are no pair. Of all variants in which they must hold, what says least.
@@ -395,7 +397,7 @@ def _tested(score_tests: ScoreTests, two: tuple[Candidate, Candidate], level: st
     columns = np.column_stack([c.columns * fitted.slope(c.acts_on, c.operation)[:, None] for c in two])
     unit = min((c.unit for c in two), key=lambda name: fitted.rows.groups.starts[name].size)
     white = fitted.whitening(columns)
-    numbers = score_tests.cluster_tests[level].along(_larger(white, fitted.rows.groups, level))
+    numbers = score_tests.cluster_tests[level].along(_larger_column(white, fitted.rows.groups, level))
     found = []
     for left in score_tests.variants(columns, unit):
         own = fitted.rows.groups.sums(numbers.direction[:, None] * left, level)
@@ -403,24 +405,24 @@ def _tested(score_tests: ScoreTests, two: tuple[Candidate, Candidate], level: st
             return None
         made = numbers.root @ own
         made = made / np.sqrt((made**2).sum(axis=0))
-        basis = orthonormal(made, SEPARATE)
+        basis = orthonormal(made, LEAST_SINGULAR)
         if basis.shape[1] < 2 or numbers.df - 2 < LEAST_ERROR_DF_OF_RUNS:
             return None
         joint = log_p_of(numbers.values[None, :], basis, 0.0, numbers.df)[0]
-        given = max(_given(numbers.values, *made.T[order], numbers.df) for order in ([0, 1], [1, 0]))
-        found.append((joint, given, -float(((orthonormal(left, SEPARATE).T @ fitted.white_residual) ** 2).sum())))
+        given = max(_conditional_log_p(numbers.values, *made.T[order], numbers.df) for order in ([0, 1], [1, 0]))
+        found.append((joint, given, -float(((orthonormal(left, LEAST_SINGULAR).T @ fitted.white_residual) ** 2).sum())))
     joint, given, chi2 = np.max(found, axis=0).tolist()
     return joint, given, -chi2
 
 
-def _given(values: np.ndarray, one: np.ndarray, other: np.ndarray, df: int) -> float:
+def _conditional_log_p(values: np.ndarray, one: np.ndarray, other: np.ndarray, df: int) -> float:
     """Return log p of one column of independent numbers given another, all of shape (d,), the columns of length 1."""
     rest = one - (one @ other) * other
     left = values - (values @ other) * other
     return float(log_p_of(left[None, :], rest[:, None] / np.linalg.norm(rest), 0.0, df - 1)[0])
 
 
-def _larger(white: np.ndarray, groups, level: str) -> np.ndarray:
+def _larger_column(white: np.ndarray, groups, level: str) -> np.ndarray:
     """Return in each unit the larger of two columns, shape (n,): the direction along which both may move it."""
     size = groups.sums(white**2, level)
     return white[np.arange(len(white)), size.argmax(axis=1)[groups.codes[level]]]

@@ -22,7 +22,7 @@ from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import (
     MAIN_TARGETS,
     MaskedPair,
-    pairs_in_disguise,
+    equivalent_pairs,
     search,
     search_masked_pairs,
     search_pairs,
@@ -198,7 +198,7 @@ class _Growth:
         significant = _awaited(self.hidden, (*shown.claimable, *shown.pairs)) or list(shown.significant)
         significant += [c for c, _ in shown.laws if c.p_value <= self.alpha and c.sure]
         self.left = significant[0] if significant else self.ripple
-        significant += pairs_in_disguise(self.score_tests, significant, self.channels)
+        significant += equivalent_pairs(self.score_tests, significant, self.channels)
         return [c for c in significant if c.key not in self.refused]
 
     def renames(self) -> bool:
