@@ -16,7 +16,7 @@ from sealfit.closure.forms import describe
 from sealfit.closure.heldout import covered, folds, heldout_level
 from sealfit.closure.output import channel_table, curve_table, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
-from sealfit.closure.selection import Selection, Start, grow, numbered, predict_rows, steady_samples
+from sealfit.closure.selection import Selection, Start, numbered, predict_rows, select_effects, steady_samples
 from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -83,29 +83,34 @@ def close_loop(
         fine = part.rows if part.coarse is not part.rows else None
         with timed("search", rows=part.coarse.force.size, of="bins, merged"):
             begin = None if part.whole else start
-            grown = grow(part.coarse, heldout.samples, context, fine=fine, start=begin)
+            selection = select_effects(part.coarse, heldout.samples, context, fine=fine, start=begin)
         if not part.whole:
-            grown, on_all_strokes = reselect_on_all(grown, part.every, heldout.samples, config, say)
+            selection, on_all_strokes = reselect_on_all(selection, part.every, heldout.samples, config, say)
         say("before and after on all rows")
         with timed("before and after", rows=rows.force.size, of="bins"):
-            before, after = _on_all(rows, grown)
-        if not part.whole and (more := missed_by_subsample(on_all_strokes, grown, config)):
+            before, after = _on_all(rows, selection)
+        if not part.whole and (more := missed_by_subsample(on_all_strokes, selection, config)):
             say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
             continue
         say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
         with timed("held out", rows=len(heldout.masks), of="folds"):
-            held_before, held_after, found = heldout.forces(grown, say)
-            if found is not None and not _found_again(grown, found):
-                grown, after, held_after = _all_refused(grown, say), before, held_before
-            ends = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
-            grown, ends = _no_worse(grown, ends, heldout, say)
+            held_before, held_after, found = heldout.forces(selection, say)
+            if found is not None and not _found_again(selection, found):
+                selection, after, held_after = _all_refused(selection, say), before, held_before
+            before_after = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
+            selection, before_after = _no_worse(selection, before_after, heldout, say)
         break
-    before, after, held_before, held_after = ends.before, ends.after, ends.held_before, ends.held_after
-    drawn = _drawn_tables(grown, before, after, config)
-    document = closure_document(grown, ends, heldout.level, config, effects)
+    before, after, held_before, held_after = (
+        before_after.before,
+        before_after.after,
+        before_after.held_before,
+        before_after.held_after,
+    )
+    drawn = _drawn_tables(selection, before, after, config)
+    document = closure_document(selection, before_after, heldout.level, config, effects)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their order again
     tables = {
-        "effects": effect_table([e for e in document["effects"] if not e["candidate"]], grown.added),
+        "effects": effect_table([e for e in document["effects"] if not e["candidate"]], selection.added),
         "residuals_before": _residual_table(bins, before, held_before),
         "residuals_after": _residual_table(bins, after, held_after),
         **drawn,
@@ -113,26 +118,26 @@ def close_loop(
     return Closure(document, to_record(before, after, config), tables, after)
 
 
-def _drawn_tables(grown: Selection, before: Fitted, after: Fitted, config: Config) -> dict[str, pd.DataFrame]:
+def _drawn_tables(selection: Selection, before: Fitted, after: Fitted, config: Config) -> dict[str, pd.DataFrame]:
     """Return the tables that need no held-out folds, which workers may be at meanwhile."""
-    levels = [level_table("before", before, list(grown.first)), level_table("after", after, list(grown.last))]
+    levels = [level_table("before", before, list(selection.first)), level_table("after", after, list(selection.last))]
     return {
         "levels": pd.concat(levels, ignore_index=True),
-        "channels": channel_table(grown, before, after),
+        "channels": channel_table(selection, before, after),
         "shapes": shape_table(after, config),
         "curves": curve_table(before, after),
     }
 
 
-def _on_all(rows: Rows, grown: Selection) -> tuple[Fitted, Fitted]:
+def _on_all(rows: Rows, selection: Selection) -> tuple[Fitted, Fitted]:
     """Return before and after, refitted to rows as they are, held ripples included; once where nothing was added."""
-    if grown.before.rows is rows:
-        return grown.before, grown.after
-    before = fit(grown.before.model, rows, grown.before.scatter, turns=2)
-    if not grown.added:
+    if selection.before.rows is rows:
+        return selection.before, selection.after
+    before = fit(selection.before.model, rows, selection.before.scatter, turns=2)
+    if not selection.added:
         return before, before
-    model = replace(grown.after.model, terms=tuple(a.proposal.term for a in grown.added))
-    return before, fit(model, rows, grown.after.scatter, turns=2)
+    model = replace(selection.after.model, terms=tuple(a.proposal.term for a in selection.added))
+    return before, fit(model, rows, selection.after.scatter, turns=2)
 
 
 class _HeldOut:
@@ -153,7 +158,7 @@ class _HeldOut:
         return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
 
     def forces(
-        self, grown: Selection, say: Callable[[str], None]
+        self, selection: Selection, say: Callable[[str], None]
     ) -> tuple[np.ndarray, np.ndarray, Sequence[Model] | None]:
         """Return each row's force, before and after, by fits that did not see its group; NaN if never held out.
 
@@ -162,11 +167,11 @@ class _HeldOut:
         Where the search is repeated, a fold searches for as many rounds as the whole campaign took to find its last
         effect. It has less to see by: it would go on for many rounds after small effects that it refuses.
         """
-        if not (grown.added and self.repeats):
-            before = self.refitted(grown.before)
-            return before, self.refitted(grown.after) if grown.added else before, None
-        rounds = max(a.round for a in grown.added)
-        parts = run_map(_held_out, _Folds(self, grown.before, rounds), workers=self.context.workers)
+        if not (selection.added and self.repeats):
+            before = self.refitted(selection.before)
+            return before, self.refitted(selection.after) if selection.added else before, None
+        rounds = max(a.round for a in selection.added)
+        parts = run_map(_held_out, _Folds(self, selection.before, rounds), workers=self.context.workers)
         before, after = np.full(self.rows.force.size, np.nan), np.full(self.rows.force.size, np.nan)
         models = []
         for k, (out, (*forces, model)) in enumerate(zip(self.masks, parts, strict=True)):
@@ -237,7 +242,7 @@ class _Folds(Sequence):
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
     """Return the forces before and after at a fold's rows, the same without a search, and the model after."""
     if fold.rounds:
-        part = grow(fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds)
+        part = select_effects(fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds)
         before, after = part.before, part.after
     else:
         before = after = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
@@ -250,27 +255,27 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
     return first, first if after is before else force(after), after.model
 
 
-def _found_again(grown: Selection, found: Sequence[Model]) -> bool:
+def _found_again(selection: Selection, found: Sequence[Model]) -> bool:
     """Whether a fold found one of the effects again, or the evidence for one is not weak.
 
     A fold that finds nothing predicts as the declared model does: its error is equal, and says nothing for one.
     """
-    if not all(item.weak for item in grown.added):
+    if not all(item.weak for item in selection.added):
         return True
-    rows = grown.after.rows
+    rows = selection.after.rows
     known = [pair for model in found for pair in zip(model.terms, model.values, strict=True)]
     shapes = [shape_of(term, values, rows) for term, values in known if "shift" not in term.fixed]
-    terms = [item.proposal.term for item in grown.added]
-    own = [shape_of(term, values, rows) for term, values in zip(terms, grown.after.model.values, strict=True)]
+    terms = [item.proposal.term for item in selection.added]
+    own = [shape_of(term, values, rows) for term, values in zip(terms, selection.after.model.values, strict=True)]
     return any(_alike(one, other) for one in own for other in shapes)
 
 
-def _all_refused(grown: Selection, say: Callable[[str], None]) -> Selection:
+def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:
     """Return a selection without effects: those of weak evidence that no fold found again."""
-    say("left out, as no fold found them again: " + "; ".join(describe(a.proposal.term) for a in grown.added))
+    say("left out, as no fold found them again: " + "; ".join(describe(a.proposal.term) for a in selection.added))
     reason = "its evidence is weak, and the search finds it in no fold that lacks a part of the data"
-    refused = [RefusedEffect(a.proposal.term, a.proposal.p_value, reason) for a in grown.added]
-    return replace(grown, after=grown.before, added=(), refused=(*grown.refused, *refused))
+    refused = [RefusedEffect(a.proposal.term, a.proposal.p_value, reason) for a in selection.added]
+    return replace(selection, after=selection.before, added=(), refused=(*selection.refused, *refused))
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> bool:
@@ -281,7 +286,7 @@ def _alike(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _no_worse(
-    grown: Selection, ends: BeforeAfter, heldout: _HeldOut, say: Callable[[str], None]
+    selection: Selection, before_after: BeforeAfter, heldout: _HeldOut, say: Callable[[str], None]
 ) -> tuple[Selection, BeforeAfter]:
     """Return the end of the loop with the first effects alone, as many as lower the error in sample and held out.
 
@@ -289,20 +294,26 @@ def _no_worse(
     where its evidence is weak, that these files cannot tell.
     """
     refused = []
-    while grown.added and not ends.gains(_around(grown.added), weak=any(a.weak for a in grown.added)):
-        last = grown.added[-1].proposal
+    while selection.added and not before_after.gains(
+        _around(selection.added), weak=any(a.weak for a in selection.added)
+    ):
+        last = selection.added[-1].proposal
         say(f"left out, as the error is no lower with it: {describe(last.term)}")
         reason = "with it the error is no lower, in sample or held out"
         refused.append(RefusedEffect(last.term, last.p_value, reason))
-        model = grown.after.model.without_term(len(grown.added) - 1)
-        own = fit(model, grown.after.rows, grown.after.scatter, turns=2) if model.terms else grown.before
-        grown = replace(grown, after=own, added=grown.added[:-1])
-        _, after = _on_all(ends.before.rows, grown)
-        if not grown.added:
-            ends = replace(ends, after=ends.before, held_after=ends.held_before)
+        model = selection.after.model.without_term(len(selection.added) - 1)
+        own = fit(model, selection.after.rows, selection.after.scatter, turns=2) if model.terms else selection.before
+        selection = replace(selection, after=own, added=selection.added[:-1])
+        _, after = _on_all(before_after.before.rows, selection)
+        if not selection.added:
+            before_after = replace(before_after, after=before_after.before, held_after=before_after.held_before)
         else:
-            ends = replace(ends, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model))
-    return replace(grown, refused=(*grown.refused, *refused), worse=tuple(r for r in refused if not r.weak)), ends
+            before_after = replace(
+                before_after, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model)
+            )
+    return replace(
+        selection, refused=(*selection.refused, *refused), worse=tuple(r for r in refused if not r.weak)
+    ), before_after
 
 
 def _around(added: Sequence[AcceptedEffect]) -> str | None:

@@ -112,13 +112,13 @@ TIE = 1e-9  # relative: closer than that, only rounding tells runs apart
 ROWS = 4  # of each stroke at which forces are compared
 
 
-def next_runs(grown: Selection, config: Config, effects: Mapping[str, Effect]) -> list[dict]:
+def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect]) -> list[dict]:
     """Return for each effect with rivals the run that would tell it from the nearest one, and for what cannot be seen
     here the run that would show it.
 
     Parameters
     ----------
-    grown : Selection
+    selection : Selection
         The end of the loop.
     config : Config
         The rig.
@@ -131,7 +131,7 @@ def next_runs(grown: Selection, config: Config, effects: Mapping[str, Effect]) -
         `why` in words and `conditions`: the run's condition and the channels to set, of one run each.
     """
     wanted = []
-    for item in grown.added:
+    for item in selection.added:
         for rival in item.rivals[:1]:
             chosen = item.proposal
             channels = (*chosen.term.channels, *rival.term.channels)
@@ -144,11 +144,11 @@ def next_runs(grown: Selection, config: Config, effects: Mapping[str, Effect]) -
                         "conditions": found[0],
                     }
                 )
-    if grown.unsure is not None:
-        wanted.append(_replicates(grown.unsure, config))
-    if grown.after.rows.has_aging and not grown.after.scatter.knows("specimen"):
-        wanted.append(_second_specimen(grown.after.rows, config))
-    return [*wanted, *_unseen(grown.after, config, effects)]
+    if selection.inconclusive is not None:
+        wanted.append(_replicates(selection.inconclusive, config))
+    if selection.after.rows.has_aging and not selection.after.scatter.knows("specimen"):
+        wanted.append(_second_specimen(selection.after.rows, config))
+    return [*wanted, *_unseen(selection.after, config, effects)]
 
 
 def _second_specimen(rows: Rows, config: Config) -> dict:

@@ -169,12 +169,12 @@ GROUPS = 12  # groups of a numeric channel in the residual plot
 POINTS = 60  # points of a drawn curve
 
 
-def channel_table(grown: Selection, before: Fitted, after: Fitted) -> pd.DataFrame:
+def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.DataFrame:
     """Return the mean residual by channel, before and after, with standard errors from whole files."""
     rows = before.rows
     files = rows.codes("file")
     records = []
-    for name, known in grown.channels.items():
+    for name, known in selection.channels.items():
         values = rows.values(name) if name != "speed_mm_s" else np.abs(rows.speed)
         if known.numeric:
             edges = np.unique(np.quantile(values, np.linspace(0, 1, GROUPS + 1)))

@@ -44,7 +44,7 @@ class Renaming:
     samples: pd.DataFrame
     context: Context
 
-    def all_but_last(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
+    def earlier_renamed(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
         """Return a fit and its effects with each but the last named anew beside all the others.
 
         One that keeps its name was confirmed while others were missing: it goes if beside them it gains nothing
@@ -56,28 +56,30 @@ class Renaming:
             if name is None:
                 continue
             without = self._without(fitted, number)
-            proposals = self._anew(fitted, number, without, [name], item.proposal.p_value)
+            proposals = self._proposals_on(fitted, number, without, [name], item.proposal.p_value)
             # While it is missing, what stood for most of the residual may rank too low on a grid to be refitted.
             if not proposals or proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL:
                 continue
             same = proposals[0].term.key() == item.proposal.term.key()
             better = self._confirmed(without, proposals[:1] if same else proposals, item.round)
             others = [*added[:number], *added[number + 1 :]]
-            if better is None and self._as_it_is(without, fitted, number, item) is None:
+            if better is None and self._with_own_name(without, fitted, number, item) is None:
                 fitted, added = fit(without.model, fitted.rows, fitted.scatter, turns=2), others
             elif better is not None and better.proposal.term.key() != item.proposal.term.key():
                 fitted = fit(better.proposal.fitted.model, fitted.rows, fitted.scatter, turns=2)
                 added = [*others, better]
         return fitted, added
 
-    def _as_it_is(self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect) -> AcceptedEffect | None:
+    def _with_own_name(
+        self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect
+    ) -> AcceptedEffect | None:
         """Return an effect of a fit with its own name, confirmed beside the others; None where it is not."""
         model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
         own = fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
         return self._confirmed(without, [replace(item.proposal, fitted=own)], item.round)
 
-    def one_for_two(
-        self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect, *, awaited: bool = False
+    def merged_with_earlier(
+        self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect, *, pending: bool = False
     ) -> tuple[list[AcceptedEffect], AcceptedEffect]:
         """Return earlier effects and a new one that is not in `fitted` yet.
 
@@ -86,14 +88,14 @@ class Renaming:
         the new one shows, only effects of its own channel are asked.
         """
         for number, earlier in enumerate(added):
-            if awaited and self._channel(earlier) != self._channel(new):
+            if pending and self._channel(earlier) != self._channel(new):
                 continue
-            one = self._instead(fitted, number, earlier, new)
+            one = self._single_effect(fitted, number, earlier, new)
             if one is not None:
                 return [*added[:number], *added[number + 1 :]], one
         return added, new
 
-    def _instead(
+    def _single_effect(
         self, fitted: Fitted, number: int, earlier: AcceptedEffect, new: AcceptedEffect
     ) -> AcceptedEffect | None:
         """Return one effect that does as well as an earlier and a new one; None where there is none.
@@ -106,7 +108,7 @@ class Renaming:
             return None
         without = self._without(fitted, number)
         p_value = min(earlier.proposal.p_value, new.proposal.p_value)
-        proposals = self._anew(fitted, number, without, self._near(*names), p_value)
+        proposals = self._proposals_on(fitted, number, without, self._channels_near(*names), p_value)
         proposals = sorted([*proposals, *self._products(without, names, p_value)], key=lambda p: p.bic)
         two = new.proposal.bic + earlier.proposal.bic_penalty
         better = [p for p in proposals[:1] if p.bic < two + TIED]
@@ -117,7 +119,7 @@ class Renaming:
             better = sorted(fitting, key=lambda p: p.bic)[:1]
         return self._confirmed(without, better, new.round) if better else None
 
-    def _near(self, *names: str) -> list[str]:
+    def _channels_near(self, *names: str) -> list[str]:
         """Return the channels of two effects and, where both vary along strokes, those of every stroke."""
         found = list(dict.fromkeys(names))
         if all(self.channels[name].unit == "sample" for name in names):
@@ -137,7 +139,7 @@ class Renaming:
         model = fitted.model.without_term(number)
         return fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
 
-    def _anew(
+    def _proposals_on(
         self, fitted: Fitted, number: int, without: Fitted, names: Sequence[str], p_value: float
     ) -> Sequence[Proposal]:
         """Return what may stand in the place of a term on some channels, from the fit `without` it."""
@@ -148,10 +150,10 @@ class Renaming:
                 finest[c.key] = replace(c, p_value=p_value)
         found = sorted(finest.values(), key=lambda c: -c.chi2)
         own, values = fitted.model.terms[number], fitted.model.values[number]
-        there = {p.name: (values[p.name],) for p in own.effect.nonlinear}
+        at_own_values = {p.name: (values[p.name],) for p in own.effect.nonlinear}
         alike = next((c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None)
-        as_it_is = Linearised(without)(own, there, alike) if alike is not None else ()
-        return propose(without, found, self.channels, self.context.effects, as_it_is)
+        own_form = Linearised(without)(own, at_own_values, alike) if alike is not None else ()
+        return propose(without, found, self.channels, self.context.effects, own_form)
 
     def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> AcceptedEffect | None:
         self.context.say(f"  round {number} again:")

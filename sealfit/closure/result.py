@@ -20,7 +20,7 @@ from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
-from sealfit.closure.sensitivity import LEVEL_NAMES, cannot_tell, sensitivity
+from sealfit.closure.sensitivity import LEVEL_NAMES, sensitivity, undetectable_variables
 from sealfit.config import Config
 from sealfit.effects.contract import Effect, fill_unit
 from sealfit.fit.joint.estimate import Fitted, effective_df, fit
@@ -80,51 +80,54 @@ class BeforeAfter:
 
 
 def closure_document(
-    grown: Selection, ends: BeforeAfter, heldout_unit: str, config: Config, effects: Mapping[str, Effect]
+    selection: Selection, before_after: BeforeAfter, heldout_unit: str, config: Config, effects: Mapping[str, Effect]
 ) -> dict:
     """Return closure.json."""
-    after, units = ends.after, config.units
+    after, units = before_after.after, config.units
     numbers = {}
-    for name, fitted, held in (("before", ends.before, ends.held_before), ("after", after, ends.held_after)):
+    for name, fitted, held in (
+        ("before", before_after.before, before_after.held_before),
+        ("after", after, before_after.held_after),
+    ):
         found = errors(fitted.rows, fitted.residual)
         numbers[name] = {
             "rmse_N": found["rmse_N"],
             "rmse_runs_N": found["rmse_runs_N"],
-            "heldout_rmse_N": ends.heldout_rmse_N(held),
-            "heldout_extrapolated_rmse_N": ends.heldout_rmse_N(held, extrapolated=True),
+            "heldout_rmse_N": before_after.heldout_rmse_N(held),
+            "heldout_extrapolated_rmse_N": before_after.heldout_rmse_N(held, extrapolated=True),
             "max_abs_N": found["max_abs_N"],
             "mean_abs_pct": found["mean_abs_pct"],
             "lack_of_fit_p": lack_of_fit(fitted),
         }
     floor, scatter = noise_floor(after), scatter_list(after)
     quality = fit_quality(numbers["after"], floor)
-    seen = sensitivity(grown, config.loop.family_error)
-    untold = set(cannot_tell(grown, seen, scatter))
-    only_doubted = grown.unsure is not None and not grown.added
-    if grown.worse or (grown.left is not None and not only_doubted):
+    seen = sensitivity(selection, config.loop.family_error)
+    undetectable = set(undetectable_variables(selection, seen, scatter))
+    only_inconclusive = selection.inconclusive is not None and not selection.added
+    if selection.worse or (selection.left is not None and not only_inconclusive):
         verdict = "unexplained"
-    elif grown.added:
+    elif selection.added:
         verdict = "closed"
-    elif only_doubted:
+    elif only_inconclusive:
         verdict = "cannot_tell"
     else:
-        weak = any(item.weak for item in grown.refused)
-        unseen = untold and quality["state"] != "within_scatter"
+        weak = any(item.weak for item in selection.refused)
+        unseen = undetectable and quality["state"] != "within_scatter"
         verdict = "cannot_tell" if weak or unseen else "nothing_missing"
     return {
         "schema": 1,
         "verdict": verdict,
         "fit_quality": quality,
-        "sensitivity": [{**entry, "cannot_tell": entry["variable"] in untold} for entry in seen],
-        "refused": [_refused(item, after.rows) for item in grown.refused],
+        "sensitivity": [{**entry, "cannot_tell": entry["variable"] in undetectable} for entry in seen],
+        "refused": [_refused(item, after.rows) for item in selection.refused],
         "units": {slot: units.of(slot) for slot in SLOTS},
         "noise_floor_N": floor,
         **numbers,
         "heldout_unit": heldout_unit,
-        "effects": effect_entries(after, grown, config),
+        "effects": effect_entries(after, selection, config),
         "scatter": scatter,
-        "left": left_entry(grown, numbers["after"]["rmse_N"], floor),
-        "next_runs": next_runs(grown, config, effects),
+        "left": left_entry(selection, numbers["after"]["rmse_N"], floor),
+        "next_runs": next_runs(selection, config, effects),
         "incomplete_channels": incomplete_channels(after.rows),
     }
 
@@ -150,12 +153,12 @@ def _refused(item: RefusedEffect, rows: Rows) -> dict:
     }
 
 
-def effect_entries(after: Fitted, grown: Selection, config: Config) -> list[dict]:
+def effect_entries(after: Fitted, selection: Selection, config: Config) -> list[dict]:
     """Return closure.json's `effects`: one per term of the after-model, then what is a candidate only."""
-    entries = [_entry(after, number, item, config) for number, item in enumerate(grown.added)]
-    if grown.unsure is not None:
-        alone = grown.unsure.proposal.fitted
-        entries.append({**_entry(alone, len(alone.model.terms) - 1, grown.unsure, config), "candidate": True})
+    entries = [_entry(after, number, item, config) for number, item in enumerate(selection.added)]
+    if selection.inconclusive is not None:
+        alone = selection.inconclusive.proposal.fitted
+        entries.append({**_entry(alone, len(alone.model.terms) - 1, selection.inconclusive, config), "candidate": True})
     return entries
 
 
@@ -275,48 +278,49 @@ def effect_table(entries: Sequence[dict], added: Sequence[AcceptedEffect]) -> pd
     return pd.DataFrame(records, columns=names)
 
 
-def left_entry(grown: Selection, rmse_N: float, floor_N: float | None) -> dict:
+def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> dict:
     """Return closure.json's `left`: the error above the floor, and the strongest structure that is still there.
 
     Where nothing is significant any more but effects were added, the channel that orders most of what is left is named
     with its p-value: it is not significant. An effect that lowered no error is left, too.
     """
     above = float(np.sqrt(max(rmse_N**2 - floor_N**2, 0.0))) if floor_N is not None else None
-    left = grown.left
-    if left is None and grown.worse:
-        item, rows = grown.worse[-1], grown.after.rows
+    left = selection.left
+    if left is None and selection.worse:
+        item, rows = selection.worse[-1], selection.after.rows
         names = " ".join(channels_of(item.term, rows))
         return {"rmse_N": above, "level": effect_level(item.term, rows), "channel": names, "p_value": item.p_value}
-    if left is None and grown.added:
-        left = _unsteady_offset(grown) or _largest(
-            grown.after, [c for c in grown.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < EVEN]
+    if left is None and selection.added:
+        left = _unsteady_offset(selection) or _largest(
+            selection.after,
+            [c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < EVEN],
         )
     if isinstance(left, Peak):
         return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
     if left is not None:
-        names = [grown.channels[n].unit for n in left.channels if n in grown.channels]
+        names = [selection.channels[n].unit for n in left.channels if n in selection.channels]
         level = LEVEL_NAMES[min(names or [left.unit], key=FINER.get)]
         if left.channels[0] == "direction" and len(left.channels) > 1:
             level = LEVEL_NAMES[max(names, key=FINER.get)]  # it is the other channel that tells offsets apart
         return {"rmse_N": above, "level": level, "channel": " ".join(left.channels), "p_value": left.p_value}
-    smallest = min((c.p_value for c in grown.last), default=None)
+    smallest = min((c.p_value for c in selection.last), default=None)
     return {"rmse_N": above, "level": None, "channel": None, "p_value": smallest}
 
 
-def _unsteady_offset(grown: Selection) -> Candidate | None:
+def _unsteady_offset(selection: Selection) -> Candidate | None:
     """Return the category that orders most of an offset between directions which differs from run to run; else None.
 
     Each condition is given an offset of its own first, as that would hide what a set-up does to it. The p-value is
     adjusted over the categories.
     """
-    fitted = grown.after
+    fitted = selection.after
     rows = fitted.rows
     amplitude = max(
         (abs(v["A"]) for t, v in zip(fitted.model.terms, fitted.model.values, strict=True) if t.effect.id == OFFSET),
         default=0.0,
     )
     variance = sum(c.variance for c in fitted.scatter.components if c.kind == "offset" and c.level == "run")
-    categories = [c for c in grown.channels.values() if not c.numeric and not c.grouping]
+    categories = [c for c in selection.channels.values() if not c.numeric and not c.grouping]
     if amplitude == 0 or np.sqrt(variance) < UNSTEADY * amplitude or not categories:
         return None
     if 2 <= len(rows.conditions) <= rows.groups.starts["file"].size / 3:

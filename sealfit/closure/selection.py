@@ -54,23 +54,23 @@ class Selection:
     first: tuple[Candidate, ...]  # candidates on the declared model
     last: tuple[Candidate, ...]  # candidates on the final one
     left: Candidate | Peak | None  # what is still significant
-    unsure: AcceptedEffect | None  # the best form of what too few specimens show; not in any model
+    inconclusive: AcceptedEffect | None  # the best form of what too few specimens show; not in any model
     channels: Mapping[str, Channel] = field(default_factory=dict)
     refused: tuple[RefusedEffect, ...] = ()  # significant, and in no model
     worse: tuple[RefusedEffect, ...] = ()  # of these, what was in the model and lowered no error
 
 
-class _Shown(NamedTuple):
+class _SearchResult(NamedTuple):
     """What the searches show on one model."""
 
     claimable: list[Candidate]  # single channels, sure and not doubted
     laws: list[tuple[Candidate, Proposal]]  # richer laws of aging
     pairs: list[Candidate]  # pairs of channels; none where a single one is sure enough
     significant: list[Candidate]  # single channels and pairs, strongest evidence first
-    hidden: list[MaskedPair]  # effects that hide each other
+    masked: list[MaskedPair]  # effects that hide each other
 
 
-def grow(
+def select_effects(
     rows: Rows,
     samples: pd.DataFrame,
     context: Context,
@@ -96,15 +96,15 @@ def grow(
     rounds : int, optional
         Rounds after which a fold's search ends: nothing is asked then but what effects it adds, not for what is left.
     """
-    growth = _Growth(rows, samples, context, fine, start)
+    loop = _Loop(rows, samples, context, fine, start)
     last_round = context.config.loop.max_rounds + 2 if rounds is None else rounds
-    for number in range(len(growth.added) + 1, last_round + 1):
-        if growth.has_ended(number):
+    for number in range(len(loop.added) + 1, last_round + 1):
+        if loop.is_finished(number):
             break
-    return growth.selection(whole=rounds is None)
+    return loop.selection(whole=rounds is None)
 
 
-class _Growth:
+class _Loop:
     """The loop while it goes on: the model, what was added and refused, and what the searches show on the model."""
 
     def __init__(
@@ -119,13 +119,13 @@ class _Growth:
         self.last = self.first = self.searched()
         self.fitted = ripples.added_to(self.before, fine)
         self.added = list(ripples.added)
-        self.ripple, self.samples, self.not_confirmed = ripples.found, ripples.samples, ripples.refused
+        self.ripple, self.samples, self.unconfirmed = ripples.found, ripples.samples, ripples.refused
         self.renaming = Renaming(self.channels, self.samples, context)
         self.refused: set[tuple] = set()
         self.left: Candidate | Peak | None = None
-        self.hidden: list[MaskedPair] = []  # effects that hide each other, until both are in the model
+        self.masked: list[MaskedPair] = []  # effects that hide each other, until both are in the model
         self.renamed = False  # whether earlier effects have been named anew
-        self.shown: _Shown | None = None
+        self.found: _SearchResult | None = None
 
     @property
     def alpha(self) -> float:
@@ -136,51 +136,51 @@ class _Growth:
         """Return every candidate of a single channel on the present model."""
         return tuple(search(self.score_tests, list(self.channels.values()), self.rng))
 
-    def ask(
+    def confirm(
         self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
     ) -> AcceptedEffect | None:
         """Return the first of some proposals that held-out data confirm; what they refuse is added to `failed`."""
         return confirmed(base, proposals, self.samples, self.context, number, failed)
 
-    def has_ended(self, number: int) -> bool:
+    def is_finished(self, number: int) -> bool:
         """Search, name and confirm once; return whether nothing is left to be done."""
         if self.fitted is not self.score_tests.fitted:
-            self.score_tests, self.shown = ScoreTests(self.fitted), None
+            self.score_tests, self.found = ScoreTests(self.fitted), None
             self.last = self.searched()
-        if self.shown is None:  # else the last round refused what it was shown, and the model is as it was
-            self.shown = self.look(number)
+        if self.found is None:  # else the last round refused what it was shown, and the model is as it was
+            self.found = self.search_model(number)
             if self.adds_two_of_direction(number):
                 return False
         open_ = self.open_candidates()
         if not open_ or number > self.context.config.loop.max_rounds:
             return not self.renames()
-        claimable, laws = self.shown.claimable, [p for _, p in self.shown.laws]
-        open_ += [c for c in _standing_for(open_, claimable) if c.key not in self.refused]
+        claimable, laws = self.found.claimable, [p for _, p in self.found.laws]
+        open_ += [c for c in _related_candidates(open_, claimable) if c.key not in self.refused]
         proposals = propose(self.fitted, open_, self.channels, self.context.effects, laws)
-        accepted = self.ask(self.fitted, proposals, number, self.not_confirmed)
+        accepted = self.confirm(self.fitted, proposals, number, self.unconfirmed)
         if accepted is None:
             self.refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
-            self.hidden = []
+            self.masked = []
         else:
             self.add(accepted)
         return False
 
-    def look(self, number: int) -> _Shown:
+    def search_model(self, number: int) -> _SearchResult:
         """Return what the present model lacks."""
-        shown = _shown(self.score_tests, self.last, self.channels, self.context.effects, self.alpha, self.rng)
-        tried = f"{len(self.last)} candidates on {len(self.channels)} channels, {len(shown.pairs)} on pairs of them"
+        found = _search_all(self.score_tests, self.last, self.channels, self.context.effects, self.alpha, self.rng)
+        tried = f"{len(self.last)} candidates on {len(self.channels)} channels, {len(found.pairs)} on pairs of them"
         self.context.say(
-            f"round {number}: {tried}; {len(shown.significant)} significant, {len(shown.hidden)} hide each other"
+            f"round {number}: {tried}; {len(found.significant)} significant, {len(found.masked)} hide each other"
         )
-        return shown
+        return found
 
     def adds_two_of_direction(self, number: int) -> bool:
         """Whether two effects of the direction, which hid each other, were added."""
-        two = next((pair for pair in self.shown.hidden if {key[0] for key in pair.keys} == {("direction",)}), None)
-        if self.hidden or two is None:
+        two = next((pair for pair in self.found.masked if {key[0] for key in pair.keys} == {("direction",)}), None)
+        if self.masked or two is None:
             return False
-        awaited = _awaited([two], self.shown.claimable)
-        both = _both(self.fitted, awaited, self.channels, self.context.effects, self.ask, number)
+        pending = _pending_candidates([two], self.found.claimable)
+        both = _confirmed_pair(self.fitted, pending, self.channels, self.context.effects, self.confirm, number)
         if both:
             later, earlier = both
             own = earlier.proposal.fitted
@@ -192,11 +192,11 @@ class _Growth:
 
     def open_candidates(self) -> list[Candidate]:
         """Return what is significant and not refused; those of effects that hide each other where nothing else is."""
-        shown = self.shown
-        if not (self.hidden or shown.significant):
-            self.hidden = [pair for pair in shown.hidden if self.refused.isdisjoint(pair.keys)]
-        significant = _awaited(self.hidden, (*shown.claimable, *shown.pairs)) or list(shown.significant)
-        significant += [c for c, _ in shown.laws if c.p_value <= self.alpha and c.sure]
+        found = self.found
+        if not (self.masked or found.significant):
+            self.masked = [pair for pair in found.masked if self.refused.isdisjoint(pair.keys)]
+        significant = _pending_candidates(self.masked, (*found.claimable, *found.pairs)) or list(found.significant)
+        significant += [c for c, _ in found.laws if c.p_value <= self.alpha and c.sure]
         self.left = significant[0] if significant else self.ripple
         significant += equivalent_pairs(self.score_tests, significant, self.channels)
         return [c for c in significant if c.key not in self.refused]
@@ -206,7 +206,7 @@ class _Growth:
         if self.renamed or len(self.added) < 2:
             return False
         self.renamed, before = True, self.added
-        self.fitted, self.added = self.renaming.all_but_last(self.fitted, self.added)
+        self.fitted, self.added = self.renaming.earlier_renamed(self.fitted, self.added)
         if self.added is before:
             return False
         self.fitted, self.added = _drop_needless(self.fitted, self.added)
@@ -217,9 +217,9 @@ class _Growth:
     def add(self, accepted: AcceptedEffect) -> None:
         """Add an effect; drop what it makes needless."""
         source = accepted.proposal.source
-        self.hidden = [pair.without(source) for pair in self.hidden if source in pair.keys]
-        awaited = any(pair.keys for pair in self.hidden)
-        earlier, accepted = self.renaming.one_for_two(self.fitted, self.added, accepted, awaited=awaited)
+        self.masked = [pair.without(source) for pair in self.masked if source in pair.keys]
+        pending = any(pair.keys for pair in self.masked)
+        earlier, accepted = self.renaming.merged_with_earlier(self.fitted, self.added, accepted, pending=pending)
         added = [*earlier, accepted]
         own = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
         self.fitted, self.added = _drop_needless(fit(own.model, self.rows, own.scatter, turns=2), added)
@@ -233,49 +233,53 @@ class _Growth:
         found = Selection(self.before, after, added, self.first, self.last, None, None, self.channels)
         if not whole:
             return found
-        left, unsure = self.left, None
+        left, inconclusive = self.left, None
         if isinstance(left, Candidate) and left.key in self.refused and left.p_value > WEAK:
             left = None  # it is listed as refused
-        laws = self.shown.laws
-        doubtful = [c for c in (*self.last, *(c for c, _ in laws)) if c.p_value <= self.alpha and not c.sure]
-        if left is None and doubtful:
-            proposals = propose(self.fitted, doubtful, self.channels, self.context.effects, [p for _, p in laws])
+        laws = self.found.laws
+        inconclusive_candidates = [
+            c for c in (*self.last, *(c for c, _ in laws)) if c.p_value <= self.alpha and not c.sure
+        ]
+        if left is None and inconclusive_candidates:
+            proposals = propose(
+                self.fitted, inconclusive_candidates, self.channels, self.context.effects, [p for _, p in laws]
+            )
             others = tuple(rivals(proposals[0], proposals))
-            left = doubtful[0]
-            unsure = AcceptedEffect(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
-        return replace(found, left=left, unsure=unsure, refused=tuple(self.not_confirmed))
+            left = inconclusive_candidates[0]
+            inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
+        return replace(found, left=left, inconclusive=inconclusive, refused=tuple(self.unconfirmed))
 
 
-def _shown(
+def _search_all(
     score_tests: ScoreTests,
     last: Sequence[Candidate],
     channels: Mapping[str, Channel],
     effects: Mapping[str, Effect],
     alpha: float,
     rng: np.random.Generator,
-) -> _Shown:
+) -> _SearchResult:
     """Return what a model lacks by the search of single channels, `last`, and by those that come after it."""
-    doubted = _doubted(last, alpha)
-    claimable = _claimable(last, doubted)
+    inconsistent = _inconsistent_channels(last, alpha)
+    claimable = _claimable(last, inconsistent)
     significant = [c for c in claimable if c.p_value <= alpha]
     aged = not significant or any(c.channels == (AGING,) for c in significant)
     laws = richer_laws(score_tests.fitted, channels, effects) if aged else []
     if significant and significant[0].p_value <= DOUBTFUL:
-        return _Shown(claimable, laws, [], significant, [])
-    pairs = _claimable(search_pairs(score_tests, list(channels.values()), last, rng), doubted)
+        return _SearchResult(claimable, laws, [], significant, [])
+    pairs = _claimable(search_pairs(score_tests, list(channels.values()), last, rng), inconsistent)
     level = alpha * min((c.p_value for c in significant), default=1.0)
     significant = sorted([*significant, *(c for c in pairs if c.p_value <= level)], key=lambda c: c.p_value)
     level = alpha * min((c.p_value for c in significant), default=1.0)
-    hidden = search_masked_pairs(score_tests, channels, [*claimable, *pairs], level)
-    return _Shown(claimable, laws, pairs, significant, hidden)
+    masked = search_masked_pairs(score_tests, channels, [*claimable, *pairs], level)
+    return _SearchResult(claimable, laws, pairs, significant, masked)
 
 
-def _both(
+def _confirmed_pair(
     fitted: Fitted,
     two: Sequence[Candidate],
     channels: Mapping[str, Channel],
     effects: Mapping[str, Effect],
-    ask: Callable[..., AcceptedEffect | None],
+    confirm: Callable[..., AcceptedEffect | None],
     number: int,
 ) -> list[AcceptedEffect]:
     """Return two effects, each confirmed beside the other, as neither predicts held-out data alone; nothing if not."""
@@ -283,16 +287,16 @@ def _both(
         return []
     first, second = two
     base = propose(fitted, [first], channels, effects)[0].fitted
-    later = ask(base, propose(base, [second], channels, effects), number, [])
+    later = confirm(base, propose(base, [second], channels, effects), number, [])
     if later is None:
         return []
     alone = later.proposal.fitted.model.without_term(len(fitted.model.terms))
     base = fit(alone, fitted.rows, fitted.scatter, turns=1)
-    earlier = ask(base, propose(base, [first], channels, effects), number, [])
+    earlier = confirm(base, propose(base, [first], channels, effects), number, [])
     return [] if earlier is None else [later, earlier]
 
 
-def _doubted(candidates: Sequence[Candidate], alpha: float) -> set[str]:
+def _inconsistent_channels(candidates: Sequence[Candidate], alpha: float) -> set[str]:
     """Return the channels along which a few specimens differ: it may be their scatter, whatever quantity it acts on.
 
     The strongest evidence on mu or the force counts, as on a wrong quantity the same effect looks different in each.
@@ -304,25 +308,25 @@ def _doubted(candidates: Sequence[Candidate], alpha: float) -> set[str]:
     return {name for name, c in strongest.items() if not c.consistent} - {"direction"}
 
 
-def _claimable(candidates: Sequence[Candidate], doubted: set[str]) -> list[Candidate]:
+def _claimable(candidates: Sequence[Candidate], inconsistent: set[str]) -> list[Candidate]:
     """Return the candidates that are sure and of no doubted channel, whatever they act on."""
-    return [c for c in candidates if c.sure and doubted.isdisjoint(c.channels)]
+    return [c for c in candidates if c.sure and inconsistent.isdisjoint(c.channels)]
 
 
-def _awaited(hidden: Sequence[MaskedPair], candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return the straight candidates of hidden pairs that are not in the model yet, with the p-value of the pair."""
-    pairs = {key: pair for pair in reversed(hidden) for key in pair.keys}
+def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return the straight candidates of masked pairs that are not in the model yet, with the p-value of the pair."""
+    pairs = {key: pair for pair in reversed(masked) for key in pair.keys}
     found = []
     for c in candidates:
         if c.key in pairs and c.columns.shape[1] == 1:
-            chi2 = max(c.chi2, *(pair.chi2 for pair in hidden if c.key in pair.keys))
+            chi2 = max(c.chi2, *(pair.chi2 for pair in masked if c.key in pair.keys))
             p_value = min(c.p_value, pairs[c.key].p_value)
             found.append(replace(c, test_result=c.test_result._replace(chi2=chi2), p_value=p_value))
     found = [c for c in found if c.evidence > 0]  # else the effects in the model hold it
     return sorted(found, key=lambda c: c.p_value)
 
 
-def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
+def _related_candidates(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
     """Return candidates that may be what the significant ones show, though chance alone might explain them.
 
     That a channel orders the residual is shown once; on which quantity it acts is for the forms to tell, so the same
@@ -331,15 +335,15 @@ def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> 
     """
     found = []
     keys = {c.key for c in significant}
-    for shown in significant:
+    for strong in significant:
         for c in candidates:
-            alike = (c.acts_on, c.operation) == (shown.acts_on, shown.operation)
-            behind = shown.channels[0] in CALENDAR and c.unit == "specimen" and alike
-            beside = (
-                c.channels[-1:] == shown.channels[-1:] and not shown.pair and c.columns.shape == shown.columns.shape
+            same_target = (c.acts_on, c.operation) == (strong.acts_on, strong.operation)
+            condition = strong.channels[0] in CALENDAR and c.unit == "specimen" and same_target
+            same_channel = (
+                c.channels[-1:] == strong.channels[-1:] and not strong.pair and c.columns.shape == strong.columns.shape
             )
-            if (behind or beside) and c.key not in keys and c.chi2 >= HALF_OF_CALENDAR * shown.chi2:
-                found.append(replace(c, p_value=shown.p_value))
+            if (condition or same_channel) and c.key not in keys and c.chi2 >= HALF_OF_CALENDAR * strong.chi2:
+                found.append(replace(c, p_value=strong.p_value))
                 keys.add(c.key)
     return found
 
@@ -350,7 +354,7 @@ def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted,
     What one of two alike leaves may be needless too, so each is asked again when another has gone. A ripple was
     judged on the raw samples, which bins cannot overrule.
     """
-    asked: set[int] = set()
+    kept: set[int] = set()
     while True:
         # Far from needless: no refit is wanted to see that.
         size = {
@@ -358,15 +362,15 @@ def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted,
             for k, a in enumerate(added[:-1])
             if not a.proposal.term.effect.periodic
         }
-        k = min((k for k in size if size[k] <= 0 and k not in asked), key=size.__getitem__, default=None)
+        k = min((k for k in size if size[k] <= 0 and k not in kept), key=size.__getitem__, default=None)
         if k is None:
             return fitted, added
         without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
         if without.deviance - fitted.deviance < added[k].proposal.bic_penalty:
             fitted = fit(without.model, fitted.rows, fitted.scatter, turns=1)
-            added, asked = [*added[:k], *added[k + 1 :]], set()
+            added, kept = [*added[:k], *added[k + 1 :]], set()
         else:
-            asked.add(k)
+            kept.add(k)
 
 
 def _wald_statistic(fitted: Fitted, number: int) -> float:

@@ -70,14 +70,14 @@ ASIDE = ("run_order", "elapsed_h", "repeat")
 LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
 
 
-def sensitivity(grown: Selection, alpha: float) -> list[dict]:
+def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     """Return per variable and level: variable, level, acts_on, smallest_N, smallest_pct and files_needed.
 
     A variable that varies at several levels has an entry for each, of an effect that follows it at that level only.
 
     Parameters
     ----------
-    grown : Selection
+    selection : Selection
         The end of the loop, with the candidates of its last search.
     alpha : float
         Family-wise level of the search.
@@ -89,16 +89,16 @@ def sensitivity(grown: Selection, alpha: float) -> list[dict]:
         percent of the RMS force; None where the variable cannot be tested in this campaign. `files_needed` is how many
         files, made like these, would show an effect of 1 % of the force.
     """
-    fitted = grown.after
+    fitted = selection.after
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))
     files, specimens = (rows.groups.starts[level].size for level in ("file", "specimen"))
-    search = _Search(grown, alpha)
+    search = _Search(selection, alpha)
     entries = []
-    for name, channel in grown.channels.items():
+    for name, channel in selection.channels.items():
         target = ("force", "add") if name == "direction" or channel.grouping else FRICTION
-        own = [c for c in grown.last if (c.channels[-1], c.acts_on, c.operation) == (name, *target) and not c.pair]
+        own = [c for c in selection.last if (c.channels[-1], c.acts_on, c.operation) == (name, *target) and not c.pair]
         own = sorted(own, key=lambda c: c.columns.shape[1])[:1]  # a straight line
-        for level, part in _parts(grown, channel, own):
+        for level, part in _parts(selection, channel, own):
             smallest = None
             if own:
                 effect = part * fitted.slope(*target)
@@ -143,9 +143,9 @@ def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
     return COUNTED * left * float(np.sqrt(1 / (1 - LEAST_FALL) ** 2 - 1)) / size if size > 0 else np.inf
 
 
-def _parts(grown: Selection, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
+def _parts(selection: Selection, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
     """Yield each level at which a channel has a real share of its variance, and its first column's part there."""
-    groups, weight = grown.after.rows.groups, grown.after.rows.weight
+    groups, weight = selection.after.rows.groups, selection.after.rows.weight
     if not own or not channel.numeric or channel.name == "direction":
         yield channel.unit, (own[0].columns[:, 0] if own else None)
         return
@@ -174,19 +174,21 @@ class _Search:
     the variance of a contrast in few units is moderated, and that of scores of many is 1 or more.
     """
 
-    def __init__(self, grown: Selection, alpha: float) -> None:
-        self.fitted, self.channels, self.candidates = grown.after, grown.channels, grown.last
+    def __init__(self, selection: Selection, alpha: float) -> None:
+        self.fitted, self.channels, self.candidates = selection.after, selection.channels, selection.last
         self.level, self.units = alpha / SEARCHES, {}
-        results = [c.test_result for c in grown.last]
+        results = [c.test_result for c in selection.last]
         slopes = [j.slopes for j in results if j.slopes]
-        small_sample = [test for c in grown.last if (test := self._small_sample_again(c)) is not None]
+        small_sample = [test for c in selection.last if (test := self._small_sample_again(c)) is not None]
         many = [j for j in results if j.small_sample is None and not j.slopes]
         self.contrasts = N_VARIANCES * sum(own[0].slope.size for own in slopes)
         tests = [test for own in slopes for test in own]
         self.moderated = {id(t): m for t, m in zip(tests, moderated(tests), strict=True)}
-        lines = [c for c in grown.last if c.test_result.slopes and not c.pair and (c.acts_on, c.operation) == FRICTION]
-        self.lines = np.column_stack([c.columns[:, 0] for c in lines] or [np.ones(grown.after.force.size)])
-        self.lines = self.lines * grown.after.slope(*FRICTION)[:, None]
+        lines = [
+            c for c in selection.last if c.test_result.slopes and not c.pair and (c.acts_on, c.operation) == FRICTION
+        ]
+        self.lines = np.column_stack([c.columns[:, 0] for c in lines] or [np.ones(selection.after.force.size)])
+        self.lines = self.lines * selection.after.slope(*FRICTION)[:, None]
         self.many = len(many)
         self.critical_many = critical_many(many, self.level / 2, np.random.default_rng(0)) if many else 0.0
         self.critical_small_sample = {}
@@ -359,7 +361,7 @@ def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
     return replace(fitted, scatter=scatter, whitening=whitening, white_jacobian=whitening.of(fitted.jacobian))
 
 
-def cannot_tell(grown: Selection, entries: Sequence[dict], scatter: Sequence[dict]) -> list[str]:
+def undetectable_variables(selection: Selection, entries: Sequence[dict], scatter: Sequence[dict]) -> list[str]:
     """Return the variables of which this campaign could not have told; empty where it could.
 
     A variable cannot be told if no effect of it can reach the required p-value, and it varies along strokes, is the
@@ -368,20 +370,20 @@ def cannot_tell(grown: Selection, entries: Sequence[dict], scatter: Sequence[dic
 
     Parameters
     ----------
-    grown : Selection
+    selection : Selection
         The end of the loop.
     entries : sequence of dict
         As `sensitivity` gives them.
     scatter : sequence of dict
         closure.json's `scatter`.
     """
-    starts = grown.after.rows.groups.starts
-    open_ = []
+    starts = selection.after.rows.groups.starts
+    undetectable = []
     for entry in entries:
         if entry["variable"] == SPECIMEN:
-            open_.append(SPECIMEN)
+            undetectable.append(SPECIMEN)
             continue
-        channel: Channel = grown.channels[entry["variable"]]
+        channel: Channel = selection.channels[entry["variable"]]
         if channel.grouping or channel.name in ASIDE or entry["level"] != LEVEL_NAMES[channel.unit]:
             continue
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
@@ -390,5 +392,5 @@ def cannot_tell(grown: Selection, entries: Sequence[dict], scatter: Sequence[dic
         few_specimens = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS_OF_SLOPES
         decisive = channel.unit == "sample" or channel.name == "direction" or few_specimens
         if much or (decisive and not np.isfinite(smallest)):
-            open_.append(channel.name)
-    return open_
+            undetectable.append(channel.name)
+    return undetectable

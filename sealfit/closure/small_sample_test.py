@@ -317,10 +317,10 @@ class Root:
     def __init__(self, taken: Tangent, moved: np.ndarray) -> None:
         share, axes = np.linalg.eigh(taken.gram())
         kept = 1 - share > LEAST_OWN_VARIANCE
-        grown = np.where(kept, 1 / np.sqrt(np.where(kept, 1 - share, 1.0)) - 1, -1.0)
+        factor = np.where(kept, 1 / np.sqrt(np.where(kept, 1 - share, 1.0)) - 1, -1.0)
         self.taken, self.moved, self.df = taken, moved, int(moved.sum() - (~kept).sum())
         small = share < 1e-9  # the limit of the quotient
-        self.core = (axes * np.where(small, 0.5, grown / np.where(small, 1.0, share))) @ axes.T
+        self.core = (axes * np.where(small, 0.5, factor / np.where(small, 1.0, share))) @ axes.T
 
     def __matmul__(self, numbers: np.ndarray) -> np.ndarray:
         """Return numbers of the units, shape (units,) or (units, k), made independent."""

@@ -165,7 +165,7 @@ Way = tuple[str, str]  # what an effect acts on, and how
 
 
 def reselect_on_all(
-    grown: Selection, every: Rows, samples: pd.DataFrame, config: Config, say: Callable[[str], None]
+    selection: Selection, every: Rows, samples: pd.DataFrame, config: Config, say: Callable[[str], None]
 ) -> tuple[Selection, Fitted]:
     """Return what the search of a part came to, and its final model fitted to all strokes.
 
@@ -175,7 +175,7 @@ def reselect_on_all(
 
     Parameters
     ----------
-    grown : Selection
+    selection : Selection
         What the search of a part came to.
     every : Rows
         The campaign, merged along the strokes.
@@ -186,9 +186,9 @@ def reselect_on_all(
     say : callable
         Told in words what is being done.
     """
-    added, after = list(grown.added), grown.after
+    added, after = list(selection.added), selection.after
     whole = fit(after.model, every, after.scatter, turns=1)
-    for first in (a for a in grown.added if a.rivals and not _periodic(a.proposal)):
+    for first in (a for a in selection.added if a.rivals and not _periodic(a.proposal)):
         item = first
         for others_of in (_first_rivals, _on_other_quantities):
             number = next(k for k, a in enumerate(added) if a is item)
@@ -206,7 +206,7 @@ def reselect_on_all(
                 left = [_way(p) for p in found if p.bic - found[0].bic < RIVAL]
                 number = next(k for k, a in enumerate(added) if a is item)
                 added[number] = item = _with_rivals(item, [r for r in _rivals(item) if _way(r[0]) in left])
-    return replace(grown, added=tuple(added), after=after), whole
+    return replace(selection, added=tuple(added), after=after), whole
 
 
 def _first_rivals(item: AcceptedEffect) -> list[Proposal]:
@@ -268,7 +268,7 @@ def _values(proposal: Proposal) -> Mapping[str, float]:
     return proposal.fitted.model.values[-1]
 
 
-def missed_by_subsample(fitted: Fitted, grown: Selection, config: Config) -> str:
+def missed_by_subsample(fitted: Fitted, selection: Selection, config: Config) -> str:
     """Return the channel that still orders the residual of all strokes, though those searched do not show it; or "".
 
     What they show and what could not be explained there is known already.
@@ -277,13 +277,13 @@ def missed_by_subsample(fitted: Fitted, grown: Selection, config: Config) -> str
     ----------
     fitted : Fitted
         The final model, fitted to all strokes.
-    grown : Selection
+    selection : Selection
         What the search of a part came to.
     config : Config
         Levels of error, channels.
     """
     alpha = config.loop.family_error
     found = search(ScoreTests(fitted), channels_of(fitted.rows, config), np.random.default_rng(config.loop.seed))
-    known = {c.channels for c in grown.last if c.p_value <= alpha}
+    known = {c.channels for c in selection.last if c.p_value <= alpha}
     new = (c for c in found if c.p_value <= alpha and c.sure and c.channels not in known)
     return ", ".join(next((c.channels for c in new), ()))
