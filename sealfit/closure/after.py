@@ -134,8 +134,8 @@ def _principal(columns: np.ndarray, covariance: np.ndarray, rows: Rows) -> np.nd
 
 def _at_start(model: Model, reference: Model, rows: Rows) -> np.ndarray:
     """Return the effects' force at the start of each row's stroke, shape (n,): at distance and time 0."""
-    table, way = rows.table, np.sign(rows.speed)
-    origin = table["displacement_mm"] - way * table["distance_mm"].to_numpy(float)
+    table, direction = rows.table, np.sign(rows.speed)
+    origin = table["displacement_mm"] - direction * table["distance_mm"].to_numpy(float)
     start = table.assign(displacement_mm=origin, distance_mm=0.0, time_s=0.0)
     begun = replace(rows, table=start)
     return evaluate(model, begun, jacobian=False)[0] - evaluate(reference, begun, jacobian=False)[0]

@@ -123,9 +123,9 @@ def _gain(
         )
         total += float(weight.sum())
         if (*key, number) not in known:
-            known[*key, number] = _left_in(before, before.model, out, held)
+            known[*key, number] = _heldout_residual(before, before.model, out, held)
         white = []
-        for k, left in enumerate((known[*key, number], _left_in(before, after.model, out, held))):
+        for k, left in enumerate((known[*key, number], _heldout_residual(before, after.model, out, held))):
             residual = about_means(left[inside], test, around)
             squares[k] += float(weight @ residual**2)
             white.append(test.groups.sums(whitening(residual[:, None])[:, 0] ** 2, proposal.unit))
@@ -136,7 +136,7 @@ def _gain(
     return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(fall.sum()), error)
 
 
-def _left_in(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.ndarray:
+def _heldout_residual(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.ndarray:
     """Return measured minus model in the rows held out, the model fitted to the others, shape (held out,)."""
     train, friction = before.rows.subset(~out), before.friction[~out]
     model = as_smooth_as_wanted(model, train, before.scatter, friction)
@@ -181,7 +181,9 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
         shift = pass_shifts(samples[seen], rows, length, axis)
         term = replace(proposal.term, fixed={**proposal.term.fixed, "shift": shift})
         model = replace(after.model, terms=(*after.model.terms[:-1], term))
-        old, new = (_inside(test, evaluate(m, test, jacobian=False)[0]) for m in (before.model, model))
+        old, new = (
+            _residual_about_stroke_means(test, evaluate(m, test, jacobian=False)[0]) for m in (before.model, model)
+        )
         weight = rows.weight[out]
         squares += weight @ old**2, weight @ new**2
     # Files differ in how strong their ripple is, so each is asked whether it is there at all, in both halves alike.
@@ -203,7 +205,7 @@ def _first_half(table: pd.DataFrame, in_turn: bool) -> np.ndarray:
     return np.arange(stroke.size) - np.repeat(start, count) < np.repeat(count, count) / 2
 
 
-def _inside(rows: Rows, force: np.ndarray) -> np.ndarray:
+def _residual_about_stroke_means(rows: Rows, force: np.ndarray) -> np.ndarray:
     """Return measured minus model about its mean in each stroke, shape (n,)."""
     residual = rows.force - force
     return residual - rows.groups.means(residual, "stroke")[rows.codes("stroke")]
@@ -303,7 +305,7 @@ def confirmed(
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
     for proposal in proposals[:TRIES]:
         gain = heldout_gain(fitted, proposal, *folds_of)
-        reason = _why_not(fitted, proposal, gain, samples, folds_of[-1])
+        reason = _reason_refused(fitted, proposal, gain, samples, folds_of[-1])
         unit = config.units.unit("force")
         context.say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
@@ -317,15 +319,15 @@ def confirmed(
     return None
 
 
-def _why_not(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame, known: dict) -> str | None:
+def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame, known: dict) -> str | None:
     """Return why a proposal is not confirmed; None where it is."""
     if not gain.real:
         return "it does not predict the data that were held out better than the model without it"
-    if proposal.p_value > SURE_OF_CURVE and _bends_the_curve(proposal):
+    if proposal.p_value > SURE_OF_CURVE and _changes_the_curve(proposal):
         return f"its p-value is no less than {SURE_OF_CURVE:g}, and how such a coefficient scatters is not known"
     if proposal.p_value > WEAK and gain.share < LEAST_FALL:
         return f"its p-value is no less than {WEAK:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
-    least = max(unseen_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
+    least = max(rounding_error_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
     if np.sqrt(np.mean(added_force(proposal) ** 2)) <= least:
         return "it is smaller than the recorded force can show"
     if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
@@ -333,7 +335,7 @@ def _why_not(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFra
     return None
 
 
-def _bends_the_curve(proposal: Proposal) -> bool:
+def _changes_the_curve(proposal: Proposal) -> bool:
     """Whether a proposal is a free shape, inside specimens, of one coefficient or of the speed and another variable."""
     term = proposal.term
     by_speed = len(term.channels) > 1 and "speed_mm_s" in term.channels
@@ -348,7 +350,7 @@ def added_force(proposal: Proposal) -> np.ndarray:
     return fitted.force - evaluate(without, fitted.rows, jacobian=False)[0]
 
 
-def unseen_N(samples: pd.DataFrame) -> float:
+def rounding_error_N(samples: pd.DataFrame) -> float:
     r"""Return the RMS of a rounding error that noise does not average out: what an effect must exceed; else 0.
 
     A force in steps of q has a rounding error of :math:`q / \sqrt{12}`. Noise of half a step or more spreads it, and

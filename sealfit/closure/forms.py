@@ -225,9 +225,9 @@ def periodic_terms(
     rows = fitted.rows
     effect = effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"]
     both = np.unique(np.sign(rows.speed)).size == 2
-    ways = [("force", "add")] if peak.sign_symmetric else []
+    targets = [("force", "add")] if peak.sign_symmetric else []
     if not both or not peak.sign_symmetric:
-        ways += [("mu", "multiply"), ("force", "multiply")]
+        targets += [("mu", "multiply"), ("force", "multiply")]
     fixed: dict = {"x_ref": 0.0}
     phases, lengths = PHASES, (peak.wavelength,)
     if not peak.common_phase:
@@ -240,11 +240,11 @@ def periodic_terms(
         p.name: (lengths if p.name == "lambda_" or p.name.startswith("lambda") else phases) for p in effect.nonlinear
     }
     units = rows.groups.starts["file"].size
-    for way in ways:
-        if way in effect.acts_on:
+    for target in targets:
+        if target in effect.acts_on:
             test_result = ScoreTestResult(0.0, 2, units, 0.0)
-            candidate = Candidate((peak.axis,), *way, "file", np.empty((0, 0)), test_result, p_value=peak.p_value)
-            yield Term(effect, (peak.axis,), *way, fixed=fixed), names, candidate
+            candidate = Candidate((peak.axis,), *target, "file", np.empty((0, 0)), test_result, p_value=peak.p_value)
+            yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
 
 
 def reference(values: np.ndarray) -> float:

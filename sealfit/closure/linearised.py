@@ -72,8 +72,8 @@ class Proposal:
         kind = 0 if effect.physical else 2 if effect.id in UNNAMED else 1
         offset = self.source == ZERO_OFFSET  # an amplifier is off more often than friction by direction
         target = -1 if offset else PREFERRED.index(self.term.acts_on)
-        way = (self.term.acts_on, self.term.operation)
-        return (kind, self.size, target, effect.acts_on.index(way) if effect.physical else 0)
+        target = (self.term.acts_on, self.term.operation)
+        return (kind, self.size, target, effect.acts_on.index(target) if effect.physical else 0)
 
 
 class Linearised:

@@ -267,7 +267,7 @@ def _found_again(selection: Selection, found: Sequence[Model]) -> bool:
     shapes = [shape_of(term, values, rows) for term, values in known if "shift" not in term.fixed]
     terms = [item.proposal.term for item in selection.added]
     own = [shape_of(term, values, rows) for term, values in zip(terms, selection.after.model.values, strict=True)]
-    return any(_alike(one, other) for one in own for other in shapes)
+    return any(_same_shape(one, other) for one in own for other in shapes)
 
 
 def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:
@@ -278,7 +278,7 @@ def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:
     return replace(selection, after=selection.before, added=(), refused=(*selection.refused, *refused))
 
 
-def _alike(one: np.ndarray, other: np.ndarray) -> bool:
+def _same_shape(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two shapes are correlated, or the same constant."""
     one, other = one - one.mean(), other - other.mean()
     size = np.linalg.norm(one) * np.linalg.norm(other)

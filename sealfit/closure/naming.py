@@ -162,9 +162,9 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
     held = [p for p in equals if determined(p)]
     fewest = min((p.size for p in held), default=0)
     held += [p for p in equals if p.term.effect.physical and p not in held and p.size <= fewest]
-    alike = [p for p in found if p.fitted.deviance - best.fitted.deviance < TIED]
-    if not any(p.term.effect.id == LINEAR for p in alike):  # a straight line shows no mechanism
-        own = [p for p in alike if _own_mechanism(p)]
+    equal_fits = [p for p in found if p.fitted.deviance - best.fitted.deviance < TIED]
+    if not any(p.term.effect.id == LINEAR for p in equal_fits):  # a straight line shows no mechanism
+        own = [p for p in equal_fits if _own_mechanism(p)]
         least = min((p.fitted.deviance for p in own), default=0.0)
         held += [p for p in own if p.fitted.deviance - least < 2 * TIED and p not in held]
     if held:
@@ -232,8 +232,8 @@ def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
 
 
 def _rival(proposal: Proposal, chosen: Proposal) -> bool:
-    alike = correlation(proposal, chosen)
-    return alike > SAME_EFFECT or (alike > ALIKE and proposal.bic - chosen.bic < RIVAL)
+    equal_fits = correlation(proposal, chosen)
+    return equal_fits > SAME_EFFECT or (equal_fits > ALIKE and proposal.bic - chosen.bic < RIVAL)
 
 
 def _identical(one: Proposal, other: Proposal) -> bool:

@@ -164,10 +164,10 @@ def _second_specimen(rows: Rows, config: Config) -> dict:
 def _unseen(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> Iterator[dict]:
     """Yield the run that would show each effect that the model takes up whole here; one for those of like channels."""
     taken = tuple(name for name in (*config.condition, *config.rubber) if name != "aging_days")
-    alike: dict[tuple[str, ...], list[Alias]] = {}
+    by_channels: dict[tuple[str, ...], list[Alias]] = {}
     for alias in find_aliases(fitted, effects, taken):
-        alike.setdefault(alias.term.channels, []).append(alias)
-    for channels, aliases in alike.items():
+        by_channels.setdefault(alias.term.channels, []).append(alias)
+    for channels, aliases in by_channels.items():
         first = aliases[0]
         found = where_apart(first.holding, first.lacking, fitted.rows, channels, config)
         if found is not None and found[1] > SHOWN * first.size_N:

@@ -283,16 +283,18 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     rows = after.rows
     channels = {name for term in (*before.model.terms, *after.model.terms) for name in term.channels}
     read = [name for name in rows.table.columns if name in {*CURVES.names(), *channels}]
-    way = np.sign(rows.speed)
-    moving = np.flatnonzero(way != 0)
-    order = moving[np.lexsort((-way[moving], rows.condition[moving]))]  # of a condition, what moves forwards first
-    cuts = np.flatnonzero(np.diff(rows.condition[order]) | (np.diff(way[order]) != 0)) + 1
+    direction = np.sign(rows.speed)
+    sliding = np.flatnonzero(direction != 0)
+    order = sliding[
+        np.lexsort((-direction[sliding], rows.condition[sliding]))
+    ]  # of a condition, what moves forwards first
+    cuts = np.flatnonzero(np.diff(rows.condition[order]) | (np.diff(direction[order]) != 0)) + 1
     own = {name: pd.Series(rows.values(name), name=name) for name in open_columns(rows.table)}
     columns = {name: _averaged(own.get(name, rows.table[name]), np.split(order, cuts)) for name in read}
     speeds = [np.abs(rows.speed[chosen]) for chosen in np.split(order, cuts)]
     counts = [POINTS if own.max() > 1.02 * own.min() else 1 for own in speeds]
     first = order[np.r_[0, cuts]]
-    points = pd.DataFrame({**columns, "direction": way[first]}).loc[np.repeat(np.arange(first.size), counts)]
+    points = pd.DataFrame({**columns, "direction": direction[first]}).loc[np.repeat(np.arange(first.size), counts)]
     along = [np.geomspace(own.min(), own.max(), count) for own, count in zip(speeds, counts, strict=True)]
     points = points.assign(speed_mm_s=points["direction"].to_numpy() * np.concatenate(along), file="")
     points = points.reset_index(drop=True)

@@ -151,8 +151,8 @@ class Renaming:
         found = sorted(finest.values(), key=lambda c: -c.chi2)
         own, values = fitted.model.terms[number], fitted.model.values[number]
         at_own_values = {p.name: (values[p.name],) for p in own.effect.nonlinear}
-        alike = next((c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None)
-        own_form = Linearised(without)(own, at_own_values, alike) if alike is not None else ()
+        same_target = next((c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None)
+        own_form = Linearised(without)(own, at_own_values, same_target) if same_target is not None else ()
         return propose(without, found, self.channels, self.context.effects, own_form)
 
     def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> AcceptedEffect | None:

@@ -10,7 +10,7 @@ import pandas as pd
 from scipy.special import betaincc, gammaincc
 
 from sealfit.closure.criteria import ABOVE_BACKGROUND, LEAST_FILES_OF_RIPPLE, LOBE, SHARED_PHASE
-from sealfit.closure.spectrum import Spectrum, Strokes, alike, background, smooth_background, spectra_of, tops
+from sealfit.closure.spectrum import Spectrum, Strokes, background, effective_count, smooth_background, spectra_of, tops
 from sealfit.fit.joint.model import passes
 from sealfit.fit.joint.rows import Rows
 
@@ -106,7 +106,7 @@ def _incoherent(spectrum: Spectrum) -> Peak:
     """
     open_power = np.where(spectrum.taken, np.nan, spectrum.power)
     ratio = spectrum.power / smooth_background(open_power, spectrum.frequency, spectrum.count)
-    count = np.minimum(spectrum.count, alike(np.where(spectrum.taken, np.nan, ratio)))
+    count = np.minimum(spectrum.count, effective_count(np.where(spectrum.taken, np.nan, ratio)))
     with np.errstate(divide="ignore"):  # -inf: beyond doubt
         own = np.log(gammaincc(count, ratio * count))
     peaks = tops(spectrum.power) & ~spectrum.taken
@@ -194,8 +194,10 @@ def _waves(strokes: Strokes, lengths: np.ndarray) -> Waves:
     square, product = np.zeros((strokes.size.size, lengths.size, 2, 2)), np.zeros((strokes.size.size, lengths.size, 2))
     total, middle = np.zeros((2, strokes.size.size))
     for size in np.unique(strokes.size).tolist():  # those of one size at once, as far as they fit into the cache
-        alike = np.flatnonzero(strokes.size == size)
-        for some in np.array_split(alike, min(alike.size, -(-alike.size * size * lengths.size // MOST_NUMBERS))):
+        same_size = np.flatnonzero(strokes.size == size)
+        for some in np.array_split(
+            same_size, min(same_size.size, -(-same_size.size * size * lengths.size // MOST_NUMBERS))
+        ):
             place, value = strokes.together(some)
             square[some], product[some], total[some] = _normal_equations(place, value, lengths)
             middle[some] = place.mean(axis=1)

@@ -170,8 +170,8 @@ class ScoreTests:
         white, basis = self.fitted.whitening(self.fitted.friction[:, None])[:, 0], self.fitted.basis
         size = rows.groups.sums(white**2, "specimen")
         taken = (basis.sums(rows.groups, "specimen", white).values ** 2).sum(axis=1)
-        told = size - taken >= IDENTIFIABLE * size
-        own = OwnColumns(rows.codes("specimen"), white * told[rows.codes("specimen")])
+        identifiable = size - taken >= IDENTIFIABLE * size
+        own = OwnColumns(rows.codes("specimen"), white * identifiable[rows.codes("specimen")])
         return own, basis.orthonormal(RANK, freed=own.freed)
 
     def __call__(
@@ -372,12 +372,12 @@ def critical_small_sample(fitted: Fitted, tests: Sequence[SmallSampleTest], leve
 
 def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int) -> np.ndarray:
     """Return the smallest log p-value of all judgements under each of many random flips."""
-    alike = defaultdict(lambda: defaultdict(list))
+    by_units = defaultdict(lambda: defaultdict(list))
     for test_result in results:
         units, df = test_result.scores.shape
-        alike[units][df].append(test_result.scores)
+        by_units[units][df].append(test_result.scores)
     least = np.zeros(flips)
-    for units, by_df in alike.items():
+    for units, by_df in by_units.items():
         scores = np.column_stack([own for scores in by_df.values() for own in scores])
         totals = _flipped(scores, flips, rng)
         first = 0

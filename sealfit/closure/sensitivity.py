@@ -278,8 +278,8 @@ class _Search:
         prior = (df * variance - known.df * known.variance) / np.maximum(prior_df, 1e-9)
         others = contrast_test(effect, project(effect, self.lines), known.level)
         for along in (False, True) if others is not None else ():
-            alike = others.variance[others.along == along]  # the effect stands in the scatter of other contrasts
-            prior[known.along == along] *= np.exp(np.mean(np.log1p(alike))) if alike.size else 1.0
+            others_variance = others.variance[others.along == along]  # the effect enlarges it
+            prior[known.along == along] *= np.exp(np.mean(np.log1p(others_variance))) if others_variance.size else 1.0
         own = variance * test.variance / known.variance
         share = test.df / (prior_df + test.df)
         both = (1 - share) * prior + share * own

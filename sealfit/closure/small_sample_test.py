@@ -133,8 +133,8 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
             continue
         t = slopes.mean() / max(np.std(slopes) / np.sqrt(slopes.size - 1), 1e-300)
         log_p = log_p_of_t(t, np.array(slopes.size - 1.0))
-        alike = chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFER
-        found[k] = log_p < np.log(AGREE if alike or not inside[k] else CLOSELY)
+        equal_slopes = chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFER
+        found[k] = log_p < np.log(AGREE if equal_slopes or not inside[k] else CLOSELY)
     return found | (inside & (least_share(fitted, left) > LARGE))
 
 
@@ -220,7 +220,7 @@ def _prior(tests: Sequence[ContrastTest], level: str, along: bool) -> Prior:
     known = _degrees_of_freedom(spread)
     half = known / 2
     typical = float(np.exp(mean + (psi(half) - np.log(half) if known < MOST_DF else 0.0)))
-    return Prior(typical, min(known, (_independent(deviations) - 1) * float(np.median(df))))
+    return Prior(typical, min(known, (_independent_directions(deviations) - 1) * float(np.median(df))))
 
 
 def _log_moments(variance: np.ndarray, df: np.ndarray) -> tuple[float, float]:
@@ -240,14 +240,16 @@ def _degrees_of_freedom(spread: float) -> float:
     return float(2 * np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - spread, np.log(1e-3), np.log(MOST_DF / 2))))
 
 
-def _independent(deviations: np.ndarray) -> float:
+def _independent_directions(deviations: np.ndarray) -> float:
     """Return of how many independent directions the columns of scores behave like: (tr R)^2 / tr R^2, at least 1."""
     size = np.sqrt((deviations**2).sum(axis=0))
-    alike = deviations[:, size > 0] / size[size > 0]
-    if alike.shape[1] == 0:
+    standardised = deviations[:, size > 0] / size[size > 0]
+    if standardised.shape[1] == 0:
         return 1.0
-    inner = alike @ alike.T  # has the same trace of its square as the matrix between columns, and is smaller
-    return float(max(alike.shape[1] ** 2 / (inner**2).sum(), 1.0))
+    inner = (
+        standardised @ standardised.T
+    )  # has the same trace of its square as the matrix between columns, and is smaller
+    return float(max(standardised.shape[1] ** 2 / (inner**2).sum(), 1.0))
 
 
 # ---------------------------------------------------------------- small sample test
@@ -402,8 +404,8 @@ class ClusterTests:
         groups, known = self.fitted.rows.groups, list(self._numbers.values())
 
         def covariance(one: Numbers, other: Numbers) -> np.ndarray:
-            alike = np.diag(groups.sums(one.direction * other.direction, self.level))
-            return one.root @ (alike - one.taken @ other.taken.toarray().T) @ other.root.T
+            shared = np.diag(groups.sums(one.direction * other.direction, self.level))
+            return one.root @ (shared - one.taken @ other.taken.toarray().T) @ other.root.T
 
         blocks = [[covariance(one, other) for other in known] for one in known]
         size, axes = np.linalg.eigh(np.block(blocks))

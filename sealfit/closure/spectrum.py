@@ -77,7 +77,7 @@ class Strokes:
 # The background of a spectrum, from each frequency's neighbours: what a peak stands out of.
 
 
-def alike(ratio: np.ndarray) -> np.ndarray:
+def effective_count(ratio: np.ndarray) -> np.ndarray:
     """Return of how many independent powers a spectrum behaves like the mean, by its neighbours' spread, shape (f,).
 
     The logarithm of a mean of c powers has the variance trigamma(c); its spread is taken from the quartiles, which a
@@ -301,9 +301,9 @@ class _Sums:
     amplitude: np.ndarray
 
     @classmethod
-    def none(cls, f: int, ways: int) -> _Sums:
-        total, amplitude = np.zeros((ways, f), dtype=complex), np.zeros((ways, f), dtype=complex)
-        return cls(*np.zeros((3, f)), total, np.zeros((ways, f)), np.zeros(ways), amplitude)
+    def none(cls, f: int, directions: int) -> _Sums:
+        total, amplitude = np.zeros((directions, f), dtype=complex), np.zeros((directions, f), dtype=complex)
+        return cls(*np.zeros((3, f)), total, np.zeros((directions, f)), np.zeros(directions), amplitude)
 
     def __add__(self, other: _Sums) -> _Sums:
         return _Sums(*(getattr(self, part.name) + getattr(other, part.name) for part in fields(self)))
@@ -328,15 +328,15 @@ def _sums_of(block: _Block) -> _Sums:
     sums.power[:width] = (power / np.maximum(mean, 1e-300)[:, :, None]).sum(axis=(0, 1))
     most = np.zeros(units.size, dtype=int)
     np.maximum.at(most, unit, block.reach)
-    for way in range(sums.units.size):
-        own = np.einsum("usf,s->uf", wave, sides) if way else wave.sum(axis=1)
+    for k in range(sums.units.size):
+        own = np.einsum("usf,s->uf", wave, sides) if k else wave.sum(axis=1)
         power = _power(own)
         square = _medians(power, most)  # each unit weighs by its own spread, so that one noisy file does not decide
         kept = square > 0
-        sums.total[way, :width] = (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
-        sums.scaled[way, :width] = (power[kept] / square[kept, None]).sum(axis=0)
-        sums.units[way] = own.any(axis=1).sum()
-        sums.amplitude[way, :width] = own.sum(axis=0)
+        sums.total[k, :width] = (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
+        sums.scaled[k, :width] = (power[kept] / square[kept, None]).sum(axis=0)
+        sums.units[k] = own.any(axis=1).sum()
+        sums.amplitude[k, :width] = own.sum(axis=0)
     return sums
 
 
@@ -346,13 +346,13 @@ def _transformed(block: _Block) -> np.ndarray:
     found = np.zeros((reach.size, int(reach.max())), dtype=complex)
     size = np.ceil(strokes.span * points / block.longest).astype(int)
     for length, count in np.unique(np.column_stack([points, size]), axis=0):
-        alike = np.flatnonzero((points == length) & (size == count))
+        same_size = np.flatnonzero((points == length) & (size == count))
         trend, taper = _on_grid(count)
-        value = strokes.on_grids(alike, block.longest / length, count)
+        value = strokes.on_grids(same_size, block.longest / length, count)
         value -= (value @ trend) @ trend.T
-        width = int(reach[alike].max())
+        width = int(reach[same_size].max())
         wave = np.fft.rfft(value * taper, length)[:, block.numbers[0] : block.numbers[0] + width]
-        found[alike, :width] = np.where(np.arange(width) < reach[alike, None], wave, 0.0)
+        found[same_size, :width] = np.where(np.arange(width) < reach[same_size, None], wave, 0.0)
     turn = -2j * np.pi / block.longest * strokes.low[:, None]
     many, few = np.divmod(block.numbers[: found.shape[1]], EXPONENTS)  # a product of two costs less than a power
     found *= np.exp(turn * EXPONENTS * np.arange(many[-1] + 1))[:, many]
@@ -375,8 +375,8 @@ def _medians(values: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Return the median of the first so many values of each row, shape (rows,); 0 of none."""
     found = np.zeros(count.size)
     for size in np.unique(count[count > 0]):
-        alike = count == size
-        found[alike] = np.median(values[alike, :size], axis=1)
+        same_size = count == size
+        found[same_size] = np.median(values[same_size, :size], axis=1)
     return found
 
 
@@ -393,8 +393,8 @@ def _summed(
         for axis, wavelength in known:
             taken |= (axis == survey.axis) & (np.abs(frequency - 1 / wavelength) <= LOBE / longest)
         common = tuple(
-            Common(way == 0, sums.total[way], sums.scaled[way], int(units), sums.amplitude[way] / count)
-            for way, units in enumerate(sums.units)
+            Common(k == 0, sums.total[k], sums.scaled[k], int(units), sums.amplitude[k] / count)
+            for k, units in enumerate(sums.units)
         )
         amplitude = np.sqrt(sums.square / count)
         yield Spectrum(survey.axis, frequency, sums.count, sums.power / count, amplitude, common, taken)

@@ -79,7 +79,7 @@ def subsamples(rows: Rows, seed: int) -> Iterator[Subsample]:
     every, most, searched_before = _merged(rows, rows, seed), STROKES, 0
     strokes, runs = (rows.groups.starts[level].size for level in ("stroke", "run"))
     while most < strokes:
-        drawn = _dealt(rows, min(max(most / strokes, RUNS / runs), 1.0), seed)
+        drawn = _rows_drawn(rows, min(max(most / strokes, RUNS / runs), 1.0), seed)
         if searched_before < np.count_nonzero(drawn) < drawn.size:
             part = rows.subset(drawn)
             yield Subsample(part, _merged(part, rows, seed), every)
@@ -90,22 +90,22 @@ def subsamples(rows: Rows, seed: int) -> Iterator[Subsample]:
 
 def _merged(part: Rows, campaign: Rows, seed: int) -> Rows:
     """Return rows merged along their strokes, their conditions and declared model those of the whole campaign."""
-    few = merged_bins(part.table.drop(columns=POWER, errors="ignore"), seed)
-    if len(few) == part.force.size:
+    merged = merged_bins(part.table.drop(columns=POWER, errors="ignore"), seed)
+    if len(merged) == part.force.size:
         return part
-    made = make_rows(few, has_aging=campaign.has_aging, conditions=campaign.conditions)
+    made = make_rows(merged, has_aging=campaign.has_aging, conditions=campaign.conditions)
     declare(made, as_in=campaign)
     return made
 
 
-def _dealt(rows: Rows, share: float, seed: int) -> np.ndarray:
+def _rows_drawn(rows: Rows, share: float, seed: int) -> np.ndarray:
     """Return which rows are of the runs drawn, shape (n,): one at random of every 1 / `share` beside each other.
 
     At least one of each condition, and `LEAST_RUNS` of those that tell a number of the declared model.
     """
     first = rows.groups.starts["run"]
     condition = rows.condition[first]
-    drawn = _one_of_each(np.lexsort([np.abs(rows.speed[first]), condition]), share, seed)
+    drawn = _one_per_group(np.lexsort([np.abs(rows.speed[first]), condition]), share, seed)
     rng = np.random.default_rng(seed)
     _fill(drawn, condition, 1, rng)
     for numbers in declare(rows).index.values():
@@ -139,29 +139,29 @@ def merged_bins(bins: pd.DataFrame, seed: int) -> pd.DataFrame:
     strokes = bins["stroke_id"].nunique()
     if LEAST_PER_STROKE * strokes <= MOST_ROWS:
         return thin(bins, int(np.clip(PER_STROKE * strokes, ROWS, MOST_ROWS)))
-    finely = _files_dealt(bins, MOST_ROWS / (PER_STROKE * strokes), seed)
+    finely = _files_drawn(bins, MOST_ROWS / (PER_STROKE * strokes), seed)
     together = int(np.ceil(len(bins) / strokes / PER_STROKE))
     return merge(bins, np.where(finely, together, len(bins)))
 
 
-def _files_dealt(bins: pd.DataFrame, share: float, seed: int) -> np.ndarray:
+def _files_drawn(bins: pd.DataFrame, share: float, seed: int) -> np.ndarray:
     """Return whether each row's file is of those drawn, shape (n,): one of every 1 / `share` beside each other."""
     file = pd.factorize(bins["file"])[0]
     first = np.flatnonzero(np.diff(np.maximum.accumulate(file), prepend=-1))
-    beside = np.lexsort([pd.factorize(bins[name])[0][first] for name in ("run_id", "condition")])
-    return _one_of_each(beside, share, seed)[file]
+    order = np.lexsort([pd.factorize(bins[name])[0][first] for name in ("run_id", "condition")])
+    return _one_per_group(order, share, seed)[file]
 
 
-def _one_of_each(beside: np.ndarray, share: float, seed: int) -> np.ndarray:
+def _one_per_group(order: np.ndarray, share: float, seed: int) -> np.ndarray:
     """Return what is drawn, one at random of every 1 / `share` in the order `beside`, shape (n,)."""
-    group = np.floor(np.arange(beside.size) * share)
-    shuffled = np.lexsort((np.random.default_rng(seed).random(beside.size), group))
-    drawn = np.zeros(beside.size, dtype=bool)
-    drawn[beside[shuffled[np.flatnonzero(np.diff(group, prepend=-1))]]] = True
+    group = np.floor(np.arange(order.size) * share)
+    shuffled = np.lexsort((np.random.default_rng(seed).random(order.size), group))
+    drawn = np.zeros(order.size, dtype=bool)
+    drawn[order[shuffled[np.flatnonzero(np.diff(group, prepend=-1))]]] = True
     return drawn
 
 
-Way = tuple[str, str]  # what an effect acts on, and how
+Target = tuple[str, str]  # what an effect acts on, and how
 
 
 def reselect_on_all(
@@ -192,20 +192,20 @@ def reselect_on_all(
         item = first
         for others_of in (_first_rivals, _on_other_quantities):
             number = next(k for k, a in enumerate(added) if a is item)
-            asked = [item.proposal, *others_of(item)]
-            if len(asked) == 1:
+            compared = [item.proposal, *others_of(item)]
+            if len(compared) == 1:
                 continue
             base = fitted_at(whole.model.without_term(number), every, whole.scatter, whole.friction)
-            found = named_among(base, [_of_all(p, every) for p in asked])
-            chosen = next(p for p in asked if p.term is found[0].term)
+            found = named_among(base, [_on_full_campaign(p, every) for p in compared])
+            chosen = next(p for p in compared if p.term is found[0].term)
             if chosen is not item.proposal:
                 say(f"all strokes say {describe(chosen.term)} rather than {describe(item.proposal.term)}")
-                item, after = _instead(item, chosen, after, number, samples, config)
+                item, after = _replaced(item, chosen, after, number, samples, config)
                 added, whole = [*added[:number], *added[number + 1 :], item], found[0].fitted
             if others_of is _on_other_quantities:
-                left = [_way(p) for p in found if p.bic - found[0].bic < RIVAL]
+                left = [_target(p) for p in found if p.bic - found[0].bic < RIVAL]
                 number = next(k for k, a in enumerate(added) if a is item)
-                added[number] = item = _with_rivals(item, [r for r in _rivals(item) if _way(r[0]) in left])
+                added[number] = item = _with_rivals(item, [r for r in _rivals(item) if _target(r[0]) in left])
     return replace(selection, added=tuple(added), after=after), whole
 
 
@@ -217,15 +217,15 @@ def _first_rivals(item: AcceptedEffect) -> list[Proposal]:
 def _on_other_quantities(item: AcceptedEffect) -> list[Proposal]:
     """Return an effect on the quantities that its rivals act on, to begin where it stands."""
     term = item.proposal.term
-    ways = (way for way in dict.fromkeys(map(_way, item.rivals)) if way != _way(item.proposal))
+    targets = (target for target in dict.fromkeys(map(_target, item.rivals)) if target != _target(item.proposal))
     return [
-        replace(item.proposal, term=replace(term, acts_on=way[0], operation=way[1]))
-        for way in ways
-        if way in term.effect.acts_on
+        replace(item.proposal, term=replace(term, acts_on=target[0], operation=target[1]))
+        for target in targets
+        if target in term.effect.acts_on
     ]
 
 
-def _instead(
+def _replaced(
     item: AcceptedEffect, chosen: Proposal, after: Fitted, number: int, samples: pd.DataFrame, config: Config
 ) -> tuple[AcceptedEffect, Fitted]:
     """Return an effect with another proposal in its place and its own among the rivals, and the part's fit with it."""
@@ -254,12 +254,12 @@ def _with_rivals(item: AcceptedEffect, rivals: list[tuple[Proposal, float]]) -> 
     return replace(item, rivals=tuple(r for r, _ in rivals), rivals_rmse_N=tuple(rmse for _, rmse in rivals))
 
 
-def _of_all(proposal: Proposal, every: Rows) -> Proposal:
+def _on_full_campaign(proposal: Proposal, every: Rows) -> Proposal:
     """Return a proposal of a part as one of all strokes, to be fitted."""
     return replace(proposal, units=every.groups.starts[proposal.unit].size, values=_values(proposal), fitted=None)
 
 
-def _way(proposal: Proposal) -> Way:
+def _target(proposal: Proposal) -> Target:
     return proposal.term.acts_on, proposal.term.operation
 
 
