@@ -70,10 +70,12 @@ class Proposal:
         """
         effect = self.term.effect
         kind = 0 if effect.physical else 2 if effect.id in UNNAMED else 1
-        offset = self.source == ZERO_OFFSET  # an amplifier is off more often than friction by direction
-        target = -1 if offset else PREFERRED.index(self.term.acts_on)
+        is_offset = (
+            self.source == ZERO_OFFSET
+        )  # the zero of an amplifier is more often wrong than friction is one-sided
+        position = -1 if is_offset else PREFERRED.index(self.term.acts_on)
         target = (self.term.acts_on, self.term.operation)
-        return (kind, self.size, target, effect.acts_on.index(target) if effect.physical else 0)
+        return (kind, self.size, position, effect.acts_on.index(target) if effect.physical else 0)
 
 
 class Linearised:

@@ -232,8 +232,8 @@ def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
 
 
 def _rival(proposal: Proposal, chosen: Proposal) -> bool:
-    equal_fits = correlation(proposal, chosen)
-    return equal_fits > SAME_EFFECT or (equal_fits > ALIKE and proposal.bic - chosen.bic < RIVAL)
+    similarity = correlation(proposal, chosen)
+    return similarity > SAME_EFFECT or (similarity > ALIKE and proposal.bic - chosen.bic < RIVAL)
 
 
 def _identical(one: Proposal, other: Proposal) -> bool:

@@ -285,9 +285,7 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     read = [name for name in rows.table.columns if name in {*CURVES.names(), *channels}]
     direction = np.sign(rows.speed)
     sliding = np.flatnonzero(direction != 0)
-    order = sliding[
-        np.lexsort((-direction[sliding], rows.condition[sliding]))
-    ]  # of a condition, what moves forwards first
+    order = sliding[np.lexsort((-direction[sliding], rows.condition[sliding]))]  # forward strokes first
     cuts = np.flatnonzero(np.diff(rows.condition[order]) | (np.diff(direction[order]) != 0)) + 1
     own = {name: pd.Series(rows.values(name), name=name) for name in open_columns(rows.table)}
     columns = {name: _averaged(own.get(name, rows.table[name]), np.split(order, cuts)) for name in read}

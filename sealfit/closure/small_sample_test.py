@@ -246,9 +246,7 @@ def _independent_directions(deviations: np.ndarray) -> float:
     standardised = deviations[:, size > 0] / size[size > 0]
     if standardised.shape[1] == 0:
         return 1.0
-    inner = (
-        standardised @ standardised.T
-    )  # has the same trace of its square as the matrix between columns, and is smaller
+    inner = standardised @ standardised.T  # tr R^2 is the same for the smaller product
     return float(max(standardised.shape[1] ** 2 / (inner**2).sum(), 1.0))
 
 

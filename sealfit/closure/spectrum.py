@@ -301,9 +301,9 @@ class _Sums:
     amplitude: np.ndarray
 
     @classmethod
-    def none(cls, f: int, directions: int) -> _Sums:
-        total, amplitude = np.zeros((directions, f), dtype=complex), np.zeros((directions, f), dtype=complex)
-        return cls(*np.zeros((3, f)), total, np.zeros((directions, f)), np.zeros(directions), amplitude)
+    def none(cls, f: int, modes: int) -> _Sums:
+        total, amplitude = np.zeros((modes, f), dtype=complex), np.zeros((modes, f), dtype=complex)
+        return cls(*np.zeros((3, f)), total, np.zeros((modes, f)), np.zeros(modes), amplitude)
 
     def __add__(self, other: _Sums) -> _Sums:
         return _Sums(*(getattr(self, part.name) + getattr(other, part.name) for part in fields(self)))
