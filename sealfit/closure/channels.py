@@ -14,13 +14,13 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from sealfit.closure.criteria import (
+    CONSTANT_SHARE,
     FREE_DF,
     LEAST_GROUPS_HELD_OUT,
     MANY_RUNS,
     MOST_LEVELS,
     MOST_SET_VALUES,
     SAME_VALUE,
-    WITHIN,
 )
 from sealfit.closure.criteria import LEAST_UNITS_OF_SLOPES as LEAST_SLOPES
 from sealfit.config import Config
@@ -125,7 +125,7 @@ def incomplete_channels(rows: Rows) -> list[dict]:
 def unit_of(values: np.ndarray, rows: Rows) -> str:
     """Return the coarsest level within whose groups `values` vary by next to nothing; "sample" if there is none."""
     numeric = values.dtype.kind == "f"
-    least = WITHIN * float(np.var(values)) if numeric else 0.0
+    least = CONSTANT_SHARE * float(np.var(values)) if numeric else 0.0
     for level in reversed(LEVELS):
         start, code = rows.groups.starts[level], rows.codes(level)
         if not numeric:

@@ -10,15 +10,15 @@ import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, level_values, settings, varies
 from sealfit.closure.criteria import (
-    COMPARED,
+    CURVE_P,
     LEAST_FALL,
     LEAST_SIZE,
-    MOSTLY,
-    REPEATED,
-    SURE_OF_CURVE,
-    SURE_OF_RIPPLE,
-    TRIES,
-    WEAK,
+    MOST_PROPOSALS,
+    MOST_RIVALS,
+    MOST_WITHIN,
+    RIPPLE_CONFIRMED_P,
+    SAMPLES_PER_VALUE,
+    WEAK_P,
 )
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import blocks, covered, foldable, folds, whole_settings
@@ -144,7 +144,7 @@ def _heldout_residual(before: Fitted, model: Model, out: np.ndarray, test: Rows)
     return test.force - evaluate(kept.model, test, jacobian=False)[0]
 
 
-def varies_within(proposal: Proposal, share: float = MOSTLY) -> str | None:
+def varies_within(proposal: Proposal, share: float = MOST_WITHIN) -> str | None:
     """Return the finest level within whose groups a share of the variance of the effect's shape lies; None for none.
 
     The shape is used, not the force that it adds. A share of the friction that is lost along each stroke is a force
@@ -190,7 +190,7 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
     from scipy.stats import wilcoxon  # here, as scipy.stats takes half a second to load
 
     both = agreement(samples, sample_first, length, axis)
-    there = both.size > 1 and wilcoxon(both, alternative="greater").pvalue < SURE_OF_RIPPLE
+    there = both.size > 1 and wilcoxon(both, alternative="greater").pvalue < RIPPLE_CONFIRMED_P
     rmse = np.sqrt(squares)
     return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(squares[0] - squares[1]) if there else -1.0)
 
@@ -229,7 +229,7 @@ class AcceptedEffect:
     @property
     def weak(self) -> bool:
         """Whether its evidence is weak."""
-        return self.proposal.p_value > WEAK
+        return self.proposal.p_value > WEAK_P
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ class RefusedEffect:
     @property
     def weak(self) -> bool:
         """Whether its evidence is too weak to say that something is left which no effect explains."""
-        return self.p_value > WEAK
+        return self.p_value > WEAK_P
 
 
 def silent(text: str) -> None:
@@ -303,14 +303,14 @@ def confirmed(
     config = context.config
     failed: list[RefusedEffect] = []
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
-    for proposal in proposals[:TRIES]:
+    for proposal in proposals[:MOST_PROPOSALS]:
         gain = heldout_gain(fitted, proposal, *folds_of)
         reason = _reason_refused(fitted, proposal, gain, samples, folds_of[-1])
         unit = config.units.unit("force")
         context.say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
             others = rivals(proposal, proposals)
-            rmse = [heldout_gain(fitted, o, *folds_of).left_N for o in others[:COMPARED]] if context.compare else []
+            rmse = [heldout_gain(fitted, o, *folds_of).left_N for o in others[:MOST_RIVALS]] if context.compare else []
             rmse += [np.nan] * (len(others) - len(rmse))
             return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
         if proposal.p_value <= config.loop.family_error:
@@ -323,10 +323,10 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
     """Return why a proposal is not confirmed; None where it is."""
     if not gain.real:
         return "it does not predict the data that were held out better than the model without it"
-    if proposal.p_value > SURE_OF_CURVE and _changes_the_curve(proposal):
-        return f"its p-value is no less than {SURE_OF_CURVE:g}, and how such a coefficient scatters is not known"
-    if proposal.p_value > WEAK and gain.share < LEAST_FALL:
-        return f"its p-value is no less than {WEAK:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
+    if proposal.p_value > CURVE_P and _changes_the_curve(proposal):
+        return f"its p-value is no less than {CURVE_P:g}, and how such a coefficient scatters is not known"
+    if proposal.p_value > WEAK_P and gain.share < LEAST_FALL:
+        return f"its p-value is no less than {WEAK_P:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
     least = max(rounding_error_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
     if np.sqrt(np.mean(added_force(proposal) ** 2)) <= least:
         return "it is smaller than the recorded force can show"
@@ -358,7 +358,7 @@ def rounding_error_N(samples: pd.DataFrame) -> float:
     """
     force = samples["force_N"].to_numpy(dtype=float)
     steps = np.diff(np.unique(force))
-    if steps.size == 0 or steps.size > force.size / REPEATED:
+    if steps.size == 0 or steps.size > force.size / SAMPLES_PER_VALUE:
         return 0.0
     step = float(np.median(steps))
     same = np.diff(samples["stroke_id"].to_numpy()) == 0

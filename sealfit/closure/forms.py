@@ -10,7 +10,15 @@ import pandas as pd
 from scipy.special import fdtrc
 
 from sealfit.closure.channels import CALENDAR, FINER, Channel, even_knots, scaled
-from sealfit.closure.criteria import FREE_DF, JACKKNIFE_UNITS, KNOTS_APART, MOST_KNOTS, REACH, SEARCHES, UNITS_PER_KNOT
+from sealfit.closure.criteria import (
+    FREE_DF,
+    JACKKNIFE_UNITS,
+    KNOTS_APART,
+    MOST_KNOTS,
+    MOST_SPANS,
+    SEARCHES,
+    UNITS_PER_KNOT,
+)
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.linearised import Proposal, middles
 from sealfit.closure.ripples import Peak, common_wavelength, pass_shifts
@@ -267,7 +275,7 @@ def _within_reach(effect: Effect, values: np.ndarray) -> Effect:
     A bump far outside is a bent line and a constant under another name.
     """
     low, high, span = float(values.min()), float(values.max()), float(np.ptp(values)) or 1.0
-    limits = {"inside": (low, high), "between": (low, high), "span": (span / 1000, REACH * span)}
+    limits = {"inside": (low, high), "between": (low, high), "span": (span / 1000, MOST_SPANS * span)}
     parameters = []
     for p in effect.parameters:
         if p.search in limits:

@@ -6,7 +6,13 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from sealfit.closure.criteria import BEYOND, BLOCKS_OF_A_FOLD, LEAST_GROUPS_HELD_OUT, MOST_HELD_OUT, SAME_SETTING
+from sealfit.closure.criteria import (
+    BLOCKS_OF_A_FOLD,
+    LEAST_GROUPS_HELD_OUT,
+    LEAST_HELD_OUT,
+    OUTSIDE_RANGE,
+    SAME_SETTING,
+)
 from sealfit.fit.joint.rows import LEVELS, Rows
 
 
@@ -63,7 +69,7 @@ def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]
     masks: list[np.ndarray] = []
     for parts in BLOCKS_OF_A_FOLD:
         masks = list(_masks(rows, level, place * min(count * parts, start.size) // start.size % count))
-        if np.any(masks, axis=0).mean() > MOST_HELD_OUT:
+        if np.any(masks, axis=0).mean() > LEAST_HELD_OUT:
             break
     return masks
 
@@ -135,7 +141,7 @@ def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.nda
 def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return which values lie beyond those seen, by more than measured numbers of one setting differ."""
     low, high = float(seen.min()), float(seen.max())
-    slack = BEYOND * (high - low) + SAME_SETTING * max(abs(low), abs(high))
+    slack = OUTSIDE_RANGE * (high - low) + SAME_SETTING * max(abs(low), abs(high))
     return (values < low - slack) | (values > high + slack)
 
 

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.closure.criteria import IDENTIFIABLE, PAIR
+from sealfit.closure.criteria import IDENTIFIABLE, PAIR_PENALTY
 from sealfit.closure.score_test import Candidate, project
 from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
@@ -49,7 +49,7 @@ class Proposal:
     @property
     def bic_penalty(self) -> float:
         """Schwarz's price of its parameters, and of being one of the many pairs of channels."""
-        pair = PAIR if SECOND in self.term.effect.reads else 0.0
+        pair = PAIR_PENALTY if SECOND in self.term.effect.reads else 0.0
         return self.size * np.log(max(self.units, 2)) + pair
 
     @property
@@ -70,9 +70,7 @@ class Proposal:
         """
         effect = self.term.effect
         kind = 0 if effect.physical else 2 if effect.id in UNNAMED else 1
-        is_offset = (
-            self.source == ZERO_OFFSET
-        )  # the zero of an amplifier is more often wrong than friction is one-sided
+        is_offset = self.source == ZERO_OFFSET  # amplifier offsets are commoner than one-sided friction
         position = -1 if is_offset else PREFERRED.index(self.term.acts_on)
         target = (self.term.acts_on, self.term.operation)
         return (kind, self.size, position, effect.acts_on.index(target) if effect.physical else 0)

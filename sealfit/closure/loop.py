@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, silent, varies_within
-from sealfit.closure.criteria import ALIKE, JACKKNIFE_UNITS, PARTLY
+from sealfit.closure.criteria import JACKKNIFE_UNITS, PART_WITHIN, RIVAL_CORRELATION
 from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import covered, folds, heldout_level
@@ -282,7 +282,7 @@ def _same_shape(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two shapes are correlated, or the same constant."""
     one, other = one - one.mean(), other - other.mean()
     size = np.linalg.norm(one) * np.linalg.norm(other)
-    return size == 0 or abs(one @ other) > ALIKE * size
+    return size == 0 or abs(one @ other) > RIVAL_CORRELATION * size
 
 
 def _no_worse(
@@ -321,7 +321,7 @@ def _around(added: Sequence[AcceptedEffect]) -> str | None:
 
     What varies inside a run changes nothing that runs differ by, and that may be most of the error.
     """
-    levels = [varies_within(a.proposal, PARTLY) for a in added]
+    levels = [varies_within(a.proposal, PART_WITHIN) for a in added]
     return None if None in levels else max(levels, key=LEVELS.index)
 
 

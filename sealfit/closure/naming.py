@@ -16,16 +16,16 @@ import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel
 from sealfit.closure.criteria import (
-    ALIKE,
-    BEHIND,
-    CONTENDER,
-    DOMINANT,
+    CONTENDER_SHARE,
+    EQUAL_BIC,
     HALF_OF_CALENDAR,
-    HELD,
-    OVERTURNED,
-    RIVAL,
+    LARGE_CHANGE,
+    MOST_RELATIVE_ERROR,
+    REFIT_MARGIN,
+    RIVAL_BIC,
+    RIVAL_CORRELATION,
     SAME_EFFECT,
-    TIED,
+    SCATTER_FALL,
 )
 from sealfit.closure.forms import periodic_terms, terms_of
 from sealfit.closure.intervals import robust_covariance
@@ -113,7 +113,7 @@ def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
     best = next((c for c in significant if c.key == ZERO_OFFSET), significant[0])
     seen = set()
     for candidate in significant:
-        if candidate.chi2 < CONTENDER * best.chi2 or candidate.key in seen:
+        if candidate.chi2 < CONTENDER_SHARE * best.chi2 or candidate.key in seen:
             continue
         if best.channels == ("direction",) and (candidate.pair or "direction" not in candidate.channels):
             continue
@@ -128,7 +128,7 @@ def _spread(found: list[Proposal]) -> list[Proposal]:
     quantity that explains nearly as much: what is missing bends the model it is looked for in.
     """
     kept: list[Proposal] = []
-    ranked = sorted(found, key=lambda p: p.bic - TIED * p.term.effect.physical)
+    ranked = sorted(found, key=lambda p: p.bic - EQUAL_BIC * p.term.effect.physical)
     for proposal in ranked:
         kind = _kind(proposal)
         same = [p for p in kept if _kind(p) == kind]
@@ -137,7 +137,7 @@ def _spread(found: list[Proposal]) -> list[Proposal]:
         if len(kept) < REFITTED or (not proposal.named and not same):
             kept.append(proposal)
     known, most = {_target(p) for p in kept}, max((p.chi2 for p in found), default=0.0)
-    for target in dict.fromkeys(_target(p) for p in ranked if p.chi2 >= CONTENDER * most):
+    for target in dict.fromkeys(_target(p) for p in ranked if p.chi2 >= CONTENDER_SHARE * most):
         if target not in known:
             kept += [p for p in ranked if _target(p) == target][:FORMS_EACH]
     return kept
@@ -158,19 +158,19 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
         return []
     found = sorted(found, key=lambda p: p.bic)
     best = found[0]
-    equals = [p for p in found if p.bic - best.bic < TIED or _simpler(p, best)]
+    equals = [p for p in found if p.bic - best.bic < EQUAL_BIC or _simpler(p, best)]
     held = [p for p in equals if determined(p)]
     fewest = min((p.size for p in held), default=0)
     held += [p for p in equals if p.term.effect.physical and p not in held and p.size <= fewest]
-    equal_fits = [p for p in found if p.fitted.deviance - best.fitted.deviance < TIED]
+    equal_fits = [p for p in found if p.fitted.deviance - best.fitted.deviance < EQUAL_BIC]
     if not any(p.term.effect.id == LINEAR for p in equal_fits):  # a straight line shows no mechanism
         own = [p for p in equal_fits if _own_mechanism(p)]
         least = min((p.fitted.deviance for p in own), default=0.0)
-        held += [p for p in own if p.fitted.deviance - least < 2 * TIED and p not in held]
+        held += [p for p in own if p.fitted.deviance - least < 2 * EQUAL_BIC and p not in held]
     if held:
         first = min(held, key=lambda p: (_overturns(fitted, p), p.rank, p.bic))
     else:
-        first = next((p for p in found if p.bic - best.bic < RIVAL and determined(p)), best)
+        first = next((p for p in found if p.bic - best.bic < RIVAL_BIC and determined(p)), best)
     return [first, *(p for p in found if p is not first)]
 
 
@@ -186,7 +186,7 @@ def _overturns(fitted: Fitted, proposal: Proposal) -> bool:
     Two effects that take from each other what both explain read worse than one beside the other.
     """
     return any(
-        abs(now[p.name] - then[p.name]) > OVERTURNED * abs(then[p.name])
+        abs(now[p.name] - then[p.name]) > LARGE_CHANGE * abs(then[p.name])
         for term, then, now in zip(fitted.model.terms, fitted.model.values, proposal.fitted.model.values, strict=False)
         for p in term.effect.parameters
         if p.linear
@@ -205,7 +205,7 @@ def determined(proposal: Proposal) -> bool:
         if parameter.linear or parameter.name == "phi":
             continue
         error = float(np.sqrt(covariance[first + k, first + k]))
-        if error > HELD * abs(fitted.model.values[-1][parameter.name]):
+        if error > MOST_RELATIVE_ERROR * abs(fitted.model.values[-1][parameter.name]):
             return False
     return True
 
@@ -217,7 +217,7 @@ def _simpler(proposal: Proposal, best: Proposal) -> bool:
     """
     gain = (best.term.acts_on, best.term.operation) == ("force", "multiply") and proposal.term.acts_on != "force"
     plain = proposal.rank[:2] < best.rank[:2] or proposal.source == ZERO_OFFSET or gain
-    return plain and correlation(proposal, best) > SAME_EFFECT and proposal.bic - best.bic < 2 * TIED
+    return plain and correlation(proposal, best) > SAME_EFFECT and proposal.bic - best.bic < 2 * EQUAL_BIC
 
 
 def correlation(one: Proposal, other: Proposal) -> float:
@@ -233,7 +233,7 @@ def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
 
 def _rival(proposal: Proposal, chosen: Proposal) -> bool:
     similarity = correlation(proposal, chosen)
-    return similarity > SAME_EFFECT or (similarity > ALIKE and proposal.bic - chosen.bic < RIVAL)
+    return similarity > SAME_EFFECT or (similarity > RIVAL_CORRELATION and proposal.bic - chosen.bic < RIVAL_BIC)
 
 
 def _identical(one: Proposal, other: Proposal) -> bool:
@@ -252,7 +252,7 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
     likeliest = sorted(found, key=lambda p: p.bic)
     refitted = sorted((_joint(fitted, p) for p in likeliest[:LIKELIEST]), key=lambda p: p.bic)
     best, alone = _reestimated(refitted[0]), _reestimated(refitted[0], noise=True)
-    if refitted[0].fitted.deviance - alone.fitted.deviance > DOMINANT:
+    if refitted[0].fitted.deviance - alone.fitted.deviance > SCATTER_FALL:
         refitted = sorted(_from_anew(fitted, likeliest, alone.fitted.scatter), key=lambda p: p.bic)
         best = _reestimated(refitted[0])
     elif len(found) > LIKELIEST:
@@ -260,7 +260,7 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
         best = best if refitted[0].term is best.term else _reestimated(refitted[0])
     least = min(best.bic, refitted[0].bic)
     scatter = best.fitted.scatter
-    near = [_deviance_under(p.fitted, scatter) + p.bic_penalty < least + BEHIND for p in refitted[1:]]
+    near = [_deviance_under(p.fitted, scatter) + p.bic_penalty < least + REFIT_MARGIN for p in refitted[1:]]
     own = [_reestimated(p) for p, n in zip(refitted[1:], near, strict=True) if n]
     far = [p for p, n in zip(refitted[1:], near, strict=True) if not n]
     return [best, *own, *far[:LIKELIEST]]

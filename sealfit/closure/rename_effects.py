@@ -15,7 +15,7 @@ import pandas as pd
 
 from sealfit.closure.channels import Channel
 from sealfit.closure.confirm import AcceptedEffect, Context, confirmed
-from sealfit.closure.criteria import RIVAL, TIED
+from sealfit.closure.criteria import EQUAL_BIC, RIVAL_BIC
 from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.naming import propose
 from sealfit.closure.score_test import Candidate, ScoreTests
@@ -58,7 +58,7 @@ class Renaming:
             without = self._without(fitted, number)
             proposals = self._proposals_on(fitted, number, without, [name], item.proposal.p_value)
             # While it is missing, what stood for most of the residual may rank too low on a grid to be refitted.
-            if not proposals or proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL:
+            if not proposals or proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL_BIC:
                 continue
             same = proposals[0].term.key() == item.proposal.term.key()
             better = self._confirmed(without, proposals[:1] if same else proposals, item.round)
@@ -111,11 +111,11 @@ class Renaming:
         proposals = self._proposals_on(fitted, number, without, self._channels_near(*names), p_value)
         proposals = sorted([*proposals, *self._products(without, names, p_value)], key=lambda p: p.bic)
         two = new.proposal.bic + earlier.proposal.bic_penalty
-        better = [p for p in proposals[:1] if p.bic < two + TIED]
+        better = [p for p in proposals[:1] if p.bic < two + EQUAL_BIC]
         pieces = names[0] == names[1] and not any(a.proposal.term.effect.physical for a in (earlier, new))
         if pieces and not better:
             penalties = new.proposal.bic_penalty + earlier.proposal.bic_penalty
-            fitting = [p for p in proposals if p.bic - p.bic_penalty < two - penalties + RIVAL]
+            fitting = [p for p in proposals if p.bic - p.bic_penalty < two - penalties + RIVAL_BIC]
             better = sorted(fitting, key=lambda p: p.bic)[:1]
         return self._confirmed(without, better, new.round) if better else None
 

@@ -11,7 +11,15 @@ import pandas as pd
 from sealfit.closure.after import reference_of
 from sealfit.closure.channels import FINER, Channel, incomplete_channels, unit_of
 from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, about_means
-from sealfit.closure.criteria import EVEN, HALVED, HARMLESS, LACK_OF_FIT, NOT_ADJUSTED, SAME_ERROR, UNSTEADY
+from sealfit.closure.criteria import (
+    CHANCE_P,
+    HALVED_ERROR,
+    HARMLESS_RATIO,
+    LACK_OF_FIT,
+    NOT_ADJUSTED,
+    SAME_ERROR,
+    UNSTEADY_SHARE,
+)
 from sealfit.closure.error_sizes import errors, lack_of_fit, noise_floor, scatter_list
 from sealfit.closure.forms import describe, free_term
 from sealfit.closure.intervals import effect_intervals
@@ -56,14 +64,14 @@ class BeforeAfter:
 
         Weak evidence needs a lower error held out: an equal one says nothing for it. Where a level is named, this
         is asked of the errors about the means of its groups, and the whole ones are not higher by much:
-        `HARMLESS`. That needs evidence that is not weak, or a held-out error about these means that is halved.
+        `HARMLESS_RATIO`. That needs evidence that is not weak, or a held-out error about these means that is halved.
         """
         whole = self._ratios(None)
         inside = whole if around is None else self._ratios(around)
         if max(inside) > SAME_ERROR or (weak and inside[1] >= 1):
             return False
-        sure = not weak or inside[1] < HALVED
-        return max(whole) <= (HARMLESS if sure else SAME_ERROR)
+        sure = not weak or inside[1] < HALVED_ERROR
+        return max(whole) <= (HARMLESS_RATIO if sure else SAME_ERROR)
 
     def _ratios(self, around: str | None) -> tuple[float, float]:
         """Return after's error over before's, in sample and held out; 1 for the second where nothing was held out."""
@@ -293,7 +301,7 @@ def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> di
     if left is None and selection.added:
         left = _unsteady_offset(selection) or _largest(
             selection.after,
-            [c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < EVEN],
+            [c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < CHANCE_P],
         )
     if isinstance(left, Peak):
         return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
@@ -321,7 +329,7 @@ def _unsteady_offset(selection: Selection) -> Candidate | None:
     )
     variance = sum(c.variance for c in fitted.scatter.components if c.kind == "offset" and c.level == "run")
     categories = [c for c in selection.channels.values() if not c.numeric and not c.grouping]
-    if amplitude == 0 or np.sqrt(variance) < UNSTEADY * amplitude or not categories:
+    if amplitude == 0 or np.sqrt(variance) < UNSTEADY_SHARE * amplitude or not categories:
         return None
     if 2 <= len(rows.conditions) <= rows.groups.starts["file"].size / 3:
         term = free_term(Channel("condition", rows.values("condition"), "run"), "force", "add")

@@ -20,7 +20,7 @@ from sealfit.closure.criteria import (
     MANY_RUNS,
     PROMISING,
     SEARCHES,
-    WORTH_THE_RUNS,
+    TESTED_AGAINST_RUNS,
 )
 from sealfit.closure.small_sample_test import (
     ClusterTests,
@@ -251,7 +251,7 @@ class ScoreTests:
         jackknife = 0.0
         if units >= JACKKNIFE_UNITS:
             explained = _log(chdtrc(left.shape[1], total @ total))
-            if level == "run" and explained < np.log(WORTH_THE_RUNS):
+            if level == "run" and explained < np.log(TESTED_AGAINST_RUNS):
                 test = self.cluster_tests["run"].test(left, target)
                 if test is not None and test.share > CONSTANT_IN_RUNS:
                     explained = min(explained, test.log_p)

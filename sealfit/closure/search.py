@@ -32,7 +32,7 @@ from sealfit.closure.criteria import (
     LEAST_UNITS_OF_SLOPES,
     LOGARITHMIC_SPAN,
     MOST_CATEGORIES,
-    RARE,
+    PAIR_FACTOR,
     SEARCHES,
 )
 from sealfit.closure.score_test import Candidate, ScoreTests, adjusted_candidates
@@ -190,7 +190,7 @@ def search_pairs(
     if not found:
         return []
     pairs = [c for c in adjusted_candidates(score_tests, [*found, *singles], rng) if c.pair]
-    return [replace(c, p_value=min(1.0, RARE * c.p_value)) for c in pairs]
+    return [replace(c, p_value=min(1.0, PAIR_FACTOR * c.p_value)) for c in pairs]
 
 
 def equivalent_pairs(

@@ -11,7 +11,7 @@ import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel, channels_of
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
-from sealfit.closure.criteria import DOUBTFUL, HALF_OF_CALENDAR, TRIES, WEAK
+from sealfit.closure.criteria import HALF_OF_CALENDAR, MOST_PROPOSALS, PAIRS_FROM_P, WEAK_P
 from sealfit.closure.forms import AGING, richer_laws
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import propose, rivals
@@ -159,7 +159,7 @@ class _Loop:
         proposals = propose(self.fitted, open_, self.channels, self.context.effects, laws)
         accepted = self.confirm(self.fitted, proposals, number, self.unconfirmed)
         if accepted is None:
-            self.refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
+            self.refused |= {p.source for p in proposals[:MOST_PROPOSALS]} or {c.key for c in open_}
             self.masked = []
         else:
             self.add(accepted)
@@ -234,7 +234,7 @@ class _Loop:
         if not whole:
             return found
         left, inconclusive = self.left, None
-        if isinstance(left, Candidate) and left.key in self.refused and left.p_value > WEAK:
+        if isinstance(left, Candidate) and left.key in self.refused and left.p_value > WEAK_P:
             left = None  # it is listed as refused
         laws = self.found.laws
         inconclusive_candidates = [
@@ -264,7 +264,7 @@ def _search_all(
     significant = [c for c in claimable if c.p_value <= alpha]
     aged = not significant or any(c.channels == (AGING,) for c in significant)
     laws = richer_laws(score_tests.fitted, channels, effects) if aged else []
-    if significant and significant[0].p_value <= DOUBTFUL:
+    if significant and significant[0].p_value <= PAIRS_FROM_P:
         return _SearchResult(claimable, laws, [], significant, [])
     pairs = _claimable(search_pairs(score_tests, list(channels.values()), last, rng), inconsistent)
     level = alpha * min((c.p_value for c in significant), default=1.0)

@@ -18,20 +18,20 @@ from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri
 from sealfit.closure.channels import Channel, scatter_level
 from sealfit.closure.confirm import about_means
 from sealfit.closure.criteria import (
-    CLEARLY,
     CONSTANT_IN_RUNS,
-    COUNTED,
     JACKKNIFE_UNITS,
-    LARGE,
+    LARGE_SHARE,
     LEAST_FALL,
     LEAST_POWER,
     LEAST_SIZE,
     LEAST_UNITS_OF_SLOPES,
-    MATERIAL,
-    POWER_SOUGHT,
+    MATERIAL_SCATTER,
+    REAL_RATIO,
     REAL_SHARE,
     SEARCHES,
-    WEAK,
+    SIZE_MARGIN,
+    TARGET_POWER,
+    WEAK_P,
 )
 from sealfit.closure.score_test import Candidate, ScoreTests, critical_many, critical_small_sample, project
 from sealfit.closure.selection import Selection
@@ -54,7 +54,7 @@ TINY = 1e-6
 """Of the force: an effect that changes no estimate."""
 
 STEPS = 6
-"""Sizes tried, each nearer to the one found with `POWER_SOUGHT`, until it is `CLOSE` (difference of logarithms)."""
+"""Sizes tried, each nearer to the one found with `TARGET_POWER`, until it is `CLOSE` (difference of logarithms)."""
 
 CLOSE = 0.03
 
@@ -105,7 +105,7 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 effect *= force / np.sqrt(rows.weight @ effect**2)
                 times = search.smallest(own[0], effect)
                 times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
-                smallest = force * float(max(times, COUNTED * LEAST_SIZE)) if times < 1 else None
+                smallest = force * float(max(times, SIZE_MARGIN * LEAST_SIZE)) if times < 1 else None
             if smallest is None:
                 units = rows.groups.starts[scatter_level([channel], rows)].size
                 if channel.unit == "sample" and specimens > 1:
@@ -140,7 +140,7 @@ def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
     around = dict(zip(LEVEL_NAMES, (*LEVELS, None), strict=True))[level]
     own = project(fitted, effect[:, None])[:, 0] / fitted.whitening.unit
     size, left = (float(np.sqrt(rows.weight @ about_means(x, rows, around) ** 2)) for x in (own, fitted.residual))
-    return COUNTED * left * float(np.sqrt(1 / (1 - LEAST_FALL) ** 2 - 1)) / size if size > 0 else np.inf
+    return SIZE_MARGIN * left * float(np.sqrt(1 / (1 - LEAST_FALL) ** 2 - 1)) / size if size > 0 else np.inf
 
 
 def _parts(selection: Selection, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
@@ -157,7 +157,7 @@ def _parts(selection: Selection, channel: Channel, own: Sequence[Candidate]) -> 
         parts[level] = means[k] - means[k + 1]
         square = weight @ parts[level] ** 2
         each = square / max(sizes[k] - sizes[k + 1], 1)  # mean square
-        if square > REAL_SHARE * (weight @ column**2) and each > CLEARLY * finer:
+        if square > REAL_SHARE * (weight @ column**2) and each > REAL_RATIO * finer:
             real.append(level)
         finer = max(finer, each)
     if len(real) < 2:
@@ -211,17 +211,17 @@ class _Search:
         return self.units[known.level].test(project(self.fitted, columns), target)
 
     def surer(self, times: float, candidate: Candidate) -> float:
-        """Return the factor on an effect found with `POWER_SOUGHT` that makes it strong evidence; infinite for few.
+        """Return the factor on an effect found with `TARGET_POWER` that makes it strong evidence; infinite for few.
 
         The p-value of few units falls too slowly for that.
         """
         if candidate.test_result.units < JACKKNIFE_UNITS:
             return np.inf
-        found, strong = (-ndtri(p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK))
-        return times * float((strong + ndtri(POWER_SOUGHT)) / (found + ndtri(POWER_SOUGHT)))
+        found, strong = (-ndtri(p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK_P))
+        return times * float((strong + ndtri(TARGET_POWER)) / (found + ndtri(TARGET_POWER)))
 
     def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
-        """Return the factor on an effect, shape (n,) with which it is found with `POWER_SOUGHT`; infinite for never."""
+        """Return the factor on an effect, shape (n,) with which it is found with `TARGET_POWER`; infinite for never."""
         size, margin, before = TINY, self.margin(candidate, TINY * effect, self.fitted), None
         for _ in range(STEPS):
             if not 0 < margin < np.inf:
@@ -248,7 +248,7 @@ class _Search:
         variants = score_tests.variants(columns, channel.unit)
         if all(enough_specimens(noise, left).all() for left in variants):
             return self._by_units(candidate, noise, effect, variants)
-        large = min(float(least_share(effect, left).max()) for left in variants) / LARGE
+        large = min(float(least_share(effect, left).max()) for left in variants) / LARGE_SHARE
         return min(large, self._by_units(candidate, noise, effect, variants))
 
     def _by_units(self, candidate: Candidate, noise: Fitted, effect: Fitted, variants: Sequence[np.ndarray]) -> float:
@@ -309,7 +309,7 @@ class _Search:
         sums = noise.rows.groups.sums
         own, added = (float((sums(seen / length * f.unit_residual(level), level) ** 2).sum()) for f in (noise, effect))
         own *= max(1.0, k / float((scores**2).sum()))  # not quieter than noise is on average
-        beyond = ndtri(POWER_SOUGHT) * np.sqrt(own)
+        beyond = ndtri(TARGET_POWER) * np.sqrt(own)
         share = 1 - betaincinv((units - k) / 2, k / 2, np.exp(self.critical_many))
         margin = length / (np.sqrt(units * share * (own + added)) + beyond)
         if units < JACKKNIFE_UNITS:
@@ -350,7 +350,7 @@ def _margin(length: np.ndarray, quiet: np.ndarray, differs: np.ndarray, k: int, 
     It is held against a variance: `quiet` without it, and what it adds to that itself.
     """
     critical = fdtri(k, df, 1 - tail)
-    return np.abs(length) / np.sqrt(quiet * ncfdtrinc(k, df, 1 - POWER_SOUGHT, critical) + k * critical * differs)
+    return np.abs(length) / np.sqrt(quiet * ncfdtrinc(k, df, 1 - TARGET_POWER, critical) + k * critical * differs)
 
 
 def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
@@ -388,7 +388,7 @@ def undetectable_variables(selection: Selection, entries: Sequence[dict], scatte
             continue
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
         own = [s for s in scatter if channel.unit != "sample" and starts[s["level"]].size == starts[channel.unit].size]
-        much = any(s["sd_rel"] > MATERIAL and s["sd_N"] < smallest for s in own)
+        much = any(s["sd_rel"] > MATERIAL_SCATTER and s["sd_N"] < smallest for s in own)
         few_specimens = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS_OF_SLOPES
         decisive = channel.unit == "sample" or channel.name == "direction" or few_specimens
         if much or (decisive and not np.isfinite(smallest)):

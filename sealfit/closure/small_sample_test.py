@@ -12,11 +12,11 @@ from scipy.optimize import brentq
 from scipy.special import chdtrc, fdtrc, log_ndtr, polygamma, psi, stdtr
 
 from sealfit.closure.criteria import (
-    AGREE,
-    CLOSELY,
-    DIFFER,
+    CONSISTENT_P,
+    CONSISTENT_P_IF_DIFFERENT,
+    DIFFERENT_P,
     KNOWN_DF,
-    LARGE,
+    LARGE_SHARE,
     LARGEST_LEVERAGE,
     LEAST_DF,
     LEAST_ERROR_DF,
@@ -133,9 +133,9 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
             continue
         t = slopes.mean() / max(np.std(slopes) / np.sqrt(slopes.size - 1), 1e-300)
         log_p = log_p_of_t(t, np.array(slopes.size - 1.0))
-        equal_slopes = chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFER
-        found[k] = log_p < np.log(AGREE if equal_slopes or not inside[k] else CLOSELY)
-    return found | (inside & (least_share(fitted, left) > LARGE))
+        equal_slopes = chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFERENT_P
+        found[k] = log_p < np.log(CONSISTENT_P if equal_slopes or not inside[k] else CONSISTENT_P_IF_DIFFERENT)
+    return found | (inside & (least_share(fitted, left) > LARGE_SHARE))
 
 
 def _slopes_of_specimens(fitted: Fitted, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

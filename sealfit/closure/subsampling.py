@@ -10,7 +10,7 @@ import pandas as pd
 
 from sealfit.closure.channels import channels_of
 from sealfit.closure.confirm import AcceptedEffect, heldout_gain
-from sealfit.closure.criteria import COMPARED, RIVAL
+from sealfit.closure.criteria import MOST_RIVALS, RIVAL_BIC
 from sealfit.closure.forms import describe
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import named_among
@@ -203,7 +203,7 @@ def reselect_on_all(
                 item, after = _replaced(item, chosen, after, number, samples, config)
                 added, whole = [*added[:number], *added[number + 1 :], item], found[0].fitted
             if others_of is _on_other_quantities:
-                left = [_target(p) for p in found if p.bic - found[0].bic < RIVAL]
+                left = [_target(p) for p in found if p.bic - found[0].bic < RIVAL_BIC]
                 number = next(k for k, a in enumerate(added) if a is item)
                 added[number] = item = _with_rivals(item, [r for r in _rivals(item) if _target(r[0]) in left])
     return replace(selection, added=tuple(added), after=after), whole
@@ -211,7 +211,7 @@ def reselect_on_all(
 
 def _first_rivals(item: AcceptedEffect) -> list[Proposal]:
     """Return the first rivals of an effect."""
-    return [rival for rival in item.rivals[:COMPARED] if not _periodic(rival)]
+    return [rival for rival in item.rivals[:MOST_RIVALS] if not _periodic(rival)]
 
 
 def _on_other_quantities(item: AcceptedEffect) -> list[Proposal]:

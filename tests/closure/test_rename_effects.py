@@ -5,7 +5,7 @@ from bins_helpers import make_bins, make_traces
 from sealfit.closure import rename_effects
 from sealfit.closure.channels import find_channels
 from sealfit.closure.confirm import AcceptedEffect, Context
-from sealfit.closure.criteria import PAIR
+from sealfit.closure.criteria import PAIR_PENALTY
 from sealfit.closure.forms import terms_of
 from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
@@ -75,7 +75,7 @@ def test_two_channels_together_pay_for_being_one_of_many():
         for term, searched in terms_of(candidate, channels, fitted, EFFECTS):
             for proposal in linearised(term, searched, candidate):
                 bic_penalty[term.effect.id] = proposal.bic_penalty
-    assert bic_penalty["product"] - bic_penalty["linear"] == pytest.approx(PAIR)
+    assert bic_penalty["product"] - bic_penalty["linear"] == pytest.approx(PAIR_PENALTY)
 
 
 def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
