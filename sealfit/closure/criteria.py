@@ -159,7 +159,7 @@ CONTENDER_SHARE = 0.6
 """Forms are fitted for a channel that explains at least this share of the largest explained sum of squares."""
 
 SCATTER_FALL = 20.0
-"""Proposals are refitted with noise alone as scatter if this lowers the best deviance by more.
+"""Fall of the deviance, with the scatter re-estimated, from which all proposals are refitted under the new scatter.
 
 Most of the estimated scatter was then the missing effect.
 """

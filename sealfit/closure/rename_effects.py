@@ -1,8 +1,8 @@
-"""Effects asked again: what was named while others were still missing may read otherwise beside them.
+"""Renaming of effects that were named while others were still missing.
 
-While an effect is missing it stands in the scatter, and one that is named then is told from its rivals less well than
-the data allow: a factor from an added force, a line from a logarithm. Where a second effect of one channel is found,
-the first was not its whole shape: one effect that does as well as the two says so better.
+A missing effect is part of the scatter, so an effect named then is not well distinguished from its rivals: a factor
+from an added force, a line from a logarithm. If a second effect of one channel is found, the first was not its whole
+shape: one effect that fits as well replaces the two.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from sealfit.closure.search import channel_candidates, search_pairs
 from sealfit.fit.joint.estimate import Fitted, fit
 
 ALONG_STROKES = ("time_s", "distance_mm", "displacement_mm")
-"""Channels that move together along every stroke, one a multiple of the other where the speed is steady."""
+"""Channels that are proportional to one another along every stroke at a steady speed."""
 
 
 @dataclass(frozen=True)
 class Renaming:
-    """What naming an effect anew needs besides the model.
+    """What renaming an effect needs besides the model.
 
     Parameters
     ----------
@@ -45,10 +45,10 @@ class Renaming:
     context: Context
 
     def earlier_renamed(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-        """Return a fit and its effects with each but the last named anew beside all the others.
+        """Return a fit and its effects, each but the last renamed given all others.
 
-        One that keeps its name was confirmed while others were missing: it goes if beside them it gains nothing
-        on held-out data.
+        An effect that keeps its name was confirmed while others were missing. It is removed if it has no gain on
+        held-out data given the others.
         """
         for item in added[:-1]:
             number = next(k for k, a in enumerate(added) if a is item)
@@ -57,7 +57,7 @@ class Renaming:
                 continue
             without = self._without(fitted, number)
             proposals = self._proposals_on(fitted, number, without, [name], item.proposal.p_value)
-            # While it is missing, what stood for most of the residual may rank too low on a grid to be refitted.
+            # A grid may rank the right form of a large missing effect too low for it to be refitted.
             if not proposals or proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL_BIC:
                 continue
             same = proposals[0].term.key() == item.proposal.term.key()
@@ -73,7 +73,7 @@ class Renaming:
     def _with_own_name(
         self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect
     ) -> AcceptedEffect | None:
-        """Return an effect of a fit with its own name, confirmed beside the others; None where it is not."""
+        """Return an effect of a fit with its own name, confirmed given the others; None if it is not confirmed."""
         model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
         own = fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
         return self._confirmed(without, [replace(item.proposal, fitted=own)], item.round)
@@ -81,11 +81,11 @@ class Renaming:
     def merged_with_earlier(
         self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect, *, pending: bool = False
     ) -> tuple[list[AcceptedEffect], AcceptedEffect]:
-        """Return earlier effects and a new one that is not in `fitted` yet.
+        """Return the earlier effects and a new one that is not in `fitted` yet, merged with an earlier one if possible.
 
-        An earlier effect goes where one alone does as well as it and the new one: a shape of the same channel or of
-        one that moves along with it, or a product of two channels. While another is `awaited`, beside which alone
-        the new one shows, only effects of its own channel are asked.
+        Two effects are merged if a single one fits as well: a shape of the same channel or of a proportional one, or a
+        product of two channels. While the other effect of a masked pair is `pending`, only effects of the new one's own
+        channel are merged with it.
         """
         for number, earlier in enumerate(added):
             if pending and self._channel(earlier) != self._channel(new):
@@ -98,10 +98,10 @@ class Renaming:
     def _single_effect(
         self, fitted: Fitted, number: int, earlier: AcceptedEffect, new: AcceptedEffect
     ) -> AcceptedEffect | None:
-        """Return one effect that does as well as an earlier and a new one; None where there is none.
+        """Return one effect that fits as well as an earlier and a new one; None if there is none.
 
-        Two forms of one channel that are no mechanism are one shape in two pieces: then it is enough that the one
-        fits as well, whatever the number of its knots.
+        Two forms of one channel that are no physical effects are one shape: then the single effect only has to fit as
+        well, whatever its number of parameters.
         """
         names = self._channel(earlier), self._channel(new)
         if None in names:
@@ -120,14 +120,14 @@ class Renaming:
         return self._confirmed(without, better, new.round) if better else None
 
     def _channels_near(self, *names: str) -> list[str]:
-        """Return the channels of two effects and, where both vary along strokes, those of every stroke."""
+        """Return the channels of two effects; if both vary along strokes, all channels that do."""
         found = list(dict.fromkeys(names))
         if all(self.channels[name].unit == "sample" for name in names):
             found += [name for name in ALONG_STROKES if name in self.channels and name not in found]
         return found
 
     def _products(self, without: Fitted, names: tuple[str, str], p_value: float) -> Sequence[Proposal]:
-        """Return forms of two channels together; none for one channel."""
+        """Return forms of two channels together; none if both are the same channel."""
         if names[0] == names[1]:
             return ()
         rng = np.random.default_rng(self.context.config.loop.seed)
@@ -142,7 +142,7 @@ class Renaming:
     def _proposals_on(
         self, fitted: Fitted, number: int, without: Fitted, names: Sequence[str], p_value: float
     ) -> Sequence[Proposal]:
-        """Return what may stand in the place of a term on some channels, from the fit `without` it."""
+        """Return proposals that may replace a term, on some channels, from the fit `without` it."""
         finest: dict[tuple, Candidate] = {}
         score_tests = ScoreTests(without)
         for c in (c for name in names for c in channel_candidates(score_tests, self.channels[name])):

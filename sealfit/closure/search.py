@@ -1,4 +1,4 @@
-"""Does a channel order the residual? Free shapes of every channel and of pairs, on every quantity they may act on."""
+"""Search for channels that explain the residual: free shapes of channels and pairs, acting on every quantity."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from sealfit.fit.joint.rows import POWER, Rows
 from sealfit.fit.joint.variance_components import orthonormal
 
 # ---------------------------------------------------------------- search
-# Does any channel order the residual? Free shapes of every channel, on every quantity they may act on.
+# Does any channel explain the residual? A free shape of every channel is tested on every quantity it may act on.
 
 TARGETS = (
     ("mu", "multiply"),
@@ -56,7 +56,7 @@ TARGETS = (
     ("a", "multiply"),
     ("b", "multiply"),
 )
-MOST_NUMBERS = 1 << 22  # of columns on all rows that are projected at once: 34 MB
+MOST_NUMBERS = 1 << 22  # Numbers in the columns that are projected at once: 34 MB.
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 
 
@@ -68,7 +68,7 @@ def search(score_tests: ScoreTests, channels: Sequence[Channel], rng: np.random.
     score_tests : ScoreTests
         Of the current model.
     channels : sequence of Channel
-        Where to look.
+        Channels to search.
     rng : Generator
         For the sign flips.
     """
@@ -77,7 +77,7 @@ def search(score_tests: ScoreTests, channels: Sequence[Channel], rng: np.random.
 
 
 def channel_candidates(score_tests: ScoreTests, channel: Channel) -> Iterator[Candidate]:
-    """Yield the candidates of one channel, not adjusted for any search."""
+    """Yield the candidates of one channel, with p-values that are not adjusted."""
     rows = score_tests.fitted.rows
     if channel.name == "direction":
         yield from _shape_candidates(score_tests, channel, np.ones((rows.force.size, 1)), TARGETS)
@@ -104,10 +104,10 @@ def _shape_candidates(
     targets: Sequence[tuple[str, str]],
     widths: Sequence[int] = (),
 ) -> Iterator[Candidate]:
-    """Yield the candidates of a channel's columns, by the first so many of them, on every target that may take them."""
+    """Yield the candidates of a channel's columns on every target, one for each number of columns in `widths`."""
     fitted, rows = score_tests.fitted, score_tests.fitted.rows
     if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
-        return  # too few speeds to know the Stribeck curve: what depends on speed may be just that
+        return  # with few speeds a dependence on speed may be the Stribeck curve
     both_ways = rows.speed.min() < 0 < rows.speed.max()
     slopes, places = [], []
     for acts_on, operation in targets:
@@ -127,7 +127,7 @@ def _shape_candidates(
         unit = channel.unit
         names = (channel.name,)
         unsigned = both_ways and (acts_on, operation) == ("force", "add") and channel.name != "direction"
-        if unsigned and FINER[channel.unit] > FINER["stroke"]:  # it shows only between directions
+        if unsigned and FINER[channel.unit] > FINER["stroke"]:  # it is seen only as a difference between directions
             names = ("direction", channel.name)
             unit = min(unit, _direction_unit(rows), key=FINER.get)
         level = flip_level(unit, rows)
@@ -145,7 +145,7 @@ def _direction_unit(rows: Rows) -> str:
 
 
 def _declared(fitted: Fitted, acts_on: str) -> bool:
-    """Whether the declared model holds the quantity here; mu_c alone is mu where no Stribeck curve is fitted."""
+    """Whether the declared model has the quantity; without a Stribeck curve, mu_c is mu."""
     needs = {"mu_s": "v_s", "mu_c": "v_s", "v_s": "v_s", "sigma_2": "sigma_2", "a": "a_c", "b": "b_c"}.get(acts_on)
     return needs is None or bool((fitted.model.declared.index[needs] >= 0).any())
 
@@ -156,33 +156,35 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool) ->
     if channel.grouping:
         return both_ways and (acts_on, operation) == ("force", "add")
     if channel.name == "speed_mm_s":
-        return acts_on in ("mu", "a")  # mu_s, mu_c, v_s and sigma_2 are themselves the dependence on speed
+        return acts_on in ("mu", "a")  # mu_s, mu_c, v_s and sigma_2 describe the dependence on speed
     return not (channel.name == "load_N" and acts_on == "force")
 
 
 # ---------------------------------------------------------------- pairs
-# Pairs of channels, for an effect that shows only in two of them together.
+# Pairs of channels, for effects that are interactions.
 #
-# Looked at where no single channel orders the residual. The columns of a pair are mixed terms alone: what either
-# channel does by itself was tested before and is none of the pair's.
+# They are searched where no single channel explains the residual. The columns of a pair are interaction terms only:
+# the main effects of both channels have been tested before.
 
-VARIABLE_OF = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along it each acts
-NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; the calendar drifts by itself
+# The variable whose influence each coefficient describes.
+VARIABLE_OF = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
+# Direction has tests of its own, and the calendar interacts with nothing.
+NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}
 
 
 def search_pairs(
     score_tests: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
 ) -> list[Candidate]:
-    """Return candidates of two channels, adjusted over these and the single ones, strongest evidence first.
+    """Return candidates of two channels, with p-values adjusted over single channels and pairs, strongest first.
 
     Parameters
     ----------
     score_tests : ScoreTests
         Of the current model.
     channels : sequence of Channel
-        Where to look.
+        Channels to search.
     singles : sequence of Candidate
-        What the search of single channels has tried on this model.
+        Candidates of the search of single channels on this model.
     rng : Generator
         For the sign flips.
     """
@@ -196,17 +198,17 @@ def search_pairs(
 def equivalent_pairs(
     score_tests: ScoreTests, significant: Sequence[Candidate], channels: Mapping[str, Channel]
 ) -> list[Candidate]:
-    """Return the pairs that a channel's change of a or of v_s may stand for.
+    """Return the pairs that are equivalent to a single channel acting on a, b, v_s or sigma_2.
 
-    a is how mu changes with days, v_s how it changes with speed. The pair explains the same significant structure, so
-    it is tried beside the single channel whatever its own p-value; the fits decide.
+    a describes how mu changes with days, v_s how it changes with speed. The pair explains the same structure, so it is
+    fitted as well as the single channel, whatever its own p-value. The fits decide.
 
     Parameters
     ----------
     score_tests : ScoreTests
         Of the current model.
     significant : sequence of Candidate
-        What the search has accepted on it.
+        Its significant candidates.
     channels : mapping
         Channels by name.
     """
@@ -260,10 +262,10 @@ def _pair_candidates(score_tests: ScoreTests, one: Channel, other: Channel) -> l
 
 
 def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
-    """Return the mixed terms of two channels, blocks of shape (n, k) to be judged each; none for two categories.
+    """Return the interaction terms of two channels, blocks of shape (n, k) that are tested one by one.
 
-    The plain product, also of logarithms where a channel spans enough for them to matter: what either does alone may
-    hold nearly all of a product, and the rest depends on its exact shape. Then bent terms, for what is no product.
+    The first are products, also of logarithms for channels with a wide range: main effects explain most of a product,
+    and the rest depends on its exact shape. The last is a block of nonlinear terms. Two categories have none.
     """
     if not (one.numeric or other.numeric):
         return []
@@ -282,7 +284,7 @@ def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
 
 
 def _scales(channel: Channel) -> list[np.ndarray]:
-    """Return a channel, centred, and its logarithm where that is another shape (from 0 on, moved by its least)."""
+    """Return a channel, centred, and its logarithm if the range is wide (values from 0 on are shifted first)."""
     x = channel.values
     scales = [x]
     if x.min() >= 0 and x.max() > LOGARITHMIC_SPAN * x[x > 0].min(initial=np.inf):
@@ -299,31 +301,32 @@ def _centred(values: np.ndarray) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- masked pairs
-# Two effects that hide each other: each stands in the other's error, and neither passes a test of its own.
+# Two effects that mask each other: each is part of the other's error, and neither is significant alone.
 #
-# Looked at where nothing else is significant, in few units. The pairs are simple ones only: two straight lines (an
-# offset, for the direction) that share a channel or of which one is of the direction, and a line along strokes with its
-# change along a coarser channel. Both columns must move each unit along one direction, so that a unit is one number;
-# then
+# They are searched in few units, where nothing else is significant. Only simple pairs are tested: two straight lines
+# (an offset, for the direction) that share a channel or of which one is of the direction, and a line along strokes with
+# its change along a coarser channel. Both columns must change each unit along one direction, so that a unit is one
+# number; then
 #
 # .. math:: F = \frac{(RSS_0 - RSS_{12}) / 2}{RSS_{12} / (d - 2)}
 #
-# holds both against what the units scatter by beside them, exactly where that scatter is normal and alike. P-values are
-# adjusted for the number of pairs (Bonferroni). A pair counts where each of the two is significant given the other.
+# tests both against the residual scatter of the units. The test is exact if that scatter is normal with one variance.
+# P-values are adjusted for the number of pairs (Bonferroni). In a significant pair each of the two is significant given
+# the other.
 
 OF_DIRECTION = (("force", "add"), ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
-LEAST_SINGULAR = 1e-3  # singular value of two columns of length 1 below which they are one
+LEAST_SINGULAR = 1e-3  # Two unit columns with a smaller singular value are collinear.
 
 
 class MaskedPair(NamedTuple):
-    """Two effects that hide each other: what the tests say of both together, and the keys of their candidates."""
+    """Two effects that mask each other: their joint test and the keys of their candidates."""
 
     p_value: float  # adjusted
     chi2: float  # whitened sum of squares they explain
-    keys: tuple[tuple, ...]  # of those not in the model yet
+    keys: tuple[tuple, ...]  # of those that are not in the model yet
 
     def without(self, key: tuple) -> MaskedPair:
-        """Return what is left once one of them is in the model."""
+        """Return the pair without the one that is now in the model."""
         return MaskedPair(self.p_value, 0.0, tuple(k for k in self.keys if k != key))
 
 
@@ -339,7 +342,7 @@ def search_masked_pairs(
     channels : mapping
         Channels by name.
     candidates : sequence of Candidate
-        What the searches of single channels and of pairs have tried on this model.
+        Candidates of the searches of single channels and of pairs on this model.
     alpha : float
         Level of the search, and of each of the two given the other.
     """
@@ -356,7 +359,7 @@ def search_masked_pairs(
 def _pairs(
     score_tests: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate]
 ) -> Iterator[tuple[tuple[Candidate, Candidate], str]]:
-    """Yield the pairs to be tested and the level of their units."""
+    """Yield the pairs to test and the level of their units."""
     rows = score_tests.fitted.rows
     straight = [c for c in candidates if c.columns.shape[1] == 1 and c.sure]
     between = {c.channels: [channels[n] for n in c.channels if n != "direction"] for c in straight}
@@ -372,7 +375,7 @@ def _pairs(
 
 
 def _is_simple_pair(line: Candidate, other: Candidate, channels: Mapping[str, Channel]) -> bool:
-    """Whether a line and another, or a product, are one of the simple pairs."""
+    """Whether a line and another line, or a product, are a simple pair (see above)."""
     name = line.channels[-1]
     if not other.pair:
         return name == other.channels[-1] or ("direction",) in (line.channels, other.channels)
@@ -389,9 +392,9 @@ def _targets(candidate: Candidate) -> Sequence[tuple[str, str]]:
 def _joint_test(
     score_tests: ScoreTests, two: tuple[Candidate, Candidate], level: str
 ) -> tuple[float, float, float] | None:
-    """Return log p of two candidates jointly, the larger of each given the other, and what they explain; else None.
+    """Return log p of two candidates jointly, the larger log p of one given the other, and their chi-squared.
 
-    None is where they are no pair. Of all variants in which they must hold, what says least.
+    Of several variants the weakest result counts. None if they are no pair.
     """
     fitted = score_tests.fitted
     columns = np.column_stack([c.columns * fitted.slope(c.acts_on, c.operation)[:, None] for c in two])
@@ -423,6 +426,6 @@ def _conditional_log_p(values: np.ndarray, one: np.ndarray, other: np.ndarray, d
 
 
 def _larger_column(white: np.ndarray, groups, level: str) -> np.ndarray:
-    """Return in each unit the larger of two columns, shape (n,): the direction along which both may move it."""
+    """Return the larger of two columns in each unit, shape (n,): the direction along which both may change it."""
     size = groups.sums(white**2, level)
     return white[np.arange(len(white)), size.argmax(axis=1)[groups.codes[level]]]

@@ -1,4 +1,4 @@
-"""Round after round: search, name, confirm, add, refit, drop what became needless, until nothing is left."""
+"""The rounds of the loop: search, name, confirm, add, refit and remove effects until nothing significant is left."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter
 from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
 
-SAMPLED = ("displacement_mm", "time_s", "force_N")  # what the ripple search reads of a sample
+SAMPLED = ("displacement_mm", "time_s", "force_N")  # columns of the samples that the ripple search reads
 
 
 class Start(NamedTuple):
-    """The declared model as it was fitted to more rows, and their scatter."""
+    """The declared model fitted to more rows, and their scatter."""
 
     model: Model
     scatter: Scatter
@@ -46,28 +46,28 @@ class Start(NamedTuple):
 
 @dataclass(frozen=True)
 class Selection:
-    """The end of the loop on some rows: both fits, what was added, and what the last searches found."""
+    """The result of the loop on some rows: both fits, the added effects, and the candidates of the searches."""
 
     before: Fitted
     after: Fitted
     added: tuple[AcceptedEffect, ...]
     first: tuple[Candidate, ...]  # candidates on the declared model
     last: tuple[Candidate, ...]  # candidates on the final one
-    left: Candidate | Peak | None  # what is still significant
-    inconclusive: AcceptedEffect | None  # the best form of what too few specimens show; not in any model
+    left: Candidate | Peak | None  # still significant, in no model
+    inconclusive: AcceptedEffect | None  # best form of an effect that too few specimens show; in no model
     channels: Mapping[str, Channel] = field(default_factory=dict)
-    refused: tuple[RefusedEffect, ...] = ()  # significant, and in no model
-    worse: tuple[RefusedEffect, ...] = ()  # of these, what was in the model and lowered no error
+    refused: tuple[RefusedEffect, ...] = ()  # significant, in no model
+    worse: tuple[RefusedEffect, ...] = ()  # those of them that were removed because they lowered no error
 
 
 class _SearchResult(NamedTuple):
-    """What the searches show on one model."""
+    """The result of all searches on one model."""
 
-    claimable: list[Candidate]  # single channels, sure and not doubted
+    claimable: list[Candidate]  # single channels that may be claimed
     laws: list[tuple[Candidate, Proposal]]  # richer laws of aging
-    pairs: list[Candidate]  # pairs of channels; none where a single one is sure enough
+    pairs: list[Candidate]  # pairs of channels; none if a single channel is significant enough
     significant: list[Candidate]  # single channels and pairs, strongest evidence first
-    masked: list[MaskedPair]  # effects that hide each other
+    masked: list[MaskedPair]  # effects that mask each other
 
 
 def select_effects(
@@ -79,7 +79,7 @@ def select_effects(
     start: Start | None = None,
     rounds: int | None = None,
 ) -> Selection:
-    """Return the model grown until no channel orders its residual.
+    """Add effects until no channel explains the residual, and return the result.
 
     Parameters
     ----------
@@ -90,11 +90,11 @@ def select_effects(
     context : Context
         Levels of error, rounds, folds, and the catalogue.
     fine : Rows, optional
-        The bins as they are, to fit ripples to, which merged bins would blur; they are held as found there.
+        Bins that are not merged, to which ripples are fitted; they are then fixed.
     start : Start, optional
-        Where the fit of the declared model begins, so that it need not search again.
+        Start of the fit of the declared model, which then needs no search.
     rounds : int, optional
-        Rounds after which a fold's search ends: nothing is asked then but what effects it adds, not for what is left.
+        Rounds after which the search of a fold ends. What is left is not determined then.
     """
     loop = _Loop(rows, samples, context, fine, start)
     last_round = context.config.loop.max_rounds + 2 if rounds is None else rounds
@@ -105,7 +105,7 @@ def select_effects(
 
 
 class _Loop:
-    """The loop while it goes on: the model, what was added and refused, and what the searches show on the model."""
+    """State of the loop: the model, the effects added and refused, and the search results on the model."""
 
     def __init__(
         self, rows: Rows, samples: pd.DataFrame, context: Context, fine: Rows | None, start: Start | None
@@ -123,31 +123,31 @@ class _Loop:
         self.renaming = Renaming(self.channels, self.samples, context)
         self.refused: set[tuple] = set()
         self.left: Candidate | Peak | None = None
-        self.masked: list[MaskedPair] = []  # effects that hide each other, until both are in the model
-        self.renamed = False  # whether earlier effects have been named anew
+        self.masked: list[MaskedPair] = []  # effects that mask each other, until both are in the model
+        self.renamed = False  # whether earlier effects have been renamed
         self.found: _SearchResult | None = None
 
     @property
     def alpha(self) -> float:
-        """Level of error of the whole search."""
+        """Family-wise error rate of the search."""
         return self.context.config.loop.family_error
 
     def searched(self) -> tuple[Candidate, ...]:
-        """Return every candidate of a single channel on the present model."""
+        """Return every candidate of a single channel on the current model."""
         return tuple(search(self.score_tests, list(self.channels.values()), self.rng))
 
     def confirm(
         self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
     ) -> AcceptedEffect | None:
-        """Return the first of some proposals that held-out data confirm; what they refuse is added to `failed`."""
+        """Return the first proposal that held-out data confirm; a refused one is appended to `failed`."""
         return confirmed(base, proposals, self.samples, self.context, number, failed)
 
     def is_finished(self, number: int) -> bool:
-        """Search, name and confirm once; return whether nothing is left to be done."""
+        """Search, name and confirm once; return whether the loop is finished."""
         if self.fitted is not self.score_tests.fitted:
             self.score_tests, self.found = ScoreTests(self.fitted), None
             self.last = self.searched()
-        if self.found is None:  # else the last round refused what it was shown, and the model is as it was
+        if self.found is None:  # else the last round added nothing
             self.found = self.search_model(number)
             if self.adds_two_of_direction(number):
                 return False
@@ -166,16 +166,16 @@ class _Loop:
         return False
 
     def search_model(self, number: int) -> _SearchResult:
-        """Return what the present model lacks."""
+        """Return the result of all searches on the current model."""
         found = _search_all(self.score_tests, self.last, self.channels, self.context.effects, self.alpha, self.rng)
         tried = f"{len(self.last)} candidates on {len(self.channels)} channels, {len(found.pairs)} on pairs of them"
         self.context.say(
-            f"round {number}: {tried}; {len(found.significant)} significant, {len(found.masked)} hide each other"
+            f"round {number}: {tried}; {len(found.significant)} significant, {len(found.masked)} mask each other"
         )
         return found
 
     def adds_two_of_direction(self, number: int) -> bool:
-        """Whether two effects of the direction, which hid each other, were added."""
+        """Add two effects of the direction that mask each other; return whether that was done."""
         two = next((pair for pair in self.found.masked if {key[0] for key in pair.keys} == {("direction",)}), None)
         if self.masked or two is None:
             return False
@@ -191,7 +191,7 @@ class _Loop:
         return bool(both)
 
     def open_candidates(self) -> list[Candidate]:
-        """Return what is significant and not refused; those of effects that hide each other where nothing else is."""
+        """Return the significant candidates that are not refused; if there are none, those of masked pairs."""
         found = self.found
         if not (self.masked or found.significant):
             self.masked = [pair for pair in found.masked if self.refused.isdisjoint(pair.keys)]
@@ -202,7 +202,7 @@ class _Loop:
         return [c for c in significant if c.key not in self.refused]
 
     def renames(self) -> bool:
-        """Name earlier effects anew beside the later ones, once; return whether one has another name."""
+        """Rename earlier effects given the later ones, once; return whether a name changed."""
         if self.renamed or len(self.added) < 2:
             return False
         self.renamed, before = True, self.added
@@ -215,19 +215,19 @@ class _Loop:
         return True
 
     def add(self, accepted: AcceptedEffect) -> None:
-        """Add an effect; drop what it makes needless."""
+        """Add an effect and remove earlier ones that it makes redundant."""
         source = accepted.proposal.source
         self.masked = [pair.without(source) for pair in self.masked if source in pair.keys]
         pending = any(pair.keys for pair in self.masked)
         earlier, accepted = self.renaming.merged_with_earlier(self.fitted, self.added, accepted, pending=pending)
         added = [*earlier, accepted]
-        own = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
+        own = accepted.proposal.fitted  # under its own scatter: the former one contains the missing effect
         self.fitted, self.added = _drop_needless(fit(own.model, self.rows, own.scatter, turns=2), added)
-        # What came and went does not come again.
+        # A removed effect is not added again.
         self.refused |= {a.proposal.source for a in added if all(a is not k for k in self.added)}
 
     def selection(self, *, whole: bool) -> Selection:
-        """Return the end of the loop; without what is left where not the whole campaign was searched."""
+        """Return the result of the loop; for a fold, without what is left."""
         added = tuple(self.added)
         after = self.fitted if added else self.before
         found = Selection(self.before, after, added, self.first, self.last, None, None, self.channels)
@@ -258,7 +258,7 @@ def _search_all(
     alpha: float,
     rng: np.random.Generator,
 ) -> _SearchResult:
-    """Return what a model lacks by the search of single channels, `last`, and by those that come after it."""
+    """Return the result of all searches on a model; `last` is that of single channels."""
     inconsistent = _inconsistent_channels(last, alpha)
     claimable = _claimable(last, inconsistent)
     significant = [c for c in claimable if c.p_value <= alpha]
@@ -282,7 +282,7 @@ def _confirmed_pair(
     confirm: Callable[..., AcceptedEffect | None],
     number: int,
 ) -> list[AcceptedEffect]:
-    """Return two effects, each confirmed beside the other, as neither predicts held-out data alone; nothing if not."""
+    """Return two effects of which each is confirmed given the other; an empty list if they are not."""
     if len(two) < 2:
         return []
     first, second = two
@@ -297,9 +297,9 @@ def _confirmed_pair(
 
 
 def _inconsistent_channels(candidates: Sequence[Candidate], alpha: float) -> set[str]:
-    """Return the channels along which a few specimens differ: it may be their scatter, whatever quantity it acts on.
+    """Return the significant channels whose slopes are not consistent between two to four specimens.
 
-    The strongest evidence on mu or the force counts, as on a wrong quantity the same effect looks different in each.
+    Their strongest candidate on mu or the force decides: on a wrong quantity the same effect differs by specimen.
     """
     strongest: dict[str, Candidate] = {}
     for c in candidates:  # strongest evidence first
@@ -309,12 +309,12 @@ def _inconsistent_channels(candidates: Sequence[Candidate], alpha: float) -> set
 
 
 def _claimable(candidates: Sequence[Candidate], inconsistent: set[str]) -> list[Candidate]:
-    """Return the candidates that are sure and of no doubted channel, whatever they act on."""
+    """Return the candidates that may be claimed and are of no inconsistent channel."""
     return [c for c in candidates if c.sure and inconsistent.isdisjoint(c.channels)]
 
 
 def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return the straight candidates of masked pairs that are not in the model yet, with the p-value of the pair."""
+    """Return the linear candidates of masked pairs that are not in the model yet, with the p-value of the pair."""
     pairs = {key: pair for pair in reversed(masked) for key in pair.keys}
     found = []
     for c in candidates:
@@ -322,16 +322,16 @@ def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candi
             chi2 = max(c.chi2, *(pair.chi2 for pair in masked if c.key in pair.keys))
             p_value = min(c.p_value, pairs[c.key].p_value)
             found.append(replace(c, test_result=c.test_result._replace(chi2=chi2), p_value=p_value))
-    found = [c for c in found if c.evidence > 0]  # else the effects in the model hold it
+    found = [c for c in found if c.evidence > 0]  # else it is explained by effects in the model
     return sorted(found, key=lambda c: c.p_value)
 
 
 def _related_candidates(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
-    """Return candidates that may be what the significant ones show, though chance alone might explain them.
+    """Return further candidates that may explain the same structure as the significant ones.
 
-    That a channel orders the residual is shown once; on which quantity it acts is for the forms to tell, so the same
-    channel on others comes along. So do conditions that explain half of what the calendar does on the same quantity:
-    they are tested one after the other, so the calendar follows them, and a dozen specimens may not say so.
+    The same channel on other quantities is one: the fits decide on which it acts. Conditions that explain half of what
+    the calendar does on the same quantity are others: they are tested one after the other, so the calendar is
+    correlated with them, and a dozen specimens may give too little evidence.
     """
     found = []
     keys = {c.key for c in significant}
@@ -349,14 +349,13 @@ def _related_candidates(significant: list[Candidate], candidates: list[Candidate
 
 
 def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-    """Return the fit without effects that a later one has made needless, by Schwarz's price; the weakest first.
+    """Return the fit without effects that a later one has made redundant by the BIC; the weakest is removed first.
 
-    What one of two alike leaves may be needless too, so each is asked again when another has gone. A ripple was
-    judged on the raw samples, which bins cannot overrule.
+    After a removal all are tested again. Ripples are kept: they were tested on the raw samples.
     """
     kept: set[int] = set()
     while True:
-        # Far from needless: no refit is wanted to see that.
+        # An effect with a larger Wald statistic is not redundant, and is not refitted.
         size = {
             k: _wald_statistic(fitted, k) - 2 * a.proposal.bic_penalty
             for k, a in enumerate(added[:-1])
@@ -374,7 +373,7 @@ def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted,
 
 
 def _wald_statistic(fitted: Fitted, number: int) -> float:
-    """Return the squared standardised size of an effect's amplitudes, all together."""
+    """Return the Wald statistic of an effect's amplitudes."""
     at = fitted.model.place(number).start
     effect, values = fitted.model.terms[number].effect, fitted.model.values[number]
     places = [at + k for k, p in enumerate(effect.parameters) if p.linear]
@@ -383,7 +382,7 @@ def _wald_statistic(fitted: Fitted, number: int) -> float:
 
 
 def numbered(bins: pd.DataFrame) -> pd.DataFrame:
-    """Return `bins` with `stroke_id`, a number per stroke that samples and every part of the rows share."""
+    """Return `bins` with `stroke_id`, a number per stroke that samples and all subsets of the rows share."""
     return bins.assign(stroke_id=bins.groupby(["file", "stroke"], sort=False).ngroup().to_numpy())
 
 
@@ -393,7 +392,7 @@ def steady_samples(traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows) ->
     Parameters
     ----------
     traces : DataFrame or sequence of StoredTraces
-        Table `traces`, the samples of a stroke one after the other, or where it lies: then it is read part by part.
+        Table `traces`, its samples ordered by stroke; or where it is stored, to be read part by part.
     rows : Rows
         Rows made from `numbered` bins.
 
