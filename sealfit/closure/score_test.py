@@ -1,4 +1,4 @@
-"""Score tests of columns of the force, judged by sign flips of whole units, and adjusted for the whole search."""
+"""Score tests of columns of the force by sign flips of whole units, with p-values adjusted for the whole search."""
 
 from __future__ import annotations
 
@@ -37,42 +37,44 @@ from sealfit.fit.joint.rows import LEVELS
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 
 # ---------------------------------------------------------------- score test
-# Score tests of columns of the force, judged by sign flips of whole units and by their jackknife.
+# Score tests of columns of the force by sign flips of whole units and by the jackknife over them.
 #
 # A candidate is a free shape of one channel acting on one quantity: columns c of the force. After whitening and after
 # projection on the tangent space of the current model, the score of unit u is :math:`s_u = c_u^T r_u`, and
 #
 # .. math:: T = S^T V^{-1} S, \quad S = \sum_u s_u, \quad V = \sum_u s_u s_u^T .
 #
-# The r_u in V are widened for what the fit has taken out of each unit (CR2, Bell & McCaffrey 2002), as residuals are
-# smaller than errors and few units would otherwise look too quiet. V is unchanged when a unit's sign is flipped,
-# so that flips hold T against chance (`adjusted`).
+# The r_u in V are enlarged for what the fit has removed from each unit (CR2, Bell & McCaffrey 2002), because residuals
+# are smaller than errors and V would be too small with few units. V does not change when the sign of a unit is flipped,
+# so random flips give the null distribution of T.
 #
-# Sign flips hold whatever the units' scatter is, but a strong effect stands in V itself: T never exceeds the number of
-# units over the kurtosis of c, and a few runs in extreme places hide what all others show. So from thirty units on the
-# estimate is also held against its jackknife over whole units (CV3; MacKinnon, Nielsen & Webb 2023,
-# doi:10.1016/j.jeconom.2022.04.001). A few runs may hold nearly all that columns say and agree by chance, so what the
-# columns explain must count as well: by chi-squared, or by F against the runs' own scatter where they are one number a
-# run. With fewer specimens than thirty, what is constant in them is held against their own scatter (`few`), and what
-# varies within them against the scatter of their slopes (`slopes`); with fewer runs than twenty to tell slopes apart,
-# what is constant in runs against the scatter of these (`few`).
+# Sign flips are valid for any scatter of the units, but a strong effect is part of V itself: T never exceeds the number
+# of units over the kurtosis of c, and a few runs in extreme places may mask the others. From thirty units on the
+# estimate is therefore also tested against its jackknife over whole units (CV3; MacKinnon, Nielsen & Webb 2023,
+# doi:10.1016/j.jeconom.2022.04.001). A few runs may have nearly all of the leverage and agree by chance, so what the
+# columns explain must be significant too: by chi-squared, or by F against the scatter of runs if they are one number
+# per run. With fewer than thirty specimens, what is constant in them is tested against their own scatter
+# (`small_sample`), and what varies within them against the scatter of their slopes (`slopes`). With fewer than twenty
+# runs, what is constant in runs is tested against their scatter (`small_sample`).
 
-OWN = 1e-6  # eigenvalue of what is left without a unit, below which the unit alone determines it
-RANK = 1e-9  # singular value of what specimens do not hold of the tangent space, below which that is nothing
+# A unit alone determines a direction if the eigenvalue of what is left without the unit is smaller.
+OWN = 1e-6
+# A direction of the tangent space with a smaller singular value lies in the specimens' own columns.
+RANK = 1e-9
 
 
 class ScoreTestResult(NamedTuple):
-    """What the residual says of some columns."""
+    """Score test of some columns."""
 
     chi2: float  # whitened sum of squares they explain
     df: int
     units: int
     log_p: float  # of T by its F distribution, not adjusted
-    log_p_jackknife: float = 0.0  # of the estimate against its jackknife over units; 0 where that was not tried
+    log_p_jackknife: float = 0.0  # of the estimate by the jackknife over units; 0 if not computed
     scores: np.ndarray | None = None  # (units, k)
-    small_sample: SmallSampleTest | None = None  # against the scatter of few specimens; None where that was not tried
-    slopes: tuple[ContrastTest, ...] = ()  # against the slopes of few units, in every variant; empty where not tried
-    consistent: bool = True  # whether two to four specimens show the same along strokes, where many runs are the units
+    small_sample: SmallSampleTest | None = None  # against the scatter of few units; None if not tested
+    slopes: tuple[ContrastTest, ...] = ()  # against the slopes of few units, one per variant
+    consistent: bool = True  # whether two to four specimens have the same slopes along strokes
 
 
 @dataclass(frozen=True)
@@ -82,26 +84,26 @@ class Candidate:
     channels: tuple[str, ...]
     acts_on: str
     operation: str
-    unit: str  # level of the groups moved by sign flips
+    unit: str  # level of the groups whose signs are flipped
     columns: np.ndarray  # (n, k) shape values, before the slope of the quantity
     test_result: ScoreTestResult
     p_value: float = 1.0  # adjusted over the search
-    pair: bool = False  # whether it acts by two channels together
+    pair: bool = False  # whether it is an interaction of two channels
 
     @property
     def key(self) -> tuple:
-        """What it acts with and on."""
+        """Its channels and target."""
         return (self.channels, self.acts_on, self.operation)
 
     @property
     def consistent(self) -> bool:
-        """Whether two to four specimens show the same of it."""
+        """Whether two to four specimens have the same slopes."""
         strongest = (test.consistent[np.argmax(np.abs(test.slope))] for test in self.test_result.slopes)
         return self.test_result.consistent and all(strongest)
 
     @property
     def sure(self) -> bool:
-        """Whether it may be claimed: too few specimens do not show their own scatter, or show that they differ."""
+        """Whether it may be claimed: there are enough units, and two to four specimens are consistent."""
         return self.consistent and (self.test_result.small_sample is None or self.test_result.small_sample.sure)
 
     @property
@@ -111,18 +113,18 @@ class Candidate:
 
     @property
     def evidence(self) -> float:
-        """Explained sum of squares less what as many idle columns would be given (Schwarz)."""
+        """Explained sum of squares less the BIC penalty of the columns."""
         return self.chi2 - self.test_result.df * np.log(max(self.test_result.units, 2))
 
 
 def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
-    """Return columns of the force, whitened and freed of the current model's tangent space, shape (n, k)."""
+    """Return columns of the force, whitened and projected off the tangent space of the model, shape (n, k)."""
     white = fitted.whitening(columns)
     return _distinct(fitted.basis.freed(white), white)
 
 
 def _distinct(left: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return what is left of columns, shape (n, k) both, with zeros for those of which next to nothing is."""
+    """Return projected columns, shape (n, k), with zeros for those that are not identifiable."""
     left[:, _squares(left) < IDENTIFIABLE * _squares(columns)] = 0.0
     return left
 
@@ -132,7 +134,7 @@ def _squares(columns: np.ndarray) -> np.ndarray:
 
 
 class ScoreTests:
-    """Holds columns of the force against the residual of a fit.
+    """Score tests of columns of the force on the residual of a fit.
 
     Parameters
     ----------
@@ -146,11 +148,11 @@ class ScoreTests:
         self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
-        """Return columns of a channel of some unit, shape (n, k), in every way in which they must hold.
+        """Return the columns of a channel, shape (n, k), in each variant in which they must be significant.
 
-        They are projected; and, where the scatter of specimens is not known, freed of what tells specimens apart. With
-        about as many specimens as conditions that scatter cannot be told from the conditions' own values, and a channel
-        that varies from run to run, such as the time since the start, would be given what specimens do.
+        The first variant is projected. If the scatter of specimens is not known, the second is also projected off the
+        specimens' own columns. With about as many specimens as conditions their scatter is confounded with the
+        conditions, and a channel that varies between runs, such as the time since the start, would explain it.
         """
         left = project(self.fitted, columns)
         if self._specimens is None or FINER[unit] >= FINER["specimen"]:
@@ -160,9 +162,10 @@ class ScoreTests:
 
     @cached_property
     def _specimens(self) -> tuple[OwnColumns, Tangent] | None:
-        """What tells specimens apart: their friction, and the tangent space less that; None where that cannot be had.
+        """The specimens' own columns (their friction), and the tangent space projected off them.
 
-        It cannot where their scatter is known, or where each specimen is one run."""
+        None if their scatter is known or each specimen is one run.
+        """
         rows = self.fitted.rows
         starts = rows.groups.starts
         if self.fitted.scatter.knows("specimen") or not 1 < starts["specimen"].size < starts["run"].size:
@@ -177,16 +180,16 @@ class ScoreTests:
     def __call__(
         self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]
     ) -> ScoreTestResult | None:
-        """Return the judgement that says least of all variants of some columns; None where one cannot be judged.
+        """Return the weakest test of all variants of some columns; None if one of them cannot be tested.
 
         Parameters
         ----------
         variants : sequence of ndarray, shape (n, k)
-            Columns as `variants` gives them.
+            Columns as returned by `variants`.
         between : str
             Level of the units whose slopes along the columns may scatter.
         level : str
-            Level whose whole groups are held out.
+            Level of the units of evidence.
         target : tuple of str
             (acts_on, operation) of the columns.
         """
@@ -213,7 +216,7 @@ class ScoreTests:
         return weakest._replace(slopes=tests, small_sample=self._test_of_runs(variants, between, level, target))
 
     def _specimens_agree(self, left: np.ndarray) -> bool:
-        """Return whether a few specimens show the same of what columns along strokes explain together."""
+        """Return whether two to four specimens are consistent in what columns along strokes explain together."""
         fitted = self.fitted
         if not few_specimens(fitted):
             return True
@@ -224,9 +227,9 @@ class ScoreTests:
     def _test_of_runs(
         self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]
     ) -> SmallSampleTest | None:
-        """Return the F test, of all variants that which says least, of columns constant in each of a few runs.
+        """Return the weakest F test of all variants of columns that are constant in each of a few runs.
 
-        It is exact there, while the variance of a slope from half a dozen runs has two or three degrees of freedom.
+        It is exact; the variance of a slope from half a dozen runs has two or three degrees of freedom.
         """
         if not between == level == "run" or self.fitted.rows.groups.starts["run"].size >= MANY_RUNS:
             return None
@@ -260,10 +263,10 @@ class ScoreTests:
         return ScoreTestResult(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
 
     def _jackknife(self, left: np.ndarray, level: str) -> float:
-        """Return the log p-value of orthonormal columns' coefficients against their jackknife over whole units.
+        """Return the log p-value of the coefficients of orthonormal columns by their jackknife over whole units.
 
-        Everything is estimated anew without each unit u, the current model's numbers too, in the tangent space: the
-        normal equations less those of u, [[1 - B'B, -B'L], [-L'B, 1 - L'L]] with B, L its rows of basis and columns.
+        All parameters, also those of the model, are re-estimated without each unit u in the tangent space, from the
+        normal equations less those of u: [[1 - B'B, -B'L], [-L'B, 1 - L'L]] with B, L its rows of basis and columns.
         """
         fitted, start = self.fitted, self.fitted.rows.groups.starts[level]
         units, k = start.size, left.shape[1]
@@ -296,7 +299,7 @@ def _log(p_value: float) -> float:
 
 
 def _inverse_of(size: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return inverses, shape (u, k, k), from eigenvalues and axes; what one unit alone determines is left as it is."""
+    """Return inverses, shape (u, k, k), from eigenvalues and axes; 0 for what one unit alone determines."""
     shrink = np.where(size > OWN, 1 / np.maximum(size, OWN), 0.0)
     return (axes * shrink[:, None, :]) @ axes.transpose(0, 2, 1)
 
@@ -314,16 +317,16 @@ def log_p_of(t: np.ndarray, df: int, units: int) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- multiplicity
-# P-values adjusted for the whole search: for every channel, quantity and width that was tried.
+# P-values adjusted for the whole search: all channels, quantities and numbers of columns.
 #
-# Flipping the signs of whole units at random many times costs one matrix product a candidate, and the largest
-# standardised T over all candidates gives the p-value adjusted for the search (Westfall & Young 1993; sign flips of
-# score contributions: Hemerik, Goeman & Finos 2020, doi:10.1111/rssb.12369). P-values by the jackknife are adjusted by
-# the number of candidates (Bonferroni); each way has half of the error. Tests on few specimens are adjusted by draws
-# (`few`), contrasts in few units by their number (`slopes`).
+# The signs of whole units are flipped at random many times. The largest T over all candidates gives the p-value
+# adjusted for the search (Westfall & Young 1993; sign flips of score contributions: Hemerik, Goeman & Finos 2020,
+# doi:10.1111/rssb.12369). P-values by the jackknife are adjusted for the number of candidates (Bonferroni); each of the
+# two tests has half of the error rate. Tests on few specimens are adjusted by random draws (`small_sample`), contrasts
+# in few units by their number (`slopes`).
 
-FLIPS = 1999  # resolves p = 0.0005, a tenth of the family-wise level
-MOST_SIGNS = 1 << 22  # drawn at once: 34 MB
+FLIPS = 1999  # Random sign flips: they resolve p = 0.0005, a tenth of the family-wise level.
+MOST_SIGNS = 1 << 22  # Signs that are drawn at once: 34 MB.
 
 
 def adjusted_candidates(
@@ -336,7 +339,7 @@ def adjusted_candidates(
     if many:
         p_values[many] = adjust([results[k] for k in many], rng)
     for k in many:
-        if results[k].scores.shape[0] >= JACKKNIFE_UNITS:  # of two ways, each has half of the error
+        if results[k].scores.shape[0] >= JACKKNIFE_UNITS:  # two tests, each with half of the error rate
             p_values[k] = 2 * min(p_values[k], len(many) * np.exp(results[k].log_p_jackknife))
     small_sample_p = np.min(
         [adjust_small_sample(units, results, rng) for units in score_tests.cluster_tests.values()], axis=0
@@ -350,20 +353,20 @@ def adjusted_candidates(
 
 
 def adjust(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:
-    """Return each p-value adjusted over all judgements, by the maximum over sign flips, shape (m,).
+    """Return each p-value adjusted over all results by the maximum over sign flips, shape (m,).
 
-    Those of as many units are flipped with the same signs, so that what they share counts once.
+    Results with the same number of units are flipped with the same signs, so that their correlation is used.
     """
     return _adjusted([j.log_p for j in results], _least(results, rng, flips))
 
 
 def critical_many(results: Sequence[ScoreTestResult], level: float, rng: np.random.Generator) -> float:
-    """Return the log p-value, not adjusted, that the smallest of all judgements falls below by chance at a level."""
+    """Return the critical value at a level of the smallest log p-value (not adjusted) of all results."""
     return float(np.quantile(_least(results, rng, FLIPS), level))
 
 
 def critical_small_sample(fitted: Fitted, tests: Sequence[SmallSampleTest], level: float) -> float:
-    """Return the same for the tests on few units of one level."""
+    """Return the same for the small-sample tests of one level."""
     units = ClusterTests(fitted, tests[0].level)
     for test in tests:
         units.numbers(test.target)
@@ -371,7 +374,7 @@ def critical_small_sample(fitted: Fitted, tests: Sequence[SmallSampleTest], leve
 
 
 def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int) -> np.ndarray:
-    """Return the smallest log p-value of all judgements under each of many random flips."""
+    """Return the smallest log p-value of all results under each of many random flips."""
     by_units = defaultdict(lambda: defaultdict(list))
     for test_result in results:
         units, df = test_result.scores.shape
@@ -404,29 +407,31 @@ def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.nda
 def adjust_small_sample(
     units: ClusterTests, results: Sequence[ScoreTestResult], rng: np.random.Generator, draws: int = FLIPS
 ) -> np.ndarray:
-    """Return the p-values of the tests on few units of a level, adjusted over all of them, shape (m,); 1 for none."""
+    """Return the p-values of the small-sample tests of a level, adjusted over all, shape (m,); 1 if not tested."""
     p_values = np.ones(len(results))
     tried = [k for k, j in enumerate(results) if j.small_sample is not None and j.small_sample.level == units.level]
     if tried:
         tests = [results[k].small_sample for k in tried]
         logs = np.array([test.log_p for test in tests])
         least = _least_small_sample(units, tests, rng, draws)
-        p_values[tried] = np.minimum(_adjusted(logs, least), len(tried) * np.exp(logs))  # below what draws resolve
+        p_values[tried] = np.minimum(
+            _adjusted(logs, least), len(tried) * np.exp(logs)
+        )  # for p-values smaller than draws resolve
     return p_values
 
 
 def _least_small_sample(
     units: ClusterTests, tests: Sequence[SmallSampleTest], rng: np.random.Generator, draws: int
 ) -> np.ndarray:
-    """Return the smallest log p-value of all tests on few units of one level in each of many draws."""
+    """Return the smallest log p-value of all small-sample tests of one level in each of many draws."""
     drawn = units.draws(draws, rng)
     return np.min([small_sample_test.log_p_of(drawn[test.target], test.basis, test.known) for test in tests], axis=0)
 
 
 def adjust_slopes(results: Sequence[ScoreTestResult]) -> np.ndarray:
-    """Return the p-values of the contrasts in few units, times the number of all contrasts, shape (m,); 1 for none.
+    """Return the p-values of the contrasts in few units, times their number, shape (m,); 1 if not tested.
 
-    A candidate has that of its strongest contrast, by the variant of it that says least.
+    A candidate has the p-value of its strongest contrast in its weakest variant.
     """
     p_values = np.ones(len(results))
     tried = [k for k, j in enumerate(results) if j.slopes]
@@ -439,5 +444,5 @@ def adjust_slopes(results: Sequence[ScoreTestResult]) -> np.ndarray:
 
 
 def _adjusted(own: Sequence[float], least: np.ndarray) -> np.ndarray:
-    """Return p-values from log p and the least of all candidates under chance, drawn many times."""
+    """Return adjusted p-values from log p and many draws of the smallest log p under the null hypothesis."""
     return (1 + np.searchsorted(np.sort(least), own, side="right")) / (least.size + 1)
