@@ -70,8 +70,8 @@ class BeforeAfter:
         inside = whole if around is None else self._ratios(around)
         if max(inside) > SAME_ERROR or (weak and inside[1] >= 1):
             return False
-        sure = not weak or inside[1] < HALVED_ERROR
-        return max(whole) <= (HARMLESS_RATIO if sure else SAME_ERROR)
+        strong = not weak or inside[1] < HALVED_ERROR
+        return max(whole) <= (HARMLESS_RATIO if strong else SAME_ERROR)
 
     def _ratios(self, around: str | None) -> tuple[float, float]:
         """Return after's error over before's, in sample and held out; 1 for the second where nothing was held out."""

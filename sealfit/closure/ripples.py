@@ -68,8 +68,10 @@ def find_ripple(
         return None
     # What is periodic in time shows in displacement too, speed by speed, and the other way round: where both are sure,
     # the axis along which it is the same wave in all files holds more of it.
-    sure = [peak for peak in peaks if peak.p_value < SHARED_PHASE]
-    best = max(sure, key=lambda p: p.energy) if sure else min(peaks, key=lambda p: (p.p_value, -p.statistic))
+    significant = [peak for peak in peaks if peak.p_value < SHARED_PHASE]
+    best = (
+        max(significant, key=lambda p: p.energy) if significant else min(peaks, key=lambda p: (p.p_value, -p.statistic))
+    )
     # A phase that all files share says more than power alone.
     shared = [p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED_PHASE]
     best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
@@ -114,8 +116,8 @@ def _incoherent(spectrum: Spectrum) -> Peak:
     p = float(np.exp(own[k])) * spectrum.frequency.size
     wavelength = _refined(spectrum.power, spectrum.frequency, k)
     energy = spectrum.amplitude**2 * spectrum.count * (1 - 1 / np.maximum(ratio, 1.0))
-    sure = peaks & (own < np.log(SHARED_PHASE / spectrum.frequency.size))
-    sure[k] = True
+    significant = peaks & (own < np.log(SHARED_PHASE / spectrum.frequency.size))
+    significant[k] = True
     return Peak(
         spectrum.axis,
         wavelength,
@@ -124,7 +126,7 @@ def _incoherent(spectrum: Spectrum) -> Peak:
         float(ratio[k]),
         p,
         float(spectrum.amplitude[k]),
-        float(energy[sure].max()),
+        float(energy[significant].max()),
     )
 
 

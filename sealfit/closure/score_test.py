@@ -102,9 +102,9 @@ class Candidate:
         return self.test_result.consistent and all(strongest)
 
     @property
-    def sure(self) -> bool:
+    def claimable(self) -> bool:
         """Whether it may be claimed: there are enough units, and two to four specimens are consistent."""
-        return self.consistent and (self.test_result.small_sample is None or self.test_result.small_sample.sure)
+        return self.consistent and (self.test_result.small_sample is None or self.test_result.small_sample.enough_df)
 
     @property
     def chi2(self) -> float:
@@ -414,9 +414,8 @@ def adjust_small_sample(
         tests = [results[k].small_sample for k in tried]
         logs = np.array([test.log_p for test in tests])
         least = _least_small_sample(units, tests, rng, draws)
-        p_values[tried] = np.minimum(
-            _adjusted(logs, least), len(tried) * np.exp(logs)
-        )  # for p-values smaller than draws resolve
+        # Bonferroni is for p-values that are smaller than the draws resolve.
+        p_values[tried] = np.minimum(_adjusted(logs, least), len(tried) * np.exp(logs))
     return p_values
 
 

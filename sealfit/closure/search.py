@@ -361,7 +361,7 @@ def _pairs(
 ) -> Iterator[tuple[tuple[Candidate, Candidate], str]]:
     """Yield the pairs to test and the level of their units."""
     rows = score_tests.fitted.rows
-    straight = [c for c in candidates if c.columns.shape[1] == 1 and c.sure]
+    straight = [c for c in candidates if c.columns.shape[1] == 1 and c.claimable]
     between = {c.channels: [channels[n] for n in c.channels if n != "direction"] for c in straight}
     level = {id(c): scatter_level(between[c.channels] or [channels["direction"]], rows) for c in straight}
     lines = [c for c in straight if not c.pair and (c.acts_on, c.operation) in _targets(c)]

@@ -196,7 +196,7 @@ class _Loop:
         if not (self.masked or found.significant):
             self.masked = [pair for pair in found.masked if self.refused.isdisjoint(pair.keys)]
         significant = _pending_candidates(self.masked, (*found.claimable, *found.pairs)) or list(found.significant)
-        significant += [c for c, _ in found.laws if c.p_value <= self.alpha and c.sure]
+        significant += [c for c, _ in found.laws if c.p_value <= self.alpha and c.claimable]
         self.left = significant[0] if significant else self.ripple
         significant += equivalent_pairs(self.score_tests, significant, self.channels)
         return [c for c in significant if c.key not in self.refused]
@@ -238,7 +238,7 @@ class _Loop:
             left = None  # it is listed as refused
         laws = self.found.laws
         inconclusive_candidates = [
-            c for c in (*self.last, *(c for c, _ in laws)) if c.p_value <= self.alpha and not c.sure
+            c for c in (*self.last, *(c for c, _ in laws)) if c.p_value <= self.alpha and not c.claimable
         ]
         if left is None and inconclusive_candidates:
             proposals = propose(
@@ -310,7 +310,7 @@ def _inconsistent_channels(candidates: Sequence[Candidate], alpha: float) -> set
 
 def _claimable(candidates: Sequence[Candidate], inconsistent: set[str]) -> list[Candidate]:
     """Return the candidates that may be claimed and are of no inconsistent channel."""
-    return [c for c in candidates if c.sure and inconsistent.isdisjoint(c.channels)]
+    return [c for c in candidates if c.claimable and inconsistent.isdisjoint(c.channels)]
 
 
 def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candidate]) -> list[Candidate]:

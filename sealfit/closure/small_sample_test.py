@@ -284,7 +284,7 @@ class SmallSampleTest(NamedTuple):
     level: str = "specimen"  # of the units
 
     @property
-    def sure(self) -> bool:
+    def enough_df(self) -> bool:
         """Whether there are enough residual degrees of freedom between units."""
         return self.error_df >= (LEAST_ERROR_DF if self.level == "specimen" else LEAST_ERROR_DF_OF_RUNS)
 

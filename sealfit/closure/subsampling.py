@@ -285,5 +285,5 @@ def missed_by_subsample(fitted: Fitted, selection: Selection, config: Config) ->
     alpha = config.loop.family_error
     found = search(ScoreTests(fitted), channels_of(fitted.rows, config), np.random.default_rng(config.loop.seed))
     known = {c.channels for c in selection.last if c.p_value <= alpha}
-    new = (c for c in found if c.p_value <= alpha and c.sure and c.channels not in known)
+    new = (c for c in found if c.p_value <= alpha and c.claimable and c.channels not in known)
     return ", ".join(next((c.channels for c in new), ()))

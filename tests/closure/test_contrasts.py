@@ -24,7 +24,7 @@ def strongest(bins):
     score_tests, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
     singles = search(score_tests, channels, rng)
     return min(
-        (c.p_value for c in (*singles, *search_pairs(score_tests, channels, singles, rng)) if c.sure), default=1.0
+        (c.p_value for c in (*singles, *search_pairs(score_tests, channels, singles, rng)) if c.claimable), default=1.0
     )
 
 
@@ -159,7 +159,7 @@ def test_two_specimens_with_the_same_slope_are_too_few_to_claim_it():
     found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     along = [c for c in found if c.channels == ("displacement_mm",) and c.p_value < 0.005]
     assert along
-    assert not any(c.sure for c in along)
+    assert not any(c.claimable for c in along)
 
 
 def test_what_two_specimens_show_is_a_candidate_and_the_verdict_cannot_tell():

@@ -53,8 +53,8 @@ def test_one_fold_that_finds_one_of_them_on_any_quantity_is_enough(selection):
 
 def test_evidence_that_is_not_weak_needs_no_fold_to_find_it_again(selection):
     first = selection.added[0]
-    sure = replace(first, proposal=replace(first.proposal, p_value=1e-9))
-    assert _found_again(replace(selection, added=(sure, *selection.added[1:])), [selection.before.model])
+    strong = replace(first, proposal=replace(first.proposal, p_value=1e-9))
+    assert _found_again(replace(selection, added=(strong, *selection.added[1:])), [selection.before.model])
 
 
 def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(selection):

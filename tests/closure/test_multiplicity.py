@@ -159,9 +159,9 @@ def test_a_search_says_the_strongest_evidence_first_with_p_values_for_two_search
 
 def test_two_ways_to_test_have_half_of_the_error_each():
     """The jackknife over 40 units, times the candidates; and F with contrasts, in few units."""
-    sure = alike(40)._replace(log_p_jackknife=-20.0)
+    strong = alike(40)._replace(log_p_jackknife=-20.0)
     found = adjusted_candidates(
-        SimpleNamespace(cluster_tests={"specimen": FourNumbers}), [candidate("a", sure)], np.random.default_rng(0)
+        SimpleNamespace(cluster_tests={"specimen": FourNumbers}), [candidate("a", strong)], np.random.default_rng(0)
     )
     assert found[0].p_value == pytest.approx(2 * 2 * np.exp(-20.0))
     both = ScoreTestResult(1.0, 1, 8, NOWHERE, small_sample=along(-30.0, 0), slopes=(slopes_of(0.1),))
@@ -173,11 +173,11 @@ def test_two_ways_to_test_have_half_of_the_error_each():
 
 def test_a_claim_needs_enough_specimens_and_that_they_agree():
     shown = ScoreTestResult(1.0, 1, 8, NOWHERE)
-    assert candidate("a", shown).sure
-    assert not candidate("a", shown._replace(consistent=False)).sure
+    assert candidate("a", shown).claimable
+    assert not candidate("a", shown._replace(consistent=False)).claimable
     assert not candidate(
         "a", shown._replace(small_sample=along(-9.0, 0)._replace(error_df=3))
-    ).sure  # of specimens: four
-    assert candidate("a", shown._replace(small_sample=along(-9.0, 0)._replace(error_df=3, level="run"))).sure
+    ).claimable  # of specimens: four
+    assert candidate("a", shown._replace(small_sample=along(-9.0, 0)._replace(error_df=3, level="run"))).claimable
     differ = slopes_of(3.0, 1.0)._replace(consistent=np.array([False, True]))  # the stronger of the two does
-    assert not candidate("a", shown._replace(slopes=(differ,))).sure
+    assert not candidate("a", shown._replace(slopes=(differ,))).claimable

@@ -100,21 +100,21 @@ def document(selection, after=None):
 
 def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted):
     item, after = accepted(fitted)
-    weak, sure = (RefusedEffect(WARMING, p, "it is too small") for p in (1e-4, 1e-7))
+    weak, strong = (RefusedEffect(WARMING, p, "it is too small") for p in (1e-4, 1e-7))
     left = candidate("oil_ppm")
     verdicts = {
         "closed": document(replace(selection, added=(item,)), after),
         "unexplained": document(replace(selection, left=left)),
         "cannot_tell": document(replace(selection, inconclusive=item)),
-        "nothing_missing": document(replace(selection, refused=(sure,))),
+        "nothing_missing": document(replace(selection, refused=(strong,))),
     }
     assert {name: found["verdict"] for name, found in verdicts.items()} == {name: name for name in verdicts}
     assert document(replace(selection, added=(item,), left=left), after)["verdict"] == "unexplained"
     assert (
         document(replace(selection, left=left, inconclusive=item))["verdict"] == "cannot_tell"
     )  # too few specimens show it
-    assert document(replace(selection, worse=(sure,), refused=(sure,)))["verdict"] == "unexplained"
-    refused = document(replace(selection, refused=(weak, sure)))
+    assert document(replace(selection, worse=(strong,), refused=(strong,)))["verdict"] == "unexplained"
+    refused = document(replace(selection, refused=(weak, strong)))
     assert refused["verdict"] == "cannot_tell"
     assert [(entry["id"], entry["weak"], entry["reason"]) for entry in refused["refused"]] == [
         ("warming_distance", True, "it is too small"), ("warming_distance", False, "it is too small"),
