@@ -1,10 +1,9 @@
-"""What a campaign could have shown: for each variable the smallest effect that it would have found.
+"""Sensitivity of a campaign: the smallest effect of each variable that it would have found.
 
 The effect is a factor on mu, linear in the variable at one of the levels at which it varies, or an offset force for the
-direction. It is put into the residual, the scatter is estimated anew, as part of the effect is taken for scatter, and
-the search's own tests are asked: the size is sought that exceeds the critical value of the whole search with 80 %
-chance (noncentral F). Of what follows the search the least size that counts is asked, and that weak evidence must lower
-the held-out error; naming is not.
+direction. It is added to the residual, and the scatter is re-estimated, because part of the effect is taken for
+scatter. The smallest effect exceeds the critical value of the whole search with a power of 80 % (noncentral F). It must
+also have the least size that is reported and, with weak evidence, lower the held-out error. Naming is not considered.
 """
 
 from __future__ import annotations
@@ -51,43 +50,44 @@ from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening
 
 TINY = 1e-6
-"""Of the force: an effect that changes no estimate."""
+"""Size of an effect, as a share of the force, that changes no estimate."""
 
 STEPS = 6
-"""Sizes tried, each nearer to the one found with `TARGET_POWER`, until it is `CLOSE` (difference of logarithms)."""
+"""Most sizes that are tried to reach `TARGET_POWER`."""
 
 CLOSE = 0.03
+"""Relative error of the size at which the iteration ends."""
 
 WANTED_PCT = 1.0
-"""Of the friction: the effect that `files_needed` refers to."""
+"""Effect to which `files_needed` refers, in percent of the friction force."""
 
 SPECIMEN, SPECIMENS = "specimen_id", "specimen"
 FRICTION = ("mu", "multiply")
 
 ASIDE = ("run_order", "elapsed_h", "repeat")
-"""Channels of the order of tests: what they show is no reason to doubt the model of friction."""
+"""Channels that describe the order of the tests. They do not make the verdict `cannot_tell`."""
 
 LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
 
 
 def sensitivity(selection: Selection, alpha: float) -> list[dict]:
-    """Return per variable and level: variable, level, acts_on, smallest_N, smallest_pct and files_needed.
+    """Return an entry per variable and level: variable, level, acts_on, smallest_N, smallest_pct, files_needed.
 
-    A variable that varies at several levels has an entry for each, of an effect that follows it at that level only.
+    A variable that varies at several levels has an entry for each, for an effect at that level only.
 
     Parameters
     ----------
     selection : Selection
-        The end of the loop, with the candidates of its last search.
+        The result of the loop, with the candidates of its last search.
     alpha : float
         Family-wise level of the search.
 
     Returns
     -------
     list of dict
-        `smallest_N` is the RMS over all rows of the smallest effect found with 80 % chance, `smallest_pct` the same in
-        percent of the RMS force; None where the variable cannot be tested in this campaign. `files_needed` is how many
-        files, made like these, would show an effect of 1 % of the force.
+        `smallest_N` is the RMS over all rows of the smallest effect that is found with a power of 80 %, `smallest_pct`
+        the same in percent of the RMS force; None if the variable cannot be tested in this campaign. `files_needed` is
+        the number of files, made like these, that would show an effect of 1 % of the force.
     """
     fitted = selection.after
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))
@@ -123,7 +123,7 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                     "files_needed": needed,
                 }
             )
-    if len(rows.conditions) < specimens < LEAST_UNITS_OF_SLOPES:  # they may differ, and no variable says how
+    if len(rows.conditions) < specimens < LEAST_UNITS_OF_SLOPES:  # no variable describes how specimens differ
         needed = int(np.ceil(files * LEAST_UNITS_OF_SLOPES / specimens))
         unknown = {"variable": SPECIMEN, "level": "condition", "acts_on": "mu", "smallest_N": None}
         entries.append({**unknown, "smallest_pct": None, "files_needed": needed})
@@ -131,10 +131,10 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
 
 
 def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
-    """Return by how much an effect at a level, shape (n,), must be multiplied to lower the error as weak evidence must.
+    """Return the factor on an effect at a level, shape (n,), with which it lowers the error by `LEAST_FALL`.
 
-    Only what the declared model does not take up of it lowers the error; both are taken about the means of the groups
-    inside which the effect varies.
+    Only the part that the declared model does not explain lowers the error. Effect and error are taken about the means
+    of the groups within which the effect varies.
     """
     rows = fitted.rows
     around = dict(zip(LEVEL_NAMES, (*LEVELS, None), strict=True))[level]
@@ -144,7 +144,7 @@ def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
 
 
 def _parts(selection: Selection, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
-    """Yield each level at which a channel has a real share of its variance, and its first column's part there."""
+    """Yield each level at which a channel varies, and the part of its first column at that level."""
     groups, weight = selection.after.rows.groups, selection.after.rows.weight
     if not own or not channel.numeric or channel.name == "direction":
         yield channel.unit, (own[0].columns[:, 0] if own else None)
@@ -167,11 +167,11 @@ def _parts(selection: Selection, channel: Channel, own: Sequence[Candidate]) -> 
 
 
 class _Search:
-    """The last search of a loop, asked what it would say of an effect that is put into the residual.
+    """The tests of the last search, applied to an effect that is added to the residual.
 
-    The effect is in the residual when scatter is estimated, and raises it; and what of it differs between units stands
-    in the variance it is held against. Where the noise has been looser or quieter by chance counts as in the search:
-    the variance of a contrast in few units is moderated, and that of scores of many is 1 or more.
+    The effect raises the estimated scatter, and its differences between units raise the variance that it is tested
+    against. Variances are treated as in the search: those of contrasts in few units are moderated, and those of the
+    scores of many units are 1 or more.
     """
 
     def __init__(self, selection: Selection, alpha: float) -> None:
@@ -193,15 +193,13 @@ class _Search:
         self.critical_many = critical_many(many, self.level / 2, np.random.default_rng(0)) if many else 0.0
         self.critical_small_sample = {}
         for name in {test.level for test in small_sample}:
-            level = self.level / (
-                1 if name == SPECIMENS else N_VARIANCES
-            )  # runs are tested in two ways, by slopes as well
+            level = self.level / (1 if name == SPECIMENS else N_VARIANCES)  # runs are also tested by slopes
             self.critical_small_sample[name] = critical_small_sample(
                 self.fitted, [t for t in small_sample if t.level == name], level
             )
 
     def _small_sample_again(self, candidate: Candidate) -> SmallSampleTest | None:
-        """Return a candidate's test on few units at the last model, which may hold fewer effects than were searched."""
+        """Return a candidate's small-sample test on the final model, which may have fewer effects."""
         known, target = candidate.test_result.small_sample, (candidate.acts_on, candidate.operation)
         if known is None:
             return None
@@ -211,9 +209,9 @@ class _Search:
         return self.units[known.level].test(project(self.fitted, columns), target)
 
     def surer(self, times: float, candidate: Candidate) -> float:
-        """Return the factor on an effect found with `TARGET_POWER` that makes it strong evidence; infinite for few.
+        """Return the factor on an effect, found with `TARGET_POWER`, with which its evidence is not weak.
 
-        The p-value of few units falls too slowly for that.
+        Infinite for few units, whose p-value falls too slowly.
         """
         if candidate.test_result.units < JACKKNIFE_UNITS:
             return np.inf
@@ -221,7 +219,7 @@ class _Search:
         return times * float((strong + ndtri(TARGET_POWER)) / (found + ndtri(TARGET_POWER)))
 
     def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
-        """Return the factor on an effect, shape (n,) with which it is found with `TARGET_POWER`; infinite for never."""
+        """Return the factor on an effect, shape (n,), that gives it `TARGET_POWER`; infinite if there is none."""
         size, margin, before = TINY, self.margin(candidate, TINY * effect, self.fitted), None
         for _ in range(STEPS):
             if not 0 < margin < np.inf:
@@ -237,7 +235,7 @@ class _Search:
         return size
 
     def margin(self, candidate: Candidate, effect: np.ndarray, fitted: Fitted) -> float:
-        """Return how many times as long as needed an effect is."""
+        """Return the ratio of an effect to the size that is needed."""
         score_tests = ScoreTests(fitted)
         white = fitted.basis.freed(fitted.whitening(np.column_stack([self.fitted.residual, effect])))
         noise, effect = (replace(fitted, white_residual=column) for column in white.T)
@@ -252,7 +250,7 @@ class _Search:
         return min(large, self._by_units(candidate, noise, effect, variants))
 
     def _by_units(self, candidate: Candidate, noise: Fitted, effect: Fitted, variants: Sequence[np.ndarray]) -> float:
-        """Return the margin by the units' own scatter."""
+        """Return the margin by the tests against the units' scatter."""
         channel, test_result = self.channels[candidate.channels[-1]], candidate.test_result
         small_sample = test_result.small_sample
         by_small_sample = (
@@ -308,7 +306,7 @@ class _Search:
         units, k = scores.shape
         sums = noise.rows.groups.sums
         own, added = (float((sums(seen / length * f.unit_residual(level), level) ** 2).sum()) for f in (noise, effect))
-        own *= max(1.0, k / float((scores**2).sum()))  # not quieter than noise is on average
+        own *= max(1.0, k / float((scores**2).sum()))  # not smaller than the noise is on average
         beyond = ndtri(TARGET_POWER) * np.sqrt(own)
         share = 1 - betaincinv((units - k) / 2, k / 2, np.exp(self.critical_many))
         margin = length / (np.sqrt(units * share * (own + added)) + beyond)
@@ -332,7 +330,7 @@ def _by_numbers(
     tail: float,
     least: float = 0.0,
 ) -> float:
-    """Return the margin by the F test of one number a unit, at a p-value; 0 where columns are not one number a unit."""
+    """Return the margin by the F test of one number per unit, at a p-value; 0 if the columns are not that."""
     test, added = (units.test(left, target) for units in (noise, effect))
     if test is None or test.share <= least:
         return 0.0
@@ -345,16 +343,16 @@ def _by_numbers(
 
 
 def _margin(length: np.ndarray, quiet: np.ndarray, differs: np.ndarray, k: int, df: np.ndarray, tail: float):
-    """Return how many times as long as needed an effect is, by F with k and df degrees of freedom at a p-value.
+    """Return the ratio of an effect to the size needed, by F with k and df degrees of freedom at a p-value.
 
-    It is held against a variance: `quiet` without it, and what it adds to that itself.
+    It is tested against a variance: `quiet` without the effect, plus `differs`, which the effect adds itself.
     """
     critical = fdtri(k, df, 1 - tail)
     return np.abs(length) / np.sqrt(quiet * ncfdtrinc(k, df, 1 - TARGET_POWER, critical) + k * critical * differs)
 
 
 def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
-    """Return a fit under the scatter that is estimated where its residual holds an effect."""
+    """Return a fit under the scatter that is estimated with an effect added to its residual."""
     rows, friction, residual = fitted.rows, fitted.friction, fitted.residual + effect
     scatter = estimate_scatter(rows, residual, friction, fitted.jacobian, fitted.scatter)
     whitening = Whitening(scatter, friction, rows.groups)
@@ -362,18 +360,18 @@ def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
 
 
 def undetectable_variables(selection: Selection, entries: Sequence[dict], scatter: Sequence[dict]) -> list[str]:
-    """Return the variables of which this campaign could not have told; empty where it could.
+    """Return the variables whose effects are not detectable in this campaign.
 
-    A variable cannot be told if no effect of it can reach the required p-value, and it varies along strokes, is the
-    direction, or varies between fewer than five specimens; or if the units that it varies between scatter by much, and
-    an effect that explains all of that would not have been seen.
+    An effect is not detectable if it cannot reach the required p-value, and the variable varies along strokes, is the
+    direction, or varies between fewer than five specimens; or if the units between which it varies scatter strongly,
+    and an effect that explains all of that scatter would not have been found.
 
     Parameters
     ----------
     selection : Selection
-        The end of the loop.
+        The result of the loop.
     entries : sequence of dict
-        As `sensitivity` gives them.
+        As returned by `sensitivity`.
     scatter : sequence of dict
         closure.json's `scatter`.
     """

@@ -159,11 +159,14 @@ STEPS = pd.DataFrame({"force_N": np.repeat([10.0, 10.1, 10.2], 40), "stroke_id":
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        ({"gains": [Gain(0.5, 0.5, 1.0, 2.0)]}, "does not predict the data that were held out better"),
+        ({"gains": [Gain(0.5, 0.5, 1.0, 2.0)]}, "does not lower the error on held-out data"),
         ({"gains": [Gain(0.01, 0.99, 9.0)], "p_value": 1e-4}, "lowers the held-out error by less than 5%"),
-        ({"added": 0.0019}, "smaller than the recorded force can show"),  # 2e-4 of 10 N
-        ({"added": 0.028, "samples": STEPS}, "smaller than the recorded force can show"),  # 0.1 N over sqrt(12)
-        ({"settings": [GOOD, Gain(-0.1, 1.0, 1.0)]}, "does not predict whole settings that were held out"),
+        ({"added": 0.0019}, "smaller than the resolution of the recorded force"),  # 2e-4 of 10 N
+        (
+            {"added": 0.028, "samples": STEPS},
+            "smaller than the resolution of the recorded force",
+        ),  # 0.1 N over sqrt(12)
+        ({"settings": [GOOD, Gain(-0.1, 1.0, 1.0)]}, "does not predict held-out settings"),
     ],
 )
 def test_why_a_proposal_is_refused_is_said(decide, given, reason):
