@@ -1,4 +1,4 @@
-"""closure.json: the verdict, errors, effects with intervals, what could have been seen, and what is left."""
+"""closure.json: the verdict, errors, effects with intervals, sensitivity, and what is left."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ SLOTS = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
 
 @dataclass(frozen=True)
 class BeforeAfter:
-    """The model before and after on all rows, and the forces by fits that did not see a row's unit."""
+    """The models before and after on all rows, and the forces by fits without a row's unit."""
 
     before: Fitted
     after: Fitted
     held_before: np.ndarray  # (n,) NaN where never held out
     held_after: np.ndarray
-    covered: np.ndarray  # (n,) whether the rest of the campaign covers the row: what it does not is extrapolated
+    covered: np.ndarray  # (n,) whether the other rows cover the row; else it is extrapolated
 
     def heldout_rmse_N(self, held: np.ndarray, *, extrapolated: bool = False) -> float | None:
-        """Return the error of forces held out, on rows that the rest of the campaign covers or on the others."""
+        """Return the held-out error, on rows that the other rows cover or on extrapolated ones."""
         rows = self.before.rows
         chosen = np.isfinite(held) & (self.covered != extrapolated)
         weight = rows.weight[chosen]
@@ -60,11 +60,11 @@ class BeforeAfter:
         return float(np.sqrt(weight @ (rows.force - held)[chosen] ** 2 / weight.sum()))
 
     def gains(self, around: str | None, *, weak: bool) -> bool:
-        """Whether after has no higher errors than before, in sample and held out.
+        """Whether the model after has no larger errors than that before, in sample and held out.
 
-        Weak evidence needs a lower error held out: an equal one says nothing for it. Where a level is named, this
-        is asked of the errors about the means of its groups, and the whole ones are not higher by much:
-        `HARMLESS_RATIO`. That needs evidence that is not weak, or a held-out error about these means that is halved.
+        With weak evidence the held-out error must be lower. If a level is given, the errors about the means of its
+        groups are compared, and the whole errors may be larger by `HARMLESS_RATIO`. This needs evidence that is not
+        weak, or a held-out error about the means that is halved.
         """
         whole = self._ratios(None)
         inside = whole if around is None else self._ratios(around)
@@ -74,7 +74,7 @@ class BeforeAfter:
         return max(whole) <= (HARMLESS_RATIO if strong else SAME_ERROR)
 
     def _ratios(self, around: str | None) -> tuple[float, float]:
-        """Return after's error over before's, in sample and held out; 1 for the second where nothing was held out."""
+        """Return the ratio of the errors after and before, in sample and held out (1 if nothing was held out)."""
         rows, weight = self.before.rows, self.before.rows.weight
         inside = [weight @ about_means(f.residual, rows, around) ** 2 for f in (self.before, self.after)]
         known = np.isfinite(self.held_before) & np.isfinite(self.held_after) & self.covered
@@ -141,7 +141,7 @@ def closure_document(
 
 
 def fit_quality(errors_after: Mapping, floor_N: float | None) -> dict:
-    """Return closure.json's `fit_quality`: whether the error is what repeats scatter by, or how many times that."""
+    """Return closure.json's `fit_quality`: whether the error exceeds the scatter of repeats, and their ratio."""
     p_value = errors_after["lack_of_fit_p"]
     if floor_N is None or p_value is None:
         return {"state": "unknown", "ratio": None, "p_value": None}
@@ -162,7 +162,7 @@ def _refused(item: RefusedEffect, rows: Rows) -> dict:
 
 
 def effect_entries(after: Fitted, selection: Selection, config: Config) -> list[dict]:
-    """Return closure.json's `effects`: one per term of the after-model, then what is a candidate only."""
+    """Return closure.json's `effects`: one per term of the after-model, then the inconclusive candidate."""
     entries = [_entry(after, number, item, config) for number, item in enumerate(selection.added)]
     if selection.inconclusive is not None:
         alone = selection.inconclusive.proposal.fitted
@@ -173,7 +173,7 @@ def effect_entries(after: Fitted, selection: Selection, config: Config) -> list[
 def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> dict:
     """Return the entry of one effect of a fit's model."""
     term, proposal = after.model.terms[number], item.proposal
-    own_phase = "shift" in term.fixed  # each pass has a phase of its own: there is not one to print
+    own_phase = "shift" in term.fixed  # each stroke direction of a file has its own
     intervals = effect_intervals(after, number, proposal.unit)
     parameters = [
         {
@@ -186,7 +186,7 @@ def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> 
     ]
     return {
         "id": term.effect.id,
-        "label": describe(term) + (", its phase each pass's own" if own_phase else ""),
+        "label": describe(term) + (", separate phase per stroke" if own_phase else ""),
         "level": effect_level(term, after.rows),
         "channels": channels_of(term, after.rows),
         "acts_on": term.acts_on,
@@ -216,7 +216,7 @@ def _number(value: float) -> float | None:
 
 
 def channels_of(term: Term, rows: Rows) -> list[str]:
-    """Return the channels an effect uses; an unsigned force along a channel of whole files uses direction too."""
+    """Return the channels of an effect; an unsigned force along a channel of whole files has direction too."""
     names = list(term.channels)
     both_ways = rows.speed.min() < 0 < rows.speed.max()
     coarse = all(FINER[unit_of(rows.values(name), rows)] > FINER["stroke"] for name in names)
@@ -232,7 +232,7 @@ def effect_level(term: Term, rows: Rows) -> str:
 
 
 def _smoothness(after: Fitted, number: int) -> str:
-    """Return how smooth a free shape is, to follow its equation; "" for other effects."""
+    """Return a text with the effective degrees of freedom of a penalised free shape; "" for other effects."""
     if after.model.terms[number].smoothness is None:
         return ""
     return f"; smooth, {effective_df(after, number):.1f} effective degrees of freedom"
@@ -248,7 +248,7 @@ def form_of(term: Term) -> str:
 
 
 def parameter_unit(unit: str, term: Term, units: Units) -> str:
-    """Return a parameter's true unit: {x} and {z} are the channels', {y} that of what the effect gives."""
+    """Return a parameter's unit: {x} and {z} stand for those of the channels, {y} for that of the effect."""
     channel, second = units.of(term.channels[0]), units.of(term.channels[-1])
     if term.operation == "multiply":
         given = ""
@@ -287,10 +287,10 @@ def effect_table(entries: Sequence[dict], added: Sequence[AcceptedEffect]) -> pd
 
 
 def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> dict:
-    """Return closure.json's `left`: the error above the floor, and the strongest structure that is still there.
+    """Return closure.json's `left`: the error above the noise floor, and the strongest structure in the residual.
 
-    Where nothing is significant any more but effects were added, the channel that orders most of what is left is named
-    with its p-value: it is not significant. An effect that lowered no error is left, too.
+    This is what is still significant, or an effect that was removed because it lowered no error. If there is neither
+    but effects were added, it is the channel that explains most of the residual, which is not significant.
     """
     above = float(np.sqrt(max(rmse_N**2 - floor_N**2, 0.0))) if floor_N is not None else None
     left = selection.left
@@ -309,17 +309,17 @@ def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> di
         names = [selection.channels[n].unit for n in left.channels if n in selection.channels]
         level = LEVEL_NAMES[min(names or [left.unit], key=FINER.get)]
         if left.channels[0] == "direction" and len(left.channels) > 1:
-            level = LEVEL_NAMES[max(names, key=FINER.get)]  # it is the other channel that tells offsets apart
+            level = LEVEL_NAMES[max(names, key=FINER.get)]  # offsets differ along the other channel
         return {"rmse_N": above, "level": level, "channel": " ".join(left.channels), "p_value": left.p_value}
     smallest = min((c.p_value for c in selection.last), default=None)
     return {"rmse_N": above, "level": None, "channel": None, "p_value": smallest}
 
 
 def _unsteady_offset(selection: Selection) -> Candidate | None:
-    """Return the category that orders most of an offset between directions which differs from run to run; else None.
+    """Return the category that explains most of an offset between directions that differs between runs, or None.
 
-    Each condition is given an offset of its own first, as that would hide what a set-up does to it. The p-value is
-    adjusted over the categories.
+    An offset per condition is fitted first, because it would mask the influence of a set-up. The p-value is adjusted
+    over the categories.
     """
     fitted = selection.after
     rows = fitted.rows
@@ -340,7 +340,7 @@ def _unsteady_offset(selection: Selection) -> Candidate | None:
 
 
 def _largest(fitted: Fitted, candidates: Sequence[Candidate]) -> Candidate | None:
-    """Return the candidate that explains most of the residual's sum of squares."""
+    """Return the candidate with the largest explained sum of squares."""
     best, most = None, 0.0
     root = np.sqrt(fitted.rows.weight)
     for candidate in candidates:
