@@ -149,7 +149,7 @@ UNITS_PER_KNOT = 3
 KNOTS_APART = 1e-3
 """Knots of a channel scaled to -1..1 that are closer than this are one value that was measured twice."""
 
-MOST_SPANS = 4.0
+SPANS = 4.0
 """Largest width or time constant of a form, as a multiple of the channel's range."""
 
 PAIR_PENALTY = 10.0
@@ -196,7 +196,7 @@ LEAST_HELD_OUT = 0.5
 BLOCKS_OF_A_FOLD = (1, 2, 4)
 """Numbers of calendar blocks per fold, tried in this order until `LEAST_HELD_OUT` of the rows are held out."""
 
-OUTSIDE_RANGE = 0.02
+OUTSIDE = 0.02
 """Share of the range of the other rows by which a held-out row may lie outside without being extrapolated."""
 
 SAME_SETTING = 0.01
@@ -256,16 +256,16 @@ CHANCE_P = 0.5
 SAME_ERROR = 1.005
 """Ratio of errors up to which they count as equal. The fit minimises whitened, not plain, squares."""
 
-HARMLESS_RATIO = 1.1
+HARMLESS = 1.1
 """Largest ratio of errors between runs with an effect that lowers the error within runs."""
 
-HALVED_ERROR = 0.5
-"""Ratio of held-out errors below which an effect of weak evidence is allowed `HARMLESS_RATIO` too."""
+HALVED = 0.5
+"""Ratio of held-out errors below which an effect of weak evidence is allowed `HARMLESS` too."""
 
 LACK_OF_FIT = 0.05
 """The error is larger than the scatter of repeats if the p-value of the lack of fit is below this."""
 
-UNSTEADY_SHARE = 0.2
+UNSTEADY = 0.2
 """An offset differs between runs if its standard deviation between them exceeds this share of it."""
 
 TARGET_POWER = 0.8

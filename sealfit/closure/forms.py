@@ -10,15 +10,7 @@ import pandas as pd
 from scipy.special import fdtrc
 
 from sealfit.closure.channels import CALENDAR, FINER, Channel, even_knots, scaled
-from sealfit.closure.criteria import (
-    FREE_DF,
-    JACKKNIFE_UNITS,
-    KNOTS_APART,
-    MOST_KNOTS,
-    MOST_SPANS,
-    SEARCHES,
-    UNITS_PER_KNOT,
-)
+from sealfit.closure.criteria import FREE_DF, JACKKNIFE_UNITS, KNOTS_APART, MOST_KNOTS, SEARCHES, SPANS, UNITS_PER_KNOT
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.linearised import Proposal, middles
 from sealfit.closure.ripples import Peak, common_wavelength, pass_shifts
@@ -275,7 +267,7 @@ def _within_reach(effect: Effect, values: np.ndarray) -> Effect:
     A peak far outside is not distinguishable from a curve with a constant.
     """
     low, high, span = float(values.min()), float(values.max()), float(np.ptp(values)) or 1.0
-    limits = {"inside": (low, high), "between": (low, high), "span": (span / 1000, MOST_SPANS * span)}
+    limits = {"inside": (low, high), "between": (low, high), "span": (span / 1000, SPANS * span)}
     parameters = []
     for p in effect.parameters:
         if p.search in limits:

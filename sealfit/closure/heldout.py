@@ -6,13 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from sealfit.closure.criteria import (
-    BLOCKS_OF_A_FOLD,
-    LEAST_GROUPS_HELD_OUT,
-    LEAST_HELD_OUT,
-    OUTSIDE_RANGE,
-    SAME_SETTING,
-)
+from sealfit.closure.criteria import BLOCKS_OF_A_FOLD, LEAST_GROUPS_HELD_OUT, LEAST_HELD_OUT, OUTSIDE, SAME_SETTING
 from sealfit.fit.joint.rows import LEVELS, Rows
 
 
@@ -141,7 +135,7 @@ def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.nda
 def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return which values lie outside the range of those seen, by more than values of one setting differ."""
     low, high = float(seen.min()), float(seen.max())
-    slack = OUTSIDE_RANGE * (high - low) + SAME_SETTING * max(abs(low), abs(high))
+    slack = OUTSIDE * (high - low) + SAME_SETTING * max(abs(low), abs(high))
     return (values < low - slack) | (values > high + slack)
 
 

@@ -97,17 +97,12 @@ def close_loop(
             held_before, held_after, found = heldout.forces(selection, say)
             if found is not None and not _found_again(selection, found):
                 selection, after, held_after = _all_refused(selection, say), before, held_before
-            before_after = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
-            selection, before_after = _no_worse(selection, before_after, heldout, say)
+            models = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
+            selection, models = _no_worse(selection, models, heldout, say)
         break
-    before, after, held_before, held_after = (
-        before_after.before,
-        before_after.after,
-        before_after.held_before,
-        before_after.held_after,
-    )
+    before, after, held_before, held_after = models.before, models.after, models.held_before, models.held_after
     drawn = _drawn_tables(selection, before, after, config)
-    document = closure_document(selection, before_after, heldout.level, config, effects)
+    document = closure_document(selection, models, heldout.level, config, effects)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their original order
     tables = {
         "effects": effect_table([e for e in document["effects"] if not e["candidate"]], selection.added),
@@ -285,7 +280,7 @@ def _same_shape(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _no_worse(
-    selection: Selection, before_after: BeforeAfter, heldout: _HeldOut, say: Callable[[str], None]
+    selection: Selection, models: BeforeAfter, heldout: _HeldOut, say: Callable[[str], None]
 ) -> tuple[Selection, BeforeAfter]:
     """Return the result without the last effects that do not lower the error in sample and held out.
 
@@ -293,9 +288,7 @@ def _no_worse(
     weak, `cannot_tell`.
     """
     refused = []
-    while selection.added and not before_after.gains(
-        _around(selection.added), weak=any(a.weak for a in selection.added)
-    ):
+    while selection.added and not models.gains(_around(selection.added), weak=any(a.weak for a in selection.added)):
         last = selection.added[-1].proposal
         say(f"removed, because it does not lower the error: {describe(last.term)}")
         reason = "it does not lower the error, in sample or on held-out data"
@@ -303,16 +296,13 @@ def _no_worse(
         model = selection.after.model.without_term(len(selection.added) - 1)
         own = fit(model, selection.after.rows, selection.after.scatter, turns=2) if model.terms else selection.before
         selection = replace(selection, after=own, added=selection.added[:-1])
-        _, after = _on_all(before_after.before.rows, selection)
+        _, after = _on_all(models.before.rows, selection)
         if not selection.added:
-            before_after = replace(before_after, after=before_after.before, held_after=before_after.held_before)
+            models = replace(models, after=models.before, held_after=models.held_before)
         else:
-            before_after = replace(
-                before_after, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model)
-            )
-    return replace(
-        selection, refused=(*selection.refused, *refused), worse=tuple(r for r in refused if not r.weak)
-    ), before_after
+            models = replace(models, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model))
+    strong = tuple(r for r in refused if not r.weak)
+    return replace(selection, refused=(*selection.refused, *refused), worse=strong), models
 
 
 def _around(added: Sequence[AcceptedEffect]) -> str | None:

@@ -158,16 +158,16 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
     found = sorted(found, key=lambda p: p.bic)
     best = found[0]
     equals = [p for p in found if p.bic - best.bic < EQUAL_BIC or _simpler(p, best)]
-    held = [p for p in equals if determined(p)]
-    fewest = min((p.size for p in held), default=0)
-    held += [p for p in equals if p.term.effect.physical and p not in held and p.size <= fewest]
+    candidates = [p for p in equals if determined(p)]
+    fewest = min((p.size for p in candidates), default=0)
+    candidates += [p for p in equals if p.term.effect.physical and p not in candidates and p.size <= fewest]
     equal_fits = [p for p in found if p.fitted.deviance - best.fitted.deviance < EQUAL_BIC]
     if not any(p.term.effect.id == LINEAR for p in equal_fits):  # a straight line shows no mechanism
         own = [p for p in equal_fits if _own_mechanism(p)]
         least = min((p.fitted.deviance for p in own), default=0.0)
-        held += [p for p in own if p.fitted.deviance - least < 2 * EQUAL_BIC and p not in held]
-    if held:
-        first = min(held, key=lambda p: (_overturns(fitted, p), p.rank, p.bic))
+        candidates += [p for p in own if p.fitted.deviance - least < 2 * EQUAL_BIC and p not in candidates]
+    if candidates:
+        first = min(candidates, key=lambda p: (_overturns(fitted, p), p.rank, p.bic))
     else:
         first = next((p for p in found if p.bic - best.bic < RIVAL_BIC and determined(p)), best)
     return [first, *(p for p in found if p is not first)]

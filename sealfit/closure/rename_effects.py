@@ -144,8 +144,8 @@ class Renaming:
     ) -> Sequence[Proposal]:
         """Return proposals that may replace a term, on some channels, from the fit `without` it."""
         finest: dict[tuple, Candidate] = {}
-        score_tests = ScoreTests(without)
-        for c in (c for name in names for c in channel_candidates(score_tests, self.channels[name])):
+        tests = ScoreTests(without)
+        for c in (c for name in names for c in channel_candidates(tests, self.channels[name])):
             if c.key not in finest or c.test_result.df > finest[c.key].test_result.df:
                 finest[c.key] = replace(c, p_value=p_value)
         found = sorted(finest.values(), key=lambda c: -c.chi2)

@@ -11,15 +11,7 @@ import pandas as pd
 from sealfit.closure.after import reference_of
 from sealfit.closure.channels import FINER, Channel, incomplete_channels, unit_of
 from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, about_means
-from sealfit.closure.criteria import (
-    CHANCE_P,
-    HALVED_ERROR,
-    HARMLESS_RATIO,
-    LACK_OF_FIT,
-    NOT_ADJUSTED,
-    SAME_ERROR,
-    UNSTEADY_SHARE,
-)
+from sealfit.closure.criteria import CHANCE_P, HALVED, HARMLESS, LACK_OF_FIT, NOT_ADJUSTED, SAME_ERROR, UNSTEADY
 from sealfit.closure.error_sizes import errors, lack_of_fit, noise_floor, scatter_list
 from sealfit.closure.forms import describe, free_term
 from sealfit.closure.intervals import effect_intervals
@@ -63,15 +55,15 @@ class BeforeAfter:
         """Whether the model after has no larger errors than that before, in sample and held out.
 
         With weak evidence the held-out error must be lower. If a level is given, the errors about the means of its
-        groups are compared, and the whole errors may be larger by `HARMLESS_RATIO`. This needs evidence that is not
+        groups are compared, and the whole errors may be larger by `HARMLESS`. This needs evidence that is not
         weak, or a held-out error about the means that is halved.
         """
         whole = self._ratios(None)
         inside = whole if around is None else self._ratios(around)
         if max(inside) > SAME_ERROR or (weak and inside[1] >= 1):
             return False
-        strong = not weak or inside[1] < HALVED_ERROR
-        return max(whole) <= (HARMLESS_RATIO if strong else SAME_ERROR)
+        strong = not weak or inside[1] < HALVED
+        return max(whole) <= (HARMLESS if strong else SAME_ERROR)
 
     def _ratios(self, around: str | None) -> tuple[float, float]:
         """Return the ratio of the errors after and before, in sample and held out (1 if nothing was held out)."""
@@ -88,21 +80,18 @@ class BeforeAfter:
 
 
 def closure_document(
-    selection: Selection, before_after: BeforeAfter, heldout_unit: str, config: Config, effects: Mapping[str, Effect]
+    selection: Selection, models: BeforeAfter, heldout_unit: str, config: Config, effects: Mapping[str, Effect]
 ) -> dict:
     """Return closure.json."""
-    after, units = before_after.after, config.units
+    after, units = models.after, config.units
     numbers = {}
-    for name, fitted, held in (
-        ("before", before_after.before, before_after.held_before),
-        ("after", after, before_after.held_after),
-    ):
+    for name, fitted, held in (("before", models.before, models.held_before), ("after", after, models.held_after)):
         found = errors(fitted.rows, fitted.residual)
         numbers[name] = {
             "rmse_N": found["rmse_N"],
             "rmse_runs_N": found["rmse_runs_N"],
-            "heldout_rmse_N": before_after.heldout_rmse_N(held),
-            "heldout_extrapolated_rmse_N": before_after.heldout_rmse_N(held, extrapolated=True),
+            "heldout_rmse_N": models.heldout_rmse_N(held),
+            "heldout_extrapolated_rmse_N": models.heldout_rmse_N(held, extrapolated=True),
             "max_abs_N": found["max_abs_N"],
             "mean_abs_pct": found["mean_abs_pct"],
             "lack_of_fit_p": lack_of_fit(fitted),
@@ -299,10 +288,8 @@ def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> di
         names = " ".join(channels_of(item.term, rows))
         return {"rmse_N": above, "level": effect_level(item.term, rows), "channel": names, "p_value": item.p_value}
     if left is None and selection.added:
-        left = _unsteady_offset(selection) or _largest(
-            selection.after,
-            [c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < CHANCE_P],
-        )
+        last = [c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < CHANCE_P]
+        left = _unsteady_offset(selection) or _largest(selection.after, last)
     if isinstance(left, Peak):
         return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
     if left is not None:
@@ -329,7 +316,7 @@ def _unsteady_offset(selection: Selection) -> Candidate | None:
     )
     variance = sum(c.variance for c in fitted.scatter.components if c.kind == "offset" and c.level == "run")
     categories = [c for c in selection.channels.values() if not c.numeric and not c.grouping]
-    if amplitude == 0 or np.sqrt(variance) < UNSTEADY_SHARE * amplitude or not categories:
+    if amplitude == 0 or np.sqrt(variance) < UNSTEADY * amplitude or not categories:
         return None
     if 2 <= len(rows.conditions) <= rows.groups.starts["file"].size / 3:
         term = free_term(Channel("condition", rows.values("condition"), "run"), "force", "add")

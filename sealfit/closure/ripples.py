@@ -135,9 +135,9 @@ def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
     k = first + int(np.argmax(power[first : k + LOBE + 1]))
     if 0 < k < power.size - 1:
         left, middle, right = power[k - 1 : k + 2]
-        bend = left - 2 * middle + right
-        if bend < 0:
-            shift = 0.5 * (left - right) / bend
+        curvature = left - 2 * middle + right
+        if curvature < 0:
+            shift = 0.5 * (left - right) / curvature
             return float(1 / (frequency[k] + shift * (frequency[1] - frequency[0])))
     return float(1 / frequency[k])
 
@@ -249,10 +249,10 @@ def _top(lengths: np.ndarray, power: np.ndarray) -> float:
     """Return the maximum of a sampled curve, by the parabola through its highest point and two neighbours."""
     k = int(np.clip(np.argmax(power), 1, power.size - 2))
     left, middle, right = power[k - 1 : k + 2]
-    bend = left - 2 * middle + right
-    if bend >= 0:
+    curvature = left - 2 * middle + right
+    if curvature >= 0:
         return float(lengths[k])
-    return float(lengths[k] + 0.25 * (left - right) / bend * (lengths[k + 1] - lengths[k - 1]))
+    return float(lengths[k] + 0.25 * (left - right) / curvature * (lengths[k + 1] - lengths[k - 1]))
 
 
 def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis: str) -> np.ndarray:

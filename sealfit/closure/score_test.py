@@ -207,9 +207,9 @@ class ScoreTests:
             return weakest._replace(consistent=all(map(self._specimens_agree, variants)))
         if level == "specimen":
             test = self.cluster_tests[level].test(variants[0], target)
-            return (
-                weakest if test is None else weakest._replace(chi2=test.chi2, df=test.basis.shape[1], small_sample=test)
-            )
+            if test is None:
+                return weakest
+            return weakest._replace(chi2=test.chi2, df=test.basis.shape[1], small_sample=test)
         tests = tuple(contrast_test(self.fitted, left, between) for left in variants)
         if any(test is None for test in tests):
             return None
@@ -329,25 +329,19 @@ FLIPS = 1999  # Random sign flips: they resolve p = 0.0005, a tenth of the famil
 MOST_SIGNS = 1 << 22  # Signs that are drawn at once: 34 MB.
 
 
-def adjusted_candidates(
-    score_tests: ScoreTests, candidates: Sequence[Candidate], rng: np.random.Generator
-) -> list[Candidate]:
+def adjust_all(tests: ScoreTests, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
     """Return candidates with p-values adjusted over all of them, strongest evidence first."""
     results = [c.test_result for c in candidates]
     p_values = np.ones(len(candidates))
-    many = [k for k, j in enumerate(results) if j.small_sample is None and not j.slopes]
+    many = [k for k, r in enumerate(results) if r.small_sample is None and not r.slopes]
     if many:
         p_values[many] = adjust([results[k] for k in many], rng)
     for k in many:
         if results[k].scores.shape[0] >= JACKKNIFE_UNITS:  # two tests, each with half of the error rate
             p_values[k] = 2 * min(p_values[k], len(many) * np.exp(results[k].log_p_jackknife))
-    small_sample_p = np.min(
-        [adjust_small_sample(units, results, rng) for units in score_tests.cluster_tests.values()], axis=0
-    )
-    p_values = np.minimum(p_values, np.minimum(small_sample_p, adjust_slopes(results)))
-    p_values[[j.small_sample is not None and bool(j.slopes) for j in results]] *= (
-        2  # of two ways, each has half of the error
-    )
+    small = np.min([adjust_small_sample(units, results, rng) for units in tests.cluster_tests.values()], axis=0)
+    p_values = np.minimum(p_values, np.minimum(small, adjust_slopes(results)))
+    p_values[[r.small_sample is not None and bool(r.slopes) for r in results]] *= 2  # two tests here as well
     found = [replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)]
     return sorted(found, key=lambda c: -c.evidence)
 

@@ -35,7 +35,7 @@ from sealfit.closure.criteria import (
     PAIR_FACTOR,
     SEARCHES,
 )
-from sealfit.closure.score_test import Candidate, ScoreTests, adjusted_candidates
+from sealfit.closure.score_test import Candidate, ScoreTests, adjust_all
 from sealfit.closure.small_sample_test import log_p_of
 from sealfit.effects.free import BENDS, evenly
 from sealfit.fit.joint.estimate import Fitted
@@ -60,52 +60,52 @@ MOST_NUMBERS = 1 << 22  # Numbers in the columns that are projected at once: 34 
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 
 
-def search(score_tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
+def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
     """Return every candidate with its adjusted p-value, strongest evidence first.
 
     Parameters
     ----------
-    score_tests : ScoreTests
+    tests : ScoreTests
         Of the current model.
     channels : sequence of Channel
         Channels to search.
     rng : Generator
         For the sign flips.
     """
-    candidates = [c for channel in channels for c in channel_candidates(score_tests, channel)]
-    return adjusted_candidates(score_tests, candidates, rng) if candidates else []
+    candidates = [c for channel in channels for c in channel_candidates(tests, channel)]
+    return adjust_all(tests, candidates, rng) if candidates else []
 
 
-def channel_candidates(score_tests: ScoreTests, channel: Channel) -> Iterator[Candidate]:
+def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidate]:
     """Yield the candidates of one channel, with p-values that are not adjusted."""
-    rows = score_tests.fitted.rows
+    rows = tests.fitted.rows
     if channel.name == "direction":
-        yield from _shape_candidates(score_tests, channel, np.ones((rows.force.size, 1)), TARGETS)
+        yield from _shape_candidates(tests, channel, np.ones((rows.force.size, 1)), TARGETS)
         return
     few_specimens = (
         channel.numeric and channel.unit == "specimen" and rows.groups.starts["specimen"].size < JACKKNIFE_UNITS
     )
     shapes = free_columns(channel, FEW_DF if few_specimens else FREE_DF)
     widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
-    yield from _shape_candidates(score_tests, channel, shapes, TARGETS, widths)
+    yield from _shape_candidates(tests, channel, shapes, TARGETS, widths)
     if few_specimens:
         for kink in kinks(channel).T:
-            yield from _shape_candidates(score_tests, channel, kink[:, None], MAIN_TARGETS)
+            yield from _shape_candidates(tests, channel, kink[:, None], MAIN_TARGETS)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
     fine = channel.numeric and channel.name not in CALENDAR and units >= FINE_UNITS
     if fine and np.unique(channel.values).size > 2 * FINE_DF:
-        yield from _shape_candidates(score_tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
+        yield from _shape_candidates(tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
 
 
 def _shape_candidates(
-    score_tests: ScoreTests,
+    tests: ScoreTests,
     channel: Channel,
     shapes: np.ndarray,
     targets: Sequence[tuple[str, str]],
     widths: Sequence[int] = (),
 ) -> Iterator[Candidate]:
     """Yield the candidates of a channel's columns on every target, one for each number of columns in `widths`."""
-    fitted, rows = score_tests.fitted, score_tests.fitted.rows
+    fitted, rows = tests.fitted, tests.fitted.rows
     if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
         return  # with few speeds a dependence on speed may be the Stribeck curve
     both_ways = rows.speed.min() < 0 < rows.speed.max()
@@ -122,7 +122,7 @@ def _shape_candidates(
     variants: tuple[np.ndarray, ...] = ()
     for number, (acts_on, operation, own) in enumerate(places):
         if number % together == 0:
-            variants = score_tests.variants(np.column_stack(slopes[number : number + together]), channel.unit)
+            variants = tests.variants(np.column_stack(slopes[number : number + together]), channel.unit)
         first = number % together * own.shape[1]
         unit = channel.unit
         names = (channel.name,)
@@ -133,9 +133,7 @@ def _shape_candidates(
         level = flip_level(unit, rows)
         between = level if channel.grouping else scatter_level([channel], rows)
         for width in dict.fromkeys(widths or (own.shape[1],)):
-            test_result = score_tests(
-                [v[:, first : first + width] for v in variants], between, level, (acts_on, operation)
-            )
+            test_result = tests([v[:, first : first + width] for v in variants], between, level, (acts_on, operation))
             if test_result is not None:
                 yield Candidate(names, acts_on, operation, level, own[:, :width], test_result)
 
@@ -173,13 +171,13 @@ NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}
 
 
 def search_pairs(
-    score_tests: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
+    tests: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
 ) -> list[Candidate]:
     """Return candidates of two channels, with p-values adjusted over single channels and pairs, strongest first.
 
     Parameters
     ----------
-    score_tests : ScoreTests
+    tests : ScoreTests
         Of the current model.
     channels : sequence of Channel
         Channels to search.
@@ -188,15 +186,15 @@ def search_pairs(
     rng : Generator
         For the sign flips.
     """
-    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _pair_candidates(score_tests, *pair)]
+    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _pair_candidates(tests, *pair)]
     if not found:
         return []
-    pairs = [c for c in adjusted_candidates(score_tests, [*found, *singles], rng) if c.pair]
+    pairs = [c for c in adjust_all(tests, [*found, *singles], rng) if c.pair]
     return [replace(c, p_value=min(1.0, PAIR_FACTOR * c.p_value)) for c in pairs]
 
 
 def equivalent_pairs(
-    score_tests: ScoreTests, significant: Sequence[Candidate], channels: Mapping[str, Channel]
+    tests: ScoreTests, significant: Sequence[Candidate], channels: Mapping[str, Channel]
 ) -> list[Candidate]:
     """Return the pairs that are equivalent to a single channel acting on a, b, v_s or sigma_2.
 
@@ -205,7 +203,7 @@ def equivalent_pairs(
 
     Parameters
     ----------
-    score_tests : ScoreTests
+    tests : ScoreTests
         Of the current model.
     significant : sequence of Candidate
         Its significant candidates.
@@ -218,7 +216,7 @@ def equivalent_pairs(
         if single.pair or len(pair) != 2 or not pair <= channels.keys() or pair in best:
             continue
         members = _usable([channels[name] for name in sorted(pair)])
-        found = _pair_candidates(score_tests, *members) if len(members) == 2 else []
+        found = _pair_candidates(tests, *members) if len(members) == 2 else []
         strongest = [max(own, key=lambda c: c.chi2) for t in MAIN_TARGETS if (own := [c for c in found if _on(c, t)])]
         best[pair] = [
             replace(c, test_result=c.test_result._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value)
@@ -239,11 +237,11 @@ def _usable(channels: Sequence[Channel]) -> list[Channel]:
     ]
 
 
-def _pair_candidates(score_tests: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
+def _pair_candidates(tests: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
     blocks = mixed_columns(one, other)
     if not blocks:
         return []
-    fitted, finer = score_tests.fitted, min(one.unit, other.unit, key=FINER.get)
+    fitted, finer = tests.fitted, min(one.unit, other.unit, key=FINER.get)
     between = scatter_level((one, other), fitted.rows)
     level = flip_level(finer, fitted.rows)
     shapes = np.column_stack(blocks)
@@ -252,9 +250,9 @@ def _pair_candidates(score_tests: ScoreTests, one: Channel, other: Channel) -> l
     for target in MAIN_TARGETS:
         if "load_N" in (one.name, other.name) and target[0] == "force":
             continue
-        variants = score_tests.variants(shapes * fitted.slope(*target)[:, None], finer)
+        variants = tests.variants(shapes * fitted.slope(*target)[:, None], finer)
         for block, first, last in zip(blocks, ends[:-1], ends[1:], strict=True):
-            test_result = score_tests([v[:, first:last] for v in variants], between, level, target)
+            test_result = tests([v[:, first:last] for v in variants], between, level, target)
             if test_result is not None:
                 names = (one.name, other.name)
                 found.append(Candidate(names, *target, level, block, test_result, pair=True))
@@ -331,13 +329,13 @@ class MaskedPair(NamedTuple):
 
 
 def search_masked_pairs(
-    score_tests: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate], alpha: float
+    tests: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate], alpha: float
 ) -> list[MaskedPair]:
     """Return the pairs that are significant jointly, most significant first.
 
     Parameters
     ----------
-    score_tests : ScoreTests
+    tests : ScoreTests
         Of the current model.
     channels : mapping
         Channels by name.
@@ -346,7 +344,7 @@ def search_masked_pairs(
     alpha : float
         Level of the search, and of each of the two given the other.
     """
-    tested = [(two, _joint_test(score_tests, two, level)) for two, level in _pairs(score_tests, channels, candidates)]
+    tested = [(two, _joint_test(tests, two, level)) for two, level in _pairs(tests, channels, candidates)]
     tested = [(two, test) for two, test in tested if test is not None]
     found = [
         MaskedPair(min(1.0, SEARCHES * len(tested) * float(np.exp(joint))), chi2, tuple(c.key for c in two))
@@ -357,10 +355,10 @@ def search_masked_pairs(
 
 
 def _pairs(
-    score_tests: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate]
+    tests: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate]
 ) -> Iterator[tuple[tuple[Candidate, Candidate], str]]:
     """Yield the pairs to test and the level of their units."""
-    rows = score_tests.fitted.rows
+    rows = tests.fitted.rows
     straight = [c for c in candidates if c.columns.shape[1] == 1 and c.claimable]
     between = {c.channels: [channels[n] for n in c.channels if n != "direction"] for c in straight}
     level = {id(c): scatter_level(between[c.channels] or [channels["direction"]], rows) for c in straight}
@@ -389,20 +387,18 @@ def _targets(candidate: Candidate) -> Sequence[tuple[str, str]]:
     return OF_DIRECTION if candidate.channels == ("direction",) else MAIN_TARGETS
 
 
-def _joint_test(
-    score_tests: ScoreTests, two: tuple[Candidate, Candidate], level: str
-) -> tuple[float, float, float] | None:
+def _joint_test(tests: ScoreTests, two: tuple[Candidate, Candidate], level: str) -> tuple[float, float, float] | None:
     """Return log p of two candidates jointly, the larger log p of one given the other, and their chi-squared.
 
     Of several variants the weakest result counts. None if they are no pair.
     """
-    fitted = score_tests.fitted
+    fitted = tests.fitted
     columns = np.column_stack([c.columns * fitted.slope(c.acts_on, c.operation)[:, None] for c in two])
     unit = min((c.unit for c in two), key=lambda name: fitted.rows.groups.starts[name].size)
     white = fitted.whitening(columns)
-    numbers = score_tests.cluster_tests[level].along(_larger_column(white, fitted.rows.groups, level))
+    numbers = tests.cluster_tests[level].along(_larger_column(white, fitted.rows.groups, level))
     found = []
-    for left in score_tests.variants(columns, unit):
+    for left in tests.variants(columns, unit):
         own = fitted.rows.groups.sums(numbers.direction[:, None] * left, level)
         if ((own**2).sum(axis=0) <= CONSTANT_IN_RUNS * (left**2).sum(axis=0)).any() or not left.any(axis=0).all():
             return None

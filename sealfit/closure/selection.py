@@ -115,7 +115,7 @@ class _Loop:
         ripples = Ripples(samples, context)
         self.before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
         self.channels = {c.name: c for c in channels_of(rows, self.context.config)}
-        self.score_tests = ScoreTests(self.before)
+        self.tests = ScoreTests(self.before)
         self.last = self.first = self.searched()
         self.fitted = ripples.added_to(self.before, fine)
         self.added = list(ripples.added)
@@ -134,7 +134,7 @@ class _Loop:
 
     def searched(self) -> tuple[Candidate, ...]:
         """Return every candidate of a single channel on the current model."""
-        return tuple(search(self.score_tests, list(self.channels.values()), self.rng))
+        return tuple(search(self.tests, list(self.channels.values()), self.rng))
 
     def confirm(
         self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
@@ -144,8 +144,8 @@ class _Loop:
 
     def is_finished(self, number: int) -> bool:
         """Search, name and confirm once; return whether the loop is finished."""
-        if self.fitted is not self.score_tests.fitted:
-            self.score_tests, self.found = ScoreTests(self.fitted), None
+        if self.fitted is not self.tests.fitted:
+            self.tests, self.found = ScoreTests(self.fitted), None
             self.last = self.searched()
         if self.found is None:  # else the last round added nothing
             self.found = self.search_model(number)
@@ -167,7 +167,7 @@ class _Loop:
 
     def search_model(self, number: int) -> _SearchResult:
         """Return the result of all searches on the current model."""
-        found = _search_all(self.score_tests, self.last, self.channels, self.context.effects, self.alpha, self.rng)
+        found = _search_all(self.tests, self.last, self.channels, self.context.effects, self.alpha, self.rng)
         tried = f"{len(self.last)} candidates on {len(self.channels)} channels, {len(found.pairs)} on pairs of them"
         self.context.say(
             f"round {number}: {tried}; {len(found.significant)} significant, {len(found.masked)} mask each other"
@@ -198,7 +198,7 @@ class _Loop:
         significant = _pending_candidates(self.masked, (*found.claimable, *found.pairs)) or list(found.significant)
         significant += [c for c, _ in found.laws if c.p_value <= self.alpha and c.claimable]
         self.left = significant[0] if significant else self.ripple
-        significant += equivalent_pairs(self.score_tests, significant, self.channels)
+        significant += equivalent_pairs(self.tests, significant, self.channels)
         return [c for c in significant if c.key not in self.refused]
 
     def renames(self) -> bool:
@@ -251,7 +251,7 @@ class _Loop:
 
 
 def _search_all(
-    score_tests: ScoreTests,
+    tests: ScoreTests,
     last: Sequence[Candidate],
     channels: Mapping[str, Channel],
     effects: Mapping[str, Effect],
@@ -263,14 +263,14 @@ def _search_all(
     claimable = _claimable(last, inconsistent)
     significant = [c for c in claimable if c.p_value <= alpha]
     aged = not significant or any(c.channels == (AGING,) for c in significant)
-    laws = richer_laws(score_tests.fitted, channels, effects) if aged else []
+    laws = richer_laws(tests.fitted, channels, effects) if aged else []
     if significant and significant[0].p_value <= PAIRS_FROM_P:
         return _SearchResult(claimable, laws, [], significant, [])
-    pairs = _claimable(search_pairs(score_tests, list(channels.values()), last, rng), inconsistent)
+    pairs = _claimable(search_pairs(tests, list(channels.values()), last, rng), inconsistent)
     level = alpha * min((c.p_value for c in significant), default=1.0)
     significant = sorted([*significant, *(c for c in pairs if c.p_value <= level)], key=lambda c: c.p_value)
     level = alpha * min((c.p_value for c in significant), default=1.0)
-    masked = search_masked_pairs(score_tests, channels, [*claimable, *pairs], level)
+    masked = search_masked_pairs(tests, channels, [*claimable, *pairs], level)
     return _SearchResult(claimable, laws, pairs, significant, masked)
 
 

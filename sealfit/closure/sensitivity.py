@@ -236,14 +236,14 @@ class _Search:
 
     def margin(self, candidate: Candidate, effect: np.ndarray, fitted: Fitted) -> float:
         """Return the ratio of an effect to the size that is needed."""
-        score_tests = ScoreTests(fitted)
+        tests = ScoreTests(fitted)
         white = fitted.basis.freed(fitted.whitening(np.column_stack([self.fitted.residual, effect])))
         noise, effect = (replace(fitted, white_residual=column) for column in white.T)
         for one in (noise, effect):
             one.__dict__["basis"] = fitted.basis
         channel = self.channels[candidate.channels[-1]]
         columns = candidate.columns * noise.slope(candidate.acts_on, candidate.operation)[:, None]
-        variants = score_tests.variants(columns, channel.unit)
+        variants = tests.variants(columns, channel.unit)
         if all(enough_specimens(noise, left).all() for left in variants):
             return self._by_units(candidate, noise, effect, variants)
         large = min(float(least_share(effect, left).max()) for left in variants) / LARGE_SHARE

@@ -21,10 +21,10 @@ FEW_SPEEDS = (1.0, 4.0, 16.0, 64.0)
 def strongest(bins):
     """The smallest p-value of a claim in one search of single channels and pairs."""
     rows = make_rows(bins, has_aging=True)
-    score_tests, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
-    singles = search(score_tests, channels, rng)
+    tests, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
+    singles = search(tests, channels, rng)
     return min(
-        (c.p_value for c in (*singles, *search_pairs(score_tests, channels, singles, rng)) if c.claimable), default=1.0
+        (c.p_value for c in (*singles, *search_pairs(tests, channels, singles, rng)) if c.claimable), default=1.0
     )
 
 

@@ -19,10 +19,10 @@ ONE = {"temperatures": (), "days": (), "directions": (1, -1), "setup": 0.003, "b
 
 def hidden(bins, alpha=0.005):
     rows = make_rows(bins, has_aging=True)
-    score_tests, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
-    singles = search(score_tests, channels, rng)
-    pairs = search_pairs(score_tests, channels, singles, rng)
-    return search_masked_pairs(score_tests, {c.name: c for c in channels}, [*singles, *pairs], alpha)
+    tests, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
+    singles = search(tests, channels, rng)
+    pairs = search_pairs(tests, channels, singles, rng)
+    return search_masked_pairs(tests, {c.name: c for c in channels}, [*singles, *pairs], alpha)
 
 
 def one_way(table, force):

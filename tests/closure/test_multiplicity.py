@@ -11,9 +11,9 @@ from sealfit.closure.score_test import (
     Candidate,
     ScoreTestResult,
     adjust,
+    adjust_all,
     adjust_slopes,
     adjust_small_sample,
-    adjusted_candidates,
     critical_many,
     log_p_of,
     score_statistic,
@@ -149,9 +149,7 @@ def candidate(name, result):
 
 def test_a_search_says_the_strongest_evidence_first_with_p_values_for_two_searches():
     given = [candidate("idle", scored(np.array([[1.0], [-1.0]] * 4))), candidate("oil", alike(8))]
-    found = adjusted_candidates(
-        SimpleNamespace(cluster_tests={"specimen": FourNumbers}), given, np.random.default_rng(0)
-    )
+    found = adjust_all(SimpleNamespace(cluster_tests={"specimen": FourNumbers}), given, np.random.default_rng(0))
     assert [c.channels for c in found] == [("oil",), ("idle",)]
     assert found[0].p_value == pytest.approx(2 / 64, abs=0.012)  # 4 of 256 flips say as much of either; two searches
     assert found[1].p_value == 1.0
@@ -160,12 +158,12 @@ def test_a_search_says_the_strongest_evidence_first_with_p_values_for_two_search
 def test_two_ways_to_test_have_half_of_the_error_each():
     """The jackknife over 40 units, times the candidates; and F with contrasts, in few units."""
     strong = alike(40)._replace(log_p_jackknife=-20.0)
-    found = adjusted_candidates(
+    found = adjust_all(
         SimpleNamespace(cluster_tests={"specimen": FourNumbers}), [candidate("a", strong)], np.random.default_rng(0)
     )
     assert found[0].p_value == pytest.approx(2 * 2 * np.exp(-20.0))
     both = ScoreTestResult(1.0, 1, 8, NOWHERE, small_sample=along(-30.0, 0), slopes=(slopes_of(0.1),))
-    found = adjusted_candidates(
+    found = adjust_all(
         SimpleNamespace(cluster_tests={"specimen": FourNumbers}), [candidate("a", both)], np.random.default_rng(0)
     )
     assert found[0].p_value == pytest.approx(2 * 2 * np.exp(-30.0))

@@ -71,10 +71,10 @@ def candidate(*channels, p_value=1e-3, log_p=-9.0, chi2=20.0, unit="run"):
 def test_an_error_held_out_weighs_rows_and_leaves_out_what_is_not_covered():
     rows = SimpleNamespace(force=np.array([1.0, 2.0, 3.0, 4.0]), weight=np.array([0.1, 0.2, 0.3, 0.4]))
     held = np.array([2.0, np.nan, 5.0, 7.0])  # errors of 1, 2 and 3; the second row was never held out
-    before_after = BeforeAfter(SimpleNamespace(rows=rows), None, held, held, np.array([True, True, True, False]))
-    assert before_after.heldout_rmse_N(held) == pytest.approx(np.sqrt((0.1 * 1 + 0.3 * 4) / 0.4))
-    assert before_after.heldout_rmse_N(held, extrapolated=True) == pytest.approx(3.0)
-    assert before_after.heldout_rmse_N(np.full(4, np.nan)) is None
+    models = BeforeAfter(SimpleNamespace(rows=rows), None, held, held, np.array([True, True, True, False]))
+    assert models.heldout_rmse_N(held) == pytest.approx(np.sqrt((0.1 * 1 + 0.3 * 4) / 0.4))
+    assert models.heldout_rmse_N(held, extrapolated=True) == pytest.approx(3.0)
+    assert models.heldout_rmse_N(np.full(4, np.nan)) is None
 
 
 @pytest.mark.parametrize(
@@ -94,8 +94,8 @@ def test_the_error_is_compared_with_what_repeats_scatter_by(p_value, floor, stat
 def document(selection, after=None):
     after = selection.after if after is None else after
     held = np.full(after.force.size, np.nan)
-    before_after = BeforeAfter(selection.before, after, held, held, np.ones(held.size, dtype=bool))
-    return closure_document(replace(selection, after=after), before_after, "run", Config(), EFFECTS)
+    models = BeforeAfter(selection.before, after, held, held, np.ones(held.size, dtype=bool))
+    return closure_document(replace(selection, after=after), models, "run", Config(), EFFECTS)
 
 
 def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted):
