@@ -64,9 +64,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
             notes[k].append("the scatter of specimens is not known: intervals hold for the tested ones")
     if model["df"] == 0:
         for k in np.flatnonzero(good):
-            notes[k].append(
-                "no interval: the model has as many parameters as there are runs; test repeats or more speeds"
-            )
+            notes[k].append("no interval: as many parameters in the model as runs; test repeats or more speeds")
     extrapolated = _outside(table, conditions, code, model, notes, after)
     if good.any():
         at = point_rows(

@@ -63,16 +63,14 @@ class Renaming:
             same = proposals[0].term.key() == item.proposal.term.key()
             better = self._confirmed(without, proposals[:1] if same else proposals, item.round)
             others = [*added[:number], *added[number + 1 :]]
-            if better is None and self._with_own_name(without, fitted, number, item) is None:
+            if better is None and self._unchanged(without, fitted, number, item) is None:
                 fitted, added = fit(without.model, fitted.rows, fitted.scatter, turns=2), others
             elif better is not None and better.proposal.term.key() != item.proposal.term.key():
                 fitted = fit(better.proposal.fitted.model, fitted.rows, fitted.scatter, turns=2)
                 added = [*others, better]
         return fitted, added
 
-    def _with_own_name(
-        self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect
-    ) -> AcceptedEffect | None:
+    def _unchanged(self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect) -> AcceptedEffect | None:
         """Return an effect of a fit with its own name, confirmed given the others; None if it is not confirmed."""
         model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
         own = fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)

@@ -82,13 +82,11 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
     if channel.name == "direction":
         yield from _shape_candidates(tests, channel, np.ones((rows.force.size, 1)), TARGETS)
         return
-    few_specimens = (
-        channel.numeric and channel.unit == "specimen" and rows.groups.starts["specimen"].size < JACKKNIFE_UNITS
-    )
-    shapes = free_columns(channel, FEW_DF if few_specimens else FREE_DF)
+    few_units = channel.numeric and channel.unit == "specimen" and rows.groups.starts["specimen"].size < JACKKNIFE_UNITS
+    shapes = free_columns(channel, FEW_DF if few_units else FREE_DF)
     widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
     yield from _shape_candidates(tests, channel, shapes, TARGETS, widths)
-    if few_specimens:
+    if few_units:
         for kink in kinks(channel).T:
             yield from _shape_candidates(tests, channel, kink[:, None], MAIN_TARGETS)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size

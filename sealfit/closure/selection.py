@@ -237,15 +237,12 @@ class _Loop:
         if isinstance(left, Candidate) and left.key in self.refused and left.p_value > WEAK_P:
             left = None  # it is listed as refused
         laws = self.found.laws
-        inconclusive_candidates = [
-            c for c in (*self.last, *(c for c, _ in laws)) if c.p_value <= self.alpha and not c.claimable
-        ]
-        if left is None and inconclusive_candidates:
-            proposals = propose(
-                self.fitted, inconclusive_candidates, self.channels, self.context.effects, [p for _, p in laws]
-            )
+        tested = (*self.last, *(c for c, _ in laws))
+        unclaimable = [c for c in tested if c.p_value <= self.alpha and not c.claimable]
+        if left is None and unclaimable:
+            proposals = propose(self.fitted, unclaimable, self.channels, self.context.effects, [p for _, p in laws])
             others = tuple(rivals(proposals[0], proposals))
-            left = inconclusive_candidates[0]
+            left = unclaimable[0]
             inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
         return replace(found, left=left, inconclusive=inconclusive, refused=tuple(self.unconfirmed))
 

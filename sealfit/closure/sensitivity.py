@@ -179,14 +179,12 @@ class _Search:
         self.level, self.units = alpha / SEARCHES, {}
         results = [c.test_result for c in selection.last]
         slopes = [j.slopes for j in results if j.slopes]
-        small_sample = [test for c in selection.last if (test := self._small_sample_again(c)) is not None]
+        small_sample = [test for c in selection.last if (test := self._retested(c)) is not None]
         many = [j for j in results if j.small_sample is None and not j.slopes]
         self.contrasts = N_VARIANCES * sum(own[0].slope.size for own in slopes)
         tests = [test for own in slopes for test in own]
         self.moderated = {id(t): m for t, m in zip(tests, moderated(tests), strict=True)}
-        lines = [
-            c for c in selection.last if c.test_result.slopes and not c.pair and (c.acts_on, c.operation) == FRICTION
-        ]
+        lines = [c for c in selection.last if c.test_result.slopes and c.key[1:] == FRICTION and not c.pair]
         self.lines = np.column_stack([c.columns[:, 0] for c in lines] or [np.ones(selection.after.force.size)])
         self.lines = self.lines * selection.after.slope(*FRICTION)[:, None]
         self.many = len(many)
@@ -194,11 +192,10 @@ class _Search:
         self.critical_small_sample = {}
         for name in {test.level for test in small_sample}:
             level = self.level / (1 if name == SPECIMENS else N_VARIANCES)  # runs are also tested by slopes
-            self.critical_small_sample[name] = critical_small_sample(
-                self.fitted, [t for t in small_sample if t.level == name], level
-            )
+            own = [t for t in small_sample if t.level == name]
+            self.critical_small_sample[name] = critical_small_sample(self.fitted, own, level)
 
-    def _small_sample_again(self, candidate: Candidate) -> SmallSampleTest | None:
+    def _retested(self, candidate: Candidate) -> SmallSampleTest | None:
         """Return a candidate's small-sample test on the final model, which may have fewer effects."""
         known, target = candidate.test_result.small_sample, (candidate.acts_on, candidate.operation)
         if known is None:
@@ -252,18 +249,14 @@ class _Search:
     def _by_units(self, candidate: Candidate, noise: Fitted, effect: Fitted, variants: Sequence[np.ndarray]) -> float:
         """Return the margin by the tests against the units' scatter."""
         channel, test_result = self.channels[candidate.channels[-1]], candidate.test_result
-        small_sample = test_result.small_sample
-        by_small_sample = (
-            0.0
-            if small_sample is None
-            else min(self._by_small_sample(noise, effect, left, small_sample) for left in variants)
-        )
+        known = test_result.small_sample
+        by_test = 0.0 if known is None else min(self._by_one_test(noise, effect, left, known) for left in variants)
         if test_result.slopes:
-            tail = self.level / self.contrasts / (1 if small_sample is None else N_VARIANCES)
+            tail = self.level / self.contrasts / (1 if known is None else N_VARIANCES)
             pairs = zip(variants, test_result.slopes, strict=True)
-            return max(by_small_sample, min(self._by_slopes(noise, effect, left, test, tail) for left, test in pairs))
-        if small_sample is not None:
-            return by_small_sample
+            return max(by_test, min(self._by_slopes(noise, effect, left, test, tail) for left, test in pairs))
+        if known is not None:
+            return by_test
         level = candidate.unit if channel.grouping else scatter_level([channel], noise.rows)
         return min(self._by_many(noise, effect, left, level, candidate) for left in variants)
 
@@ -290,7 +283,7 @@ class _Search:
         ]
         return float(np.nanmax(margins))
 
-    def _by_small_sample(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: SmallSampleTest) -> float:
+    def _by_one_test(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: SmallSampleTest) -> float:
         if known.level not in self.critical_small_sample:
             return 0.0
         units = (ClusterTests(one, known.level) for one in (noise, effect))
