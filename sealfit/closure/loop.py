@@ -267,7 +267,7 @@ def _found_again(selection: Selection, found: Sequence[Model]) -> bool:
 def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:
     """Return a selection without its effects, which are refused: their evidence is weak and no fold found them."""
     say("removed, because no fold found them again: " + "; ".join(describe(a.proposal.term) for a in selection.added))
-    reason = "its evidence is weak, and no search without a part of the data finds it"
+    reason = "its evidence is weak, and the repeated search finds it in no fold"
     refused = [RefusedEffect(a.proposal.term, a.proposal.p_value, reason) for a in selection.added]
     return replace(selection, after=selection.before, added=(), refused=(*selection.refused, *refused))
 
