@@ -239,7 +239,7 @@ def even_knots(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(k) for k in np.unique(knots))
 
 
-def off_zero(values: np.ndarray) -> np.ndarray:
+def shifted_from_zero(values: np.ndarray) -> np.ndarray:
     """Return values; those that start at 0 are shifted by the smallest positive one, so that they have logarithms."""
     return values + values[values > 0].min() if values.min() == 0 < values.max() else values
 
@@ -249,7 +249,7 @@ def scaled(values: np.ndarray) -> np.ndarray:
 
     A channel that starts at 0, such as days of aging, is shifted by its smallest positive value first.
     """
-    values = off_zero(values)
+    values = shifted_from_zero(values)
     low, high = float(values.min()), float(values.max())
     if low > 0 and high / low >= WIDE:
         values, low, high = np.log(values), np.log(low), np.log(high)

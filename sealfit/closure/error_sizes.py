@@ -78,12 +78,12 @@ def lack_of_fit(fitted: Fitted) -> float | None:
 
     The smallest p-value is multiplied by the number of tests (Bonferroni).
     """
-    means = _lack_of_means(fitted)
-    tests = [p for p in (means, *_lack_of_shapes(fitted)) if p is not None]
+    means = _p_of_run_means(fitted)
+    tests = [p for p in (means, *_p_of_shapes(fitted)) if p is not None]
     return None if means is None else min(1.0, len(tests) * min(tests))
 
 
-def _lack_of_shapes(fitted: Fitted) -> list[float]:
+def _p_of_shapes(fitted: Fitted) -> list[float]:
     """Return the p-values of shapes along strokes that the repeats of a run have in common.
 
     Each is one number per stroke, the coefficient of a Legendre polynomial, so that noise may be correlated within
@@ -112,7 +112,7 @@ def _lack_of_shapes(fitted: Fitted) -> list[float]:
     return found
 
 
-def _lack_of_means(fitted: Fitted) -> float | None:
+def _p_of_run_means(fitted: Fitted) -> float | None:
     """Return the p-value of run means against the scatter of files within runs (F test); None without repeats.
 
     The scatter of specimens is not lack of fit and is removed with the model.
@@ -136,14 +136,14 @@ def _lack_of_means(fitted: Fitted) -> float | None:
     first = ~files["run_id"].duplicated().to_numpy()
     root = np.sqrt(count[first])
     size = mean[first] * root
-    left, rank = _left_of_model(fitted, files["force"].to_numpy(), size, np.flatnonzero(first), root / scale[first])
+    left, rank = _residual_of_model(fitted, files["force"].to_numpy(), size, np.flatnonzero(first), root / scale[first])
     df_fit = float(runs - rank)
     if df_pure < 1 or df_fit < 1:
         return None
     return float(fdtrc(df_fit, df_pure, (left @ left / df_fit) / max(pure / df_pure, 1e-300)))
 
 
-def _left_of_model(
+def _residual_of_model(
     fitted: Fitted, force: np.ndarray, size: np.ndarray, chosen: np.ndarray, factor: np.ndarray
 ) -> tuple[np.ndarray, int]:
     """Return the residual of one number per run left by model and specimens, and their rank.

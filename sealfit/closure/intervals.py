@@ -102,10 +102,10 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Inter
     for p, r in zip(term.effect.parameters, reach, strict=True):
         low, high = held.get(p.name, (values[p.name] - r, values[p.name] + r))
         result[p.name] = (values[p.name], float(low), float(high))
-    return waves_upright(result)
+    return normalised_waves(result)
 
 
-def waves_upright(intervals: dict[str, Interval]) -> dict[str, Interval]:
+def normalised_waves(intervals: dict[str, Interval]) -> dict[str, Interval]:
     """Return intervals with the amplitude of every sine positive and its phase in (-pi, pi].
 
     An amplitude -A is the same as A with the phase shifted by pi.

@@ -95,10 +95,10 @@ def close_loop(
         say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
         with timed("held out", rows=len(heldout.masks), of="folds"):
             held_before, held_after, found = heldout.forces(selection, say)
-            if found is not None and not _found_again(selection, found):
+            if found is not None and not _found_in_folds(selection, found):
                 selection, after, held_after = _all_refused(selection, say), before, held_before
             models = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
-            selection, models = _no_worse(selection, models, heldout, say)
+            selection, models = _only_gains(selection, models, heldout, say)
         break
     before, after, held_before, held_after = models.before, models.after, models.held_before, models.held_after
     drawn = _drawn_tables(selection, before, after, config)
@@ -249,7 +249,7 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
     return first, first if after is before else force(after), after.model
 
 
-def _found_again(selection: Selection, found: Sequence[Model]) -> bool:
+def _found_in_folds(selection: Selection, found: Sequence[Model]) -> bool:
     """Whether a fold found one of the effects again, or the evidence for one is not weak.
 
     A fold that finds nothing predicts as the declared model does, so its error is no evidence for an effect.
@@ -279,7 +279,7 @@ def _same_shape(one: np.ndarray, other: np.ndarray) -> bool:
     return size == 0 or abs(one @ other) > RIVAL_CORRELATION * size
 
 
-def _no_worse(
+def _only_gains(
     selection: Selection, models: BeforeAfter, heldout: _HeldOut, say: Callable[[str], None]
 ) -> tuple[Selection, BeforeAfter]:
     """Return the result without the last effects that do not lower the error in sample and held out.
@@ -288,7 +288,7 @@ def _no_worse(
     weak, `cannot_tell`.
     """
     refused = []
-    while selection.added and not models.gains(_around(selection.added), weak=any(a.weak for a in selection.added)):
+    while selection.added and not models.gains(_level_of(selection.added), weak=any(a.weak for a in selection.added)):
         last = selection.added[-1].proposal
         say(f"removed, because it does not lower the error: {describe(last.term)}")
         reason = "it does not lower the error, in sample or on held-out data"
@@ -305,7 +305,7 @@ def _no_worse(
     return replace(selection, refused=(*selection.refused, *refused), worse=strong), models
 
 
-def _around(added: Sequence[AcceptedEffect]) -> str | None:
+def _level_of(added: Sequence[AcceptedEffect]) -> str | None:
     """Return the coarsest level within whose groups the effects vary; None if one differs between specimens.
 
     An effect within runs does not change the error between runs, which may be the largest part.

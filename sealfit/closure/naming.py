@@ -72,9 +72,9 @@ def propose(
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
     others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
     if not (calendar and others and max(p.chi2 for p in others) >= HALF_OF_CALENDAR * max(p.chi2 for p in calendar)):
-        return named_among(fitted, _spread(found))
+        return named_among(fitted, _best_few(found))
     # Conditions are tested one after the other, so the calendar is correlated with them: other channels come first.
-    others, calendar = (_refitted(fitted, part) for part in (_spread(others), _spread(calendar)[:CALENDAR_RIVALS]))
+    others, calendar = (_refitted(fitted, part) for part in (_best_few(others), _best_few(calendar)[:CALENDAR_RIVALS]))
     return _ordered(fitted, others) + sorted(calendar, key=lambda p: p.bic)
 
 
@@ -94,7 +94,7 @@ def propose_ripples(fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: 
     """
     linearised = Linearised(fitted)
     found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(*form)]
-    return named_among(fitted, _spread(found))
+    return named_among(fitted, _best_few(found))
 
 
 def named_among(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
@@ -120,7 +120,7 @@ def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
         yield candidate
 
 
-def _spread(found: list[Proposal]) -> list[Proposal]:
+def _best_few(found: list[Proposal]) -> list[Proposal]:
     """Return the few best proposals to refit, the best free shape among them.
 
     Each effect is kept at most once per target and on at most two. A grid is coarse, so physical effects get a margin.
@@ -163,23 +163,23 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
     candidates += [p for p in equals if p.term.effect.physical and p not in candidates and p.size <= fewest]
     equal_fits = [p for p in found if p.fitted.deviance - best.fitted.deviance < EQUAL_BIC]
     if not any(p.term.effect.id == LINEAR for p in equal_fits):  # a straight line shows no mechanism
-        own = [p for p in equal_fits if _own_mechanism(p)]
+        own = [p for p in equal_fits if _is_specific(p)]
         least = min((p.fitted.deviance for p in own), default=0.0)
         candidates += [p for p in own if p.fitted.deviance - least < 2 * EQUAL_BIC and p not in candidates]
     if candidates:
-        first = min(candidates, key=lambda p: (_overturns(fitted, p), p.rank, p.bic))
+        first = min(candidates, key=lambda p: (_changes_earlier(fitted, p), p.rank, p.bic))
     else:
         first = next((p for p in found if p.bic - best.bic < RIVAL_BIC and determined(p)), best)
     return [first, *(p for p in found if p is not first)]
 
 
-def _own_mechanism(proposal: Proposal) -> bool:
+def _is_specific(proposal: Proposal) -> bool:
     """Whether a form is a physical effect of just these channels; the BIC penalty is not decisive then."""
     effect = proposal.term.effect
     return effect.physical and CHANNEL not in effect.reads
 
 
-def _overturns(fitted: Fitted, proposal: Proposal) -> bool:
+def _changes_earlier(fitted: Fitted, proposal: Proposal) -> bool:
     """Whether a proposal changes an amplitude of an earlier effect by more than a third.
 
     Two effects that explain the same structure are harder to interpret than two separate ones.
@@ -252,7 +252,7 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
     refitted = sorted((_joint(fitted, p) for p in likeliest[:LIKELIEST]), key=lambda p: p.bic)
     best, alone = _reestimated(refitted[0]), _reestimated(refitted[0], noise=True)
     if refitted[0].fitted.deviance - alone.fitted.deviance > SCATTER_FALL:
-        refitted = sorted(_from_anew(fitted, likeliest, alone.fitted.scatter), key=lambda p: p.bic)
+        refitted = sorted(_refitted_under(fitted, likeliest, alone.fitted.scatter), key=lambda p: p.bic)
         best = _reestimated(refitted[0])
     elif len(found) > LIKELIEST:
         refitted = sorted([*refitted, *(_joint(fitted, p) for p in likeliest[LIKELIEST:])], key=lambda p: p.bic)
@@ -276,7 +276,7 @@ def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
     return replace(proposal, fitted=reestimated(proposal.fitted, noise=noise))
 
 
-def _from_anew(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
+def _refitted_under(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
     """Yield proposals fitted under another scatter, with a new search for v_s and b, which may have been biased.
 
     The search is made with the likeliest effect on each quantity; further effects on it start from its result.

@@ -135,7 +135,7 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
         for rival in item.rivals[:1]:
             chosen = item.proposal
             channels = (*chosen.term.channels, *rival.term.channels)
-            found = where_apart(chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, config)
+            found = largest_difference(chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, config)
             if found is not None:
                 wanted.append(
                     {
@@ -145,10 +145,10 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
                     }
                 )
     if selection.inconclusive is not None:
-        wanted.append(_replicates(selection.inconclusive, config))
+        wanted.append(_replicate_of(selection.inconclusive, config))
     if selection.after.rows.has_aging and not selection.after.scatter.knows("specimen"):
         wanted.append(_second_specimen(selection.after.rows, config))
-    return [*wanted, *_unseen(selection.after, config, effects)]
+    return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
 
 
 def _second_specimen(rows: Rows, config: Config) -> dict:
@@ -161,15 +161,15 @@ def _second_specimen(rows: Rows, config: Config) -> dict:
     }
 
 
-def _unseen(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> Iterator[dict]:
+def _runs_for_aliases(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> Iterator[dict]:
     """Yield the run that would show each alias; one run for aliases of the same channels."""
     taken = tuple(name for name in (*config.condition, *config.rubber) if name != "aging_days")
-    by_channels: dict[tuple[str, ...], list[Alias]] = {}
+    by_channel: dict[tuple[str, ...], list[Alias]] = {}
     for alias in find_aliases(fitted, effects, taken):
-        by_channels.setdefault(alias.term.channels, []).append(alias)
-    for channels, aliases in by_channels.items():
+        by_channel.setdefault(alias.term.channels, []).append(alias)
+    for channels, aliases in by_channel.items():
         first = aliases[0]
-        found = where_apart(first.holding, first.lacking, fitted.rows, channels, config)
+        found = largest_difference(first.holding, first.lacking, fitted.rows, channels, config)
         if found is not None and found[1] > SHOWN * first.size_N:
             names = " or ".join(describe(a.term) for a in aliases)
             yield {
@@ -178,7 +178,7 @@ def _unseen(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> It
             }
 
 
-def _replicates(item: AcceptedEffect, config: Config) -> dict:
+def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
     """Return the condition to repeat on a new specimen: where an effect shown by too few specimens is largest."""
     fitted = item.proposal.fitted
     k = int(np.argmax(np.abs(added_force(item.proposal))))
@@ -191,7 +191,7 @@ def _replicates(item: AcceptedEffect, config: Config) -> dict:
     }
 
 
-def where_apart(
+def largest_difference(
     chosen: Model, rival: Model, rows: Rows, channels: Sequence[str], config: Config
 ) -> tuple[dict, float] | None:
     """Return the run at which two models differ most, and the difference (force unit); None if they do not differ.
@@ -203,7 +203,7 @@ def where_apart(
     channels = tuple(dict.fromkeys(channels))
     best: tuple[dict, float] | None = None
     for changes in ({}, *_combinations(chosen, rows, channels)):
-        moved = _moved(rows, changes)
+        moved = _rows_with(rows, changes)
         apart = np.abs(evaluate(chosen, moved, jacobian=False)[0] - evaluate(rival, moved, jacobian=False)[0])
         apart = np.where(np.isfinite(apart), apart, 0.0)
         k = int(np.argmax(apart >= apart.max() * (1 - TIE)))  # the first of those equal but for rounding
@@ -236,7 +236,7 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
         yield dict(zip(values, point, strict=True))
 
 
-def _moved(rows: Rows, changes: Mapping[str, object]) -> Rows:
+def _rows_with(rows: Rows, changes: Mapping[str, object]) -> Rows:
     """Return rows with channels set to other values; time is scaled with the speed."""
     if not changes:
         return rows

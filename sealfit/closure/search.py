@@ -17,8 +17,8 @@ from sealfit.closure.channels import (
     flip_level,
     free_columns,
     kinks,
-    off_zero,
     scatter_level,
+    shifted_from_zero,
     unit_of,
 )
 from sealfit.closure.criteria import (
@@ -284,7 +284,7 @@ def _scales(channel: Channel) -> list[np.ndarray]:
     x = channel.values
     scales = [x]
     if x.min() >= 0 and x.max() > LOGARITHMIC_SPAN * x[x > 0].min(initial=np.inf):
-        scales.append(np.log(off_zero(x)))
+        scales.append(np.log(shifted_from_zero(x)))
     return [_centred(x) / max(float(np.ptp(x)), 1e-300) for x in scales]
 
 

@@ -84,11 +84,11 @@ def select_effects(
     Parameters
     ----------
     rows : Rows
-        Bins as arrays, merged along their strokes where there are many.
+        Bins as arrays, merged along their strokes if there are many.
     samples : DataFrame
         Steady samples for the ripple search: as `steady_samples` gives them.
     context : Context
-        Levels of error, rounds, folds, and the catalogue.
+        Error rate, rounds, folds, and the catalogue.
     fine : Rows, optional
         Bins that are not merged, to which ripples are fitted; they are then fixed.
     start : Start, optional
@@ -99,7 +99,7 @@ def select_effects(
     loop = _Loop(rows, samples, context, fine, start)
     last_round = context.config.loop.max_rounds + 2 if rounds is None else rounds
     for number in range(len(loop.added) + 1, last_round + 1):
-        if loop.is_finished(number):
+        if loop.run_round(number):
             break
     return loop.selection(whole=rounds is None)
 
@@ -116,7 +116,7 @@ class _Loop:
         self.before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
         self.channels = {c.name: c for c in channels_of(rows, self.context.config)}
         self.tests = ScoreTests(self.before)
-        self.last = self.first = self.searched()
+        self.last = self.first = self.search_single()
         self.fitted = ripples.added_to(self.before, fine)
         self.added = list(ripples.added)
         self.ripple, self.samples, self.unconfirmed = ripples.found, ripples.samples, ripples.refused
@@ -132,7 +132,7 @@ class _Loop:
         """Family-wise error rate of the search."""
         return self.context.config.loop.family_error
 
-    def searched(self) -> tuple[Candidate, ...]:
+    def search_single(self) -> tuple[Candidate, ...]:
         """Return every candidate of a single channel on the current model."""
         return tuple(search(self.tests, list(self.channels.values()), self.rng))
 
@@ -142,18 +142,18 @@ class _Loop:
         """Return the first proposal that held-out data confirm; a refused one is appended to `failed`."""
         return confirmed(base, proposals, self.samples, self.context, number, failed)
 
-    def is_finished(self, number: int) -> bool:
+    def run_round(self, number: int) -> bool:
         """Search, name and confirm once; return whether the loop is finished."""
         if self.fitted is not self.tests.fitted:
             self.tests, self.found = ScoreTests(self.fitted), None
-            self.last = self.searched()
+            self.last = self.search_single()
         if self.found is None:  # else the last round added nothing
             self.found = self.search_model(number)
-            if self.adds_two_of_direction(number):
+            if self.add_pair_of_direction(number):
                 return False
         open_ = self.open_candidates()
         if not open_ or number > self.context.config.loop.max_rounds:
-            return not self.renames()
+            return not self.rename_earlier()
         claimable, laws = self.found.claimable, [p for _, p in self.found.laws]
         open_ += [c for c in _related_candidates(open_, claimable) if c.key not in self.refused]
         proposals = propose(self.fitted, open_, self.channels, self.context.effects, laws)
@@ -174,7 +174,7 @@ class _Loop:
         )
         return found
 
-    def adds_two_of_direction(self, number: int) -> bool:
+    def add_pair_of_direction(self, number: int) -> bool:
         """Add two effects of the direction that mask each other; return whether that was done."""
         two = next((pair for pair in self.found.masked if {key[0] for key in pair.keys} == {("direction",)}), None)
         if self.masked or two is None:
@@ -201,7 +201,7 @@ class _Loop:
         significant += equivalent_pairs(self.tests, significant, self.channels)
         return [c for c in significant if c.key not in self.refused]
 
-    def renames(self) -> bool:
+    def rename_earlier(self) -> bool:
         """Rename earlier effects given the later ones, once; return whether a name changed."""
         if self.renamed or len(self.added) < 2:
             return False
@@ -209,7 +209,7 @@ class _Loop:
         self.fitted, self.added = self.renaming.earlier_renamed(self.fitted, self.added)
         if self.added is before:
             return False
-        self.fitted, self.added = _drop_needless(self.fitted, self.added)
+        self.fitted, self.added = _remove_redundant(self.fitted, self.added)
         rounds = {a.round for a in self.added}
         self.refused |= {a.proposal.source for a in before if a.round not in rounds}
         return True
@@ -222,7 +222,7 @@ class _Loop:
         earlier, accepted = self.renaming.merged_with_earlier(self.fitted, self.added, accepted, pending=pending)
         added = [*earlier, accepted]
         own = accepted.proposal.fitted  # under its own scatter: the former one contains the missing effect
-        self.fitted, self.added = _drop_needless(fit(own.model, self.rows, own.scatter, turns=2), added)
+        self.fitted, self.added = _remove_redundant(fit(own.model, self.rows, own.scatter, turns=2), added)
         # A removed effect is not added again.
         self.refused |= {a.proposal.source for a in added if all(a is not k for k in self.added)}
 
@@ -345,7 +345,7 @@ def _related_candidates(significant: list[Candidate], candidates: list[Candidate
     return found
 
 
-def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
+def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
     """Return the fit without effects that a later one has made redundant by the BIC; the weakest is removed first.
 
     After a removal all are tested again. Ripples are kept: they were tested on the raw samples.

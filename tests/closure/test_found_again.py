@@ -6,7 +6,7 @@ from bins_helpers import make_bins
 
 from sealfit.closure.confirm import AcceptedEffect, silent
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.loop import _all_refused, _found_again
+from sealfit.closure.loop import _all_refused, _found_in_folds
 from sealfit.closure.selection import Selection
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit, fit_declared
@@ -41,20 +41,20 @@ def selection():
 def test_effects_of_weak_evidence_are_not_found_again_where_no_fold_has_their_shape(selection):
     nothing = selection.before.model
     other = nothing.with_term(term_of("time_s"), {"A": 1e-3})
-    assert not _found_again(selection, [nothing] * 5)
-    assert not _found_again(selection, [other] * 5)
+    assert not _found_in_folds(selection, [nothing] * 5)
+    assert not _found_in_folds(selection, [other] * 5)
 
 
 def test_one_fold_that_finds_one_of_them_on_any_quantity_is_enough(selection):
     nothing = selection.before.model
     again = nothing.with_term(term_of("humidity_pct", "mu_c"), {"A": -1e-3})
-    assert _found_again(selection, [nothing, again])
+    assert _found_in_folds(selection, [nothing, again])
 
 
 def test_evidence_that_is_not_weak_needs_no_fold_to_find_it_again(selection):
     first = selection.added[0]
     strong = replace(first, proposal=replace(first.proposal, p_value=1e-9))
-    assert _found_again(replace(selection, added=(strong, *selection.added[1:])), [selection.before.model])
+    assert _found_in_folds(replace(selection, added=(strong, *selection.added[1:])), [selection.before.model])
 
 
 def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(selection):
