@@ -73,7 +73,7 @@ def _at_grid(
     rows = fitted.rows
     values = {name: rows.values(name) for name in effect.reads}
     if any(v.dtype.kind != "f" or (np.ptp(v) == 0 and name != "direction") for name, v in values.items()):
-        return  # what does not vary is no effect here
+        return  # a constant has no effect here
     slope = fitted.slope(*target)
     if np.abs(slope).max() <= 0:
         return
@@ -128,7 +128,7 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
     Returns
     -------
     list of dict
-        `why` in words and `conditions`: the run's condition and the channels to set, of one run each.
+        `why`, a text, and `conditions`: the condition and the channels of one run.
     """
     wanted = []
     for item in selection.added:

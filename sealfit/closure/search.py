@@ -66,7 +66,7 @@ def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Genera
     Parameters
     ----------
     tests : ScoreTests
-        Of the current model.
+        Score tests of the current model.
     channels : sequence of Channel
         Channels to search.
     rng : Generator
@@ -176,7 +176,7 @@ def search_pairs(
     Parameters
     ----------
     tests : ScoreTests
-        Of the current model.
+        Score tests of the current model.
     channels : sequence of Channel
         Channels to search.
     singles : sequence of Candidate
@@ -202,7 +202,7 @@ def equivalent_pairs(
     Parameters
     ----------
     tests : ScoreTests
-        Of the current model.
+        Score tests of the current model.
     significant : sequence of Candidate
         Its significant candidates.
     channels : mapping
@@ -334,7 +334,7 @@ def search_masked_pairs(
     Parameters
     ----------
     tests : ScoreTests
-        Of the current model.
+        Score tests of the current model.
     channels : mapping
         Channels by name.
     candidates : sequence of Candidate

@@ -63,7 +63,7 @@ class ContrastTest(NamedTuple):
     slope: np.ndarray  # (m,) estimates, in standard errors by the fitted scatter
     variance: np.ndarray  # (m,) of the estimates, from the units; about 1 if only noise scatters
     df: np.ndarray  # (m,) Satterthwaite degrees of freedom of the variance
-    along: np.ndarray  # (m,) whether the contrast lies inside strokes
+    along: np.ndarray  # (m,) whether the contrast varies within strokes
     deviations: np.ndarray  # (units, m) of the scores
     consistent: np.ndarray  # (m,) whether two to four specimens have the same slope
 
@@ -179,7 +179,7 @@ def few_specimens(fitted: Fitted) -> bool:
 
 
 def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return whether most of each whitened column varies inside strokes, shape (n, m) -> (m,)."""
+    """Return whether most of each whitened column varies within strokes, shape (n, m) -> (m,)."""
     sums = fitted.rows.groups.sums
     between = sums(left, "stroke") ** 2 / sums(np.ones(len(left)), "stroke")[:, None]
     return between.sum(axis=0) < 0.5 * (left**2).sum(axis=0)
@@ -195,7 +195,7 @@ def slope_log_p(tests: Sequence[ContrastTest]) -> list[np.ndarray]:
 
 
 def moderated(tests: Sequence[ContrastTest]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return for each test the variances of its contrasts, moderated by all of a kind, and their degrees of freedom."""
+    """Return for each test the variances of its contrasts, moderated by all of one kind, and their degrees of freedom."""
     priors = {kind: _prior(tests, *kind) for kind in {(t.level, bool(a)) for t in tests for a in t.along}}
     found = []
     for test in tests:
@@ -290,9 +290,9 @@ class SmallSampleTest(NamedTuple):
 
 
 class Numbers(NamedTuple):
-    """One number per specimen along the direction of one quantity."""
+    """One number per unit along the direction of one quantity."""
 
-    direction: np.ndarray  # (n,) whitened slope, of length 1 in each specimen
+    direction: np.ndarray  # (n,) whitened slope, of length 1 in each unit
     taken: Tangent  # (units, p) of the model's basis along it
     root: np.ndarray | Root  # (d, units) whitens the numbers
     values: np.ndarray  # (d,), or (units,) with zeros in the other directions

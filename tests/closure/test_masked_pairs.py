@@ -1,4 +1,4 @@
-"""Effects that hide each other in few units."""
+"""Effects that mask each other in few units."""
 
 import numpy as np
 import pytest
