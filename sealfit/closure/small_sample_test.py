@@ -195,7 +195,7 @@ def slope_log_p(tests: Sequence[ContrastTest]) -> list[np.ndarray]:
 
 
 def moderated(tests: Sequence[ContrastTest]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return for each test the variances of its contrasts, moderated by all of one kind, and their degrees of freedom."""
+    """Return per test the variances of its contrasts, moderated by all of one kind, and their degrees of freedom."""
     priors = {kind: _prior(tests, *kind) for kind in {(t.level, bool(a)) for t in tests for a in t.along}}
     found = []
     for test in tests:
