@@ -88,7 +88,7 @@ def test_an_asymmetry_of_viscous_friction_is_found_in_sixteen_runs_without_repea
         rows = make_rows(bins, has_aging=True)
         candidates = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
         best = min(candidates, key=lambda c: c.p_value)
-        found.append(best.key == (("direction",), "sigma_2", "add") and best.p_value < 0.005 and best.sure)
+        found.append(best.key == (("direction",), "sigma_2", "add") and best.p_value < 0.005 and best.claimable)
     assert sum(found) >= 5
 
 
