@@ -137,7 +137,7 @@ def laws(settings: dict, seed: int) -> Iterator[Entry]:
         fitted, chosen = fit_joint_law(aged, "log", "rate"), fit_laws(aged)
         for name, _, low, high, known in fitted.parameters():
             yield Entry(f"{quantity} {name}", (law | varied)[name], low, high, known)
-        likely = [(one.loss.name, one.way) for one in (chosen[0], *rivals_of(chosen))]
+        likely = [(one.loss.name, one.acts_on) for one in (chosen[0], *rivals_of(chosen))]
         yield Entry(f"{quantity}: the true law is the likeliest", likely[0] == ("log", "rate"), None, None)
         yield Entry(f"{quantity}: the true law is the likeliest or a rival", ("log", "rate") in likely, None, None)
         yield from _lives(quantity, law, fitted, chosen, middle, seed)

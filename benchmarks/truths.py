@@ -132,7 +132,7 @@ def test_true_forms(declared: Model, rows: Rows, scatter, true: list[TrueEffect]
     known = fit(held, rows, scatter, turns=2)
     tests = []
     for number, effect in enumerate(true):
-        first = held.place(number).start
+        first = held.term_slice(number).start
         places = [first + k for k, p in enumerate(effect.term.effect.parameters) if p.linear]
         covariance = _wider(known, effect.unit)[np.ix_(places, places)]
         fitted = known.model.values[number]

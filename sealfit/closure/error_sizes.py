@@ -125,7 +125,7 @@ def _lack_of_means(fitted: Fitted) -> float | None:
     spread = np.sqrt(fitted.scatter.level_variance("file", files["force"].to_numpy()) + 1e-300)
     noise = fitted.scatter.noise_sd(files["force"].to_numpy())
     per_file = len(rows.table) / len(files)
-    scale = np.asarray(np.sqrt(spread**2 + noise**2 * fitted.scatter.alike / per_file))
+    scale = np.asarray(np.sqrt(spread**2 + noise**2 * fitted.scatter.design_effect / per_file))
     files["z"] = files["residual"] / scale
     by_run = files.groupby("run_id")["z"]
     count = by_run.transform("count").to_numpy()

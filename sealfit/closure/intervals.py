@@ -91,7 +91,7 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Inter
     """
     term = fitted.model.terms[number]
     held = term.fixed.get("held", {})
-    place = fitted.model.place(number)
+    place = fitted.model.term_slice(number)
     variance = np.diag(robust_covariance(fitted, level))[place]
     if not held:  # a wave is finer than the shapes in which files differ, which the fitted scatter holds against it
         variance = np.maximum(variance, np.diag(fitted.covariance)[place])

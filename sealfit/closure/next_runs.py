@@ -146,7 +146,7 @@ def next_runs(grown: Selection, config: Config, effects: Mapping[str, Effect]) -
                 )
     if grown.unsure is not None:
         wanted.append(_replicates(grown.unsure, config))
-    if grown.after.rows.has_aging and not grown.after.scatter.knows("specimen"):
+    if grown.after.rows.has_aging and not grown.after.scatter.estimates("specimen"):
         wanted.append(_second_specimen(grown.after.rows, config))
     return [*wanted, *_unseen(grown.after, config, effects)]
 

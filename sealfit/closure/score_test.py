@@ -165,7 +165,7 @@ class ScoreTests:
         It cannot where their scatter is known, or where each specimen is one run."""
         rows = self.fitted.rows
         starts = rows.groups.starts
-        if self.fitted.scatter.knows("specimen") or not 1 < starts["specimen"].size < starts["run"].size:
+        if self.fitted.scatter.estimates("specimen") or not 1 < starts["specimen"].size < starts["run"].size:
             return None
         white, basis = self.fitted.whitening(self.fitted.friction[:, None])[:, 0], self.fitted.basis
         size = rows.groups.sums(white**2, "specimen")

@@ -371,7 +371,7 @@ def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted,
 
 def _wald_statistic(fitted: Fitted, number: int) -> float:
     """Return the squared standardised size of an effect's amplitudes, all together."""
-    at = fitted.model.place(number).start
+    at = fitted.model.term_slice(number).start
     effect, values = fitted.model.terms[number].effect, fitted.model.values[number]
     places = [at + k for k, p in enumerate(effect.parameters) if p.linear]
     amplitude = np.array([values[p.name] for p in effect.parameters if p.linear])

@@ -17,8 +17,8 @@ from sealfit.fit.joint.search import (
     bounds_of,
     least_squares,
     least_squares_within,
-    linear_solved,
     search_nonlinear,
+    solve_linear,
     start_model,
 )
 from sealfit.fit.joint.whitening import Component, Scatter
@@ -60,7 +60,7 @@ def test_a_stribeck_speed_moves_only_for_what_its_prior_costs(gained, moves, mon
     def solved(at, *_, most=np.inf):
         return 100.0 - gained * float(np.abs(at.vector() - stands).max() > 1.0), at
 
-    monkeypatch.setattr(search, "_linear_solved", solved)
+    monkeypatch.setattr(search, "_solve_linear", solved)
     found = search_nonlinear(model, rows, SCATTER).vector()
     assert np.array_equal(found[curved], stands[curved]) != moves
 
@@ -72,7 +72,7 @@ def test_a_search_never_ends_worse_than_it_began(gain, noise):
     model, rows, _ = astray(one_specimen=False, aging=False)
     rows = rows.sparse(ROWS_FOR_START)
     scatter = Scatter(noise, 0.0, (Component("file", "gain", gain),))
-    begun = linear_solved(model, rows, scatter, rows.force)
+    begun = solve_linear(model, rows, scatter, rows.force)
     found = search_nonlinear(model, rows, scatter)
     low, high = bounds_of(found, rows)
     assert np.all((found.vector() >= low) & (found.vector() <= high))
@@ -95,12 +95,12 @@ def test_bounds_are_asked_only_where_the_best_so_far_could_be_beaten(monkeypatch
     monkeypatch.setattr("sealfit.fit.joint.search.lsq_linear", counted)
     found = search_nonlinear(model, rows, SCATTER)
     few, solved[:] = len(solved), []
-    every = joint_search._linear_solved
+    every = joint_search._solve_linear
 
     def without_limit(*given, most=np.inf):
         return every(*given)
 
-    monkeypatch.setattr(joint_search, "_linear_solved", without_limit)
+    monkeypatch.setattr(joint_search, "_solve_linear", without_limit)
     npt.assert_array_equal(search_nonlinear(model, rows, SCATTER).vector(), found.vector())
     assert few < len(solved) / 2
 

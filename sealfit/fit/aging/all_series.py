@@ -92,7 +92,7 @@ def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
         held = left_out(law) if number < LIKELY else {}
         head = {
             "law": law.loss.name,
-            "way": law.way if best.aged.drivers() else "",
+            "way": law.acts_on if best.aged.drivers() else "",
             "form": law.loss.form,
             "rank": number + 1,
             "rival": law in rivals,
@@ -143,7 +143,7 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
     aged = law.aged
     tested = (aged.temperature_C, aged.compression_pct)
     scaled, start = law.tested_days(), law.x[0]
-    value = aged.value if law.way == "rate" else start + (aged.value - start) / law.rate(aged)
+    value = aged.value if law.acts_on == "rate" else start + (aged.value - start) / law.rate(aged)
     points = {"kind": "value", "scaled_days": scaled, "value": value, "aging_days": aged.days}
     for name, column in zip((TEMPERATURE, COMPRESSION), tested, strict=True):
         points[name] = np.nan if column is None else np.where(aged.days > 0, column, np.nan)

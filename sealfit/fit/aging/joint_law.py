@@ -172,12 +172,12 @@ def reference_of(tested: np.ndarray) -> float:
 #
 # with T in kelvin and C the height while aging in percent. Temperature and compression change the rate of aging (w = 0:
 # time-temperature superposition, all series fall on one master curve over k t) or the loss itself (w = 1). mu_0 is that
-# of the unaged rubber, shared by all. phi is one of `sealfit.physics.aging_laws`; which shape and which way is chosen
-# by Schwarz's criterion, and the rivals are kept beside it.
+# of the unaged rubber, shared by all. phi is one of `sealfit.physics.aging_laws`. BIC chooses the shape and w; the rivals
+# are kept beside the chosen law.
 #
 # Ferry 1980, Viscoelastic Properties of Polymers, chapter 11 (superposition); ISO 11346 (life of rubber by Arrhenius).
 
-WAYS = ("rate", "loss")  # what temperature and compression change
+TARGETS = ("rate", "loss")  # what temperature and compression change
 TURNS, SETTLED = 4, 0.02  # of the fit and the scatter, at most; relative change of the scatter that ends them
 RIVAL = 6.0  # of the criterion: a rival law is less likely than the chosen one by less than exp(3)
 KNOWN = np.log(100.0)  # a positive number whose 95 % interval spans more than this is not determined
@@ -191,7 +191,7 @@ class JointLaw:
     ----------
     aged : Aged
         What it was fitted to.
-    loss, way : Loss, str
+    loss, acts_on : Loss, str
         Shape, and what temperature and compression change.
     names : tuple of str
         mu_0, a, the shape's own, E, kappa, those that there are.
@@ -207,7 +207,7 @@ class JointLaw:
 
     aged: Aged
     loss: Loss
-    way: str
+    acts_on: str
     names: tuple[str, ...]
     x: np.ndarray
     covariance: np.ndarray
@@ -231,7 +231,7 @@ class JointLaw:
         """
         x = self.x if x is None else x
         k, own = self.rate(aged, x), self.own(x)
-        lost = self.loss.value(aged.days * k, *own) if self.way == "rate" else k * self.loss.value(aged.days, *own)
+        lost = self.loss.value(aged.days * k, *own) if self.acts_on == "rate" else k * self.loss.value(aged.days, *own)
         return x[..., :1] - x[..., 1:2] * lost
 
     def own(self, x: np.ndarray | None = None) -> list[np.ndarray]:
@@ -254,7 +254,7 @@ class JointLaw:
         """Return the derivative of the law along its parameters, shape (p, n), or (..., p, n) for many x."""
         x = self.x if x is None else x
         k, own, a = self.rate(aged, x), self.own(x), x[..., 1:2]
-        if self.way == "rate":
+        if self.acts_on == "rate":
             lost = self.loss.value(aged.days * k, *own)
             along_k, *along_own = self.loss.slopes(aged.days * k, *own)
         else:
@@ -265,7 +265,7 @@ class JointLaw:
 
     def tested_days(self) -> np.ndarray:
         """Return the days of the tests, in the master curve's time where there is one, shape (n,)."""
-        return self.aged.days * (self.rate(self.aged) if self.way == "rate" else 1.0)
+        return self.aged.days * (self.rate(self.aged) if self.acts_on == "rate" else 1.0)
 
     def parameters(self) -> Iterator[tuple[str, float, float, float, bool]]:
         """Yield name, value, ends of the 95 % interval, and whether the values determine it."""
@@ -279,7 +279,7 @@ class JointLaw:
                 yield name, float(self.x[k]), float(self.x[k] - half), float(self.x[k] + half), bool(known)
 
 
-def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
+def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> JointLaw:
     """Fit one law to all series of a quantity, the scatter between specimens estimated with it.
 
     Parameters
@@ -288,7 +288,7 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
         Values of at least as many conditions as the law has numbers.
     loss : str
         Name in `LOSSES`.
-    way : str
+    acts_on : str
         "rate" or "loss".
 
     Raises
@@ -306,7 +306,7 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
             f"{conditions} conditions do not determine the {len(names)} numbers of the law '{loss}'.",
             fix="Test more days, or choose a law with fewer numbers.",
         )
-    empty = JointLaw(aged, shape, way, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf)
+    empty = JointLaw(aged, shape, acts_on, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf)
     x, scatter, before = None, 0.05, np.inf
     for _ in range(TURNS):
         x = solved(empty, aged.spread.whitening(scatter), x)
@@ -333,9 +333,9 @@ def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw
     found, first = [], None
     for loss in losses:
         both = aged.drivers() and loss != "power"  # a power of k t is a power of k times one of t
-        for way in WAYS if both else WAYS[:1]:
+        for acts_on in TARGETS if both else TARGETS[:1]:
             try:
-                found.append(fit_joint_law(aged, loss, way))
+                found.append(fit_joint_law(aged, loss, acts_on))
             except FitError as error:
                 first = first or error  # of the law with the fewest numbers
     if not found:

@@ -96,7 +96,7 @@ def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, comp
         half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if np.isfinite(slope).all() else np.inf
         low, high = (float(days * np.exp(np.clip(s * half, -700, 700))) for s in (-1, 1))
         low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
-    asked = days * (float(law.rate(place)[0]) if law.way == "rate" else 1.0)
+    asked = days * (float(law.rate(place)[0]) if law.acts_on == "rate" else 1.0)
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
     return Lifetime(days, low, high, threshold, beyond, _outside(law, temperature_C, compression_pct))
 
@@ -178,12 +178,12 @@ def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | 
 def _days(law: JointLaw, x: np.ndarray, goal: Goal, place: Aged) -> float:
     """Return the days to the goal for parameters x; inf where it is never reached."""
     k, own = float(law.rate(place, x)[0]), [float(value[0]) for value in law.own(x)]
-    a = x[1] * (k if law.way == "loss" else 1.0)
+    a = x[1] * (k if law.acts_on == "loss" else 1.0)
     phi = (x[0] - goal.reached(x[0])) / a if a != 0 else np.inf
     if phi <= 0:
         return 0.0 if a > 0 else np.inf
     with np.errstate(over="ignore"):
-        days = float(law.loss.time(phi, *own)) / (k if law.way == "rate" else 1.0)
+        days = float(law.loss.time(phi, *own)) / (k if law.acts_on == "rate" else 1.0)
     return days if days < FOREVER else np.inf
 
 
@@ -339,7 +339,7 @@ def answer(
             "no unaged rubber was tested: there is no start of which a share could be lost.",
             fix="Give --threshold VALUE, or test unaged rubber.",
         )
-    found = {"law": law.loss.name, "way": law.way, "form": law.loss.form, "criterion": law.bic}
+    found = {"law": law.loss.name, "way": law.acts_on, "form": law.loss.form, "criterion": law.bic}
     found |= {"parameters": {name: value for name, value, *_ in law.parameters()}}
     if years is not None:
         celsius, *ends = temperature_for(law, goal, years, compression_pct)

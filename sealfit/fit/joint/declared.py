@@ -45,7 +45,7 @@ class Declared:
     law: Mapping[str, bool]  # series -> whether Eq. 15 is fitted across its days
 
     @property
-    def numbers_of_mu(self) -> int:
+    def mu_parameter_count(self) -> int:
         """How many numbers the model fits to one coefficient across conditions: specimens beyond them show scatter."""
         return sum(p.quantity in ("mu_0c", "a_c", "b_c") for p in self.parameters)
 
@@ -59,9 +59,9 @@ def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
     otherwise pass for a Stribeck curve. Made once for the same rows. Rows that are a part of a campaign, with its
     conditions, may carry its model: `as_in` is the campaign.
     """
-    if ("declared",) not in rows.kept:
-        rows.kept["declared",] = _declare(rows) if as_in is None else declare(as_in)
-    return rows.kept["declared",]
+    if ("declared",) not in rows.cache:
+        rows.cache["declared",] = _declare(rows) if as_in is None else declare(as_in)
+    return rows.cache["declared",]
 
 
 def _declare(rows: Rows) -> Declared:

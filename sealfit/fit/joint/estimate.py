@@ -144,7 +144,7 @@ def fit(
         scatter = estimate_scatter(
             rows, rows.force - force, friction_of(model, rows), jacobian, scatter if turn else None
         )
-        model = descend(as_smooth_as_wanted(model, rows, scatter), rows, scatter, centre)
+        model = descend(with_reml_smoothness(model, rows, scatter), rows, scatter, centre)
     if not turns:
         model = descend(model, rows, scatter, centre, friction, near=COMPARED)
         return fitted_at(model, rows, scatter, friction)
@@ -176,7 +176,7 @@ def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
     """
     rows, estimate = fitted.rows, estimate_scatter if noise else estimate_components
     scatter = estimate(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
-    model = as_smooth_as_wanted(fitted.model, rows, scatter, fitted.friction)
+    model = with_reml_smoothness(fitted.model, rows, scatter, fitted.friction)
     model = descend(model, rows, scatter, centre_of(model), fitted.friction, near=COMPARED)
     return fitted_at(model, rows, scatter, fitted.friction)
 
@@ -184,12 +184,12 @@ def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
 def effective_df(fitted: Fitted, number: int) -> float:
     """Return how many numbers a term's free shape is worth, held as smooth as it is."""
     model, white = fitted.model, fitted.white_jacobian
-    place = model.place(number)
+    place = model.term_slice(number)
     own, pull = free_of_others(model, white.gram(), white.against(fitted.white_residual), place)
     return penalised(own, pull, precision_of(model)[place, place])[1]
 
 
-def as_smooth_as_wanted(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Model:
+def with_reml_smoothness(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Model:
     """Return the model with its free shapes as smooth as the data want them under this scatter."""
     if all(term.smoothness is None for term in model.terms):
         return model

@@ -48,9 +48,9 @@ class Term:
     def inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         """Return what the effect's shape reads, from the rows' channels."""
         key = ("inputs", self.shape_key)
-        if key not in rows.kept:
-            rows.kept[key] = self._inputs(rows)
-        return rows.kept[key]
+        if key not in rows.cache:
+            rows.cache[key] = self._inputs(rows)
+        return rows.cache[key]
 
     def _inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         given = {}
@@ -72,9 +72,9 @@ class Term:
         closely where it may be as fine as the bin. The rest is taken in the middle.
         """
         key = ("nodes", self.shape_key)
-        if key not in rows.kept:
-            rows.kept[key] = self._nodes(rows)
-        return rows.kept[key]
+        if key not in rows.cache:
+            rows.cache[key] = self._nodes(rows)
+        return rows.cache[key]
 
     def _nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
         inputs = self.inputs(rows)
@@ -176,16 +176,16 @@ def derivatives_of(term: Term, values: Mapping[str, float], rows: Rows) -> list[
 def _kept(what: str, term: Term, values: Mapping[str, float], rows: Rows, make: Callable):
     """Return what was made last for a term at the same values, or make it: a fit moves some terms and not others."""
     key, at = (what, term.shape_key), tuple(values.values())
-    if key not in rows.kept or rows.kept[key][0] != at:
-        rows.kept[key] = (at, make())
-    return rows.kept[key][1]
+    if key not in rows.cache or rows.cache[key][0] != at:
+        rows.cache[key] = (at, make())
+    return rows.cache[key][1]
 
 
 def _columns_of(term: Term, rows: Rows) -> np.ndarray:
     key = ("columns", term.shape_key)
-    if key not in rows.kept:
-        rows.kept[key] = _linear_columns(term, term.inputs(rows))
-    return rows.kept[key]
+    if key not in rows.cache:
+        rows.cache[key] = _linear_columns(term, term.inputs(rows))
+    return rows.cache[key]
 
 
 # ---------------------------------------------------------------- joint
@@ -228,12 +228,12 @@ class Model:
         return self.theta.size + sum(len(t.effect.parameters) for t in self.terms)
 
     @property
-    def bent(self) -> np.ndarray:
+    def nonlinear(self) -> np.ndarray:
         """Which numbers act nonlinearly, v_s and b among them, in the order of `vector`, shape (size,)."""
         declared = [p.quantity in LOGARITHMIC for p in self.declared.parameters]
         return np.array(declared + [not p.linear for t in self.terms for p in t.effect.parameters], dtype=bool)
 
-    def place(self, number: int) -> slice:
+    def term_slice(self, number: int) -> slice:
         """Return where a term's numbers stand in `vector`."""
         first = self.theta.size + sum(len(t.effect.parameters) for t in self.terms[:number])
         return slice(first, first + len(self.terms[number].effect.parameters))
@@ -289,9 +289,9 @@ def _layout(model: Model, rows: Rows) -> Layout:
     """Return the blocks of the model's tangent: the numbers of a specimen's conditions, then those of all terms."""
     declared, size = model.declared, model.theta.size
     key, made = ("blocks",), ("layout", model.size)
-    if made in rows.kept and rows.kept[made][0] is declared:
-        return rows.kept[made][1]
-    if key not in rows.kept or rows.kept[key][0] is not declared:
+    if made in rows.cache and rows.cache[made][0] is declared:
+        return rows.cache[made][1]
+    if key not in rows.cache or rows.cache[key][0] is not declared:
         used = np.stack([declared.index[quantity] for quantity in QUANTITIES], axis=1)
         of_condition = [frozenset(numbers[numbers >= 0].tolist()) for numbers in used]
         specimen, conditions = rows.codes("specimen"), len(used)
@@ -301,12 +301,12 @@ def _layout(model: Model, rows: Rows) -> Layout:
             touched[number] = touched.get(number, frozenset()) | of_condition[condition]
         whole = [frozenset(range(size))]
         index, block = blocks_of(whole * len(touched) if size <= FEW else list(touched.values()), size)
-        rows.kept[key] = (declared, index, block[specimen])
-    _, index, block = rows.kept[key]
+        rows.cache[key] = (declared, index, block[specimen])
+    _, index, block = rows.cache[key]
     added = np.arange(size, model.size)
     index = np.column_stack([np.where(index == size, model.size, index), np.tile(added, (len(index), 1))])
-    rows.kept[made] = (declared, Layout(model.size, index, block))
-    return rows.kept[made][1]
+    rows.cache[made] = (declared, Layout(model.size, index, block))
+    return rows.cache[made][1]
 
 
 def friction_of(model: Model, rows: Rows) -> np.ndarray:

@@ -43,7 +43,7 @@ def precision_of(model: Model) -> np.ndarray:
     precision[range(len(own)), range(len(own))] = own
     for number, term in enumerate(model.terms):
         if term.smoothness is not None:
-            place = model.place(number)
+            place = model.term_slice(number)
             precision[place, place] = term.smoothness * roughness_of(term)
     return precision
 
@@ -53,7 +53,7 @@ def centre_of(model: Model) -> np.ndarray:
     centre = model.vector()
     for number, term in enumerate(model.terms):
         if term.smoothness is not None:
-            centre[model.place(number)] = 0.0
+            centre[model.term_slice(number)] = 0.0
     return centre
 
 
@@ -65,7 +65,7 @@ def covariance_of(normal: np.ndarray, precision: np.ndarray) -> np.ndarray:
     return scale[:, None] * np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
 
 
-def likely_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray) -> float:
+def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray) -> float:
     """Return the smoothness of greatest restricted likelihood.
 
     Parameters
@@ -118,9 +118,9 @@ def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
     for number, term in enumerate(model.terms):
         if term.smoothness is None:
             continue
-        place = model.place(number)
+        place = model.term_slice(number)
         own, pull = free_of_others(model, normal, gradient, place)
-        value = likely_smoothness(own, pull, roughness_of(term))
+        value = reml_smoothness(own, pull, roughness_of(term))
         terms = tuple(replace(t, smoothness=value) if k == number else t for k, t in enumerate(model.terms))
         model = replace(model, terms=terms)
     return model

@@ -62,12 +62,12 @@ class Groups:
 # ---------------------------------------------------------------- both ways
 # Strokes both ways of one file: one set-up and one repeat, so one piece of evidence of how large the friction is.
 
-BOTH = 0  # `direction` of a row that stands for both
+BOTH_DIRECTIONS = 0  # `direction` of a row that stands for both
 SAME_SPEED = 1.25  # measured speeds within 25 % are one setting: rigs without speed control wander that much
 KEYS = ["file", "run_id"]
 
 
-def both_ways_together(steady: pd.DataFrame) -> pd.DataFrame:
+def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
     """Return table `steady` with one row per record for runs that go both ways at one speed, other rows as they are.
 
     The size of the force is the mean of the two ways, so that an offset between them cancels; what gain and set-up do
@@ -103,7 +103,7 @@ def both_ways_together(steady: pd.DataFrame) -> pd.DataFrame:
     force = ways["force_N"].unstack("direction")
     together = own.drop(columns=numbers).groupby(KEYS, sort=False).first()
     together[numbers] = ways.groupby(level=KEYS, sort=False).mean()
-    together = together.assign(direction=BOTH, half_N=(force[1] - force[-1]) / 2)
+    together = together.assign(direction=BOTH_DIRECTIONS, half_N=(force[1] - force[-1]) / 2)
     return pd.concat([rows[~alike], together.reset_index()[list(rows.columns)]], ignore_index=True)
 
 
@@ -160,7 +160,7 @@ class Rows:
     has_aging: bool
     weight: np.ndarray  # (n,) sums to 1; each file weighs the same
     filled: dict[str, np.ndarray] = field(default_factory=dict)  # channels that some files lack: `fill_missing`
-    kept: dict = field(default_factory=dict, init=False, compare=False, repr=False)
+    cache: dict = field(default_factory=dict, init=False, compare=False, repr=False)
     """What follows from these rows and was computed once, by what it depends on besides them."""
 
     @property
@@ -172,13 +172,13 @@ class Rows:
         """Return one channel as floats, or as strings if it is a category; with what stands for missing values."""
         if channel in self.filled:
             return self.filled[channel]
-        if channel not in self.kept:
+        if channel not in self.cache:
             column = self.table[channel]
             if pd.api.types.is_numeric_dtype(column):
-                self.kept[channel] = column.to_numpy(dtype=float, na_value=np.nan)
+                self.cache[channel] = column.to_numpy(dtype=float, na_value=np.nan)
             else:
-                self.kept[channel] = column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
-        return self.kept[channel]
+                self.cache[channel] = column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
+        return self.cache[channel]
 
     def bin_width(self, channel: str) -> np.ndarray:
         """Return how far a channel goes within each row's bin, shape (n,): its samples times the step between them.
@@ -187,14 +187,14 @@ class Rows:
         both.
         """
         key = ("width", channel)
-        if key not in self.kept:
+        if key not in self.cache:
             values, code, samples = self.values(channel), self.codes("stroke"), self.samples
             inside = np.diff(code) == 0
             step = np.where(inside, np.diff(values) / ((samples[1:] + samples[:-1]) / 2), 0.0)
             left, right = np.r_[0.0, step], np.r_[step, 0.0]
             own = np.where(left == 0, right, np.where(right == 0, left, (left + right) / 2))
-            self.kept[key] = samples * own
-        return self.kept[key]
+            self.cache[key] = samples * own
+        return self.cache[key]
 
     @property
     def samples(self) -> np.ndarray:
@@ -208,14 +208,14 @@ class Rows:
     def sparse(self, most: int) -> Rows:
         """Return at most about `most` rows of each stroke, evenly spread: enough for what acts on whole strokes."""
         key = ("sparse", most)
-        if key not in self.kept:
+        if key not in self.cache:
             start, code = self.groups.starts["stroke"], self.codes("stroke")
             for channel in (name for name in ALONG if name in self.table):
                 self.bin_width(channel)  # of the bins as they are, not from one kept row to the next
             place = np.arange(code.size) - start[code]
             step = -(-np.bincount(code) // most)[code]  # rounded up
-            self.kept[key] = self.subset(place % step == step // 2)
-        return self.kept[key]
+            self.cache[key] = self.subset(place % step == step // 2)
+        return self.cache[key]
 
     def subset(self, mask: np.ndarray) -> Rows:
         """Return the rows where `mask` is true; conditions keep their numbers, so that a model fits both."""
@@ -234,9 +234,9 @@ class Rows:
             weight=weight / weight.sum(),
             filled={name: values[mask] for name, values in self.filled.items()},
         )
-        for name, values in self.kept.items():
+        for name, values in self.cache.items():
             if isinstance(name, str) or name[0] == "width":  # channels, and bins as they are
-                part.kept[name] = values[mask]
+                part.cache[name] = values[mask]
         return part
 
 

@@ -116,7 +116,7 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
 
     def solved_at(at: Model, most: float = np.inf) -> tuple[float, Model]:
         own = _equations(at, moving, whitening)
-        return _linear_solved(at, own if rest is None else own.plus(rest), *prior, (low, high), most=most)
+        return _solve_linear(at, own if rest is None else own.plus(rest), *prior, (low, high), most=most)
 
     best, chosen = solved_at(model)
     for value in np.linspace(low[group[0]], high[group[0]], GRID_POINTS):
@@ -142,12 +142,12 @@ def _parted(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, Rows | No
     if acts.all() or not acts.any():
         return rows, None
     key = ("parted", acts.tobytes())
-    if key not in rows.kept:
-        rows.kept[key] = (rows.subset(acts), rows.subset(~acts))
-    return rows.kept[key]
+    if key not in rows.cache:
+        rows.cache[key] = (rows.subset(acts), rows.subset(~acts))
+    return rows.cache[key]
 
 
-def linear_solved(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
+def solve_linear(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
     """Return the model with all that acts linearly solved for, v_s, b and the effects' own numbers where they stand.
 
     A term that has just come in takes over what others had explained for it: until they have given that back, a
@@ -155,13 +155,13 @@ def linear_solved(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarr
     """
     low, high = bounds_of(model, rows)
     equations = _equations(model, rows, Whitening(scatter, friction, rows.groups))
-    solved = _linear_solved(model, equations, *_linear_prior(model), (low, high))[1]
+    solved = _solve_linear(model, equations, *_linear_prior(model), (low, high))[1]
     return model.at(np.clip(solved.vector(), low, high))
 
 
 def _linear_prior(model: Model) -> tuple[np.ndarray, np.ndarray]:
     """Return the prior's precision of the numbers that act linearly, and where it lies."""
-    linear = ~model.bent
+    linear = ~model.nonlinear
     return precision_of(model)[np.ix_(linear, linear)], centre_of(model)[linear]
 
 
@@ -180,11 +180,11 @@ class _Equations(NamedTuple):
 def _equations(model: Model, rows: Rows, whitening: Whitening) -> _Equations:
     force, jacobian = evaluate(model, rows)
     residual = whitening((rows.force - force)[:, None])[:, 0]
-    linear = ~model.bent  # one step far from the optimum would throw the others anywhere
+    linear = ~model.nonlinear  # one step far from the optimum would throw the others anywhere
     return _Equations(*whitening.normal(jacobian.columns(linear), residual), float(residual @ residual))
 
 
-def _linear_solved(
+def _solve_linear(
     model: Model,
     equations: _Equations,
     precision: np.ndarray,
@@ -198,7 +198,7 @@ def _linear_solved(
     Without the bounds, a v_s far off can seem the best, with a negative friction that the fit cannot have. Bounds only
     add to what is left: where that is more than `most` without them, they are not asked.
     """
-    linear, vector = ~model.bent, model.vector()
+    linear, vector = ~model.nonlinear, model.vector()
     away = vector[linear] - centre
     normal, gradient = equations.normal + precision, equations.gradient - precision @ away
     low, high = (bound[linear] - vector[linear] for bound in bounds)

@@ -306,7 +306,7 @@ def estimate_components(
     kinds = usable_components(rows)
     known = {(c.level, c.kind): c.variance for c in scatter.components}
     components = reml(
-        GroupMeans(means[:, 0], noise * scatter.alike / count, means[:, 1], groups.at(level)),
+        GroupMeans(means[:, 0], noise * scatter.design_effect / count, means[:, 1], groups.at(level)),
         jacobian.means(groups, level),
         kinds,
         [known.get(kind, 0.0) for kind in kinds] if known else None,
@@ -337,7 +337,7 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
 
 def _specimens_free(rows: Rows) -> bool:
     """Whether specimens scatter about something: replicate specimens of a condition, or a law across conditions."""
-    return rows.groups.starts["specimen"].size - declare(rows).numbers_of_mu >= 2
+    return rows.groups.starts["specimen"].size - declare(rows).mu_parameter_count >= 2
 
 
 def _df(rows: Rows, component: Component) -> float:

@@ -45,10 +45,10 @@ class Scatter:
     s0: float
     g: float
     components: tuple[Component, ...] = ()
-    alike: float = 1.0  # by which neighbours that resemble each other widen the variance of a mean
+    design_effect: float = 1.0  # by which neighbours that resemble each other widen the variance of a mean
     shape: float = 1.0  # by which files' own shapes widen the variance of a pattern along the stroke, beyond that
 
-    def knows(self, level: str) -> bool:
+    def estimates(self, level: str) -> bool:
         """Whether the variance of a level could be told from that of the others, be it zero."""
         return any(part.level == level for part in self.components)
 
@@ -142,7 +142,7 @@ class Whitening:
         start, code = groups.starts[finest], groups.codes[finest]
         n, m = friction.size, start.size
         self.twice = np.repeat(start, 2)  # a row of the stroke that each of the two numbers is of
-        sd = scatter.noise_sd(friction) * np.sqrt(scatter.alike)
+        sd = scatter.noise_sd(friction) * np.sqrt(scatter.design_effect)
         size = np.sqrt(np.bincount(code, sd**-2.0))
         mean = 1 / (sd * size[code])  # unit vector along a stroke's mean, in units of the rows' noise
         level = np.bincount(code, mean * friction / sd)

@@ -10,7 +10,7 @@ import pandas as pd
 from scipy.special import stdtrit
 
 from sealfit.config import Config
-from sealfit.fit.joint.rows import both_ways_together
+from sealfit.fit.joint.rows import merge_directions
 from sealfit.fit.steady.condition import FULL, Condition, bound, drop_flat_curve, judge, make_condition, solve
 from sealfit.fit.steady.stribeck import NAMES, linearised
 from sealfit.fit.steady.uncertainty import (
@@ -92,7 +92,7 @@ def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, Un
         If nothing is left to fit.
     """
     runs = run_means(steady)
-    scatter = repeat_scatter(both_ways_together(steady[steady["used"].to_numpy(bool)]))
+    scatter = repeat_scatter(merge_directions(steady[steady["used"].to_numpy(bool)]))
     conditions = _solved(runs.assign(weight=run_weights(runs, scatter)))
     if not scatter.df > 0:
         conditions = _likelier_weighted(conditions)

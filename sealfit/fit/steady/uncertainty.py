@@ -17,7 +17,7 @@ from scipy.special import fdtrc, stdtrit
 
 from sealfit.errors import FitError
 from sealfit.fit.joint.declared import speed_clusters
-from sealfit.fit.joint.rows import BOTH, both_ways_together
+from sealfit.fit.joint.rows import BOTH_DIRECTIONS, merge_directions
 from sealfit.ingest.scatter import Scatter
 
 POOLING_P = 0.25  # Bancroft's level for "is there set-up scatter at all": at 5 % it would too often be missed
@@ -54,7 +54,7 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     rows = steady[steady["used"].to_numpy(bool) & steady["condition"].notna().to_numpy()]
     if rows.empty:
         raise FitError("no steady window is left to fit.", fix="Look in table quality why each was left out.")
-    rows = both_ways_together(rows)
+    rows = merge_directions(rows)
     commanded = rows["speed_set_mm_s"] if "speed_set_mm_s" in rows.columns else pd.Series(np.nan, rows.index)
     numbers = pd.DataFrame(
         {
@@ -65,7 +65,7 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
             "speed": rows["speed_mm_s"].astype(float).abs(),
             "set": commanded.astype(float).abs(),
             "load": rows["load_N"].astype(float),
-            "force": rows["force_N"].astype(float) * rows["direction"].astype(int).replace(BOTH, 1),
+            "force": rows["force_N"].astype(float) * rows["direction"].astype(int).replace(BOTH_DIRECTIONS, 1),
             "half": rows["half_N"],
             **{name: rows[name].astype(float) for name in shifts_of(rows)},
         }
@@ -206,7 +206,7 @@ def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
     ways, commanded, measured = (runs[name].to_numpy() for name in ("direction", "set", "speed"))
     levels = {}
     for direction in (1, -1):
-        own = (ways == direction) | (ways == BOTH)
+        own = (ways == direction) | (ways == BOTH_DIRECTIONS)
         if not own.any():
             continue
         speeds = commanded[own].astype(float)
