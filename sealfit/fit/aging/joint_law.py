@@ -172,8 +172,8 @@ def reference_of(tested: np.ndarray) -> float:
 #
 # with T in kelvin and C the height while aging in percent. Temperature and compression change the rate of aging (w = 0:
 # time-temperature superposition, all series fall on one master curve over k t) or the loss itself (w = 1). mu_0 is that
-# of the unaged rubber, shared by all. phi is one of `sealfit.physics.aging_laws`. BIC chooses the shape and w; the rivals
-# are kept beside the chosen law.
+# of the unaged rubber, shared by all. phi is one of `sealfit.physics.aging_laws`. BIC chooses the shape and w; the
+# rivals are kept beside the chosen law.
 #
 # Ferry 1980, Viscoelastic Properties of Polymers, chapter 11 (superposition); ISO 11346 (life of rubber by Arrhenius).
 

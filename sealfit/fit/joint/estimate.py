@@ -136,7 +136,7 @@ def fit(
     centre = centre_of(model)
     if scatter is None:
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
-        model = descend(model, rows, scatter, centre, near=ROUGH)
+        model = descend(model, rows, scatter, centre, tolerance=ROUGH)
     if turns and model.terms:
         model = search_nonlinear(model, rows, scatter)
     for turn in range(turns):
@@ -146,7 +146,7 @@ def fit(
         )
         model = descend(with_reml_smoothness(model, rows, scatter), rows, scatter, centre)
     if not turns:
-        model = descend(model, rows, scatter, centre, friction, near=COMPARED)
+        model = descend(model, rows, scatter, centre, friction, tolerance=COMPARED)
         return fitted_at(model, rows, scatter, friction)
     return fitted_at(model, rows, scatter)
 
@@ -177,7 +177,7 @@ def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
     rows, estimate = fitted.rows, estimate_scatter if noise else estimate_components
     scatter = estimate(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
     model = with_reml_smoothness(fitted.model, rows, scatter, fitted.friction)
-    model = descend(model, rows, scatter, centre_of(model), fitted.friction, near=COMPARED)
+    model = descend(model, rows, scatter, centre_of(model), fitted.friction, tolerance=COMPARED)
     return fitted_at(model, rows, scatter, fitted.friction)
 
 
