@@ -169,10 +169,10 @@ def _left_of_model(
     tangent = Tangent(fitted.jacobian.layout.of(place), means[chosen] * factor[:, None])
     if not any(c.level == "specimen" and c.variance > 0 for c in fitted.scatter.components):
         basis = tangent.orthonormal(RANK)
-        return basis.freed(size), basis.shape[1]
+        return basis.project_out(size), basis.shape[1]
     own = OwnColumns(rows.codes("specimen")[place], force[chosen] * factor)
-    basis = tangent.orthonormal(RANK, freed=own.freed)
-    return basis.freed(own.freed(size)), basis.shape[1] + own.count
+    basis = tangent.orthonormal(RANK, project_out=own.project_out)
+    return basis.project_out(own.project_out(size)), basis.shape[1] + own.count
 
 
 def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.DataFrame:

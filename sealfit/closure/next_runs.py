@@ -86,7 +86,7 @@ def _at_grid(
             column = slope * shape
             if np.isfinite(shape).all() and (column**2).mean() > NEGLIGIBLE**2 * (slope**2).mean():
                 white = fitted.whitening(column[:, None])[:, 0]
-                left = fitted.basis.freed(white)
+                left = fitted.basis.project_out(white)
                 amplitudes = {n: float(n == name) for n in effect.linear}
                 yield term, {**at, **amplitudes}, column, float(left @ left / (white @ white))
 

@@ -118,7 +118,7 @@ class Candidate:
 def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
     """Return columns of the force, whitened and freed of the current model's tangent space, shape (n, k)."""
     white = fitted.whitening(columns)
-    return _distinct(fitted.basis.freed(white), white)
+    return _distinct(fitted.basis.project_out(white), white)
 
 
 def _distinct(left: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -156,7 +156,7 @@ class ScoreTests:
         if self._specimens is None or FINER[unit] >= FINER["specimen"]:
             return (left,)
         own, basis = self._specimens
-        return left, _distinct(basis.freed(own.freed(left)), left)
+        return left, _distinct(basis.project_out(own.project_out(left)), left)
 
     @cached_property
     def _specimens(self) -> tuple[OwnColumns, Tangent] | None:
@@ -172,7 +172,7 @@ class ScoreTests:
         taken = (basis.sums(rows.groups, "specimen", white).values ** 2).sum(axis=1)
         told = size - taken >= IDENTIFIABLE * size
         own = OwnColumns(rows.codes("specimen"), white * told[rows.codes("specimen")])
-        return own, basis.orthonormal(RANK, freed=own.freed)
+        return own, basis.orthonormal(RANK, project_out=own.project_out)
 
     def __call__(
         self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]

@@ -353,7 +353,7 @@ class ClusterTests:
     @cached_property
     def _residual(self) -> np.ndarray:
         """Whitened residual less what priors and bounds have kept the fit from taking out of it, shape (n,)."""
-        return self.fitted.basis.freed(self.fitted.white_residual)
+        return self.fitted.basis.project_out(self.fitted.white_residual)
 
     @cached_property
     def _finer(self) -> Whitening:
