@@ -8,10 +8,8 @@ from sealfit.effects.contract import AMPLITUDE, Effect, Parameter, not_negative,
 
 # Gas constant in J/(mol K), CODATA 2018.
 GAS_CONSTANT = 8.314462618
-
 # 0 degrees Celsius in K.
 ZERO_C = 273.15
-
 # Standard laboratory temperature of rubber tests in degrees Celsius, ISO 23529.
 STANDARD_C = 23.0
 

@@ -16,13 +16,10 @@ from sealfit.errors import ParameterError
 
 # Stands for any numeric channel in `Effect.reads`; its values are `inputs["x"]` of the shape.
 CHANNEL = "x"
-
 # Stands for any second channel in `Effect.reads`, after CHANNEL.
 SECOND = "z"
-
 # Allowed values of `Effect.reads` with CHANNEL.
 READS_ANY = ((CHANNEL,), (CHANNEL, "direction"), (CHANNEL, SECOND))
-
 # Bounds of an amplitude with units. They are far beyond the numbers of any rig.
 AMPLITUDE = (-1e9, 1e9)
 

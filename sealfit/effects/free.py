@@ -58,7 +58,6 @@ def sine_attenuation(inputs: Mapping, name: str, wavelength: float):
 
 LEVELS, SLOPES = "levels", "slopes"
 LESS_MEAN = "; less its mean over the campaign"
-
 # Reference of a shape minus its mean.
 MEAN_OF_CAMPAIGN = "mean over {x} in the campaign"
 
@@ -199,10 +198,8 @@ def listed(values: Sequence[object]) -> str:
 # subtracted, as the declared model has a constant already.
 
 SMOOTH, SURFACE = "smooth", "surface"
-
 # A positive channel with at least this ratio of its largest to its smallest value is transformed by the logarithm.
 WIDE = 20.0
-
 # Powers of the two scaled channels in the terms of a free surface.
 BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))
 

@@ -22,7 +22,6 @@ from sealfit.effects.free import FREE
 from sealfit.errors import ConfigError, ParameterError
 
 EXAMPLE = "See sealfit/effects/sensors.py for an example."
-
 # Relative tolerance of a worked value, which a user may have written with ten digits.
 TOLERANCE = 1e-9
 

@@ -87,9 +87,8 @@ def warming_power_shape(inputs, *, A, tau):
 
     .. math:: h = -A \frac{N |v|}{N_{ref} v_{ref}} (1 - e^{-t / \tau})
 
-    A is the share lost when warm at the reference load and speed. For a loss that is small against 1: the form is
-    linear in the temperature and takes P without the fall of mu itself. Needs several speeds or loads to be told from
-    `warming_time`.
+    A is the share lost when warm at the reference load and speed, well below 1: the form is linear in the temperature,
+    and P is computed without the fall of mu. Several speeds or loads are needed to distinguish it from `warming_time`.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
     speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)

@@ -16,19 +16,14 @@ from sealfit.errors import FitError
 
 # Largest number of steps.
 STEPS = 2000
-
 # Relative change of the sum of squares that counts as rounding.
 SAME = 1e-13
-
 # Steps that shrink at least by this factor still converge, though the sum of squares no longer changes.
 SHRINKS = 0.9
-
 # Damping of the first step. Below it a step is close to a Gauss-Newton step.
 DAMPING = 1e-3
-
 # Damping at which the search ends without a further decrease.
 LARGEST_DAMPING = 1e12
-
 # Singular values below this share of the largest count as zero, with columns scaled to length 1.
 RANK = 1e-11
 
@@ -172,20 +167,15 @@ def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple
 
 # A column is linearly dependent if the others explain all but this share of its variance.
 DEPENDENT = 1e-13
-
 # Number of values in a temporary array: 16 MB.
 CHUNK = 2_000_000
-
 # Absolute tolerance of the nonlinear parameter (usually a logarithm) in the search. The sum of squares is constant in
 # double precision within it.
 CLOSE = 1e-9
-
 # Largest number of steps of this search.
 MOST_STEPS = 60
-
 # Damping of the final steps, which start from a minimum that is known to half of its digits.
 LEAST_DAMPING = 1e-15
-
 # Steps of the nonlinear parameter for a numerical derivative of fourth order.
 STEPS_OF_DERIVATIVE = 1e-3 * np.array([-2, -1, 0, 1, 2])
 
@@ -307,8 +297,6 @@ def profile(problems: Separable, u: np.ndarray, *, refine: int = 0) -> tuple[np.
 
     Parameters
     ----------
-    problems : Separable
-        The problems.
     u : ndarray, shape (problems, g)
         Nonlinear parameters.
     refine : int
@@ -342,8 +330,6 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
 
     Parameters
     ----------
-    problems : Separable
-        The problems.
     grid : ndarray, shape (problems, g)
         Rising nonlinear parameters, so close that no minimum lies between two of them.
 

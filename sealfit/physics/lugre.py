@@ -28,7 +28,6 @@ from sealfit.physics.stribeck import stribeck_decay
 
 # Relative tolerance of the solver, and its absolute tolerance as a multiple of the largest deflection.
 RTOL, ATOL = 1e-9, 1e-12
-
 # Smallest number of steps of the solver. It has to resolve a reversal of the speed between two output times.
 LEAST_STEPS = 200
 

@@ -44,7 +44,6 @@ from sealfit.simulation.spec import Spec, plan_files
 
 SCHEMA = 1
 MADE_BY = "sealfit simulate"
-
 # Decimals of a mean force in N. They are far below any noise.
 DIGITS = 9
 
@@ -169,13 +168,10 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
 
 # Decimals of the displacement in mm: 10 nm, the resolution of a linear encoder.
 DISPLACEMENT_DECIMALS = 5
-
 # Keys and derived channels that ingest computes.
 NOT_IN_RUNS = ["condition", "direction", "run_order", "elapsed_h"]
-
 # Smallest speed at which effects are evaluated, as a share of the set speed. A law in log speed is not defined at 0.
 CRAWL = 1e-3
-
 # Number of rows per file for the RMS of an effect. It gives two digits.
 RMS_ROWS = 64
 

@@ -18,7 +18,6 @@ from sealfit.simulation.spec import STEADY_LENGTHS, Design, Spec
 
 # Number of steps of constant speed in the simulation of a ramp.
 RAMP_STEPS = 256
-
 # Resolution of the logged time in s; sampling intervals are multiples of it.
 TICK_S = 1e-5
 

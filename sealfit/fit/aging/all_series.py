@@ -17,16 +17,12 @@ from sealfit.physics.aging_laws import LOSSES
 from sealfit.tables import AGING_LAWS, MASTER_CURVE
 
 TEMPERATURE, COMPRESSION = "temperature_C", "compression_ratio_pct"
-
 # Name of the law with separate a and b of Eq. 15 for every series.
 SEPARATE = "separate"
-
 # Number of the best laws whose held-out error is computed.
 HELD_OUT_LAWS = 3
-
 # Points of a curve from a third of the first aged day on.
 CURVE_POINTS = 61
-
 # Further points between day 0 and a third of the first aged day.
 START_POINTS = 20
 

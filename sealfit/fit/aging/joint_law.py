@@ -21,10 +21,8 @@ from sealfit.physics.aging_laws import LOSSES, Loss
 
 # Gas constant in kJ/(mol K).
 GAS_CONSTANT = aging_laws.GAS_CONSTANT / 1000
-
 # Smallest variance of a value. It keeps the weights of values without scatter finite.
 TINY = 1e-300
-
 # Variances below this share of the largest are rounding.
 ROUNDING = 1e-14
 
@@ -186,16 +184,12 @@ def reference_of(tested: np.ndarray) -> float:
 
 # Quantities that temperature and compression may change.
 TARGETS = ("rate", "loss")
-
 # Largest number of alternating fits of the law and the scatter.
 TURNS = 4
-
 # Relative change of the scatter at which these fits have converged.
 CONVERGED = 0.02
-
 # Largest difference in BIC of a rival law. It is less likely than the chosen law by a factor of up to exp(3).
 RIVAL = 6.0
-
 # A positive parameter is not determined if its 95 % interval spans more than this natural logarithm.
 KNOWN = np.log(100.0)
 

@@ -14,17 +14,13 @@ if TYPE_CHECKING:
 
 # Starting values of E in kJ/mol.
 ENERGIES = (0.0, 50.0, 100.0)
-
 # Starting values and bounds of the parameters of the shapes: days, and exponents.
 SHAPES = {"b": (0.01, 0.3, 10.0), "tau": (0.5, 5.0, 50.0), "beta": (0.5, 1.0), "n": (0.2, 0.5, 1.0), "t_i": (0.3, 3.0)}
 LIMITS = {"b": (1e-9, 1e4), "tau": (1e-6, 1e6), "beta": (0.05, 5.0), "n": (0.01, 5.0), "t_i": (1e-3, 1e3)}
-
 # Number of linear parameters: mu_0 and a.
 LINEAR = 2
-
 # Number of starting points that are polished.
 POLISHED = 4
-
 # The loss is constant, and a not determined, if mu_0 explains all but this share of its square.
 DEPENDENT = 1e-20
 
@@ -52,10 +48,8 @@ def solved_many(law: JointLaw, white: np.ndarray, values: np.ndarray) -> np.ndar
 
     Parameters
     ----------
-    law : JointLaw
-        Starting point.
-    white : ndarray, shape (n, n)
-        W with W C W' = 1 for the covariance C of the values of a draw.
+    law, white
+        As `solved`; the parameters of the law are the starting point.
     values : ndarray, shape (draws, n)
         The draws.
     """
@@ -67,10 +61,8 @@ def solved_without(law: JointLaw, white: np.ndarray, masks: np.ndarray) -> np.nd
 
     Parameters
     ----------
-    law : JointLaw
-        Starting point.
-    white : ndarray, shape (n, n)
-        W with W C W' = 1 for the covariance C of the values.
+    law, white
+        As `solved`; the parameters of the law are the starting point.
     masks : ndarray of bool, shape (masks, n)
         Values to leave out.
     """
@@ -83,10 +75,8 @@ class _Projected:
 
     Parameters
     ----------
-    law : JointLaw
-    white : ndarray, shape (n, n)
-        W with W C W' = 1 for the covariance C of the values of a set.
     values : ndarray, shape (sets, n)
+        Sets of values; `law` and `white` as in `solved`.
     masks : ndarray of bool, shape (sets, n), optional
         Values to leave out of each set.
 

@@ -25,13 +25,10 @@ from sealfit.fit.least_squares import (
 
 # b is searched from this share of the first aged day to this multiple of the last.
 SOONEST, LATEST = 1e-9, 1e3
-
 # Grid points of b per decade. ln(1 + t/b) changes slowly over a decade of b.
 PER_DECADE = 8
-
 # Largest relative scatter. If a law is zero, no relative scatter explains its residuals.
 MOST_SCATTER = 1e6
-
 # Number of points along ln b at which the intervals of a and c are computed.
 PROFILED = 17
 

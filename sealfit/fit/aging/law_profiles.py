@@ -13,7 +13,6 @@ from sealfit.fit.least_squares import covariance_of, levenberg_marquardt
 
 # Tolerance of the ends of intervals in ln b: 0.1 % of b.
 CLOSE = 1e-3
-
 # The first step along ln b from the optimum outwards; each further step is twice as long.
 FIRST_STEP = 0.25
 

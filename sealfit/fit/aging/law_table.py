@@ -14,10 +14,8 @@ from sealfit.fit.steady.fit import table_row
 
 # Number of days that a law needs: mu_0, a and b are three parameters.
 DAYS_FOR_LAW = 3
-
 # b is not determined if the ends of its 95 % interval differ by more than this ratio.
 WIDE_B = 100.0
-
 # Level of the test for lack of fit.
 SIGNIFICANT = 0.05
 

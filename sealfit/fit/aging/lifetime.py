@@ -20,16 +20,12 @@ from sealfit.fit.least_squares import central_jacobian
 # (rubber, estimation of life-time and maximum temperature of use) has a threshold relative to the start.
 
 DAYS_PER_YEAR = 365.25
-
 # Range of temperatures of use in degrees Celsius.
 SPAN_C = (-80.0, 300.0)
-
 # Step in degrees Celsius of the search for the ends of a temperature interval, and number of bisections after it.
 STRIDE_C, HALVINGS = 2.0, 12
-
 # Range of the height in use, in percent of the original height; above 100 the rubber is stretched.
 SPAN_PCT = (1.0, 200.0)
-
 # Range of lifetimes in days. A law has no meaning beyond it.
 AT_ONCE, FOREVER = 1e-9, 1e9
 
@@ -81,10 +77,8 @@ def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, comp
 
     Parameters
     ----------
-    law : JointLaw
-        Fitted law.
-    goal : Goal
-        End of life.
+    law, goal : JointLaw, Goal
+        Fitted law, and end of life.
     temperature_C, compression_pct : float, optional
         Temperature in degrees Celsius and height in percent in use; needed if the tests varied them.
 
@@ -217,8 +211,6 @@ def resampled(
 
     Parameters
     ----------
-    law, goal, temperature_C, compression_pct
-        As `lifetime`.
     draws, seed : int
         Number of draws, and seed of the random numbers.
     """

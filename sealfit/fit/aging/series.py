@@ -26,10 +26,8 @@ from sealfit.physics import aging_law
 from sealfit.tables import AGING_CURVES, AGING_FIT
 
 PAIRS = (("mu_s", "mu_c"), ("F_s", "F_c"))
-
 # Smallest relative standard deviation of a steady value.
 SMALLEST = 1e-6
-
 # Number of points of a curve.
 CURVE_POINTS = 61
 

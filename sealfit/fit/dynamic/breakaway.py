@@ -14,7 +14,6 @@ from sealfit.fit.dynamic.stiffness import together
 
 # Width of the window over which a peak is averaged, the larger of a number of samples and a share of the distance.
 SAMPLES, SHARE = 8, 1 / 40
-
 # Family-wise error rate of the test for a peak in a campaign.
 FAMILY = 0.01
 
@@ -218,8 +217,6 @@ def _places(above: np.ndarray, hits: np.ndarray, unit: np.ndarray, cells: Cells)
         Sum of the force above sliding over a window about each cell, and number of cells in the sum.
     unit : ndarray of int, shape (strokes,)
         Unit of evidence of each stroke.
-    cells : Cells
-        Cells of the strokes.
     """
 
     def highest(total: np.ndarray, count: np.ndarray) -> np.ndarray:

@@ -94,8 +94,6 @@ def mean_over(cells: Cells, values: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
     Parameters
     ----------
-    cells : Cells
-        Cells of the strokes.
     values : ndarray, shape (strokes, cells)
         Values, NaN if missing.
     """
@@ -112,19 +110,14 @@ def mean_over(cells: Cells, values: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 # Grid values of the stiffness. The length of the rise goes from a third of a step to the whole stroke.
 STIFFNESSES = 40
-
 # Every such grid value is tried first, then all values around the best.
 COARSE = 4
-
 # Grid values of the damping: tau as a share of the duration of the rise.
 DAMPINGS = np.array([0.0, 0.01, 0.03, 0.1, 0.3, 1.0])
-
 # Samples between these shares of the rise determine its length.
 SHARE = (0.02, 0.98)
-
 # Number of rise lengths after which the exponential is zero; larger exponents overflow.
 FAR = 500.0
-
 # Level and start are not distinguishable if the determinant of their normal equations is below this share of the
 # product of its diagonal.
 APART = 1e-10

@@ -19,13 +19,10 @@ from sealfit.ingest.stored_parts import noise_from_bends, stroke_index, strokes_
 
 # Starting values of the length of a ramp, in time steps.
 RAMPS = np.geomspace(0.5, 200.0, 12)
-
 # The rows of every stroke are padded to a multiple of this, so that sums do not depend on the strokes fitted together.
 PADDED = 64
-
 # Largest number of rows fitted together.
 TOGETHER = 16_384
-
 # Bound of |ln(length of a ramp in s)|.
 LONGEST = 50.0
 
@@ -185,19 +182,14 @@ def _lagging(since: np.ndarray, ramp: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 # A platform is at rest below this share of the steady speed.
 STANDSTILL = 0.05
-
 # Largest standard deviation of the local speed, as a share of the steady speed.
 ROUGH = 0.1
-
 # A ramp is accepted if its RMS residual is at most this multiple of the noise.
 AS_NOISE = 1.2
-
 # Noise below this share of the displacement is rounding; the local speed is then exact.
 ROUNDING = 1e-13
-
 # Share of the steady window in which the force at the beginning of sliding is fitted.
 JUST_BEGUN = 0.1
-
 # Smallest number of rows of a start.
 LEAST = 4
 

@@ -27,13 +27,10 @@ from sealfit.fit.least_squares import levenberg_marquardt
 
 # Number of samples inside the rise that an estimate needs.
 LEAST = 3
-
 # Fall of the sum of squares by the rise, in residual variances, that an estimate needs.
 RISES = 30.0
-
 # A fit disagrees with the data if its RMS residual exceeds these multiples of the noise and of the sliding force.
 MISSED_NOISE, MISSED_LEVEL = 2.0, 0.03
-
 # Half-width of the 95 % interval of log sigma_0 from which sigma_0 is not determined.
 OPEN = np.log(3.0)
 
@@ -188,8 +185,6 @@ def _between_files(found: Tangent, inverse: np.ndarray, file: np.ndarray) -> tup
 
     Parameters
     ----------
-    found : Tangent
-        Tangent at the optimum.
     inverse : ndarray, shape (p, p)
         Inverse of J'J.
     file : ndarray of int, shape (strokes,)

@@ -12,22 +12,16 @@ import pandas as pd
 from sealfit.fit.joint.rows import SAME_SPEED, Rows
 
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
-
 # Number of tested speeds that a Stribeck curve needs. With sigma_2 >= 0 three speeds determine it at these speeds.
 SPEEDS_FOR_STRIBECK = 3
-
 # Number of tested speeds that determine the curve between them as well: mu_s, mu_c, v_s and sigma_2 are four numbers.
 SPEEDS_BETWEEN = 4
-
 # Forms of the speed dependence with mu_s and v_s.
 CURVED = ("full", "interpolated")
-
 # Number of tested speeds that the viscous term needs.
 SPEEDS_FOR_VISCOUS = 2
-
 # Number of aging days that Eq. 15 needs: mu_0, a and b are three numbers.
 DAYS_FOR_LAW = 3
-
 # A residual sum of squares below this share of the total is rounding.
 ROUNDING = 1e-24
 

@@ -22,10 +22,8 @@ from sealfit.fit.joint.whitening import Scatter, Whitening
 # Fall of the whitened sum of squares at which a descent ends when fits are only compared. Rivals differ by several
 # units.
 COMPARED = 1e-2
-
 # The same for the first fit, before the scatter is estimated.
 ROUGH = 1.0
-
 # Number of alternating fits of model and scatter. The third changes no estimate by a tenth of its standard error.
 TURNS = 3
 

@@ -202,7 +202,6 @@ def _columns_of(term: Term, rows: Rows) -> np.ndarray:
 
 # Quantities whose logarithm is fitted.
 LOGARITHMIC = ("b_s", "b_c", "v_s")
-
 # Quantities of the declared model that an effect on each target changes. Effects on mu_s and mu_c come after aging.
 QUANTITIES_OF = {
     "mu_0": ("mu_0s", "mu_0c"),

@@ -25,10 +25,8 @@ from sealfit.fit.joint.model import LOGARITHMIC, Model, Term
 
 # Standard deviation of the prior of log v_s and log b.
 PRIOR_SD = 3.0
-
 # Decimal logarithms of the smoothness tried, relative to the one whose penalty weighs as much as the data.
 DECADES = np.linspace(-8.0, 6.0, 57)
-
 # Ridge added to the normal matrix, as a share of its diagonal. The declared model may contain the straight line, which
 # then makes the matrix singular.
 RIDGE = 1e-10
@@ -114,8 +112,6 @@ def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
 
     Parameters
     ----------
-    model : Model
-        The model at which the tangent was evaluated.
     normal : ndarray, shape (model.size, model.size)
         Normal matrix of the whitened tangent, without prior.
     gradient : ndarray, shape (model.size,)

@@ -64,7 +64,6 @@ class Groups:
 
 # `direction` of a row that is the mean of both directions.
 BOTH_DIRECTIONS = 0
-
 # Measured speeds within this ratio are one setting. The speed of rigs without speed control varies by so much.
 SAME_SPEED = 1.25
 
@@ -116,10 +115,8 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
 
 # Grouping levels, finest first. A row of `bins` is a mean of samples of a stroke.
 LEVELS = ("stroke", "file", "run", "specimen")
-
 # Channels that increase along a stroke, so that they vary within a bin.
 ALONG = ("displacement_mm", "distance_mm", "time_s")
-
 # Derived channel if loads differ: load times |speed|, the power of friction over its coefficient.
 POWER = "power"
 

@@ -18,17 +18,13 @@ from sealfit.fit.joint.whitening import Scatter, Whitening
 
 # Largest number of Levenberg-Marquardt steps.
 MAX_STEPS = 60
-
 # Number of grid values of log v_s and of log b that are tried when an effect has been added.
 GRID_POINTS = 12
-
 # Number of rows of each stroke that the grid search uses. v_s and b act on a stroke as a whole.
 ROWS_FOR_START = 4
-
 # Fall of the whitened sum of squares below which a step counts as slow. The descent ends after four slow steps in a
 # row: the data then determine nothing along its direction.
 SLOW = 1e-2
-
 # Fall of the whitened sum of squares below which the descent has converged. The estimates then lie within a hundredth
 # of a standard error of the optimum.
 CONVERGED = 1e-4
@@ -49,8 +45,6 @@ def descend(
     ----------
     model : Model
         Starting point; it is moved inside the bounds.
-    rows, scatter : Rows, Scatter
-        Data, and the covariance of its rows.
     centre : ndarray, shape (model.size,)
         Mean of the prior.
     friction : ndarray, shape (n,), optional
@@ -285,11 +279,9 @@ def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 
 # Number of grid values of v_s.
 GRID = 80
-
 # Values of v_s whose sums of squares differ by less than this share of the sum of squared forces fit equally well. The
 # middle one is taken.
 EQUAL = 1e-10
-
 # Singular values below this share of the largest one count as zero.
 RANK = 1e-10
 

@@ -32,14 +32,11 @@ from sealfit.ingest.scatter import two_nonnegative
 # Smallest start of a component, as a share of the residual variance. The gradient is 0 at a component of 0, which
 # could not grow again.
 LEAST_START = 0.03
-
 # Largest relative standard deviation of a gain; no rig's is larger. Without a limit a force of nearly 0 with a large
 # gain would fit any data.
 MOST_GAIN = 0.5
-
 # A component below this share of the residual variance counts as zero.
 LEAST = 1e-5
-
 # Largest component, as a multiple of the residual variance. It exceeds 1 as a model with nearly as many parameters as
 # groups leaves small residuals.
 MOST_SHARE = 30.0
@@ -77,8 +74,6 @@ def reml(
 
     Parameters
     ----------
-    means : GroupMeans
-        Data.
     jacobian : Tangent, shape (m, p)
         Mean tangent of the model, for the restricted likelihood.
     kinds : sequence of (level, kind)
@@ -228,7 +223,7 @@ Symmetric = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _shrinkage(q: Symmetric, size: np.ndarray) -> tuple[Symmetric, np.ndarray]:
-    """Return (S^-1 + q)^-1 and log det (1 + S q), shape (groups,), for S the diagonal of `size`; S may hold zeros."""
+    """Return (S^-1 + q)^-1 and log det (1 + S q), shape (groups,), for S the diagonal of `size`, which may be 0."""
     a, b, c = 1.0 + size[0] * q[0], np.sqrt(size[0] * size[1]) * q[1], 1.0 + size[1] * q[2]
     det = a * c - b * b
     return (size[0] * c / det, -np.sqrt(size[0] * size[1]) * b / det, size[1] * a / det), np.log(det)
@@ -270,7 +265,6 @@ def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
 # Smallest row noise, as a share of the force. It is below the resolution of any sensor, and keeps the weights of
 # noise-free data finite.
 LEAST_NOISE = 1e-6
-
 # Number of files from which differences in their shape along strokes are estimated.
 LEAST_FILES = 6
 
@@ -410,8 +404,6 @@ def shape_scatter(rows: Rows, residual: np.ndarray, sd: np.ndarray) -> float:
 
     Parameters
     ----------
-    rows : Rows
-        Data.
     residual, sd : ndarray, shape (n,)
         Measured minus model, and standard deviation of row noise, in N.
     """

@@ -24,10 +24,8 @@ from sealfit.physics import stribeck_force
 
 # Number of speed levels within one direction that each model needs.
 FULL, VISCOUS, CONSTANT = 4, 2, 1
-
 # Level of the test for a Stribeck curve.
 SIGNIFICANT = 0.05
-
 # Parameters of each model.
 COLUMNS = {4: NAMES, 2: ("mu_c", "sigma_2"), 1: ("mu_c",)}
 

@@ -28,13 +28,10 @@ from sealfit.units import Units
 
 # Level of the test for lack of fit.
 SIGNIFICANT = 0.05
-
 # Number of conditions whose intervals are computed together. It bounds the memory.
 BLOCK = 250
-
 # Numeric columns of a fit table.
 NUMBERS = ("value", "se", "lo95", "hi95", "u_sys")
-
 # Names of the coefficients if the load is unknown.
 FORCES = {"mu_s": "F_s", "mu_c": "F_c"}
 

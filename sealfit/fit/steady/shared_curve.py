@@ -33,13 +33,10 @@ from sealfit.tables import STEADY_FIT
 
 # Level of the F test for a shared v_s and sigma_2.
 SHARED_P = 0.01
-
 # Grid points of v_s per decade. With all days of a series together no minimum is narrow.
 PER_DECADE = 30
-
 # Largest relative standard error of a value that counts as determined.
 DETERMINED = 0.3
-
 # Singular values of a condition's two columns below this share of the largest count as zero. With one speed mu_s and
 # mu_c are not distinguishable.
 RANK = 1e-8

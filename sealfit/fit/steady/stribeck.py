@@ -112,18 +112,14 @@ def _ends(gram, centre, spare, j, keep, nonnegative):
 # v_s is searched from a fifth of the slowest speed, below which E < 1e-10 at every speed, to twenty times the fastest,
 # above which 1 - E < 0.0025 is proportional to v^2.
 SLOWEST, FASTEST = 1 / 5, 20.0
-
 # Grid points of v_s per decade, 1 % apart. With four or five speeds a minimum can be that narrow.
 PER_DECADE = 240
-
 # Bisections of one grid cell. They give ln v_s to 1e-13.
 HALVINGS = 40
-
 # Points inside the interval of v_s at which the intervals of the other parameters are computed.
 FINE = 61
 
 NAMES = ("mu_s", "mu_c", "v_s", "sigma_2")
-
 # mu_s, mu_c and sigma_2 are nonnegative.
 PHYSICAL = (True, True, True)
 

@@ -22,17 +22,13 @@ from sealfit.ingest.scatter import Scatter
 
 # Level of the preliminary test for set-up scatter (Bancroft 1944). A level of 5 % would miss it too often.
 POOLING_P = 0.25
-
 # Level at which a condition with more lack of fit than the others is widened by its own ratio.
 WORSE_P = 0.01
-
 # Smallest standard deviation of a run mean, as a share of the largest force. It keeps the weights of identical repeats
 # finite.
 SMALLEST_SD = 1e-9
-
 # Smallest force in a scatter proportional to the force, as a share of the largest force.
 SMALLEST_SHARE = 0.05
-
 # Prefix of the columns of `steady_after` with the directions of the subtracted effects' uncertainty.
 SHIFT = "effects_u"
 
