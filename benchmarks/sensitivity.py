@@ -35,10 +35,14 @@ from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.rows import make_rows
 
-ALIKE = 0.9  # correlation, after projection, from which two effects are one here
-LARGEST_PCT = 30.0  # stated sizes above are not tried: so large an effect is not linear any more
-ENTRIES = 3  # of a design
-BINS = 6  # of a stroke
+# Correlation after projection from which two effects count as one.
+ALIKE = 0.9
+# Largest stated size, in percent, that is tried. Larger effects are not linear.
+LARGEST_PCT = 30.0
+# Number of entries of a design.
+ENTRIES = 3
+# Number of bins of a stroke.
+BINS = 6
 MOST_FILES = 200
 CONFIG = Config()
 GROUPS = {

@@ -100,7 +100,7 @@ def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.D
     reference = at_reference(model, config)
     effects = force - evaluate(reference, rows, jacobian=False)[0]
     taken = [k for k, term in enumerate(model.terms) if not is_kept(term, config)]
-    places = np.array([i for k in taken for i in range(*model.place(k).indices(model.size))], int)
+    places = np.array([i for k in taken for i in range(*model.term_slice(k).indices(model.size))], int)
     last = tangent.values.shape[1] - model.size
     principal = _principal(tangent.values[:, last + places], after.covariance[np.ix_(places, places)], rows)
     columns = {"effects_N": effects, "effects_start_N": _at_start(model, reference, rows)}
@@ -185,7 +185,7 @@ def law_df(after: Fitted) -> float:
 
     With few specimens their variance is often estimated as zero, and the runs would give too many degrees of freedom.
     """
-    left = after.rows.groups.starts["specimen"].size - after.model.declared.numbers_of_mu
+    left = after.rows.groups.starts["specimen"].size - after.model.declared.mu_parameter_count
     return min(degrees_of_freedom(after), float(max(left, 1)))
 
 
@@ -311,7 +311,8 @@ class _Law:
             has_aging=rows.has_aging,
         )
         force, tangent = evaluate(replace(model, theta=theta), replace(at, days=days))
-        kept = [np.arange(after.model.size)[after.model.place(after.model.terms.index(term))] for term in model.terms]
+        own = (after.model.term_slice(after.model.terms.index(term)) for term in model.terms)
+        kept = [np.arange(after.model.size)[place] for place in own]
         slope = np.zeros((days.size, after.model.size))
         slope[:, np.concatenate([np.arange(theta.size), *kept])] = tangent.toarray()
         slope[:, list(index.values())] = 0.0

@@ -27,7 +27,7 @@ from sealfit.closure.naming import rivals
 from sealfit.closure.ripples import agreement, pass_shifts
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
-from sealfit.fit.joint.estimate import Fitted, as_smooth_as_wanted, fit
+from sealfit.fit.joint.estimate import Fitted, fit, with_reml_smoothness
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.whitening import Whitening
@@ -139,7 +139,7 @@ def _gain(
 def _heldout_residual(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.ndarray:
     """Return measured minus model in the rows held out, the model fitted to the others, shape (held out,)."""
     train, friction = before.rows.subset(~out), before.friction[~out]
-    model = as_smooth_as_wanted(model, train, before.scatter, friction)
+    model = with_reml_smoothness(model, train, before.scatter, friction)
     kept = fit(model, train, before.scatter, turns=0, friction=friction)
     return test.force - evaluate(kept.model, test, jacobian=False)[0]
 

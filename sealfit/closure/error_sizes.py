@@ -124,7 +124,7 @@ def _p_of_run_means(fitted: Fitted) -> float | None:
     spread = np.sqrt(fitted.scatter.level_variance("file", files["force"].to_numpy()) + 1e-300)
     noise = fitted.scatter.noise_sd(files["force"].to_numpy())
     per_file = len(rows.table) / len(files)
-    scale = np.asarray(np.sqrt(spread**2 + noise**2 * fitted.scatter.alike / per_file))
+    scale = np.asarray(np.sqrt(spread**2 + noise**2 * fitted.scatter.design_effect / per_file))
     files["z"] = files["residual"] / scale
     by_run = files.groupby("run_id")["z"]
     count = by_run.transform("count").to_numpy()
@@ -168,10 +168,10 @@ def _residual_of_model(
     tangent = Tangent(fitted.jacobian.layout.of(place), means[chosen] * factor[:, None])
     if not any(c.level == "specimen" and c.variance > 0 for c in fitted.scatter.components):
         basis = tangent.orthonormal(RANK)
-        return basis.freed(size), basis.shape[1]
+        return basis.project_out(size), basis.shape[1]
     own = OwnColumns(rows.codes("specimen")[place], force[chosen] * factor)
-    basis = tangent.orthonormal(RANK, freed=own.freed)
-    return basis.freed(own.freed(size)), basis.shape[1] + own.count
+    basis = tangent.orthonormal(RANK, project_out=own.project_out)
+    return basis.project_out(own.project_out(size)), basis.shape[1] + own.count
 
 
 def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.DataFrame:

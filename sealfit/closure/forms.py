@@ -53,7 +53,7 @@ def terms_of(
     target = (candidate.acts_on, candidate.operation)
     if candidate.pair:
         pair = [channels[name] for name in candidate.channels]
-        alone = fitted.scatter.knows("specimen") or all(c.unit != "specimen" for c in pair)
+        alone = fitted.scatter.estimates("specimen") or all(c.unit != "specimen" for c in pair)
         alone = alone and all(room_along(c, fitted) > 0 for c in pair)
         yield from _terms_of_pair(*pair, target, effects, alone=alone)
         return
@@ -346,7 +346,7 @@ def richer_laws(
     known = {t.effect.id for t in fitted.model.terms}
     laws = [e for e in effects.values() if e.physical and e.reads == (AGING,) and TARGET in e.acts_on]
     laws = [e for e in laws if e.id not in known and len(e.linear) == 1 and e.nonlinear]
-    if specimens - fitted.model.declared.numbers_of_mu <= FEWEST:
+    if specimens - fitted.model.declared.mu_parameter_count <= FEWEST:
         return []
     rows = fitted.rows.sparse(ROWS)
     before = reestimated(fit(fitted.model, rows, fitted.scatter, turns=1))
@@ -366,12 +366,12 @@ def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tupl
     )
     gain = min(before.deviance, without.deviance) - after.deviance
     units = fitted.rows.groups.starts["specimen"].size
-    q, left = len(effect.parameters), units - fitted.model.declared.numbers_of_mu
+    q, left = len(effect.parameters), units - fitted.model.declared.mu_parameter_count
     error = left - q
     if error < 1:
         return None
     amplitude = effect.linear[0]
-    at = after.model.place(place).start + [p.name for p in effect.parameters].index(amplitude)
+    at = after.model.term_slice(place).start + [p.name for p in effect.parameters].index(amplitude)
     ratio = np.exp((gain + units * np.log(left / error) - q) / units)
     t = after.model.values[place][amplitude] / np.sqrt(max(after.covariance[at, at], 1e-300))
     f = max(min((ratio - 1) * error / q, t**2 / q), 0.0)

@@ -91,7 +91,7 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Inter
     """
     term = fitted.model.terms[number]
     held = term.fixed.get("held", {})
-    place = fitted.model.place(number)
+    place = fitted.model.term_slice(number)
     variance = np.diag(robust_covariance(fitted, level))[place]
     if not held:  # the variance components describe coarser shapes than a wave
         variance = np.maximum(variance, np.diag(fitted.covariance)[place])

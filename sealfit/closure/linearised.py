@@ -15,7 +15,7 @@ from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.joint.estimate import Fitted, effective_df
 from sealfit.fit.joint.model import Term, mean_derivatives
-from sealfit.fit.joint.prior import likely_smoothness, penalised, roughness_of
+from sealfit.fit.joint.prior import penalised, reml_smoothness, roughness_of
 from sealfit.fit.joint.rows import Rows
 
 PART = 32  # Grid points that are whitened at once.
@@ -159,7 +159,7 @@ def middles(values: np.ndarray) -> np.ndarray:
 def _smooth(term: Term, left: np.ndarray, residual: np.ndarray) -> tuple[Term, np.ndarray, float]:
     """Return a free shape with estimated smoothness, its amplitudes, and its effective degrees of freedom."""
     normal, gradient, rough = left.T @ left, left.T @ residual, roughness_of(term)
-    smoothness = likely_smoothness(normal, gradient, rough)
+    smoothness = reml_smoothness(normal, gradient, rough)
     amplitude, size = penalised(normal, gradient, smoothness * rough)
     return replace(term, smoothness=smoothness), amplitude, size
 

@@ -33,7 +33,7 @@ from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.joint.estimate import Fitted, fit, reestimated
-from sealfit.fit.joint.search import linear_solved, search_nonlinear
+from sealfit.fit.joint.search import search_nonlinear, solve_linear
 from sealfit.fit.joint.whitening import Scatter, Whitening
 
 REFITTED = 8  # Proposals that are refitted jointly.
@@ -198,7 +198,7 @@ def determined(proposal: Proposal) -> bool:
     Otherwise the form is not distinguishable from a straight line or a constant.
     """
     fitted, effect = proposal.fitted, proposal.term.effect
-    first = fitted.model.place(len(fitted.model.terms) - 1).start
+    first = fitted.model.term_slice(len(fitted.model.terms) - 1).start
     covariance = np.maximum(fitted.covariance, robust_covariance(fitted, proposal.unit))
     for k, parameter in enumerate(effect.parameters):
         if parameter.linear or parameter.name == "phi":
@@ -268,7 +268,7 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
 def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:
     """Return a proposal fitted jointly with the model, under the current scatter."""
     model = fitted.model.with_term(proposal.term, proposal.values)
-    model = linear_solved(model, fitted.rows, fitted.scatter, fitted.friction)
+    model = solve_linear(model, fitted.rows, fitted.scatter, fitted.friction)
     return replace(proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction))
 
 
@@ -287,7 +287,7 @@ def _refitted_under(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter)
         model = fitted.model.with_term(proposal.term, proposal.values)
         target = _target(proposal)
         if target in begun:
-            model = linear_solved(replace(model, theta=begun[target]), rows, scatter, friction)
+            model = solve_linear(replace(model, theta=begun[target]), rows, scatter, friction)
         else:
             model = search_nonlinear(model, rows, scatter)
         anew = fit(model, rows, scatter, turns=0, friction=friction)

@@ -86,7 +86,7 @@ def _at_grid(
             column = slope * shape
             if np.isfinite(shape).all() and (column**2).mean() > NEGLIGIBLE**2 * (slope**2).mean():
                 white = fitted.whitening(column[:, None])[:, 0]
-                left = fitted.basis.freed(white)
+                left = fitted.basis.project_out(white)
                 amplitudes = {n: float(n == name) for n in effect.linear}
                 yield term, {**at, **amplitudes}, column, float(left @ left / (white @ white))
 
@@ -146,7 +146,7 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
                 )
     if selection.inconclusive is not None:
         wanted.append(_replicate_of(selection.inconclusive, config))
-    if selection.after.rows.has_aging and not selection.after.scatter.knows("specimen"):
+    if selection.after.rows.has_aging and not selection.after.scatter.estimates("specimen"):
         wanted.append(_second_specimen(selection.after.rows, config))
     return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
 

@@ -64,7 +64,7 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
         "scatter": {
             "s0": float(after.scatter.s0),
             "g": float(after.scatter.g),
-            "alike": float(after.scatter.alike),
+            "alike": float(after.scatter.design_effect),
             "shape": float(after.scatter.shape),
             "components": [
                 {"level": c.level, "kind": c.kind, "variance": float(c.variance)} for c in after.scatter.components
@@ -206,7 +206,7 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
     records: list[dict] = []
     reach = t_quantile(degrees_of_freedom(after))
     for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True)):
-        place = after.model.place(number)
+        place = after.model.term_slice(number)
         covariance = (robust_covariance(after, "file") if "held" in term.fixed else after.covariance)[place, place]
         inputs, x, labels = _along(term, after)
         value = np.asarray(term.effect.shape(inputs, **values), dtype=float)

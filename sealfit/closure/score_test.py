@@ -120,7 +120,7 @@ class Candidate:
 def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
     """Return columns of the force, whitened and projected off the tangent space of the model, shape (n, k)."""
     white = fitted.whitening(columns)
-    return _distinct(fitted.basis.freed(white), white)
+    return _distinct(fitted.basis.project_out(white), white)
 
 
 def _distinct(left: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -158,7 +158,7 @@ class ScoreTests:
         if self._specimens is None or FINER[unit] >= FINER["specimen"]:
             return (left,)
         own, basis = self._specimens
-        return left, _distinct(basis.freed(own.freed(left)), left)
+        return left, _distinct(basis.project_out(own.project_out(left)), left)
 
     @cached_property
     def _specimens(self) -> tuple[OwnColumns, Tangent] | None:
@@ -168,14 +168,14 @@ class ScoreTests:
         """
         rows = self.fitted.rows
         starts = rows.groups.starts
-        if self.fitted.scatter.knows("specimen") or not 1 < starts["specimen"].size < starts["run"].size:
+        if self.fitted.scatter.estimates("specimen") or not 1 < starts["specimen"].size < starts["run"].size:
             return None
         white, basis = self.fitted.whitening(self.fitted.friction[:, None])[:, 0], self.fitted.basis
         size = rows.groups.sums(white**2, "specimen")
         taken = (basis.sums(rows.groups, "specimen", white).values ** 2).sum(axis=1)
         identifiable = size - taken >= IDENTIFIABLE * size
         own = OwnColumns(rows.codes("specimen"), white * identifiable[rows.codes("specimen")])
-        return own, basis.orthonormal(RANK, freed=own.freed)
+        return own, basis.orthonormal(RANK, project_out=own.project_out)
 
     def __call__(
         self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]

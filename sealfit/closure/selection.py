@@ -371,7 +371,7 @@ def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitt
 
 def _wald_statistic(fitted: Fitted, number: int) -> float:
     """Return the Wald statistic of an effect's amplitudes."""
-    at = fitted.model.place(number).start
+    at = fitted.model.term_slice(number).start
     effect, values = fitted.model.terms[number].effect, fitted.model.values[number]
     places = [at + k for k, p in enumerate(effect.parameters) if p.linear]
     amplitude = np.array([values[p.name] for p in effect.parameters if p.linear])

@@ -234,7 +234,7 @@ class _Search:
     def margin(self, candidate: Candidate, effect: np.ndarray, fitted: Fitted) -> float:
         """Return the ratio of an effect to the size that is needed."""
         tests = ScoreTests(fitted)
-        white = fitted.basis.freed(fitted.whitening(np.column_stack([self.fitted.residual, effect])))
+        white = fitted.basis.project_out(fitted.whitening(np.column_stack([self.fitted.residual, effect])))
         noise, effect = (replace(fitted, white_residual=column) for column in white.T)
         for one in (noise, effect):
             one.__dict__["basis"] = fitted.basis

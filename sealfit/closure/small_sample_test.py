@@ -353,7 +353,7 @@ class ClusterTests:
     @cached_property
     def _residual(self) -> np.ndarray:
         """Whitened residual, projected off the tangent space (priors and bounds may leave a part there), shape (n,)."""
-        return self.fitted.basis.freed(self.fitted.white_residual)
+        return self.fitted.basis.project_out(self.fitted.white_residual)
 
     @cached_property
     def _finer(self) -> Whitening:
@@ -370,8 +370,7 @@ class ClusterTests:
             slope = fitted.slope(*target)[:, None]
             white = fitted.whitening(slope)[:, 0]
             size, finer = (groups.sums(w**2, self.level) for w in (white, self._finer(slope)[:, 0]))
-            explained = float(np.mean(size[finer > 0] / finer[finer > 0]))
-            self._numbers[target] = self.along(white)._replace(known=KNOWN_DF * min(explained, 1.0))
+            self._numbers[target] = self.along(white)._replace(known=KNOWN_DF * min(mean_ratio(size, finer), 1.0))
         return self._numbers[target]
 
     def along(self, white: np.ndarray) -> Numbers:
@@ -415,6 +414,16 @@ class ClusterTests:
             scale = np.sqrt(df / rng.chisquare(df, count)) if df > LEAST_KNOWN_DF else np.ones(count)
             found[target] = own * scale[:, None]
         return found
+
+
+def mean_ratio(squares: np.ndarray, finer: np.ndarray) -> float:
+    """Return the mean of squares / finer, shape (units,) each, over units where `finer` is not rounding; 1 if none.
+
+    Rounding is below 1e-30 of the largest. A derivative far from its Stribeck velocity may underflow in a unit, and the
+    ratio then overflows.
+    """
+    known = finer > 1e-30 * finer.max(initial=0.0)
+    return float(np.mean(squares[known] / finer[known])) if known.any() else 1.0
 
 
 def log_p_of(values: np.ndarray, basis: np.ndarray, known: float, d: int | None = None) -> np.ndarray:
