@@ -11,10 +11,19 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from sealfit.errors import ConfigError
-from sealfit.units import Units
+from sealfit.units import Conversion, Units, conversion
 
 AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
 
@@ -23,6 +32,33 @@ class Strict(BaseModel):
     """A table of a config or SPEC: unknown keys refused, values fixed, numbers finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class FileColumn(Strict):
+    """A column of a file: `force_N = "Kraft"`, or with its unit `force_N = {name = "Kraft", unit = "kgf"}`.
+
+    `name` is what the file calls it, or its position from 1; `unit` is that of its numbers in the file where it is
+    another than ours. The numbers are converted to our unit when they are read.
+    """
+
+    name: str | int
+    unit: str | None = None
+
+
+def _in_full(columns: object) -> object:
+    """Return a config's table of columns with each of them in its long form; one without a name has ours."""
+    if not isinstance(columns, dict):
+        return columns  # refused by the type
+    full = dict(columns)
+    for ours, column in columns.items():
+        if isinstance(column, str | int):
+            full[ours] = {"name": column}
+        elif isinstance(column, dict):
+            full[ours] = {"name": ours, **column}
+    return full
+
+
+FileColumns = Annotated[dict[str, FileColumn], BeforeValidator(_in_full)]
 
 
 class TraceFormat(Strict):
@@ -40,9 +76,9 @@ class TraceFormat(Strict):
     units_row: bool = Field(False, description="a row of units follows the names")
     trailing_separator: bool = Field(False, description="lines end in stray separators; strip them")
     drop_first_rows: int = Field(0, ge=0)
-    columns: dict[str, str | int] = Field(
-        default_factory=lambda: {"time_s": "time_s", "displacement_mm": "displacement_mm", "force_N": "force_N"},
-        description="our name = the file's column name, or its position from 1",
+    columns: FileColumns = Field(
+        default_factory=lambda: {name: FileColumn(name=name) for name in ("time_s", "displacement_mm", "force_N")},
+        description="our name = the file's column name, or its position from 1; with a unit {name = .., unit = ..}",
     )
     optional: list[str] = Field(default_factory=list, description="of `columns`, those a file may lack")
     other_columns: Literal["channels", "ignore"] = Field("channels", description="columns not listed above")
@@ -80,7 +116,18 @@ class Files(Strict):
     compute: dict[str, str] = Field(
         default_factory=dict, description="column = safe expression over parts, e.g. speed_mm_s = 'sign * rpm'"
     )
-    runs_columns: dict[str, str] = Field(default_factory=dict, description="our name = runs.csv's column name")
+    units: dict[str, str] = Field(
+        default_factory=dict, description="unit of a part or column that names of files give: temperature_C = 'degF'"
+    )
+    runs_columns: FileColumns = Field(
+        default_factory=dict, description="our name = runs.csv's column name; with a unit {name = .., unit = ..}"
+    )
+
+    @property
+    def copies(self) -> dict[str, str]:
+        """Columns that are a part as it stands, by the template "{T}" or the expression T, and that part."""
+        whole = {name: text[1:-1] for name, text in self.columns.items() if re.fullmatch(r"\{[^{}]*\}", text)}
+        return {name: text.strip() for name, text in self.compute.items() if text.strip().isidentifier()} | whole
 
 
 class Quantity(Strict):
@@ -161,6 +208,8 @@ class Config(Strict):
     quality: Quality = Quality()
     sensor: Sensor = Sensor()
     loop: Loop = Loop()
+    _conversions: dict[str, dict[str, Conversion]] = PrivateAttr(default_factory=dict)
+    _kept_units: dict[str, str] = PrivateAttr(default_factory=dict)
 
     @field_validator("condition")
     @classmethod
@@ -198,10 +247,38 @@ class Config(Strict):
                 raise ValueError(f"{place}: {error}") from None
         return self
 
+    @model_validator(mode="after")
+    def _units_convert(self) -> Config:
+        units = self.units
+        for table, place, name, unit in self._units_of_files():
+            # A channel of the campaign's own has no unit of ours: it keeps its numbers, and labels show its unit.
+            to = units.of(name) or self._kept_units.setdefault(name, unit)
+            try:
+                self._conversions.setdefault(table, {})[name] = conversion(unit, to)
+            except ConfigError as error:
+                raise ValueError(f"{place}.{name}: {error}") from None
+        return self
+
+    def _units_of_files(self) -> list[tuple[str, str, str, str]]:
+        """Return every column whose unit is given: its table, its place in the config, its name and the unit."""
+        parts, ours = self.files.units, self.units
+        copies = {n: parts[p] for n, p in self.files.copies.items() if p in parts and not ours.of(p)}
+        tables = (
+            ("trace", "trace.columns", {name: column.unit for name, column in self.trace.columns.items()}),
+            ("runs", "files.runs_columns", {name: column.unit for name, column in self.files.runs_columns.items()}),
+            ("names", "files.units", copies | parts),
+        )
+        return [(table, place, n, unit) for table, place, units in tables for n, unit in units.items() if unit]
+
+    def conversions(self, table: Literal["trace", "runs", "names"]) -> dict[str, Conversion]:
+        """Return the conversion of every column of traces, runs.csv or file names whose unit the config gives."""
+        return self._conversions.get(table, {})
+
     @property
     def units(self) -> Units:
         """True unit of every slot."""
-        return Units({slot: (q.quantity, q.unit) for slot, q in self.quantities.items()}, self.column_units)
+        declared = {slot: (q.quantity, q.unit) for slot, q in self.quantities.items()}
+        return Units(declared, self._kept_units | self.column_units)
 
     @property
     def aging(self) -> bool:

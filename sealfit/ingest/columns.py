@@ -44,7 +44,8 @@ def locate(layout: Layout, width: int, settings: TraceFormat, file: str) -> dict
     """
     found: dict[int, str] = {}
     faults = []
-    for ours, theirs in settings.columns.items():
+    for ours, column in settings.columns.items():
+        theirs = column.name
         if isinstance(theirs, int):
             positions = [theirs - 1] if 0 < theirs <= width else []
         else:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -16,6 +17,7 @@ from sealfit.ingest.categorical import Column, Columns, condition_columns, keys_
 from sealfit.ingest.file_names import TEXT_COLUMNS
 from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import Entries, Entry
+from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- run values
 # Cells of runs.csv and of file names to values: which columns are numbers, which are labels, and what cannot be.
@@ -70,6 +72,17 @@ def _column(name: str, cells: Column, entries: Entries, config: Config) -> tuple
 def _number(cell: float | str) -> float:
     number = cell if isinstance(cell, float) else as_number(cell)
     return math.nan if number is None else number
+
+
+def in_our_units(columns: Columns, conversions: Mapping[str, Conversion]) -> Columns:
+    """Return the columns with numbers of other units converted; cells that are no numbers stay as they are."""
+
+    def converted(cell: float | str, convert: Conversion) -> float | str:
+        number = _number(cell)
+        return convert.of_cell(number) if math.isfinite(number) else cell
+
+    changed = {name: convert for name, convert in conversions.items() if name in columns}
+    return columns | {name: mapped(columns[name], partial(converted, convert=c)) for name, c in changed.items()}
 
 
 def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:

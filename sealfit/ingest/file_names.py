@@ -13,6 +13,7 @@ from sealfit.errors import ConfigError
 from sealfit.ingest.categorical import Columns, taken
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.files import as_number
+from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- refs
 
@@ -78,6 +79,7 @@ class NameParts:
 
 
 SAYS_NOTHING = NameParts(True, {})
+SAME_UNITS: Mapping[str, Conversion] = {}
 
 
 def names_speak(settings: Files) -> bool:
@@ -85,11 +87,12 @@ def names_speak(settings: Files) -> bool:
     return bool(settings.name_pattern is not None or settings.compute or settings.columns)
 
 
-def name_parts(file: str, settings: Files) -> NameParts:
+def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion] = SAME_UNITS) -> NameParts:
     """Return what the relative path `file` says under the config's `files`.
 
     Every named group of `name_pattern` is a part; a part with a value map takes the mapped value where the map has
     one; numbers become numbers; `compute` and the templates of `columns` then add columns. Empty parts say nothing.
+    Numbers in other units than ours are converted, those of parts first.
 
     Raises
     ------
@@ -119,13 +122,23 @@ def name_parts(file: str, settings: Files) -> NameParts:
             else:
                 texts[name] = f"{mapped:g}" if isinstance(mapped, int | float) else mapped
                 values[name] = float(mapped) if isinstance(mapped, int | float) else mapped
+            _convert(name, texts, values, conversions)
     for name, expression in settings.compute.items():
         values[name] = float(evaluate(parse(expression), values))
         texts[name] = f"{values[name]:g}"
+        _convert(name, texts, values, conversions)
     for name, template in settings.columns.items():
         texts[name] = _FIELD.sub(lambda found: _part(found.group(1), texts, template), template)  # noqa: B023
         values[name] = texts[name] if name in TEXT_COLUMNS else _value(texts[name])
+        _convert(name, texts, values, conversions)
     return NameParts(True, {name: value for name, value in values.items() if value != "" or name.startswith("_")})
+
+
+def _convert(name: str, texts: dict[str, str], values: dict, conversions: Mapping[str, Conversion]) -> None:
+    """Change the number of a column to our unit, where the config gives the one that it is in."""
+    if name in conversions and isinstance(values[name], float):
+        values[name] = conversions[name].of_cell(values[name])
+        texts[name] = f"{values[name]:.12g}"
 
 
 def _value(text: str) -> float | str:

@@ -170,7 +170,7 @@ def _rows(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) ->
 
 def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault]]:
     """Return our name of every column of runs.csv, and faults: missing, doubled, or misspelt columns."""
-    ours = {theirs: name for name, theirs in config.files.runs_columns.items()}
+    ours = {str(theirs.name): name for name, theirs in config.files.runs_columns.items()}
     names = [ours.get(name, name) for name in header]
     faults = []
     for name in sorted({name for name in names if name and names.count(name) > 1}):

@@ -37,6 +37,7 @@ from sealfit.ingest.derived_columns import (
     as_set,
     condition_keys,
     disagreements,
+    in_our_units,
     out_of_range,
     to_values,
 )
@@ -73,6 +74,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     kept, named, found = _named(entries, config)
     faults += found
     entries, cells = _kept(kept, entries, cells)
+    cells = in_our_units(cells, config.conversions("runs"))
     columns = in_order(overlaid(_headers(campaign, entries, config), named, cells))
     columns, found = to_values(entries, columns, config)
     faults += found
@@ -143,13 +145,13 @@ def _config_faults(config: Config) -> list[Fault]:
             "cannot be a condition column: it differs within a condition.",
             "Take it out of condition.",
         )
-    named = {} if settings.names != "none" else {k: v for k, v in settings.columns.items() if isinstance(v, str)}
-    for ours, theirs in named.items():
+    named = {ours: theirs.name for ours, theirs in settings.columns.items() if isinstance(theirs.name, str)}
+    for ours, theirs in named.items() if settings.names == "none" else ():
         fix = "Give its position, counted from 1, or names = 'header'."
         add(f"trace.columns.{ours}", theirs, "is a name, but the files have none.", fix)
     checks = {"quantities": lambda: speed_factor(config.units)}
     if config.files.name_pattern is None:
-        checks["files"] = lambda: name_parts("", config.files)
+        checks["files"] = lambda: name_parts("", config.files, config.conversions("names"))
     for column, check in checks.items():
         try:
             check()
@@ -181,7 +183,7 @@ def _named(entries: Entries, config: Config) -> tuple[np.ndarray, Columns, list[
     kept, parts, faults = [], [], []
     for i, entry in enumerate(entries):
         try:
-            named = name_parts(entry.file, config.files)
+            named = name_parts(entry.file, config.files, config.conversions("names"))
         except ConfigError as error:
             raise CampaignError([entry.fault("file_name", error.message, error.column, fix=error.fix)]) from error
         if not named.matched:
