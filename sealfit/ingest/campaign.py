@@ -17,7 +17,7 @@ from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, plan_parts, shaped
-from sealfit.ingest.quality import incomplete_columns, quality_table
+from sealfit.ingest.quality import improbable_loads, incomplete_columns, quality_table
 from sealfit.ingest.repeat_checks import constant_strokes, outlying_files, reversed_strokes
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.stored_parts import (
@@ -180,7 +180,7 @@ def ingest_campaign(
         raise CampaignError(_nothing_left(faults, len(listing)))
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
-    faults += incomplete_columns(steady)
+    faults += incomplete_columns(steady) + improbable_loads(steady, config)
     strokes = strokes.assign(used=_still_used(strokes, steady))
     parts = reader.reestimated(parts, _ruled_out(plan, strokes, files))
     used = np.zeros(len(listing), bool)
