@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal
@@ -59,6 +60,17 @@ def _in_full(columns: object) -> object:
 
 
 FileColumns = Annotated[dict[str, FileColumn], BeforeValidator(_in_full)]
+
+
+def _as_list(formats: object) -> object:
+    return [formats] if isinstance(formats, str) else formats
+
+
+class StartedAt(Strict):
+    """Columns of date and time of day, where these are two: `started_at = {date = "Datum", time = "Zeit"}`."""
+
+    date: str
+    time: str
 
 
 class TraceFormat(Strict):
@@ -119,6 +131,10 @@ class Files(Strict):
     units: dict[str, str] = Field(
         default_factory=dict, description="unit of a part or column that names of files give: temperature_C = 'degF'"
     )
+    date_format: Annotated[list[str], BeforeValidator(_as_list)] = Field(
+        default_factory=list, description="formats of started_at as strptime has them, one or several, tried in order"
+    )
+    started_at: StartedAt | None = Field(None, description="columns of date and time of day, where these are two")
     runs_columns: FileColumns = Field(
         default_factory=dict, description="our name = runs.csv's column name; with a unit {name = .., unit = ..}"
     )
@@ -128,6 +144,24 @@ class Files(Strict):
         """Columns that are a part as it stands, by the template "{T}" or the expression T, and that part."""
         whole = {name: text[1:-1] for name, text in self.columns.items() if re.fullmatch(r"\{[^{}]*\}", text)}
         return {name: text.strip() for name, text in self.compute.items() if text.strip().isidentifier()} | whole
+
+    @property
+    def text_parts(self) -> tuple[str, ...]:
+        """Parts of names that stay text, with their leading zeros: date and time of day."""
+        return () if self.started_at is None else (self.started_at.date, self.started_at.time)
+
+    @field_validator("date_format")
+    @classmethod
+    def _formats_are_known(cls, formats: list[str]) -> list[str]:
+        for one in formats:
+            try:
+                day = datetime(2024, 2, 1, 9, 30, tzinfo=UTC).strftime(one)
+                datetime.strptime(day, one)
+            except ValueError as error:
+                raise ValueError(f"{one!r} is no date format: {error}. Write for example '%d.%m.%Y %H:%M'") from None
+            if not {"%d", "%j", "%x", "%c"} & set(re.findall("%.", one)):
+                raise ValueError(f"{one!r} has no day. Write for example '%d.%m.%Y %H:%M'")
+        return formats
 
 
 class Quantity(Strict):

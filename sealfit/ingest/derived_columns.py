@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from functools import partial
 
 import numpy as np
-import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import Fault
@@ -155,43 +153,6 @@ def _one_setting(column: Column) -> Column:
             group.append(value)
             usual.update(dict.fromkeys(group, max(group, key=count.__getitem__)))
     return mapped(column, lambda value: usual.get(value, value))
-
-
-def add_order(entries: Entries, columns: Columns) -> tuple[Columns, list[Fault]]:
-    """Return the columns with `run_order` and `elapsed_h` where files say when they were started; faults of bad times.
-
-    Equal times share the order of the first of them. A time without a zone is taken as UTC, so that one campaign
-    with and without zones keeps one order.
-    """
-    if "started_at" not in columns:
-        return columns, []
-    texts = mapped(columns["started_at"], lambda value: str(value).strip())
-    times = mapped(texts, _time)
-    fix = "Write it as 2024-03-01T09:30:00."
-    faults = [
-        entries[i].fault("not_a_time", "is not an ISO 8601 time.", "started_at", value=text, fix=fix)
-        for i, (text, time) in enumerate(zip(texts, times, strict=True))
-        if text is not None and time is None
-    ]
-    if any(time.tzinfo for time in times if time is not None):
-        times = mapped(times, lambda time: (time if time.tzinfo else time.replace(tzinfo=UTC)).astimezone(UTC))
-    moments = pd.Series(pd.to_datetime(pd.Series(times, dtype=object), utc=True))
-    if not moments.notna().any():
-        return columns, faults
-    hours = (moments - moments.min()) / pd.Timedelta(hours=1)
-    derived = {"run_order": moments.rank(method="min"), "elapsed_h": hours}
-    return columns | {name: _with_none(values) for name, values in derived.items()}, faults
-
-
-def _with_none(values: pd.Series) -> Column:
-    return [None if math.isnan(value) else value for value in values.tolist()]
-
-
-def _time(text: str) -> datetime | None:
-    try:
-        return datetime.fromisoformat(text)
-    except ValueError:
-        return None
 
 
 def add_specimens(columns: Columns, conditions: list[str]) -> Columns:

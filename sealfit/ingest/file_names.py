@@ -118,7 +118,7 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
             mapped = settings.values.get(name, {}).get(text)
             if mapped is None:
                 texts[name] = text
-                values[name] = text if name in TEXT_COLUMNS else _value(text)
+                values[name] = text if name in TEXT_COLUMNS or name in settings.text_parts else _value(text)
             else:
                 texts[name] = f"{mapped:g}" if isinstance(mapped, int | float) else mapped
                 values[name] = float(mapped) if isinstance(mapped, int | float) else mapped

@@ -30,7 +30,6 @@ from sealfit.ingest.categorical import (
 )
 from sealfit.ingest.columns import RESERVED, beside, suggestion
 from sealfit.ingest.derived_columns import (
-    add_order,
     add_repeats,
     add_runs,
     add_specimens,
@@ -45,6 +44,7 @@ from sealfit.ingest.file_names import TEXT_COLUMNS, Listing, TraceRef, name_part
 from sealfit.ingest.files import as_utf8, find_layout, header_fields, read_bytes
 from sealfit.ingest.listing import Entries, list_entries
 from sealfit.ingest.reader import read_trace
+from sealfit.ingest.start_times import add_order, join_date_and_time
 from sealfit.ingest.trace_checks import measured_speed, speed_factor
 
 
@@ -76,6 +76,8 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     entries, cells = _kept(kept, entries, cells)
     cells = in_our_units(cells, config.conversions("runs"))
     columns = in_order(overlaid(_headers(campaign, entries, config), named, cells))
+    columns, found = join_date_and_time(entries, columns, config)
+    faults += found
     columns, found = to_values(entries, columns, config)
     faults += found
     needed = _Needed.of(config)
@@ -86,7 +88,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     entries, columns = _kept(kept, entries, columns)
     columns, measured = in_order(columns), [measured[i] for i in kept.tolist()]
     faults += found + _missing(entries, columns, needed) + out_of_range(entries, columns)
-    columns, found = add_order(entries, columns)
+    columns, found = add_order(entries, columns, config)
     faults += found
     _stop_at_errors(faults)
     columns = as_set(columns)
