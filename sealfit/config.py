@@ -164,6 +164,18 @@ class Files(Strict):
         return formats
 
 
+class Runs(Strict):
+    """What is worked out from runs.csv, or what it leaves out."""
+
+    compute: dict[str, str] = Field(
+        default_factory=dict,
+        description="column = safe expression over what is known of a file: load_N = 'm_kg * 9.81'",
+    )
+    constants: dict[str, float | str] = Field(
+        default_factory=dict, description="columns with one value, where the log has none: load_N = 49.03"
+    )
+
+
 class Quantity(Strict):
     """Another quantity and unit in a slot: `[quantities] force = {quantity = "torque", unit = "mN m"}`."""
 
@@ -235,6 +247,7 @@ class Config(Strict):
     position_origin: Literal["rig", "file"] = "rig"
     trace: TraceFormat = TraceFormat()
     files: Files = Files()
+    runs: Runs = Runs()
     quantities: dict[Literal["force", "displacement", "speed", "load", "time"], Quantity] = Field(default_factory=dict)
     column_units: dict[str, str] = Field(default_factory=dict, description="units of the campaign's own channels")
     strokes: Strokes = Strokes()
@@ -272,6 +285,7 @@ class Config(Strict):
 
         rows = {f"trace.compute.{k}": (v, False) for k, v in self.trace.compute.items()}
         rows |= {f"files.compute.{k}": (v, False) for k, v in self.files.compute.items()}
+        rows |= {f"runs.compute.{k}": (v, False) for k, v in self.runs.compute.items()}
         if self.trace.keep is not None:
             rows["trace.keep"] = (self.trace.keep, True)
         for place, (text, condition) in rows.items():

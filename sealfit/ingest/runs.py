@@ -39,6 +39,8 @@ from sealfit.ingest.derived_columns import (
     in_our_units,
     out_of_range,
     to_values,
+    with_computed,
+    with_day_0,
 )
 from sealfit.ingest.file_names import TEXT_COLUMNS, Listing, TraceRef, name_parts, names_speak
 from sealfit.ingest.files import as_utf8, find_layout, header_fields, read_bytes
@@ -78,7 +80,9 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     columns = in_order(overlaid(_headers(campaign, entries, config), named, cells))
     columns, found = join_date_and_time(entries, columns, config)
     faults += found
-    columns, found = to_values(entries, columns, config)
+    columns, found = to_values(entries, with_day_0(columns, config), config)
+    faults += found
+    columns, found = with_computed(entries, columns, config)
     faults += found
     needed = _Needed.of(config)
     columns, measured, left_out, found = _from_traces(campaign, entries, columns, config, needed)
