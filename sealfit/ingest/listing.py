@@ -15,9 +15,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from sealfit.config import Config
-from sealfit.errors import BadFile, CampaignError, Fault
+from sealfit.errors import BadFile, CampaignError, Fault, nearest
 from sealfit.ingest.categorical import Columns, mapped
-from sealfit.ingest.columns import nearest, suggestion
+from sealfit.ingest.columns import suggestion
 from sealfit.ingest.files import Folder, as_number, as_utf8, read_bytes, split_line
 
 RUNS_CSV = "runs.csv"
