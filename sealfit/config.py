@@ -10,7 +10,7 @@ import tomllib
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import (
     BaseModel,
@@ -23,7 +23,7 @@ from pydantic import (
     model_validator,
 )
 
-from sealfit.errors import ConfigError
+from sealfit.errors import ConfigError, did_you_mean, nearest
 from sealfit.units import Conversion, Units, conversion
 
 AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
@@ -366,7 +366,8 @@ def read_config(path: ConfigPath = None) -> str:
     try:
         return Path(path).read_text("utf-8-sig")  # Windows editors begin with a byte-order mark
     except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, fix="Check --config.") from error
+        fix = did_you_mean(Path(path), Path.is_file) or "Check --config."
+        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, fix=fix) from error
     except UnicodeDecodeError as error:
         raise ConfigError("is not UTF-8.", file=path, fix="Save it as UTF-8.") from error
 
@@ -384,16 +385,39 @@ def parse_config(text: str, name: str) -> Config:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
     except ValidationError as error:
-        raise ConfigError(explain(error), file=name, fix="See the README for every key.") from error
+        raise ConfigError(explain(error, Config), file=name, fix="See the README for every key.") from error
 
 
-def explain(error: ValidationError) -> str:
-    """Return one sentence per fault of a config or SPEC."""
+def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
+    """Return one sentence per fault of a config or SPEC; one of `model`'s keys is named for an unknown key."""
     lines = []
     for fault in error.errors():
         key, text = ".".join(str(part) for part in fault["loc"]), fault["msg"].removeprefix("Value error, ")
         if fault["type"] == "extra_forbidden":
-            lines.append(f"unknown key '{key}'.")
-        else:
-            lines.append(f"key '{key}': {text.rstrip('.')}." if key else f"{text.rstrip('.')}.")
+            meant = _nearest_key(fault["loc"], model) if model is not None else ""
+            lines.append(f"unknown key '{key}'." + (f" Did you mean '{meant}'?" if meant else ""))
+            continue
+        end = "" if text.endswith(("?", ".")) else "."
+        lines.append(f"key '{key}': {text}{end}" if key else f"{text}{end}")
     return " ".join(lines)
+
+
+def _nearest_key(place: tuple[int | str, ...], model: type[BaseModel]) -> str:
+    """Return the key that is most likely meant: one of the same table, else one of that name in another; "" if none."""
+    *above, wrong = place
+    here = model
+    for part in above:
+        field = here.model_fields.get(str(part))
+        here = here if field is None else _table_of(field.annotation) or here
+    if close := nearest(str(wrong), here.model_fields):
+        return ".".join([*map(str, above), close])
+    tables = {name: _table_of(field.annotation) for name, field in model.model_fields.items()}
+    elsewhere = (f"{name}.{wrong}" for name, table in tables.items() if table and wrong in table.model_fields)
+    return next(elsewhere, "")
+
+
+def _table_of(annotation: object) -> type[BaseModel] | None:
+    """Return the model of a table of a config, or that of the tables that it holds; None where it holds none."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((table for part in get_args(annotation) if (table := _table_of(part))), None)

@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 from trace_helpers import DAYS, campaign, config, trace
 
-from sealfit.config import Config
-from sealfit.errors import CampaignError, Fault, did_you_mean, grouped, nearest, told
+from sealfit.config import Config, load_config
+from sealfit.errors import CampaignError, ConfigError, Fault, did_you_mean, grouped, nearest, told
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.quality import quality_table
 from sealfit.progress import Lines
@@ -99,3 +99,32 @@ def test_the_nearest_name_beside_a_path_that_is_not_there_or_nothing(tmp_path, m
     assert did_you_mean(Path("rig.tml")) == did_you_mean(Path("results")) == ""
     assert nearest("Force", ["time", "force"]) == "force"
     assert nearest("Force", ["time"]) == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[trace]\ndelimeter = ';'", "unknown key 'trace.delimeter'. Did you mean 'trace.delimiter'?"),
+        ("[tracee]\ndecimal = ','", "unknown key 'tracee'. Did you mean 'trace'?"),
+        ("decimal = ','", "unknown key 'decimal'. Did you mean 'trace.decimal'?"),
+        ("[files]\ndecimal = ','", "unknown key 'files.decimal'. Did you mean 'trace.decimal'?"),
+        ("[quantities.force]\nunits = 'N'\nquantity = 'x'", "Did you mean 'quantities.force.unit'?"),
+        (
+            "[files.runs_columns]\nload_N = {name = 'Last', units = 'kgf'}",
+            "Did you mean 'files.runs_columns.load_N.unit'?",
+        ),
+        ("zzz = 1", "unknown key 'zzz'. See the README"),
+    ],
+)
+def test_a_mistyped_key_is_answered_with_the_nearest(text, said):
+    with pytest.raises(ConfigError) as caught:
+        config(text)
+    assert said in str(caught.value)
+
+
+def test_a_mistyped_config_is_answered_with_the_nearest_file_beside_it(tmp_path):
+    (tmp_path / "rig.toml").write_text("")
+    with pytest.raises(ConfigError, match=r"Did you mean .*rig\.toml\?"):
+        load_config(tmp_path / "rog.toml")
+    with pytest.raises(ConfigError, match=r"Check --config\."):
+        load_config(tmp_path / "other.ini")

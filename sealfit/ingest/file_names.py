@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -132,6 +135,54 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
         values[name] = texts[name] if name in TEXT_COLUMNS else _value(texts[name])
         _convert(name, texts, values, conversions)
     return NameParts(True, {name: value for name, value in values.items() if value != "" or name.startswith("_")})
+
+
+_OPEN = re.compile(r"(\((\?(:|P<\w+>|=|!|<=|<!|<)?)?|\|)$")  # a group or a choice of which nothing is there yet
+
+
+def matched_part(pattern: str, file: str) -> tuple[str, str]:
+    """Return as much of a path as the longest part of a pattern matches that matches at all, and the pattern's rest.
+
+    Examples
+    --------
+    >>> matched_part(r"T(?P<T>\\d+)_d(?P<aging_days>\\d+)[.]csv", "T80_C20_d4.csv")
+    ('T80_', 'd(?P<aging_days>\\\\d+)[.]csv')
+    """
+    for part, length in _parts_of(pattern):
+        if found := part.match(file):
+            return found.group(), pattern[length:]
+    return "", pattern
+
+
+@cache
+def _parts_of(pattern: str) -> list[tuple[re.Pattern, int]]:
+    """Return the beginnings of a pattern that are patterns, open groups closed, and their lengths, longest first."""
+    found = []
+    for length in range(len(pattern), 0, -1):
+        begin = pattern[:length]
+        for closing in ("", ")", "))", ")))") if not _OPEN.search(begin) else ():
+            with suppress(re.error), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of half a set
+                found.append((re.compile(begin + closing), length))
+                break
+    return found
+
+
+def unmatched(file: str, pattern: str) -> tuple[str, str]:
+    """Return why a path does not match the config's pattern, without the path, and the fix."""
+    begin, rest = matched_part(pattern, file)
+    up_to = f"it fits up to '{begin}', then" if begin else "from its start"
+    where = f"{up_to} the pattern has {_short(rest)} and the path {_short(file[len(begin) :])}"
+    reason = f"the whole path below the campaign folder does not match files.name_pattern: {where}."
+    fix = "Rename it, widen the pattern, or list it under files.exclude."
+    if "/" in file and re.fullmatch(pattern, file.rpartition("/")[2]):
+        fix = "The pattern matches the name without its folders: begin it with '(?:.*/)?'."
+    return reason, fix
+
+
+def _short(text: str) -> str:
+    shown = text if len(text) <= 30 else f"{text[:27]}..."
+    return f"'{shown}'" if text else "nothing"
 
 
 def _convert(name: str, texts: dict[str, str], values: dict, conversions: Mapping[str, Conversion]) -> None:

@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from difflib import SequenceMatcher
+from difflib import SequenceMatcher, get_close_matches
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path, PurePosixPath
@@ -35,6 +35,7 @@ KNOWN = (
 
 
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
+FILES_LOOKED_AT = 2000  # for the one that is most like a glob; a campaign's names are much alike
 _BLANK = b" \t,;\n"  # a line of nothing else is none
 
 
@@ -206,8 +207,8 @@ def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
         raise _stop("path_outside", f"files.glob = {glob!r} leads outside the campaign folder.", "Make it relative.")
     files = sorted((p.relative_to(campaign).as_posix() for p in campaign.glob(glob) if not p.is_dir()), key=natural)
     if not files:
-        fix = "Check the folder, or files.glob in the rig config."
-        raise _stop("missing_file", f"no file in '{campaign}' matches files.glob = {glob!r}.", fix)
+        reason = f"no file in '{campaign}' matches files.glob = {glob!r}, which stands for paths below that folder."
+        raise _stop("missing_file", reason, _nearest_file(campaign, glob))
     faults, kept = [], []
     for file in files:
         if pattern := next((p for p in config.files.exclude if fnmatchcase(file, p)), None):
@@ -216,6 +217,13 @@ def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
         else:
             kept.append(file)
     return Entries(kept), faults
+
+
+def _nearest_file(campaign: Path, glob: str) -> str:
+    """Return a fix for a glob that matches nothing: the file whose path is most like it."""
+    files = (path.relative_to(campaign).as_posix() for path in campaign.rglob("*") if path.is_file())
+    close = get_close_matches(glob, list(islice(files, FILES_LOOKED_AT)), n=1, cutoff=0.0)
+    return f"The nearest file is '{close[0]}'." if close else "There is no file in it: check the folder."
 
 
 def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import codecs
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +42,15 @@ from sealfit.ingest.derived_columns import (
     with_computed,
     with_day_0,
 )
-from sealfit.ingest.file_names import TEXT_COLUMNS, Listing, TraceRef, name_parts, names_speak
+from sealfit.ingest.file_names import (
+    TEXT_COLUMNS,
+    Listing,
+    TraceRef,
+    matched_part,
+    name_parts,
+    names_speak,
+    unmatched,
+)
 from sealfit.ingest.files import as_utf8, find_layout, header_fields, read_bytes
 from sealfit.ingest.listing import Entries, list_entries
 from sealfit.ingest.reader import read_trace
@@ -194,8 +202,7 @@ def _named(entries: Entries, config: Config) -> tuple[np.ndarray, Columns, list[
             raise CampaignError([entry.fault("file_name", error.message, error.column, fix=error.fix)]) from error
         if not named.matched:
             listed = entry.line is not None
-            reason = f"the name '{entry.file}' does not match files.name_pattern."
-            fix = "Rename it, widen the pattern, or list it under files.exclude."
+            reason, fix = unmatched(entry.file, config.files.name_pattern)
             place = {"severity": "warning", "action": "kept" if listed else "file left out", "fix": fix}
             faults.append(Fault("not_matched", reason, file=entry.file, **place))
             if not listed:
@@ -203,9 +210,10 @@ def _named(entries: Entries, config: Config) -> tuple[np.ndarray, Columns, list[
         kept.append(i)
         parts.append(named.channels)
     if not kept:
-        fix = "Check files.name_pattern in the rig config."
-        reason = f"none of {len(entries)} file names is matched."
-        raise CampaignError([*faults[:3], Fault("not_matched", reason, fix=fix)])
+        pattern = config.files.name_pattern
+        nearest = max(faults, key=lambda fault: len(pattern) - len(matched_part(pattern, fault.file)[1]))
+        reason = f"none of {len(entries)} files is matched; of this one, the nearest, {nearest.reason}"
+        raise CampaignError([replace(nearest, reason=reason, severity="error", action="stopped")])
     return np.array(kept), columns_of(parts), faults
 
 
