@@ -67,7 +67,9 @@ def add_order(entries: Entries, columns: Columns, config: Config) -> tuple[Colum
         for i, (text, time) in enumerate(zip(texts, times, strict=True))
         if text is not None and time is None
     ]
-    columns = columns | {"started_at": mapped(texts, lambda text: read[text].isoformat() if read[text] else text)}
+    as_given = not formats and config.files.started_at is None
+    as_iso = {text: time.isoformat() if time and not (as_given and _iso(text)) else text for text, time in read.items()}
+    columns = columns | {"started_at": mapped(texts, as_iso.__getitem__)}
     if any(time.tzinfo for time in times if time is not None):
         times = mapped(times, lambda time: (time if time.tzinfo else time.replace(tzinfo=UTC)).astimezone(UTC))
     moments = pd.Series(pd.to_datetime(pd.Series(times, dtype=object), utc=True))
