@@ -63,6 +63,24 @@ date_format = "%Y%m%d %H%M"
     assert started(tmp_path, rig) == (ISO[:2], HOURS[:2])
 
 
+def test_two_header_lines_of_a_trace(tmp_path):
+    for name, clock in (("a", "09:30:00"), ("b", "11:00:00")):
+        trace(tmp_path, f"{name}.csv")
+        text = (tmp_path / f"{name}.csv").read_text()
+        (tmp_path / f"{name}.csv").write_text(f"Datum: 01.03.2024\nZeit: {clock}\n{text}")
+    rig = r"""[files]
+glob = "*.csv"
+name_pattern = "(?P<run_id>.)[.]csv"
+compute = {aging_days = "4"}
+started_at = {date = "started_day", time = "started_clock"}
+date_format = "%d.%m.%Y %H:%M:%S"
+[trace]
+header_lines = 3
+header_fields = {started_day = 'Datum: (\S+)', started_clock = 'Zeit: (\S+)'}
+"""
+    assert started(tmp_path, rig) == (ISO[:2], HOURS[:2])
+
+
 def test_times_with_zones_are_instants(tmp_path):
     rig = '[files]\ndate_format = "%d.%m.%Y %H:%M %z"\n'
     times, hours = started(log(tmp_path, ["01.03.2024 09:30 +0100", "01.03.2024 09:30 +0000", ISO[1] + "Z"]), rig)
