@@ -180,7 +180,9 @@ def ingest_campaign(
         raise CampaignError(_nothing_left(faults, len(listing)))
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
-    faults += incomplete_columns(steady) + improbable_loads(steady, config)
+    faults += incomplete_columns(steady, config.series_columns if config.aging else ()) + improbable_loads(
+        steady, config
+    )
     strokes = strokes.assign(used=_still_used(strokes, steady))
     parts = reader.reestimated(parts, _ruled_out(plan, strokes, files))
     used = np.zeros(len(listing), bool)

@@ -7,7 +7,7 @@ a stuck one, nor a slow rig for a gappy one. Single samples and the commanded sp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import pandas as pd
@@ -314,21 +314,24 @@ NO_VALUE = "(no value)"  # level of a category in files without one
 CALENDAR = ("run_order", "elapsed_h")  # both from started_at
 
 
-def incomplete_columns(steady: pd.DataFrame) -> list[Fault]:
+def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) -> list[Fault]:
     """Return, for every column that some files have no value of, how many, what that does, and the fix.
 
     Parameters
     ----------
     steady : DataFrame
         Table `steady`; rows with `used` false are left out.
+    aged_only : collection of str
+        Columns that unaged rubber need not have: how others are aged.
     """
     used = steady[steady["used"].to_numpy(bool)]
+    aged = used["aging_days"] != 0 if aged_only else True
     files = used["file"].nunique()
     fixed, faults = set(STEADY.names()) - set(CALENDAR) - {"load_N"}, []
     for name in used.columns:
         if name in fixed:
             continue
-        missing = used["file"][used[name].isna()].nunique()
+        missing = used["file"][used[name].isna() & (aged if name in aged_only else True)].nunique()
         if 0 < missing < files:
             reason = f"{missing} of {files} files have no value: {_what_follows(name, used[name], missing / files)}."
             fix = "Fill started_at." if name in CALENDAR else "Fill it for these files too."

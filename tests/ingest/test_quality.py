@@ -6,6 +6,7 @@ from sealfit.config import Config, Quality, Strokes, parse_config
 from sealfit.errors import Fault
 from sealfit.ingest.quality import (
     improbable_loads,
+    incomplete_columns,
     load_faults,
     quality_table,
     speed_column_faults,
@@ -289,3 +290,12 @@ def test_true_loads_are_not_blamed_nor_what_is_not_used_nor_a_torque():
     assert improbable_loads(steady_of(5.0), torque) == []
     small = parse_config('[quantities]\nforce = {quantity = "friction force", unit = "mN"}\n', "rig.toml")
     assert improbable_loads(steady_of(49.03, force=47070.0), small) == []
+
+
+def test_unaged_rubber_needs_no_temperature_and_aged_rubber_does():
+    rows = {"file": ["a", "b", "c"], "used": True, "aging_days": [0.0, 4.0, 8.0]}
+    unaged = pd.DataFrame(rows | {"temperature_C": [np.nan, 60.0, 60.0]})
+    assert incomplete_columns(unaged, ["temperature_C"]) == []
+    aged = pd.DataFrame(rows | {"temperature_C": [np.nan, np.nan, 60.0]})
+    (fault,) = incomplete_columns(aged, ["temperature_C"])
+    assert (fault.column, fault.value) == ("temperature_C", 1.0)
