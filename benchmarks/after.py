@@ -1,4 +1,4 @@
-"""How often the 95 % intervals of the after-model hold the truth, counted on simulated campaigns with hidden effects.
+"""Coverage of the 95 % intervals of the after-model on simulated campaigns with hidden effects.
 
     python benchmarks/after.py [KIND ...] [--campaigns N] [--seed S] [--strength STRENGTH] [--workers W]
 

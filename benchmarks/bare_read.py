@@ -1,4 +1,4 @@
-"""The least that reading a campaign can cost: a bare loop of pyarrow.csv.read_csv over its files.
+"""Lower bound of the time to read a campaign: a loop of pyarrow.csv.read_csv over its files.
 
     python benchmarks/bare_read.py CAMPAIGN
 

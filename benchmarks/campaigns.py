@@ -24,7 +24,8 @@ from sealfit.simulation import Spec, simulate
 
 Strength = Literal["faint", "weak", "medium", "strong"]
 STRENGTHS: dict[Strength, float] = {"weak": 1.0, "medium": 3.0, "strong": 10.0}
-FAINT = 0.002  # below what some 200 files can show, inside files too
+# Size of an effect that some 200 files cannot show, relative to medium effects.
+FAINT = 0.002
 
 SPEEDS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 50.0)
 ONE_WAY: dict[Size, dict] = {

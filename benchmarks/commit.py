@@ -1,4 +1,4 @@
-"""Which build of the program a result is of: the commit, and what has been changed since."""
+"""The build of the program: the commit, and the uncommitted changes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import subprocess
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-CODE = ("*.py", "*.toml")  # what can change a number
-SHOWN = 12  # characters of the hash of uncommitted changes
+# Files whose changes can change a number.
+CODE = ("*.py", "*.toml")
+# Number of characters of the hash of uncommitted changes.
+SHOWN = 12
 
 
 def newest_commit(folder: Path = HERE) -> str:
-    """Return the hash of the newest commit of the repository that holds a folder."""
+    """Return the hash of the newest commit of the repository of a folder."""
     return _git(folder, "rev-parse", "HEAD").strip()
 
 

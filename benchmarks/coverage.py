@@ -1,8 +1,8 @@
-"""How often the 95 % intervals that sealfit prints hold the truth, counted on simulated campaigns.
+"""Coverage of the 95 % intervals of sealfit on simulated campaigns.
 
     python benchmarks/coverage.py [steady] [aging] [laws] [dynamic] [--campaigns N] [--seed S] [--workers W]
 
-Prints, per design and number, the share of the intervals that hold the truth, the share called identified and the
+Prints, per design and number, the share of the intervals that contain the truth, the share called identified and the
 median half-width relative to the truth; and per part all of them pooled, with a standard error that takes campaigns as
 clusters. "laws" counts the law for all series fitted to the forces, what evidence chooses, and lifetimes by the true
 law and over all laws; "dynamic" starts from traces and also counts break-aways found where there is none. Intervals of
@@ -41,7 +41,8 @@ DAYS = (0, 1, 2, 4, 8, 12, 16)
 FEW, SIX, FIVE = (0.5, 2, 5, 12, 60), (0.5, 2, 5, 10, 25, 60), (1, 3, 8, 20, 60)
 TRIPLE = ((40.0, 80.0), (60.0, 80.0), (80.0, 80.0))
 GRID = tuple((celsius, percent) for celsius in (40.0, 60.0, 80.0) for percent in (80.0, 90.0))
-ENERGY, KAPPA = 80.0, 0.02  # kJ/mol, 1/%
+# True activation energy in kJ/mol, and coefficient of the height in 1/%.
+ENERGY, KAPPA = 80.0, 0.02
 BRISTLES = {"sigma_0": 100.0, "sigma_1": 0.5}
 RIG = (
     {"kind": "white", "sd_N": 0.1},
@@ -137,7 +138,7 @@ def laws(settings: dict, seed: int) -> Iterator[Entry]:
         fitted, chosen = fit_joint_law(aged, "log", "rate"), fit_laws(aged)
         for name, _, low, high, known in fitted.parameters():
             yield Entry(f"{quantity} {name}", (law | varied)[name], low, high, known)
-        likely = [(one.loss.name, one.way) for one in (chosen[0], *rivals_of(chosen))]
+        likely = [(one.loss.name, one.acts_on) for one in (chosen[0], *rivals_of(chosen))]
         yield Entry(f"{quantity}: the true law is the likeliest", likely[0] == ("log", "rate"), None, None)
         yield Entry(f"{quantity}: the true law is the likeliest or a rival", ("log", "rate") in likely, None, None)
         yield from _lives(quantity, law, fitted, chosen, middle, seed)
@@ -229,7 +230,7 @@ def report(title: str, campaigns: Sequence[Sequence[Entry]]) -> None:
 
 
 def held(entries: Sequence[Entry], name: str | None = None) -> tuple[int, int]:
-    """Return how many of a campaign's intervals hold the truth, and how many there are."""
+    """Return the number of a campaign's intervals that contain the truth, and their total number."""
     own = [e for e in entries if e.low is not None and name in (None, e.name)]
     low, high = (np.array([e[k] for e in own], float) for k in (2, 3))
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)

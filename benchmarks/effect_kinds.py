@@ -1,4 +1,4 @@
-"""The kinds of effect that benchmark campaigns hide: of the catalogue and outside it, one, two or three at once.
+"""The kinds of effect in benchmark campaigns: of the catalogue and outside of it, one to three at once.
 
 `EFFECT_CAMPAIGNS[name](k)` gives (effects, channels) of a SPEC at strength k; `DESIGNS[name]` what the kind's design
 needs beyond the common one, by size. At k = 1 each effect has an RMS of 0.25 to 2 times one file's scatter.

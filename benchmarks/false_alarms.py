@@ -1,4 +1,4 @@
-"""Count what the loop claims: on campaigns in which nothing is missing, and on campaigns with known effects.
+"""Count the claims of the loop on campaigns without effects and on campaigns with known effects.
 
     python benchmarks/false_alarms.py --seeds 3                     the 8 kinds of null
     python benchmarks/false_alarms.py --effects --strength strong   the kinds with effects

@@ -1,4 +1,4 @@
-"""Figures measured side by side: what is compared is done in turns, and ratios are taken within a turn."""
+"""Paired measurements: the programs to compare run alternately, and ratios are computed within a turn."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def heading(seed: int | None, cores: Iterable[int]) -> None:
 
 
 def cpu_model() -> str:
-    """Return the name of the processor, as far as the system tells it."""
+    """Return the name of the processor, if the system provides it."""
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
     except OSError:

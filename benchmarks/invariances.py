@@ -1,4 +1,4 @@
-"""Whether claims hang on what does not matter: campaigns changed in ways that change nothing, and analysed again.
+"""Invariance of claims: campaigns are changed in irrelevant ways and analysed again.
 
     python benchmarks/invariances.py --list
     python benchmarks/invariances.py --out out/invariances.jsonl [--campaigns ripple drift] [--changes jitter_time_1e-6]
@@ -48,11 +48,16 @@ from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.strokes import find_strokes
 from sealfit.simulation import Spec, simulate
 
-OF_SE = 0.1  # of a standard error, by which a number may move
-BINNED = 0.5  # where the bins are others
-CHANCE = 3.0  # standard deviations by which an estimate from fewer data may differ
-ROUNDING = 1e-5  # of a number that has no interval
-ERROR = 0.1  # of the ratio of the errors after and before
+# Largest change of a number, in standard errors.
+OF_SE = 0.1
+# The same for a change with other bins.
+BINNED = 0.5
+# Largest difference of an estimate from fewer data, in standard deviations.
+CHANCE = 3.0
+# Largest relative change of a number without interval.
+ROUNDING = 1e-5
+# Largest relative change of the ratio of the errors after and before.
+ERROR = 0.1
 PREFIXES = {"N": 1.0, "mN": 1e-3, "mm": 1e-3, "m": 1.0, "s": 1.0, "ms": 1e-3}
 
 # ---------------------------------------------------------------- campaigns
@@ -67,7 +72,8 @@ NULLS = {
     "null_setup": ({"kind": "run_setup", "sd_rel": 0.01, "sd_N": 0.1}, {"kind": "white", "sd_N": 0.05}),
 }
 MANY_RUNS = {**ONE_WAY, "days": (4.0,), "speeds_mm_s": tuple(np.geomspace(0.5, 50.0, 16).round(2)), "repeats": 2}
-SHORT = {**ONE_WAY, "days": (), "repeats": 2}  # ten files
+# A design of ten files.
+SHORT = {**ONE_WAY, "days": (), "repeats": 2}
 DESIGNS = {
     "column": MANY_RUNS,
     "batch": MANY_RUNS,
@@ -83,7 +89,8 @@ DESIGNS = {
     "short": SHORT,
     "aging_induction": {**AGED, "speeds_mm_s": (0.5, 5.0, 50.0)},
 }
-STRENGTH = 10.0  # strong, as campaigns.py has it
+# Strength of effects: strong in `campaigns.py`.
+STRENGTH = 10.0
 OWN_NAME = (
     "asymmetry", "bump", "log_rate", "warming_power", "lab_temperature", "column_of_the_trace", "column_step",
     "product", "two_at_once",
@@ -149,7 +156,7 @@ def names() -> list[str]:
 
 
 def campaign(name: str) -> Campaign:
-    """Return a campaign as it is."""
+    """Return a campaign unchanged."""
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "c"
         if name in ("kidney", "emps"):
@@ -485,7 +492,7 @@ def factor(unit: str) -> float:
 
 # ---------------------------------------------------------------- the table
 def main(arguments: list[str] | None = None) -> int:
-    """Run what is asked for, print the table, and return 1 if anything moved."""
+    """Run the command line, print the table, and return 1 if any result changed."""
     parser = argparse.ArgumentParser(description="Close the loop again on campaigns changed in what does not matter.")
     parser.add_argument("--list", action="store_true", help="print campaigns and changes")
     parser.add_argument("--campaigns", nargs="+", choices=names(), default=names(), metavar="NAME")

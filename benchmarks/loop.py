@@ -1,4 +1,4 @@
-"""Close the loop on campaigns of hidden truth, and hold claims, predictions and intervals against it.
+"""Close the loop on simulated campaigns, and compare claims, predictions and intervals with the truth.
 
     python benchmarks/loop.py --out FILE [--kinds K ...] [--seeds 1 2 3 4] [--strengths weak medium strong] [--nulls]
     python benchmarks/loop.py --summary FILE
@@ -50,7 +50,7 @@ def plan(
 
 
 def run(tasks: list[Task], out: Path, workers: int, *, limit: float) -> None:
-    """Run what `out` does not hold yet, appending each result as it comes; no new ones after `limit` seconds."""
+    """Run the campaigns that `out` lacks and append each result; start none after `limit` seconds."""
     done = {key(record) for record in read(out)}
     todo = [t for t in tasks if t.key not in done]
     print(f"{len(todo)} of {len(tasks)} campaigns to run", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Measure the whole loop on some 600 files of 1,000 rows with 10 columns that mean nothing: wall seconds and memory.
+"""Measure the whole loop on some 600 files of 1,000 rows with 10 irrelevant columns: wall seconds and memory.
 
     python benchmarks/loop_cost.py [KIND] [--strength strong] [--seed 1] [--workers 2]
 

@@ -16,8 +16,10 @@ from counts import bounds
 CLEAR, UNSEEN = 8.0, 0.5
 RIVALS = ("plain", "boosting", "ebm", "pygam", "pysindy")
 ORDER = ("-", "faint", "weak", "medium", "strong")
-WORSE = 1.02  # after-error above this times before counts as worse
-NEAR = 1.3  # the after-error may be this times that of the true form
+# The error counts as worse from this ratio of after to before.
+WORSE = 1.02
+# Largest ratio of the after-error to that of the true form.
+NEAR = 1.3
 POWER_EDGES = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
 
 

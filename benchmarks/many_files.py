@@ -28,10 +28,13 @@ from sealfit.physics import aging_law, stribeck_force
 SPEEDS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 50.0)
 REPEATS = 3
 PER_FOLDER = 1000
-STARTS = 16  # starting points of a stroke
+# Number of starting points of a stroke.
+STARTS = 16
 STROKE_MM, RAMP_S, RISE_MM = 20.0, 0.1, 0.3
-REST_ROWS = 0.05  # share of the rows before it moves
-SCATTER = 0.005  # of specimen, set-up and repeat each, relative
+# Share of the rows before the motion starts.
+REST_ROWS = 0.05
+# Relative scatter of specimen, set-up and repeat each.
+SCATTER = 0.005
 NOISE_N, POSITION_NOISE_MM = 0.1, 0.002
 MU_S, MU_C = {"mu_0": 0.935, "b": 0.08}, {"mu_0": 0.61, "b": 0.13}
 V_S, SIGMA_2 = 5.0, 0.05

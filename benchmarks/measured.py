@@ -14,10 +14,14 @@ import numpy as np
 import pandas as pd
 
 ROOT = Path(__file__).resolve().parents[1]
-FORCE_PER_VOLT = 35.15065  # N/V, gain of the drive as published
-SPEEDS = (42.0, 83.0, 125.0)  # mm/s, of the plateaus
-STILL, MOVING = 60.0, 15.0  # mm/s^2 and mm/s: less acceleration and more speed than these is a plateau
-SHORTEST, MARGIN = 120, 30  # samples of a plateau, and those left out at each of its ends
+# Published gain of the drive in N/V.
+FORCE_PER_VOLT = 35.15065
+# Speeds of the plateaus in mm/s.
+SPEEDS = (42.0, 83.0, 125.0)
+# A plateau has less acceleration (mm/s^2) and more speed (mm/s) than these.
+STILL, MOVING = 60.0, 15.0
+# Smallest number of samples of a plateau, and number of samples excluded at each end.
+SHORTEST, MARGIN = 120, 30
 EMPS_CONFIG = """
 name = "emps"
 condition = ["axis"]

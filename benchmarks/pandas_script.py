@@ -1,4 +1,4 @@
-"""The script that an engineer would write for this campaign with pandas and scipy: what `sealfit run` is timed against.
+"""A script for this campaign with pandas and scipy, as an engineer would write it, to compare with `sealfit run`.
 
     python benchmarks/pandas_script.py CAMPAIGN OUT [--resamples 200]     (some minutes for the paper's 1,752 files)
 
@@ -19,8 +19,10 @@ from scipy.optimize import curve_fit
 CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
 PARAMETERS = ["mu_s", "mu_c", "v_s", "sigma_2"]
 LAW = ["mu_0", "a", "b"]
-ENDS_MM = 2.0  # left out after the start and before the stop: pre-sliding and ramps
-GRID = 200  # points of a mean trace
+# Distance in mm that is excluded after the start and before the stop: pre-sliding and ramps.
+ENDS_MM = 2.0
+# Number of points of a mean trace.
+GRID = 200
 
 
 def steady_friction(x, mu_s, mu_c, v_s, sigma_2):

@@ -20,7 +20,8 @@ from sealfit.report.style import BLACK, CYCLE, FLOOR, QUIET, Key, Panel, Plot, s
 TEMPERATURES, COMPRESSIONS, DAYS = (20, 40, 60, 80), (80, 90, 100), (1, 2, 4, 8, 12, 16)
 SENSITIVITY = {"mu_s": (0.25, 0.275, 0.30, 0.325, 0.35), "mu_c": (0.20, 0.225, 0.25, 0.275, 0.30)}  # its section 2.3
 HELD = {"mu_s": 0.30, "mu_c": 0.30, "v_s": 5.0, "sigma_2": 0.2}
-LOAD = 50.0  # N
+# Normal load in N.
+LOAD = 50.0
 At = tuple[float, float, float]
 
 

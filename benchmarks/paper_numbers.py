@@ -1,4 +1,4 @@
-"""The numbers that the source paper prints, and where ours stand in the tables of an analysed campaign."""
+"""The numbers of the source paper, and their counterparts in the tables of an analysed campaign."""
 
 from __future__ import annotations
 
@@ -26,9 +26,12 @@ MEASURED = (  # section, quantity, condition (°C, %, days), value; None for una
     ("4.3", "mu_c", (60, 80, 4), 0.48429),
     ("4.3", "mu_c", (60, 80, 16), 0.44781),
 )
-PREDICTED = (("mu_s", 16.0, 0.7), ("mu_c", 16.0, 0.48082))  # by its Eq. 15
-LARGEST = ((None, 49.4), ((80, 80, 16), 35.1))  # friction force in N
-SERIES = "temperature_C=60, compression_ratio_pct=80"  # of Eq. 15 as printed
+# Values that the paper predicts by its Eq. 15.
+PREDICTED = (("mu_s", 16.0, 0.7), ("mu_c", 16.0, 0.48082))
+# Friction force in N.
+LARGEST = ((None, 49.4), ((80, 80, 16), 35.1))
+# Series of Eq. 15 as printed.
+SERIES = "temperature_C=60, compression_ratio_pct=80"
 
 
 class Line(NamedTuple):

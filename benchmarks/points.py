@@ -13,7 +13,8 @@ from sealfit.fit.joint.rows import Rows, point_rows
 from sealfit.simulation import Spec
 from sealfit.simulation.channels import CategoryChannel, NumericChannel, SlowChannel
 
-BETWEEN = 0.5  # share of the aged points at days between the tested ones
+# Share of the aged points at days between the tested ones.
+BETWEEN = 0.5
 
 
 def draw_points(bins: pd.DataFrame, spec: Spec, count: int, rng: np.random.Generator) -> pd.DataFrame:

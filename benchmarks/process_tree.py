@@ -18,8 +18,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-LOOK_EVERY_S = 0.2  # a look takes about 2 ms: one percent of one core
-KIBI = 1 if sys.platform == "darwin" else 1024  # unit of ru_maxrss
+# Interval of measurements in s. One takes about 2 ms, one percent of a core.
+LOOK_EVERY_S = 0.2
+# Unit of `ru_maxrss` in bytes.
+KIBI = 1 if sys.platform == "darwin" else 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +109,7 @@ def tree(root: int) -> list[int]:
 
 
 def memory(pids: Collection[int], proportional: bool = True) -> tuple[int, int]:
-    """Return the resident and the proportional sets of processes, in bytes; the latter 0 where it is not told."""
+    """Return the resident and the proportional sets of processes, in bytes; the latter 0 if unknown."""
     resident = shared_out = 0
     for pid in pids:
         try:

@@ -21,9 +21,12 @@ from sealfit.fit.joint.rows import Rows
 
 MOST_ROWS = 4000
 EBM_ROUNDS = 500  # by itself it goes on, as a file's rows stand on both sides of its validation: no better, 90 s
-RIDGE = 0.01  # of the number of rows, on standardised columns: several channels say much the same here
-FEW = 8  # different values up to which a number is a factor for the additive model
-THRESHOLD = 0.05  # of the residual's SD: terms below it are dropped from the sparse regression
+# Ridge penalty on standardised columns, relative to the number of rows, as several channels are collinear.
+RIDGE = 0.01
+# Largest number of different values of a numeric channel that is a factor in the additive model.
+FEW = 8
+# Terms below this share of the standard deviation of the residual are dropped from the sparse regression.
+THRESHOLD = 0.05
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ def make_inputs(rows: Rows, points: pd.DataFrame, ignore: Sequence[str] = ()) ->
 
 
 def boosting(inputs: Inputs, residual: np.ndarray, seed: int) -> np.ndarray:
-    """Return the residual by scikit-learn's histogram gradient boosting, as it comes; shape (m,)."""
+    """Return the residual by scikit-learn's histogram gradient boosting with default settings, shape (m,)."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
     model = HistGradientBoostingRegressor(categorical_features=list(inputs.categories), random_state=seed)

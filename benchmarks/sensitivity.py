@@ -28,17 +28,21 @@ from counts import bounds
 from sealfit.closure.channels import scaled
 from sealfit.closure.confirm import Context
 from sealfit.closure.score_test import project
-from sealfit.closure.selection import Selection, grow, numbered, steady_samples
+from sealfit.closure.selection import Selection, numbered, select_effects, steady_samples
 from sealfit.closure.sensitivity import sensitivity
 from sealfit.closure.subsampling import merged_bins
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.rows import make_rows
 
-ALIKE = 0.9  # correlation, after projection, from which two effects are one here
-LARGEST_PCT = 30.0  # stated sizes above are not tried: so large an effect is not linear any more
-ENTRIES = 3  # of a design
-BINS = 6  # of a stroke
+# Correlation after projection from which two effects count as one.
+ALIKE = 0.9
+# Largest stated size, in percent, that is tried. Larger effects are not linear.
+LARGEST_PCT = 30.0
+# Number of entries of a design.
+ENTRIES = 3
+# Number of bins of a stroke.
+BINS = 6
 MOST_FILES = 200
 CONFIG = Config()
 GROUPS = {
@@ -169,21 +173,27 @@ def close(bins: pd.DataFrame) -> Selection:
     """Return the end of the loop."""
     rows = make_rows(merged_bins(numbered(bins), CONFIG.loop.seed), has_aging=True)
     traces = bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(presliding_N=0.0, steady=True)
-    return grow(rows, steady_samples(traces, rows), Context(CONFIG, EFFECTS))
+    return select_effects(rows, steady_samples(traces, rows), Context(CONFIG, EFFECTS))
 
 
-def outcome(grown: Selection, entry: dict, effect: np.ndarray) -> str:
+def outcome(selection: Selection, entry: dict, effect: np.ndarray) -> str:
     """Return how an effect came out: found, same, shown (significant, in no model), other or none."""
     name = entry["variable"]
-    for item in grown.added:
+    for item in selection.added:
         if name in item.proposal.term.channels:
             return "found"
-    true = project(grown.before, effect[:, None])[:, 0]
-    for item in grown.added:
+    true = project(selection.before, effect[:, None])[:, 0]
+    for item in selection.added:
         alike = abs(true @ item.proposal.column) / np.linalg.norm(true) / np.linalg.norm(item.proposal.column)
         if alike > ALIKE or any(name in r.term.channels for r in item.rivals):
             return "same"
-    return "shown" if grown.left or grown.unsure or grown.refused else "other" if grown.added else "none"
+    return (
+        "shown"
+        if selection.left or selection.inconclusive or selection.refused
+        else "other"
+        if selection.added
+        else "none"
+    )
 
 
 def run(number: int, *, files: bool) -> list[dict]:

@@ -1,4 +1,4 @@
-"""Null campaigns whose slow strokes are few bristle lengths long: what the loop invents, and what the intervals hold.
+"""Null campaigns with slow strokes of few bristle lengths: false claims of the loop, and coverage of its intervals.
 
     python benchmarks/short_strokes.py                                      all ratios, 4 seeds of every design
     python benchmarks/short_strokes.py --ratios 3 11 --seeds 2 --designs plain noisy
@@ -33,13 +33,16 @@ from sealfit.fit.steady.fit import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
 
 LOAD, SIGMA_0, SIGMA_2, V_S = 49.03, 100.0, 0.05, 5.0
-LAW = {"mu_s": (0.93513, 0.04448, 0.0804), "mu_c": (0.609, 0.03307, 0.1324)}  # mu_0, a, b of Eq. 15
+# mu_0, a and b of Eq. 15.
+LAW = {"mu_s": (0.93513, 0.04448, 0.0804), "mu_c": (0.609, 0.03307, 0.1324)}
 DAYS = (0.0, 1.0, 4.0, 8.0, 16.0)
 SPEEDS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 SHORT_SPEEDS, LONG_MM = 3, 40.0
 RATIOS = (3.0, 6.0, 11.0, 30.0, 100.0, 300.0)
-REPEAT_SD = 0.007  # of the friction, from file to file
-STEPS = 16  # per sample, of the integration along a ramp
+# Relative standard deviation of the friction between files.
+REPEAT_SD = 0.007
+# Integration steps per sample along a ramp.
+STEPS = 16
 
 
 @dataclass(frozen=True)

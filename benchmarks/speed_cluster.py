@@ -18,8 +18,10 @@ from process_tree import Watched, watched
 from sealfit.engine.run_map import on_cluster, run_map
 
 TASKS, SENT, ANSWERED = 1_000, 60_000, 120_000  # bytes that a part of some 230 files sends and answers
-PER_PART = 230  # files, on average
-MANY = 10_000_000  # files that are reckoned with
+# Mean number of files in a partition.
+PER_PART = 230
+# Number of files of the extrapolation.
+MANY = 10_000_000
 WORKERS = (2, 128, 1024)
 
 

@@ -44,7 +44,7 @@ def startup(cores: Sequence[int], repeats: int) -> None:
 
 
 def commands(folder: Path) -> Iterator[tuple[str, list]]:
-    """Yield every command with arguments that let it work; each is to be run before the next is asked for."""
+    """Yield every command with valid arguments; each must be run before the next."""
     out, points = folder / "out", folder / "points.csv"
     one = ["--workers", "1"]
     yield "--help", ["--help"]

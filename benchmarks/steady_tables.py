@@ -7,7 +7,8 @@ import pandas as pd
 
 from sealfit.physics import aging_law, stribeck_force
 
-MU_S = {"mu_0": 0.93513, "a": 0.04448, "b": 0.0804}  # the source's laws, 80 degC and 80 %
+# Law of the source at 80 degC and 80 %.
+MU_S = {"mu_0": 0.93513, "a": 0.04448, "b": 0.0804}
 MU_C = {"mu_0": 0.609, "a": 0.03307, "b": 0.1324}
 SPEEDS = (0.5, 1, 2, 4, 8, 16, 32, 64)
 
@@ -32,13 +33,13 @@ def steady_rows(
 ):
     """Table `steady` of a campaign with known truth; noise, setup and specimen are relative, constant in N.
 
-    With `together` the two ways stand in one file, and its set-up and noise are those of both.
+    With `together` both directions are in one file and share its set-up and noise.
     """
     rng = np.random.default_rng(seed)
     rows, drawn = [], {}
 
     def once(*key):
-        """A standard normal number, the same both ways where they stand in one file."""
+        """A standard normal number, the same in both directions of one file."""
         if key not in drawn:
             drawn[key] = rng.normal()
         return drawn[key]

@@ -29,7 +29,8 @@ from sealfit.simulation import Spec
 from sealfit.simulation.motion import SteadyLaw, steady_law
 
 UNITS = ("stroke", "file", "run", "specimen")
-NO_INTERVAL = {("step", "x_0")}  # any place between two neighbouring values of the channel is the same step
+# Parameters without interval: a step is the same anywhere between two neighbouring values of the channel.
+NO_INTERVAL = {("step", "x_0")}
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def row_channels(law: SteadyLaw, rows: Rows) -> dict[str, np.ndarray]:
 
 
 def evidence_unit(term: Term, rows: Rows) -> str:
-    """Return the level of the whole groups that bear witness to an effect: that of its finest channel."""
+    """Return the level of the unit of evidence of an effect: that of its finest channel."""
     order = ("sample", *UNITS)
     finest = min((unit_of(rows.values(name), rows) for name in channels_of(term, rows)), key=order.index)
     return flip_level(finest, rows)
@@ -123,7 +124,7 @@ class Tested:
 
 
 def test_true_forms(declared: Model, rows: Rows, scatter, true: list[TrueEffect]) -> tuple[list[Tested], Fitted]:
-    """Return each true effect's test, and the true form fitted as a whole (nothing held)."""
+    """Return the test of each true effect, and the fit of the true form with all parameters free."""
     held = declared
     for effect in true:
         fixed = {p.name: (effect.values[p.name],) * 2 for p in effect.term.effect.nonlinear}
@@ -132,7 +133,7 @@ def test_true_forms(declared: Model, rows: Rows, scatter, true: list[TrueEffect]
     known = fit(held, rows, scatter, turns=2)
     tests = []
     for number, effect in enumerate(true):
-        first = held.place(number).start
+        first = held.term_slice(number).start
         places = [first + k for k, p in enumerate(effect.term.effect.parameters) if p.linear]
         covariance = _wider(known, effect.unit)[np.ix_(places, places)]
         fitted = known.model.values[number]
@@ -160,7 +161,7 @@ test_true_forms.__test__ = False  # a test of effects, not of this program
 
 
 def _wider(fitted: Fitted, unit: str) -> np.ndarray:
-    """Return the covariance of the fitted scatter, widened to what whole groups of a unit show where that is more."""
+    """Return the covariance of the fitted scatter, or the cluster-robust one of a unit if larger."""
     usual, robust = fitted.covariance, robust_covariance(fitted, unit)
     grow = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(usual), 1e-300), 1.0))
     return usual * np.outer(grow, grow)

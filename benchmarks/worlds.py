@@ -1,4 +1,4 @@
-"""Worlds drawn at random: campaigns of an independent simulator, sealfit run on them, its answers held to the truth.
+"""Random campaigns of an independent simulator: sealfit is run on them and its results are compared with the truth.
 
     python benchmarks/worlds.py --out FILE [--count 100] [--size small|any] [--jobs 1] [--workers 1] [--minutes 60]
     python benchmarks/worlds.py --summary FILE

@@ -76,6 +76,12 @@ class StartedAt(Strict):
 class TraceFormat(Strict):
     """How one trace file is written."""
 
+    format: Literal["csv", "xlsx", "tdms", "mat", "parquet"] | None = Field(
+        None, description="what the files are; without it their endings say so"
+    )
+    sheet: str | int | None = Field(None, description="xlsx: name or number (from 1) of the sheet with the data")
+    group: str | None = Field(None, description="tdms: group of the channels")
+    variable: str | None = Field(None, description="mat: struct or matrix with the data, or '(vectors)'")
     encoding: str = Field(
         "auto", description="utf-8, latin-1, utf-16, or auto (byte-order mark, then UTF-8, then Latin-1)"
     )
@@ -108,6 +114,11 @@ class TraceFormat(Strict):
     integrate_displacement: str | None = Field(None, description="speed column whose time integral is displacement")
     integrate_per: Literal["s", "min"] = Field("s", description="time unit of that speed: rpm is per min")
 
+    @property
+    def their_columns(self) -> dict[str, str | int]:
+        """Our name = the file's column name, or its position from 1."""
+        return {ours: column.name for ours, column in self.columns.items()}
+
 
 class Files(Strict):
     """Where the trace files are when runs.csv does not list them, and what their names say."""
@@ -138,6 +149,8 @@ class Files(Strict):
     runs_columns: FileColumns = Field(
         default_factory=dict, description="our name = runs.csv's column name; with a unit {name = .., unit = ..}"
     )
+    runs_table: str | None = Field(None, description="table to read as runs.csv: .csv, .xlsx or .parquet")
+    runs_sheet: str | int | None = Field(None, description="xlsx: name or number (from 1) of its sheet")
 
     @property
     def copies(self) -> dict[str, str]:

@@ -54,7 +54,7 @@ class Fault:
 # A fault that many files share is one message.
 
 EXAMPLES = 3  # places that such a message names; no more files than that are named each by itself
-RUNS_CSV = "runs.csv"  # its lines are trace files
+RUNS_TABLES = ("runs.csv", "runs.xlsx", "runs.parquet")  # their lines are trace files
 
 
 def grouped(faults: Iterable[Fault]) -> list[list[Fault]]:
@@ -124,7 +124,7 @@ def one_reason(group: Sequence[Fault]) -> bool:
 
 
 def _place(fault: Fault) -> tuple:
-    return (fault.file, fault.line) if fault.file == RUNS_CSV else (fault.file,)
+    return (fault.file, fault.line) if fault.file in RUNS_TABLES else (fault.file,)
 
 
 def _shared(fault: Fault) -> tuple:
@@ -133,7 +133,7 @@ def _shared(fault: Fault) -> tuple:
         re.sub(r"\d[\d.,]*", "#", text.replace(fault.file, "") if fault.file else text)
         for text in (fault.reason, fault.fix)
     )
-    return (fault.check, fault.severity, fault.action, fault.column, fault.file == RUNS_CSV, *words)
+    return (fault.check, fault.severity, fault.action, fault.column, fault.file in RUNS_TABLES, *words)
 
 
 # ---------------------------------------------------------------- the nearest

@@ -13,7 +13,7 @@ from sealfit.errors import CampaignError, Fault
 from sealfit.progress import Silent, timed
 from sealfit.store.manifest import STEPS, ConfigCopy, fingerprint, glob_names
 from sealfit.store.out_folder import Store
-from sealfit.store.paths import RUNS, campaign_folder, existing_out, own_effects_folder
+from sealfit.store.paths import campaign_folder, existing_out, own_effects_folder, possible_tables
 from sealfit.store.staged_writes import Staged
 
 if TYPE_CHECKING:
@@ -170,7 +170,8 @@ def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
         from sealfit.ingest.campaign import Place, ingest_campaign
 
     campaign, config = store.state.campaign, store.seen_config("ingest")
-    runs_before = fingerprint(campaign / RUNS)  # as it was when the reading began
+    # As they were when the reading began.
+    runs_before = {name: fingerprint(campaign / name) for name in possible_tables(config)}
     place = Place(staged.folder(), store.parts(), store.marks)
     with progress.counting("reading trace files") as on_file:
         ingested = ingest_campaign(campaign, config, workers=workers, on_file=on_file, place=place)
@@ -183,7 +184,7 @@ def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
     named = {fault.file for fault in ingested.faults if fault.file} | set(glob_names(campaign, config.files))
     # Missing or unreadable: if that changes, the campaign has changed.
     marks |= {name: fingerprint(campaign / name) for name in sorted(named - marks.keys())}
-    staged.inputs = marks | {RUNS: runs_before}
+    staged.inputs = marks | runs_before
     return int(ingested.tables["inputs"]["rows"].sum()), "samples"
 
 

@@ -174,8 +174,8 @@ BINS = Schema(
 )
 
 # ---------------------------------------------------------------- fits (long: one row per parameter)
-# The fits before the loop do not know its effects. Where the loop added some, the answer stands in the tables of the
-# same name with `_after`, which have no rows where nothing was added. `model` says in every row which of the two it is.
+# The fits before the loop are without effects. If the loop added effects, the tables with the suffix `_after` have the
+# fits after their subtraction; otherwise these are empty. Column `model` is "before" or "after".
 MODEL = Column("model", "", TEXT, "before: without effects | after: at the reference of the loop's effects")
 _FIT = (
     MODEL,
@@ -236,7 +236,7 @@ STEADY_AFTER = Schema(
     "steady_after",
     (
         *(replace(c, meaning=f"{c.meaning}, less `effects_N`") if c.name == "force_N" else c for c in STEADY.columns),
-        Column("effects_N", "N", FLOAT, "mean force of the effects that were taken out, over the steady window"),
+        Column("effects_N", "N", FLOAT, "mean force of the subtracted effects over the steady window"),
         Column("effects_start_N", "N", FLOAT, "force of these effects at the start of the stroke"),
     ),
     # Channels, and effects_u1_N, ...: directions in which the effects are uncertain, one standard error each.
@@ -254,7 +254,7 @@ EFFECTS = Schema(
         Column("acts_on", "", TEXT, "force, mu or a parameter of the declared model"),
         Column("operation", "", TEXT, "add | multiply"),
         Column("form", "", TEXT, "equation"),
-        Column("named", "", BOOL, "false where no form does as well as the free shape"),
+        Column("named", "", BOOL, "false where no closed form fits as well as the free shape"),
         Column("parameter", "", TEXT, "parameter, in the field's symbol"),
         Column("value", "", FLOAT, "estimate"),
         Column("lo95", "", FLOAT, "lower end of the 95 % interval"),
@@ -274,17 +274,22 @@ _RESIDUALS = (
 RESIDUALS_BEFORE = Schema("residuals_before", _RESIDUALS, open_=True)
 RESIDUALS_AFTER = Schema("residuals_after", _RESIDUALS, open_=True)
 
-# ---------------------------------------------------------------- what the report draws of the loop
+# ---------------------------------------------------------------- values of the report's plots of the loop
 LEVELS = Schema(
     "levels",
     (
         Column("stage", "", TEXT, "before | after"),
         Column("level", "", TEXT, "sample | stroke | file | run | specimen"),
-        Column("channel", "", TEXT, "null for the whole level; else the channel tested within it"),
-        Column("sd_N", "N", FLOAT, "standard deviation of the residual at this level (or that the channel orders)"),
+        Column("channel", "", TEXT, "null for the whole level; else the channel tested at it"),
+        Column(
+            "sd_N",
+            "N",
+            FLOAT,
+            "standard deviation of the residual at this level, or of the part that the channel explains",
+        ),
         Column("share", "", FLOAT, "share of the residual's variance"),
         Column("df", "", FLOAT, "degrees of freedom"),
-        Column("p_value", "", FLOAT, "that the channel orders it, adjusted over the search; null for a level"),
+        Column("p_value", "", FLOAT, "p-value of the channel, adjusted over the search; null for a level"),
     ),
 )
 CHANNELS = Schema(
@@ -338,12 +343,12 @@ AGING_LAWS = Schema(
         Column("law", "", TEXT, "log | stretched | power | induction, for all series; or separate laws"),
         Column("way", "", TEXT, "what temperature and compression change: rate | loss; empty where neither varies"),
         Column("form", "", TEXT, "equation"),
-        Column("rank", "", INT, "1: likeliest by Schwarz's criterion"),
-        Column("rival", "", BOOL, "true where these data cannot tell it from the likeliest"),
-        Column("criterion", "", FLOAT, "Schwarz's criterion above the likeliest's"),
-        Column("scatter_rel", "", FLOAT, "relative scatter between specimens that it leaves"),
-        Column("heldout_series", "", FLOAT, "RMS error at whole series it was not fitted to, in the quantity's unit"),
-        Column("heldout_last_day", "", FLOAT, "RMS error at the last days of all series, not fitted to"),
+        Column("rank", "", INT, "1: lowest BIC"),
+        Column("rival", "", BOOL, "true where it is not distinguishable from the best law with these data"),
+        Column("criterion", "", FLOAT, "BIC minus that of the best law"),
+        Column("scatter_rel", "", FLOAT, "relative scatter between specimens about the law"),
+        Column("heldout_series", "", FLOAT, "RMS error on held-out series, in the quantity's unit"),
+        Column("heldout_last_day", "", FLOAT, "RMS error on the held-out last days of all series"),
         Column("parameter", "", TEXT, "parameter; null for separate laws"),
         Column("value", "", FLOAT, "estimate"),
         Column("lo95", "", FLOAT, "lower end of the 95 % interval"),

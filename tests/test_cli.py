@@ -192,7 +192,7 @@ def test_run_does_every_step_and_says_so_in_a_few_lines(sealfit, parts, campaign
     assert "steady fit  a 1.5 a" in lines  # of the after-model: nothing in this stand-in's tables has a name
     assert "  before    mu_s 0.7 to 0.8" in lines
     assert "  before    not identified: mu_s in 1 of 3. Too few speeds." in lines
-    sentence = "one effect was missing and is added; no significant structure is left; the error is within the scatter"
+    sentence = "one effect was added; no significant residual remains; the error is within the scatter"
     assert f"verdict     closed: {sentence} of repeats" in lines
     assert "            + lead-screw ripple: A 0.25 N, n unknown" in lines
     assert "              reference state of the coefficients: mean over a wavelength" in lines
@@ -300,23 +300,23 @@ def test_an_effect_that_is_not_named_or_not_applied_is_said_so(sealfit, parts, c
     candidate = {**fake_parts.EFFECT, "candidate": True}
     parts.closure = {**fake_parts.CLOSURE, "effects": [unnamed, candidate]}
     lines = sealfit("run", campaign, "--out", out).stdout.splitlines()
-    assert "            + smooth in time: no form does as well" in lines
+    assert "            + smooth in time: no closed form fits as well" in lines
     assert "            candidate, not applied: lead-screw ripple: A 0.25 N, n unknown" in lines
-    assert "closed: one effect was missing and is added" in "".join(lines)
+    assert "closed: one effect was added" in "".join(lines)
 
 
 @pytest.mark.parametrize(
     ("verdict", "effects", "left", "expected"),
     [
-        ("nothing_missing", [], [None, None, None], "nothing was found that the declared model misses"),
+        ("nothing_missing", [], [None, None, None], "no effect beyond the declared model is significant"),
         (
             "unexplained",
             [],
             ["run", "elapsed_h", 0.00123],
-            "no effect was added, and something is left that no model holds, at the level of the run,"
-            " along time since first run (h) (p = 0.0012)",
+            "no effect was added; a significant residual remains along time since first run (h) between runs"
+            " (p = 0.0012)",
         ),
-        ("closed", [fake_parts.EFFECT] * 2, [None, None, None], "2 effects were missing and are added; no significant"),
+        ("closed", [fake_parts.EFFECT] * 2, [None, None, None], "2 effects were added; no significant"),
     ],
 )
 def test_the_verdict_is_a_sentence(sealfit, parts, campaign, out, verdict, effects, left, expected):
@@ -401,7 +401,7 @@ def predict(sealfit, done, tmp_path, text, *more):
 def test_predict_gives_back_the_points_as_written_and_their_answers(sealfit, done, tmp_path):
     ended = predict(sealfit, done, tmp_path, '\ufeffbatch,speed_mm_s\r\n007,1.50\r\n\r\n"a,b",2\r\n')
     assert ended.code == 0
-    assert ended.stdout.startswith("points      1 of 2 rows answered, 0 extrapolated; 1 row could not be")
+    assert ended.stdout.startswith("points      1 of 2 rows predicted, 0 extrapolated; 1 row not predicted")
     answers = pd.read_csv(tmp_path / "q.csv", dtype=str, keep_default_na=False)
     assert list(answers.columns) == [
         "batch", "speed_mm_s", "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N",

@@ -115,7 +115,7 @@ def test_where_nothing_is_missing_after_is_before(first):
     assert (after.pop("model"), before.pop("model")) == ("after", "before")
     assert after == before
     said = sealfit(*asked[:-1]).stdout
-    assert said.startswith("model       after: no effect was added, so it is the declared model\n")
+    assert said.startswith("model       after: no effect was added, so this is the declared model\n")
     assert sealfit(*asked[:-1], "--model", "both", code=1).stderr.startswith("sealfit: there is no model 'both'.")
 
 
@@ -124,7 +124,7 @@ def test_a_run_ends_with_a_short_summary(first):
     lines = run.stdout.splitlines()
     assert 7 <= len(lines) <= 14
     assert lines[0] == "files       50 used, 0 left out"
-    assert "verdict     nothing_missing: nothing was found that the declared model misses" in run.stdout
+    assert "verdict     nothing_missing: no effect beyond the declared model is significant" in run.stdout
     assert lines[-1] == f"report      {out / 'report.html'}"
     assert "reading trace files: 50 of 50" in run.stderr
 

@@ -323,7 +323,7 @@ def test_without_results_there_is_nothing_to_go_on_from(tmp_path):
 def test_a_moved_campaign_keeps_its_results(out, campaign):
     do_all(out, campaign)
     moved = campaign.rename(campaign.with_name("moved"))
-    assert "cannot be told" in Store.open(out).warnings[0]
+    assert "cannot be detected" in Store.open(out).warnings[0]
     assert stale(out) == []
     with Store.writing(out, moved, ConfigCopy.at(None)) as store:
         assert "holds the same data" in store.warnings[0]

@@ -1,4 +1,4 @@
-"""Everything that the fits say, once more with the effects taken out at their reference state."""
+"""The fits repeated with the effects removed at their reference state."""
 
 from __future__ import annotations
 
@@ -28,23 +28,22 @@ from sealfit.progress import timed
 from sealfit.tables import AFTER, AGING_CURVES, AGING_FIT, SCHEMAS
 
 # ---------------------------------------------------------------- reference
-# The reference state of the after-model: where its effects are zero, and what they add to the measured forces.
+# The reference state of the after-model, in which its effects are zero, and the effects' share of the measured forces.
 #
 # The coefficients of the after-model are those at the reference: the contact cold, the offset removed, a column at its
-# reference value. An effect of the condition columns alone (of days, say) is part of a condition and stays in its
-# values.
+# reference value. An effect of condition columns only (such as days) is part of the condition and is not removed.
 
-KEPT = "not taken out: part of the aging condition"
-SMALL = 1e-4  # share of the effects' variance that may be dropped with the smallest principal directions
+KEPT = "not removed: part of the aging condition"
+SMALL = 1e-4  # Share of the effects' variance in principal directions that are dropped.
 
 
 def is_kept(term: Term, config: Config) -> bool:
-    """Return whether an effect is part of the conditions: it reads nothing but their columns."""
+    """Return whether an effect is part of the conditions: it reads only their columns."""
     return set(term.channels) <= {*config.condition, *config.rubber}
 
 
 def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str:
-    """Return in words where an effect is zero, or that it is not taken out.
+    """Return a text that says where an effect is zero, or that it is not removed.
 
     Parameters
     ----------
@@ -53,7 +52,7 @@ def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str
     values : mapping of str to float
         Its fitted parameters.
     config : Config
-        Names the condition columns, and gives channels their true units.
+        Condition columns, and units of the channels.
     """
     if is_kept(term, config):
         return KEPT
@@ -65,13 +64,13 @@ def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str
 
 
 def at_reference(model: Model, config: Config) -> Model:
-    """Return the model with its effects at their reference: only those that are part of a condition are left."""
+    """Return the model at the reference: only effects that are part of a condition are kept."""
     kept = [k for k, term in enumerate(model.terms) if is_kept(term, config)]
     return replace(model, terms=tuple(model.terms[k] for k in kept), values=tuple(model.values[k] for k in kept))
 
 
 def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.DataFrame:
-    """Return table `steady_after`: the strokes' mean forces with the effects taken out at their reference.
+    """Return table `steady_after`: the strokes' mean forces with the effects removed at their reference.
 
     Parameters
     ----------
@@ -80,15 +79,15 @@ def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.D
     after : Fitted
         The after-model, fitted to all bins.
     config : Config
-        Names the condition columns.
+        Condition columns.
 
     Returns
     -------
     DataFrame
         `steady` with `force_N` less `effects_N`, the effects' mean over the steady window; `effects_start_N`, their
-        force where the stroke starts; and columns `effects_u1_N`, ...: by how much the force in the direction of motion
-        changes along each principal direction of the effects' uncertainty, for one standard error. A stroke without
-        bins is not used.
+        force at the start of the stroke; and columns `effects_u1_N`, ...: the change of the force in the direction of
+        motion for one standard error along each principal direction of the effects' covariance. A stroke without bins
+        is not used.
 
     Notes
     -----
@@ -101,7 +100,7 @@ def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.D
     reference = at_reference(model, config)
     effects = force - evaluate(reference, rows, jacobian=False)[0]
     taken = [k for k, term in enumerate(model.terms) if not is_kept(term, config)]
-    places = np.array([i for k in taken for i in range(*model.place(k).indices(model.size))], int)
+    places = np.array([i for k in taken for i in range(*model.term_slice(k).indices(model.size))], int)
     last = tangent.values.shape[1] - model.size
     principal = _principal(tangent.values[:, last + places], after.covariance[np.ix_(places, places)], rows)
     columns = {"effects_N": effects, "effects_start_N": _at_start(model, reference, rows)}
@@ -118,7 +117,7 @@ def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.D
 def _principal(columns: np.ndarray, covariance: np.ndarray, rows: Rows) -> np.ndarray:
     """Return L with L L' = J C J' for derivatives J, shape (n, p), and a covariance C, shape (p, p); few columns.
 
-    Directions whose mean over the strokes is small are dropped: a fit to the strokes does not see them.
+    Directions whose mean over the strokes is small are dropped: they do not change a fit to the strokes.
     """
     if not columns.size:
         return columns
@@ -134,18 +133,18 @@ def _principal(columns: np.ndarray, covariance: np.ndarray, rows: Rows) -> np.nd
 
 def _at_start(model: Model, reference: Model, rows: Rows) -> np.ndarray:
     """Return the effects' force at the start of each row's stroke, shape (n,): at distance and time 0."""
-    table, way = rows.table, np.sign(rows.speed)
-    origin = table["displacement_mm"] - way * table["distance_mm"].to_numpy(float)
+    table, direction = rows.table, np.sign(rows.speed)
+    origin = table["displacement_mm"] - direction * table["distance_mm"].to_numpy(float)
     start = table.assign(displacement_mm=origin, distance_mm=0.0, time_s=0.0)
     begun = replace(rows, table=start)
     return evaluate(model, begun, jacobian=False)[0] - evaluate(reference, begun, jacobian=False)[0]
 
 
 # ---------------------------------------------------------------- after law
-# The law of aging of every series as the after-model has it: Eq. 15 from the joint fit, effects at their reference.
+# The aging law of every series in the after-model: Eq. 15 from the joint fit, with effects at their reference.
 
-SLOW, FAST = 1e-6, 12.0  # of v_s: there the force is mu_s N, and mu_c N but for the viscous term
-WIDEST = 700.0  # of a logarithm
+SLOW, FAST = 1e-6, 12.0  # Multiples of v_s at which the force is mu_s N, and mu_c N without the viscous term.
+WIDEST = 700.0  # Largest logarithm.
 
 
 def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -158,13 +157,13 @@ def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple
     steady_fit : DataFrame
         Table `steady_fit_after`: the values of single conditions, which the laws are compared with.
     config : Config
-        Names the condition columns and the units.
+        Condition columns and units.
 
     Notes
     -----
-    mu_0, a and b are numbers of the joint fit, and so are their standard errors. Their intervals have Student's t on
-    specimens less the numbers of one coefficient; that of b is symmetric in its logarithm. Effects that are part of the
-    condition (of days) multiply or change the law; the curves hold them.
+    mu_0, a and b and their standard errors are those of the joint fit. Their intervals use Student's t with the number
+    of specimens less the parameters of one coefficient; that of b is symmetric in its logarithm. Effects that are part
+    of the condition (such as days) multiply or change the law; the curves include them.
     """
     rows, curves = [], []
     open_columns = [name for name in config.series_columns if name in steady_fit.columns]
@@ -182,16 +181,16 @@ def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple
 
 
 def law_df(after: Fitted) -> float:
-    """Return the degrees of freedom of the laws' intervals: specimens less the numbers fitted to one coefficient.
+    """Return the degrees of freedom of the laws' intervals: specimens less the parameters of one coefficient.
 
-    Few specimens show their scatter badly, often as none at all; that of the runs then has too many degrees of freedom.
+    With few specimens their variance is often estimated as zero, and the runs would give too many degrees of freedom.
     """
-    left = after.rows.groups.starts["specimen"].size - after.model.declared.numbers_of_mu
+    left = after.rows.groups.starts["specimen"].size - after.model.declared.mu_parameter_count
     return min(degrees_of_freedom(after), float(max(left, 1)))
 
 
 def _laws(after: Fitted, config: Config) -> Iterator[_Law]:
-    """Yield every series and quantity: those that the forces determine in some condition of the rubber."""
+    """Yield every series and every quantity that the forces determine in some condition of the rubber."""
     conditions, index = after.rows.conditions, after.model.declared.index
     series = series_of_curve(conditions, aging=True)
     aged = conditions["aging_days"].to_numpy(float) > 0
@@ -241,7 +240,7 @@ class _Law:
         return Estimate(after.model.theta[at], after.covariance[np.ix_(at, at)], shift)
 
     def _interval(self, found: Estimate) -> CurveInterval:
-        """Return the 95 % limits of a, b and c; b is open beyond where a law is ever sought."""
+        """Return the 95 % limits of a, b and c; b is open beyond the search range of laws."""
         t, error = t_quantile(self.df), np.sqrt(np.diag(found.covariance))
         low, high = (found.x[2] + s * t * error[2] for s in (-1, 1))
         first, last = search_limits(self.curve_of.days)
@@ -255,7 +254,7 @@ class _Law:
         return [f"The effect {t.effect.id} of {' and '.join(t.channels)} acts on top of it." for t in kept]
 
     def _statistics(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
-        """Yield how far the values of single conditions lie from the law, and what its intervals rest on."""
+        """Yield the errors of the law at single conditions, and the statistics behind its intervals."""
         own = steady_fit[(steady_fit["quantity"] == "steady") & (steady_fit["parameter"] == self.quantity)]
         own = own[own["identified"].astype(bool)].set_index("condition")["value"]
         names = self.after.rows.conditions["condition"].to_numpy()[self.conditions]
@@ -279,7 +278,7 @@ class _Law:
             yield {**row, "series": self.series}
 
     def curve(self) -> pd.DataFrame:
-        """Return the law along aging time with its 95 % band, the effects of the condition in it."""
+        """Return the law along aging time with its 95 % band, including effects of the condition."""
         days = self.curve_of.days[-1] * np.linspace(0, 1, CURVE_POINTS) ** 2
         value, error = self._values(days)
         half = t_quantile(self.df) * error
@@ -287,7 +286,7 @@ class _Law:
         return pd.DataFrame({"series": self.series, "quantity": self.quantity, **columns})[AGING_CURVES.names()]
 
     def _values(self, days: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the coefficient at some days and its standard error, shape (n,) each."""
+        """Return the coefficient at days of aging, and its standard error, shape (n,) each."""
         after, config, rows = self.after, self.config, self.after.rows
         model = at_reference(after.model, config)
         for number in reversed([k for k, term in enumerate(model.terms) if term.acts_on in ("v_s", "sigma_2")]):
@@ -312,7 +311,8 @@ class _Law:
             has_aging=rows.has_aging,
         )
         force, tangent = evaluate(replace(model, theta=theta), replace(at, days=days))
-        kept = [np.arange(after.model.size)[after.model.place(after.model.terms.index(term))] for term in model.terms]
+        own = (after.model.term_slice(after.model.terms.index(term)) for term in model.terms)
+        kept = [np.arange(after.model.size)[place] for place in own]
         slope = np.zeros((days.size, after.model.size))
         slope[:, np.concatenate([np.arange(theta.size), *kept])] = tangent.toarray()
         slope[:, list(index.values())] = 0.0
@@ -321,7 +321,7 @@ class _Law:
 
 
 # ---------------------------------------------------------------- after fits
-# Everything that the fits say, once more with the after-model's effects taken out at their reference.
+# The fits repeated with the effects of the after-model removed at their reference.
 
 
 def after_fits(
@@ -332,7 +332,7 @@ def after_fits(
     *,
     workers: int = 1,
 ) -> dict[str, pd.DataFrame]:
-    """Return the tables `*_after` by name, without rows where no effect was added: the fits before are the answer then.
+    """Return the tables `*_after` by name; they have no rows if no effect was added.
 
     Parameters
     ----------
@@ -341,7 +341,7 @@ def after_fits(
     steady : DataFrame
         Table `steady`.
     traces : DataFrame or sequence of StoredTraces
-        Table `traces`, or where it lies.
+        Table `traces`, or where it is stored.
     config : Config
         The rig.
     workers : int
@@ -349,9 +349,9 @@ def after_fits(
 
     Notes
     -----
-    The laws of single series are those of the joint fit. Single conditions, from which the laws for all series, the
-    starts and the break-away follow, are fitted to the strokes' forces without the effects; the effects' covariance is
-    carried through these fits.
+    The laws of single series are those of the joint fit. Single conditions are fitted to the strokes' forces without
+    the effects, and the effects' covariance is propagated through these fits. The laws for all series, the pre-sliding
+    fits and the break-away forces follow from them.
     """
     if not after.model.terms:
         return {schema.name: pd.DataFrame(columns=schema.names()) for schema in AFTER}

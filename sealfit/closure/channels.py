@@ -1,8 +1,8 @@
-"""Channels: what may order a residual, and the level at which each varies.
+"""Channels that may explain a residual, and the level at which each varies.
 
-A channel varies at the coarsest nesting level within whose groups nearly none of its variance lies. Measured numbers
-jitter, so no level rests on exact equality. A category with each of its levels in one group only (a serial number) is a
-grouping, never an effect.
+A channel varies at the coarsest level within whose groups it is nearly constant. Measured numbers scatter, so exact
+equality is not required. A category with each of its levels in one group only (a serial number) is a grouping and never
+an effect.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from sealfit.closure.criteria import (
+    CONSTANT_SHARE,
     FREE_DF,
     LEAST_GROUPS_HELD_OUT,
     MANY_RUNS,
     MOST_LEVELS,
     MOST_SET_VALUES,
     SAME_VALUE,
-    WITHIN,
 )
 from sealfit.closure.criteria import LEAST_UNITS_OF_SLOPES as LEAST_SLOPES
 from sealfit.config import Config
@@ -29,18 +29,18 @@ from sealfit.fit.joint.declared import SAME_SPEED
 from sealfit.fit.joint.rows import LEVELS, Rows, open_columns
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
-ROUNDING = 1e-9  # of the largest value: what lies between the mean of equal numbers and these themselves
-CALENDAR = ("run_order", "elapsed_h")  # conditions are tested one after the other, so the calendar follows them
+ROUNDING = 1e-9  # Relative rounding error of the mean of equal numbers.
+CALENDAR = ("run_order", "elapsed_h")  # correlated with conditions, which are tested one after the other
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One channel on the rows: numbers, or categories as strings."""
+    """A channel on the rows: numbers, or categories as strings."""
 
     name: str
     values: np.ndarray  # (n,) float or str
     unit: str  # "sample" or a nesting level
-    grouping: bool = False  # each category in one unit only: it tells units apart and orders nothing
+    grouping: bool = False  # each category in one unit only: an identifier
 
     @property
     def numeric(self) -> bool:
@@ -54,7 +54,7 @@ class Channel:
 
 
 def channels_of(rows: Rows, config: Config) -> list[Channel]:
-    """Return the channels that a campaign's config lets the loop look at: see `find_channels`."""
+    """Return the channels that the loop searches by a campaign's config: see `find_channels`."""
     on_rig = config.position_origin == "rig"
     return find_channels(rows, config.loop.ignore_channels, conditions=config.condition, rig_position=on_rig)
 
@@ -62,17 +62,17 @@ def channels_of(rows: Rows, config: Config) -> list[Channel]:
 def find_channels(
     rows: Rows, ignore: Iterable[str] = (), *, conditions: Iterable[str] = (), rig_position: bool = True
 ) -> list[Channel]:
-    """Return every channel of the rows that varies and is not a grouping, nor a text with hundreds of values.
+    """Return every channel of the rows that varies and is not a grouping or a text with hundreds of values.
 
-    A condition's own column is kept though it may be a grouping: an offset between directions may differ from one
-    condition to the next, and that is seen inside each of them.
+    Columns of the condition are kept even if they are groupings: an offset between directions may differ between
+    conditions.
 
     Parameters
     ----------
     rows : Rows
         The rows.
     ignore : iterable of str
-        Names left out.
+        Names that are left out.
     conditions : iterable of str
         Columns that make a condition.
     rig_position : bool
@@ -89,7 +89,7 @@ def find_channels(
             if not (np.isfinite(values).all() and varies(values)):
                 continue
             if name == "speed_mm_s" and values.max() <= SAME_SPEED * values.min():
-                continue  # one setting: what is left of the speed tells directions apart, or strokes
+                continue  # one setting
             values = settings(level_values(values, rows))
         elif not 2 <= np.unique(values).size <= MOST_LEVELS:
             continue
@@ -111,7 +111,7 @@ def varies(values: np.ndarray) -> bool:
 
 
 def incomplete_channels(rows: Rows) -> list[dict]:
-    """Return the campaign's own channels that some files lack, how many of how many, and whether it is searched."""
+    """Return the campaign's own channels that some files lack, their numbers, and whether they are searched."""
     found = []
     for name in open_columns(rows.table):
         known = rows.table[name].notna().groupby(rows.codes("file")).any()
@@ -123,9 +123,9 @@ def incomplete_channels(rows: Rows) -> list[dict]:
 
 
 def unit_of(values: np.ndarray, rows: Rows) -> str:
-    """Return the coarsest level within whose groups `values` vary by next to nothing; "sample" if there is none."""
+    """Return the coarsest level within whose groups `values` are nearly constant; "sample" if there is none."""
     numeric = values.dtype.kind == "f"
-    least = WITHIN * float(np.var(values)) if numeric else 0.0
+    least = CONSTANT_SHARE * float(np.var(values)) if numeric else 0.0
     for level in reversed(LEVELS):
         start, code = rows.groups.starts[level], rows.codes(level)
         if not numeric:
@@ -139,15 +139,15 @@ def unit_of(values: np.ndarray, rows: Rows) -> str:
 
 
 def level_values(values: np.ndarray, rows: Rows) -> np.ndarray:
-    """Return numbers as their means in the groups of the level at which they vary: jitter within groups is left out."""
+    """Return numbers as their means in the groups of the level at which they vary."""
     level = unit_of(values, rows)
     return values if level == "sample" else rows.groups.means(values, level)[rows.codes(level)]
 
 
 def settings(values: np.ndarray) -> np.ndarray:
-    """Return numbers with the mean of each setting in place of its measured values; as they are where nothing was set.
+    """Return numbers with measured values replaced by the mean of their setting; unchanged without settings.
 
-    Settings are groups of values with a gap on either side; a channel that goes on without gaps has none.
+    Settings are groups of values with gaps between them; a continuous channel has none.
     """
     distinct, place = np.unique(values, return_inverse=True)
     at = scaled(distinct)
@@ -160,12 +160,12 @@ def settings(values: np.ndarray) -> np.ndarray:
 
 
 def scatter_level(channels: Iterable[Channel], rows: Rows) -> str:
-    """Return the level of the units that a contrast of some channels is judged between.
+    """Return the level of the units between which a contrast of some channels is tested.
 
-    It is the coarsest level at which the slope along the channels may scatter without any effect. Specimens differ in
-    how their friction depends on the place in a stroke, on speed and on direction, so these are judged between
-    specimens; what else varies from run to run is judged between runs. A product has the units of its coarser channel,
-    as each of them may have a slope of its own along the finer one. With few units the next finer level has to do.
+    It is the coarsest level at which the slope along the channels may scatter without any effect. The dependence of
+    friction on the place in a stroke, on speed and on direction differs between specimens, so these are tested between
+    specimens; what else varies between runs is tested between runs. A product has the units of its coarser channel,
+    because each of them may have a slope of its own along the finer one. With few units the next finer level is used.
     """
     channels = list(channels)
     unit = max((c.unit for c in channels), key=FINER.get)
@@ -175,9 +175,9 @@ def scatter_level(channels: Iterable[Channel], rows: Rows) -> str:
 
 
 def flip_level(unit: str, rows: Rows) -> str:
-    """Return the level whose whole groups are held out, and counted as evidence by Schwarz's criterion.
+    """Return the level whose whole groups are held out and are the sample size of the BIC.
 
-    Of a few files, or one, the strokes speak, and of these files alone.
+    With one or a few files it is the stroke; the result then holds for these files only.
     """
     if FINER[unit] >= FINER["run"]:
         return unit
@@ -187,7 +187,7 @@ def flip_level(unit: str, rows: Rows) -> str:
 
 
 def _out_and_back(stroke: np.ndarray, rows: Rows) -> bool:
-    """Whether every stroke of one number goes one way and those of the other the other way: the direction says it."""
+    """Whether the stroke number only distinguishes the two directions."""
     pairs = np.unique(np.column_stack([stroke, np.sign(rows.speed)]), axis=0)
     return len(pairs) == 2 and bool((np.ptp(pairs, axis=0) > 0).all())
 
@@ -201,8 +201,8 @@ def _is_grouping(channel: Channel, rows: Rows) -> bool:
 def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
     """Return the columns of a free shape, first a straight line: shape (n, k), each centred and scaled.
 
-    A cubic B-spline with knots at quantiles (in the logarithm where a positive channel spans a factor of 20), a line
-    and a bend for few units; one column per category but the first for categories.
+    A cubic B-spline with knots at quantiles (of the logarithm if a positive channel spans a factor of 20), a quadratic
+    for few units; for categories, one column per level except the first.
     """
     if not channel.numeric:
         levels = np.unique(channel.values)
@@ -226,30 +226,30 @@ def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
 
 
 def kinks(channel: Channel) -> np.ndarray:
-    """Return centred columns of a channel that stops at one of its inner values, shape (n, k): floors, late starts."""
+    """Return centred columns that are linear up to an inner value of the channel and constant beyond it, (n, k)."""
     x = scaled(channel.values)
     columns = np.minimum(x[:, None], np.unique(x)[1:-1])
     return columns - columns.mean(axis=0)
 
 
 def even_knots(values: np.ndarray) -> tuple[float, ...]:
-    """Return up to five values of a channel that part its different values evenly, for `effects.free.evenly`."""
+    """Return up to five quantiles of the distinct values of a channel, for `effects.free.evenly`."""
     distinct = np.unique(values)
     knots = distinct if distinct.size <= 5 else np.quantile(distinct, np.linspace(0, 1, 5))
     return tuple(float(k) for k in np.unique(knots))
 
 
-def off_zero(values: np.ndarray) -> np.ndarray:
-    """Return values moved by their smallest positive one where they start at 0, so that they have logarithms."""
+def shifted_from_zero(values: np.ndarray) -> np.ndarray:
+    """Return values; those that start at 0 are shifted by the smallest positive one, so that they have logarithms."""
     return values + values[values > 0].min() if values.min() == 0 < values.max() else values
 
 
 def scaled(values: np.ndarray) -> np.ndarray:
-    """Return a channel on the scale it is looked at, mapped to [-1, 1]: logarithmic where it spans a factor of 20.
+    """Return a channel mapped to [-1, 1], logarithmically if it spans a factor of 20.
 
-    One that starts at 0, such as days of aging, is looked at from its smallest positive value on.
+    A channel that starts at 0, such as days of aging, is shifted by its smallest positive value first.
     """
-    values = off_zero(values)
+    values = shifted_from_zero(values)
     low, high = float(values.min()), float(values.max())
     if low > 0 and high / low >= WIDE:
         values, low, high = np.log(values), np.log(low), np.log(high)

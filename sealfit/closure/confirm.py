@@ -1,4 +1,4 @@
-"""Confirm on data that the fit did not see: whole groups held out, everything refitted without them."""
+"""Confirmation on held-out data: whole groups are held out and everything is refitted without them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, level_values, settings, varies
 from sealfit.closure.criteria import (
-    COMPARED,
+    CURVE_P,
     LEAST_FALL,
     LEAST_SIZE,
-    MOSTLY,
-    REPEATED,
-    SURE_OF_CURVE,
-    SURE_OF_RIPPLE,
-    TRIES,
-    WEAK,
+    MOST_PROPOSALS,
+    MOST_RIVALS,
+    MOST_WITHIN,
+    RIPPLE_CONFIRMED_P,
+    SAMPLES_PER_VALUE,
+    WEAK_P,
 )
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import blocks, covered, foldable, folds, whole_settings
@@ -27,30 +27,30 @@ from sealfit.closure.naming import rivals
 from sealfit.closure.ripples import agreement, pass_shifts
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
-from sealfit.fit.joint.estimate import Fitted, as_smooth_as_wanted, fit
+from sealfit.fit.joint.estimate import Fitted, fit, with_reml_smoothness
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.whitening import Whitening
 
 LEAST_SETTINGS, MOST_SETTINGS = 3, 15
-"""Settings of a channel between which a shape interpolates: with fewer none is inside, with more they lie densely."""
+"""Numbers of settings for which interpolation is tested: with fewer there is no inner one, with more they are dense."""
 
 WHOLE = ("mu", "force")
-"""What acts on these changes the whole friction."""
+"""Targets that are the whole friction."""
 
 
 @dataclass(frozen=True)
 class Gain:
-    """What a proposal gains on held-out groups: in RMSE, and in the sum of squares with scatter accounted for."""
+    """Gain of a proposal on held-out groups: in RMSE and in the whitened sum of squares."""
 
     rmse_N: float  # fall of the RMSE
     left_N: float  # RMSE with it
-    deviance: float  # fall of the whitened sum of squares: what a piece of scatter moves as a whole counts once
+    deviance: float  # fall of the whitened sum of squares
     error: float = 0.0  # standard error of that fall, from the groups held out
 
     @property
     def real(self) -> bool:
-        """Whether the held-out data speak for the proposal, in either way, by more than their own scatter."""
+        """Whether both errors fall, and the deviance by more than its standard error."""
         return self.deviance > self.error and self.rmse_N > 0
 
     @property
@@ -62,12 +62,12 @@ class Gain:
 def heldout_gain(
     before: Fitted, proposal: Proposal, count: int, seed: int, samples: pd.DataFrame, known: dict[tuple, np.ndarray]
 ) -> Gain:
-    """Return what a proposal gains on held-out groups of its own unit.
+    """Return the gain of a proposal on held-out groups of its own unit.
 
-    The RMSE of a rig whose files scatter by newtons does not see a ripple of a tenth; the whitened sum of squares of
-    the held-out groups does, as the offset and gain of a whole file or run cost it little. For the same reason both
-    are taken about the means of the groups inside which the effect varies. `known` keeps what the model without it
-    leaves in each fold, for the next proposal.
+    If files scatter by newtons, the RMSE hardly changes with a ripple of 0.1 N. The whitened sum of squares does,
+    because the offset and gain of a whole file or run have little weight in it. For the same reason both are taken
+    about the means of the groups within which the effect varies. `known` caches the residual of the model without the
+    proposal in each fold.
     """
     if "shift" in proposal.term.fixed:
         return _gain_within_files(before, proposal, samples)
@@ -75,14 +75,14 @@ def heldout_gain(
     calendar = [name for name in proposal.term.channels if name in CALENDAR]
     level = foldable(rows, proposal.unit)
     masks = blocks(rows, level, count, calendar[0]) if calendar else folds(rows, level, count, seed)
-    around = None if calendar else varies_within(proposal)  # a block of time is asked for whole
+    around = None if calendar else varies_within(proposal)  # a block of time is predicted as a whole
     return _gain(before, proposal, masks, around, (level, *calendar[:1]), known)
 
 
 def gain_between_settings(before: Fitted, proposal: Proposal, known: dict[tuple, np.ndarray]) -> Iterator[Gain]:
-    """Yield what a proposal gains where all files at an inner setting of one of its channels are held out.
+    """Yield the gain of a proposal if all files at an inner setting of one of its channels are held out.
 
-    A form of one number is not asked: it follows no setting, and a straight line is nearly zero at the inner ones.
+    Forms of one parameter are not tested: they cannot follow single settings, and a line is nearly zero at inner ones.
     """
     rows = before.rows
     if len(proposal.term.effect.parameters) == 1:
@@ -104,10 +104,10 @@ def _gain(
     key: tuple,
     known: dict[tuple, np.ndarray],
 ) -> Gain:
-    """Return the gain on rows held out by `masks`; about the means of groups where a level is named.
+    """Return the gain on rows held out by `masks`, about the means of the groups of level `around` if it is given.
 
-    Both models are whitened by the scatter that is left with the proposal in: without it the effect itself is in the
-    scatter, and a specimen counts for next to nothing.
+    Both residuals are whitened by the scatter estimated with the proposal. Without it the effect is part of the
+    scatter, and a specimen has almost no weight.
     """
     rows, after = before.rows, proposal.fitted
     squares, total, falls = np.zeros(2), 0.0, []
@@ -123,9 +123,9 @@ def _gain(
         )
         total += float(weight.sum())
         if (*key, number) not in known:
-            known[*key, number] = _left_in(before, before.model, out, held)
+            known[*key, number] = _heldout_residual(before, before.model, out, held)
         white = []
-        for k, left in enumerate((known[*key, number], _left_in(before, after.model, out, held))):
+        for k, left in enumerate((known[*key, number], _heldout_residual(before, after.model, out, held))):
             residual = about_means(left[inside], test, around)
             squares[k] += float(weight @ residual**2)
             white.append(test.groups.sums(whitening(residual[:, None])[:, 0] ** 2, proposal.unit))
@@ -136,19 +136,19 @@ def _gain(
     return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(fall.sum()), error)
 
 
-def _left_in(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.ndarray:
+def _heldout_residual(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.ndarray:
     """Return measured minus model in the rows held out, the model fitted to the others, shape (held out,)."""
     train, friction = before.rows.subset(~out), before.friction[~out]
-    model = as_smooth_as_wanted(model, train, before.scatter, friction)
+    model = with_reml_smoothness(model, train, before.scatter, friction)
     kept = fit(model, train, before.scatter, turns=0, friction=friction)
     return test.force - evaluate(kept.model, test, jacobian=False)[0]
 
 
-def varies_within(proposal: Proposal, share: float = MOSTLY) -> str | None:
-    """Return the finest level within whose groups a share of the variance of the effect's shape lies; None for none.
+def varies_within(proposal: Proposal, share: float = MOST_WITHIN) -> str | None:
+    """Return the finest level within whose groups a share of the variance of the effect's shape lies, or None.
 
-    The shape is used, not the force that it adds. A share of the friction that is lost along each stroke is a force
-    that differs from run to run as friction does, and the declared quantities take that up.
+    The shape is used, not the added force. The force of a relative loss of friction along each stroke differs between
+    runs as friction does, and the declared model explains that part.
     """
     rows, term, model = proposal.fitted.rows, proposal.term, proposal.fitted.model
     if term.channels == ("direction",):
@@ -159,7 +159,7 @@ def varies_within(proposal: Proposal, share: float = MOSTLY) -> str | None:
 
 
 def about_means(values: np.ndarray, rows: Rows, level: str | None) -> np.ndarray:
-    """Return values less their mean in each group of a level and direction: an offset between these is no shape."""
+    """Return values about their mean in each group of a level and direction, shape (n,)."""
     if level is None:
         return values
     code = rows.codes(level) * 2 + (rows.speed > 0)
@@ -167,9 +167,9 @@ def about_means(values: np.ndarray, rows: Rows, level: str | None) -> np.ndarray
 
 
 def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame) -> Gain:
-    """Return the gain on one half of every file with each pass's phase taken from the other half.
+    """Return the gain on one half of every file, with the phase of each pass estimated from the other half.
 
-    Halves are pairs of strokes there and back, taken in turn, or halves of the stroke in a file of one or two.
+    Halves are alternate pairs of forward and backward strokes, or halves of the stroke in a file with one or two.
     """
     rows, after, axis = before.rows, proposal.fitted, proposal.term.channels[0]
     in_turn = rows.table["stroke"].max() >= 4
@@ -181,20 +181,20 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
         shift = pass_shifts(samples[seen], rows, length, axis)
         term = replace(proposal.term, fixed={**proposal.term.fixed, "shift": shift})
         model = replace(after.model, terms=(*after.model.terms[:-1], term))
-        old, new = (_inside(test, evaluate(m, test, jacobian=False)[0]) for m in (before.model, model))
+        old, new = (_within_strokes(test, evaluate(m, test, jacobian=False)[0]) for m in (before.model, model))
         weight = rows.weight[out]
         squares += weight @ old**2, weight @ new**2
-    # Files differ in how strong their ripple is, so each is asked whether it is there at all, in both halves alike.
-    from scipy.stats import wilcoxon  # here, as scipy.stats takes half a second to load
+    # The amplitude of a ripple differs between files, so each file is tested for the same wave in both halves.
+    from scipy.stats import wilcoxon  # imported here: scipy.stats takes half a second to load
 
     both = agreement(samples, sample_first, length, axis)
-    there = both.size > 1 and wilcoxon(both, alternative="greater").pvalue < SURE_OF_RIPPLE
+    there = both.size > 1 and wilcoxon(both, alternative="greater").pvalue < RIPPLE_CONFIRMED_P
     rmse = np.sqrt(squares)
     return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(squares[0] - squares[1]) if there else -1.0)
 
 
 def _first_half(table: pd.DataFrame, in_turn: bool) -> np.ndarray:
-    """Return which rows or samples, those of a stroke one after the other, belong to the first half, shape (n,)."""
+    """Return which rows or samples (ordered by stroke) belong to the first half, shape (n,)."""
     if in_turn:
         return ((table["stroke"].to_numpy() - 1) // 2 % 2) == 0
     stroke = table["stroke_id"].to_numpy()
@@ -203,7 +203,7 @@ def _first_half(table: pd.DataFrame, in_turn: bool) -> np.ndarray:
     return np.arange(stroke.size) - np.repeat(start, count) < np.repeat(count, count) / 2
 
 
-def _inside(rows: Rows, force: np.ndarray) -> np.ndarray:
+def _within_strokes(rows: Rows, force: np.ndarray) -> np.ndarray:
     """Return measured minus model about its mean in each stroke, shape (n,)."""
     residual = rows.force - force
     return residual - rows.groups.means(residual, "stroke")[rows.codes("stroke")]
@@ -211,10 +211,10 @@ def _inside(rows: Rows, force: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class AcceptedEffect:
-    """An accepted effect: the proposal, its gain on held-out data and the rivals these data cannot tell from it.
+    """An accepted effect: the proposal, its gain on held-out data and the rivals that these data do not exclude.
 
-    `left_N` is the RMSE on the held-out data with it, and `rivals_rmse_N` with each rival in its place; NaN where that
-    was not asked for. Where the effect varies inside files, runs or specimens, it is the RMSE about their means.
+    `left_N` is the RMSE on the held-out data with it, and `rivals_rmse_N` with each rival instead; NaN if not computed.
+    If the effect varies within files, runs or specimens, it is the RMSE about their means.
     """
 
     proposal: Proposal
@@ -227,12 +227,12 @@ class AcceptedEffect:
     @property
     def weak(self) -> bool:
         """Whether its evidence is weak."""
-        return self.proposal.p_value > WEAK
+        return self.proposal.p_value > WEAK_P
 
 
 @dataclass(frozen=True)
 class RefusedEffect:
-    """What the search found significant and no model holds, with the reason."""
+    """A significant effect that is in no model, with the reason."""
 
     term: Term
     p_value: float
@@ -240,30 +240,30 @@ class RefusedEffect:
 
     @property
     def weak(self) -> bool:
-        """Whether its evidence is too weak to say that something is left which no effect explains."""
-        return self.p_value > WEAK
+        """Whether its evidence is too weak for the verdict `unexplained`."""
+        return self.p_value > WEAK_P
 
 
 def silent(text: str) -> None:
-    """Say nothing."""
+    """Write no progress message."""
 
 
 @dataclass(frozen=True)
 class Context:
-    """What every round of the loop needs besides the model and the data.
+    """Settings of every round of the loop.
 
     Parameters
     ----------
     config : Config
-        Levels of error, rounds, folds and units.
+        Error rate, rounds, folds and units.
     effects : mapping
         The catalogue, the user's own effects included.
     say : callable
         Called with a line on what is being done.
     compare : bool
-        Whether rivals of an accepted effect are put to held-out data too.
+        Whether the held-out error of rivals is computed too.
     workers : int
-        Processes for what is independent.
+        Number of processes.
     """
 
     config: Config
@@ -281,7 +281,7 @@ def confirmed(
     number: int,
     refused: list[RefusedEffect],
 ) -> AcceptedEffect | None:
-    """Return the first of a round's best proposals that gains on held-out data; None where none does.
+    """Return the first of a round's best proposals that has a gain on held-out data; None if none has.
 
     Parameters
     ----------
@@ -294,21 +294,21 @@ def confirmed(
     context : Context
         Folds, seed and units.
     number : int
-        Of the round.
+        Number of the round.
     refused : list of RefusedEffect
-        Grows by the best proposal, with the reason, where none is confirmed.
+        The best proposal and the reason are appended if none is confirmed.
     """
     config = context.config
     failed: list[RefusedEffect] = []
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
-    for proposal in proposals[:TRIES]:
+    for proposal in proposals[:MOST_PROPOSALS]:
         gain = heldout_gain(fitted, proposal, *folds_of)
-        reason = _why_not(fitted, proposal, gain, samples, folds_of[-1])
+        reason = _reason_refused(fitted, proposal, gain, samples, folds_of[-1])
         unit = config.units.unit("force")
         context.say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
             others = rivals(proposal, proposals)
-            rmse = [heldout_gain(fitted, o, *folds_of).left_N for o in others[:COMPARED]] if context.compare else []
+            rmse = [heldout_gain(fitted, o, *folds_of).left_N for o in others[:MOST_RIVALS]] if context.compare else []
             rmse += [np.nan] * (len(others) - len(rmse))
             return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
         if proposal.p_value <= config.loop.family_error:
@@ -317,24 +317,24 @@ def confirmed(
     return None
 
 
-def _why_not(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame, known: dict) -> str | None:
-    """Return why a proposal is not confirmed; None where it is."""
+def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame, known: dict) -> str | None:
+    """Return the reason why a proposal is refused; None if it is confirmed."""
     if not gain.real:
-        return "it does not predict the data that were held out better than the model without it"
-    if proposal.p_value > SURE_OF_CURVE and _bends_the_curve(proposal):
-        return f"its p-value is no less than {SURE_OF_CURVE:g}, and how such a coefficient scatters is not known"
-    if proposal.p_value > WEAK and gain.share < LEAST_FALL:
-        return f"its p-value is no less than {WEAK:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
-    least = max(unseen_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
+        return "it does not lower the error on held-out data"
+    if proposal.p_value > CURVE_P and _changes_the_curve(proposal):
+        return f"its p-value is above {CURVE_P:g}, and the scatter of such a coefficient is not known"
+    if proposal.p_value > WEAK_P and gain.share < LEAST_FALL:
+        return f"its p-value is above {WEAK_P:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
+    least = max(rounding_error_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
     if np.sqrt(np.mean(added_force(proposal) ** 2)) <= least:
-        return "it is smaller than the recorded force can show"
+        return "it is smaller than the resolution of the recorded force"
     if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
-        return "it does not predict whole settings that were held out, between those it was fitted to"
+        return "it does not predict held-out settings between those it was fitted to"
     return None
 
 
-def _bends_the_curve(proposal: Proposal) -> bool:
-    """Whether a proposal is a free shape, inside specimens, of one coefficient or of the speed and another variable."""
+def _changes_the_curve(proposal: Proposal) -> bool:
+    """Whether a proposal is a free shape within specimens, of one coefficient or of speed and another variable."""
     term = proposal.term
     by_speed = len(term.channels) > 1 and "speed_mm_s" in term.channels
     free = not term.effect.physical and proposal.unit != "specimen"
@@ -348,15 +348,15 @@ def added_force(proposal: Proposal) -> np.ndarray:
     return fitted.force - evaluate(without, fitted.rows, jacobian=False)[0]
 
 
-def unseen_N(samples: pd.DataFrame) -> float:
-    r"""Return the RMS of a rounding error that noise does not average out: what an effect must exceed; else 0.
+def rounding_error_N(samples: pd.DataFrame) -> float:
+    r"""Return the RMS rounding error of the recorded force if noise does not average it out, else 0.
 
-    A force in steps of q has a rounding error of :math:`q / \sqrt{12}`. Noise of half a step or more spreads it, and
-    means of many samples resolve less than a step. Below that, rounding errors repeat from file to file.
+    A force in steps of q has a rounding error of :math:`q / \sqrt{12}`. With noise of half a step or more the
+    means of many samples resolve less than a step. With less noise, rounding errors repeat from file to file.
     """
     force = samples["force_N"].to_numpy(dtype=float)
     steps = np.diff(np.unique(force))
-    if steps.size == 0 or steps.size > force.size / REPEATED:
+    if steps.size == 0 or steps.size > force.size / SAMPLES_PER_VALUE:
         return 0.0
     step = float(np.median(steps))
     same = np.diff(samples["stroke_id"].to_numpy()) == 0

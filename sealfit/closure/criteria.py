@@ -1,287 +1,296 @@
-"""Every threshold of the loop, each with its reason; what only bounds time or memory stands where it is used."""
+"""Every threshold of the loop, with its reason. Limits of time and memory are defined where they are used."""
 
 # ---------------------------------------------------------------- evidence: how many units a test needs
 MANY_RUNS = 20
-"""Runs from which a contrast inside files is judged between runs, as repeats share a set-up."""
+"""Number of runs from which a contrast within files is tested between runs, because repeats share a set-up."""
 
 LEAST_GROUPS_HELD_OUT = 6
-"""Runs below which whole files are held out, and files below which strokes are."""
+"""With fewer runs whole files are held out; with fewer files, strokes."""
 
 MOST_LEVELS = 100
-"""Levels of a category above which a column names things rather than kinds of them."""
+"""A categorical column with more levels is taken for an identifier and is not searched."""
 
 FEW_DF = 2
-"""Columns of a free shape along fewer than `JACKKNIFE_UNITS` specimens: a line and a bend."""
+"""Columns of a free shape along fewer than `JACKKNIFE_UNITS` specimens: linear and quadratic."""
 
 FREE_DF = 4
-"""Columns of a free shape: enough for a peak, an approach or a step; more only cost power."""
+"""Columns of a free shape. They describe a peak, a saturation or a step; more columns cost power."""
 
 FINE_DF = 9
-"""Columns of a second, finer shape, for two humps or a narrow one."""
+"""Columns of a second, finer free shape, for two peaks or a narrow one."""
 
 FINE_UNITS = 50
-"""Units from which the finer shape is tried."""
+"""Number of units from which the finer shape is tested."""
 
-WITHIN = 1e-4
-"""Share of a channel's variance within groups, below which it counts as constant there: 1 % of its standard deviation.
+CONSTANT_SHARE = 1e-4
+"""A channel is constant within groups if less than this share of its variance (1 % of its SD) lies within them.
 
-Measured speeds of one setting differ by 1e-5 to 1e-3 of themselves, settings by 10 % and more.
+Measured speeds of one setting differ by 1e-5 to 1e-3 of their value; settings differ by 10 % and more.
 """
 
 SAME_VALUE = 1e-3
-"""Of a channel's range on the scale it is looked at: values nearer to each other are one setting measured twice."""
+"""Values closer than this share of the channel's scaled range are one setting that was measured twice."""
 
 MOST_SET_VALUES = 50
-"""Of a channel that was set: one with more groups of values is taken as it was measured."""
+"""A channel with more groups of values than this is used as measured, not as settings."""
 
 JACKKNIFE_UNITS = 30
-"""Units from which the jackknife over them is tried."""
+"""Number of units from which the jackknife over units is used."""
 
 PROMISING = 1e-3
-"""P-value of what columns explain, before adjustment, below which the jackknife is computed."""
+"""The jackknife is computed if the unadjusted p-value of what the columns explain is below this."""
 
-WORTH_THE_RUNS = 0.05
-"""P-value, before adjustment, below which columns that are constant in a run are held against the scatter of runs."""
+TESTED_AGAINST_RUNS = 0.05
+"""Columns constant in runs are tested against the scatter of runs if their unadjusted p-value is below this."""
 
 CONSTANT_IN_RUNS = 0.9
-"""Share of the variance of columns that is one number a run, from which they are taken to be constant in runs."""
+"""Columns are constant in runs if at least this share of their variance is one number per run."""
 
 IDENTIFIABLE = 0.01
-"""Share of a column's variance that the model must leave for its amplitude to be identifiable."""
+"""An amplitude is identifiable if the model leaves at least this share of the column's variance."""
 
 SEARCHES = 2
-"""Searches that share the level of error: single channels, and pairs of them."""
+"""Number of searches that share the family-wise error rate: single channels, and pairs of channels."""
 
 LOGARITHMIC_SPAN = 5.0
-"""Ratio of largest to smallest value of a positive channel from which its logarithm is tried in pairs."""
+"""Ratio of the largest to the smallest value of a positive channel from which pairs also use its logarithm."""
 
-RARE = 2.0
-"""Factor on the p-values of pairs: they are many and seldom at work, and get half of their share of the error."""
+PAIR_FACTOR = 2.0
+"""Factor on the p-values of pairs, which are many and seldom true: they get half of their share of the error rate."""
 
 MOST_CATEGORIES = 12
-"""Levels of a category up to which a slope for each is tried."""
+"""Largest number of levels of a category for which a slope per level is tested."""
 
-DOUBTFUL = 1e-4
-"""P-value of a single channel above which pairs are searched too: a far smaller one may show in a pair."""
+PAIRS_FROM_P = 1e-4
+"""Pairs are searched too if the smallest p-value of a single channel is above this: theirs may be far smaller."""
 
 
 # ---------------------------------------------------------------- few units: slopes and means between specimens or runs
 LEAST_UNITS_OF_SLOPES = 5
-"""Units from which slopes are compared between them."""
+"""Least number of units between which slopes are compared."""
 
 LEAST_DF = 1.5
-"""Satterthwaite degrees of freedom below which one or two units hold nearly all of a contrast: it is not tested."""
+"""Least Satterthwaite degrees of freedom of a tested contrast. With fewer, one or two units decide it."""
 
 LARGEST_LEVERAGE = 0.98
-"""Of a unit in a contrast; one with more owns it, and nothing else says how it scatters."""
+"""Largest leverage of a unit in a contrast. A unit with more determines the contrast alone."""
 
 LEAST_LEVERAGE = 0.05
-"""Leverage from which a specimen says something of a contrast."""
+"""Least share of the leverage with which a specimen has a slope of its own in a contrast."""
 
-AGREE = 0.1
-"""P-value of Student's t over two to four specimens, above which their own slopes do not agree."""
+CONSISTENT_P = 0.1
+"""The slopes of two to four specimens are consistent if the p-value of Student's t over them is below this."""
 
-CLOSELY = 0.005
-"""The same p-value where the slopes differ by more than noise, so that they may agree by chance."""
+CONSISTENT_P_IF_DIFFERENT = 0.005
+"""The same where the slopes differ by more than noise, so that they may be consistent by chance."""
 
-DIFFER = 0.05
-"""P-value of chi-squared below which the slopes of specimens differ by more than noise."""
+DIFFERENT_P = 0.05
+"""Slopes of specimens differ by more than noise if the p-value of chi-squared is below this."""
 
 LEAST_SPECIMENS = 2.5
-"""Specimens, counted by their leverages, from which slopes along strokes may agree: two do too often by chance."""
+"""Least effective number of specimens (by leverage) whose slopes along strokes may be consistent.
 
-LARGE = 0.01
-"""Share of the force, root mean square: what changes along the strokes of every specimen by more, and the same way, is
-no scatter of specimens. A straight line of that size changes by 3.5 % from end to end."""
+Two specimens are consistent by chance too often.
+"""
+
+LARGE_SHARE = 0.01
+"""RMS change along strokes, as a share of the force, that is too large for the scatter of specimens.
+
+It must be exceeded in every specimen, with the same sign. A straight line of this size changes by 3.5 %
+from end to end.
+"""
 
 LEAST_OWN_VARIANCE = 0.01
-"""Share of a unit's variance that the model must leave for its number to count."""
+"""A unit's number is used if the model leaves at least this share of its variance."""
 
 KNOWN_DF = 8.0
-"""Degrees of freedom that a variance counts for which runs and files explain."""
+"""Prior degrees of freedom of a variance that the variance components of runs and files explain."""
 
 LEAST_KNOWN_DF = 0.5
-"""Fewest of these degrees of freedom; with fewer the scale is free and no draw depends on it."""
+"""Fewest prior degrees of freedom with which the scale is drawn at random; with fewer it is free."""
 
 LEAST_ERROR_DF = 4
-"""Degrees of freedom left for the scatter of specimens, with fewer of which nothing is claimed."""
+"""Fewest residual degrees of freedom between specimens with which an effect is claimed."""
 
 LEAST_ERROR_DF_OF_RUNS = 3
-"""The same for runs: three speeds both ways leave three."""
+"""The same between runs: three speeds in both directions leave three."""
 
 
 # ---------------------------------------------------------------- ripples
 SHARED_PHASE = 1e-3
-"""P-value below which the phase of a ripple is taken to be common to all files."""
+"""A ripple has one phase in all files if the p-value of that is below this."""
 
 ABOVE_BACKGROUND = 4.0
-"""Power of a peak over the median of its neighbours: a smooth trend has no peak."""
+"""Least ratio of the power of a peak to the median of its neighbours. A smooth trend has no such peak."""
 
 LEAST_FILES_OF_RIPPLE = 9
-"""Files that a test of signs at 0.5 % needs: eight of one sign have p = 0.004, and one may be small."""
+"""Fewest files of a sign test at 0.5 %: eight equal signs have p = 0.004, and one file may have a weak ripple."""
 
 LEAST_SAMPLES_OF_STROKE = 16
-"""Steady samples of a stroke with fewer of which it says nothing of a ripple."""
+"""Fewest steady samples of a stroke that is used in the search for ripples."""
 
 NEIGHBOURS = 25
-"""Frequencies on each side of one that make its local background."""
+"""Frequencies on each side of a frequency that make its local background."""
 
 LOBE = 4
-"""Frequencies on each side over which the taper spreads a peak."""
+"""Frequencies on each side of a peak over which the taper spreads it."""
 
 REACHED = 0.25
-"""Share of the strokes that must reach a frequency for it to be searched."""
+"""Least share of the strokes that must reach a frequency for it to be searched."""
 
 
 # ---------------------------------------------------------------- forms: which are tried, and which is reported
 MOST_KNOTS = 24
-"""Knots of a penalised free shape, whose smoothness the data decide."""
+"""Most knots of a penalised spline, whose smoothness is estimated from the data."""
 
 UNITS_PER_KNOT = 3
-"""Units of evidence for each knot of a free shape."""
+"""Units of evidence per knot of a free shape."""
 
 KNOTS_APART = 1e-3
-"""Of a channel scaled to -1..1: knots that are nearer are one value measured twice."""
+"""Knots of a channel scaled to -1..1 that are closer than this are one value that was measured twice."""
 
-REACH = 4.0
-"""Spans of a channel that a width or a time constant may have."""
+SPANS = 4.0
+"""Largest width or time constant of a form, as a multiple of the channel's range."""
 
-PAIR = 10.0
-"""Deviance by which two channels together must be favoured over one, exp(5): there are many more to choose from."""
+PAIR_PENALTY = 10.0
+"""Deviance added for a form of two channels, a likelihood ratio of exp(5): there are many more pairs to choose from."""
 
-CONTENDER = 0.6
-"""Share of the best explained sum of squares from which a rival channel is given forms."""
+CONTENDER_SHARE = 0.6
+"""Forms are fitted for a channel that explains at least this share of the largest explained sum of squares."""
 
-DOMINANT = 20.0
-"""Fall of the deviance under an effect's own scatter from which it had stood in most of the scatter."""
+SCATTER_FALL = 20.0
+"""Fall of the deviance, with the scatter re-estimated, from which all proposals are refitted under the new scatter.
+
+Most of the estimated scatter was then the missing effect.
+"""
 
 HALF_OF_CALENDAR = 0.5
-"""Share of what the calendar explains from which anything else comes before it."""
+"""A channel is preferred to the calendar if it explains at least this share of what the calendar explains."""
 
-BEHIND = 60.0
-"""Deviance by which a proposal may be behind under the best one's scatter and still be given one of its own."""
+REFIT_MARGIN = 60.0
+"""Variance components are re-estimated for proposals whose BIC, under the best one's scatter, is within this of it."""
 
-TIED = 3.0
-"""Deviance below which two forms are equal: the simpler or more physical one is reported."""
+EQUAL_BIC = 3.0
+"""Two forms are equal if they differ by less than this in BIC: the simpler or more physical one is reported."""
 
-RIVAL = 10.0
-"""Deviance below which a form is a rival: the data favour the chosen one by less than exp(5)."""
+RIVAL_BIC = 10.0
+"""A form is a rival if its BIC is larger by less than this, a likelihood ratio of exp(5)."""
 
-HELD = 0.5
-"""Relative standard error beyond which a form's own number is not determined."""
+MOST_RELATIVE_ERROR = 0.5
+"""A nonlinear parameter with a larger relative standard error is not determined by the data."""
 
-OVERTURNED = 1 / 3
-"""Share of its size by which a new effect may change an earlier one, where the new one has equals."""
+LARGE_CHANGE = 1 / 3
+"""Relative change of an earlier effect's amplitude from which a new effect is ranked after its equals."""
 
-ALIKE = 0.5
-"""Correlation below which two candidates explain different things."""
+RIVAL_CORRELATION = 0.5
+"""Two candidates with a smaller correlation explain different things."""
 
 SAME_EFFECT = 0.98
-"""Correlation above which two candidates are one effect in these data."""
+"""Two candidates with a larger correlation are the same effect in these data."""
 
 
 # ---------------------------------------------------------------- held-out data, and what is accepted
-MOST_HELD_OUT = 0.5
-"""Share of the rows that blocks of the calendar must hold out."""
+LEAST_HELD_OUT = 0.5
+"""Least share of the rows that blocks of the calendar must hold out."""
 
 BLOCKS_OF_A_FOLD = (1, 2, 4)
-"""Blocks of the calendar that a fold holds: as few as leave most rows held out once."""
+"""Numbers of calendar blocks per fold, tried in this order until `LEAST_HELD_OUT` of the rows are held out."""
 
-BEYOND = 0.02
-"""Of the range of what the fit saw, by which a held-out row may lie outside before it counts as extrapolated."""
+OUTSIDE = 0.02
+"""Share of the range of the other rows by which a held-out row may lie outside without being extrapolated."""
 
 SAME_SETTING = 0.01
-"""Of a value, by which measured numbers of one setting may differ."""
+"""Relative difference of measured values of one setting."""
 
-SURE_OF_RIPPLE = 0.005
-"""P-value over files (Wilcoxon) below which a ripple of free phase helps the half it was not fitted to."""
+RIPPLE_CONFIRMED_P = 0.005
+"""A ripple with a phase per stroke is confirmed if the p-value of Wilcoxon's test over files is below this."""
 
-COMPARED = 4
-"""Rivals, best first, that are put to held-out data too."""
+MOST_RIVALS = 4
+"""Number of rivals, best first, whose held-out error is computed too."""
 
-TRIES = 3
-"""Proposals put to held-out data in a round before the residual is called unexplained."""
+MOST_PROPOSALS = 3
+"""Number of proposals of a round that are tested on held-out data before the residual counts as unexplained."""
 
-MOSTLY = 0.5
-"""Share of an effect's variance that must lie within groups for its gain to be taken about their means."""
+MOST_WITHIN = 0.5
+"""The gain is computed about group means if at least this share of the effect's variance lies within the groups."""
 
-PARTLY = 0.1
-"""Share of an effect's variance within groups from which the end of the loop compares errors about their means.
+PART_WITHIN = 0.1
+"""The same share for the comparison of errors at the end of the loop.
 
-What warms a stroke by the power lost in it has a quarter of its variance inside strokes, where the evidence is.
+Frictional heating along a stroke has a quarter of its variance within strokes, and the evidence lies there.
 """
 
-REPEATED = 10.0
-"""Samples for each value of the force from which its steps are those of the recorder, not of chance."""
+SAMPLES_PER_VALUE = 10.0
+"""With more samples per distinct value of the force, the steps between values are those of the recorder."""
 
-WEAK = 1e-6
-"""P-value above which an effect must also lower the held-out error by `LEAST_FALL`.
+WEAK_P = 1e-6
+"""An effect with a larger p-value must also lower the held-out error by `LEAST_FALL`.
 
-P-values of a few specimens or runs rest on what their scatter is assumed to be; held-out data do not. Of 28 claims
-with p above 1e-5 in worlds drawn at random, 9 of the 11 true ones lower it by more, 13 of the 17 false ones by less;
-two false ones had a p between 1e-6 and 1e-5.
+P-values from a few specimens or runs depend on assumptions about their scatter; held-out data do not. Of 28 claims
+with p above 1e-5 in worlds drawn at random, 9 of the 11 true ones lower the error by more, and 13 of the 17 false ones
+by less. Two false claims had a p-value between 1e-6 and 1e-5.
 """
 
 LEAST_FALL = 0.05
-"""Share of the held-out RMSE by which an effect of weak evidence must lower it."""
+"""Least relative fall of the held-out RMSE by an effect of weak evidence."""
 
-SURE_OF_CURVE = 1e-5
-"""P-value that a free shape must reach which changes the shape of the Stribeck curve or of the aging law.
+CURVE_P = 1e-5
+"""Largest p-value of an accepted free shape that changes the Stribeck curve or the aging law.
 
-It does if it acts on one of their coefficients, or by the speed together with another variable. How the whole friction
-scatters between runs is estimated; how the coefficients do is not. In 354 worlds drawn at random 11 of 13 false claims
-of that kind had larger p-values.
+These are shapes that act on one coefficient, or on the speed together with another variable. The scatter of the whole
+friction between runs is estimated; that of the single coefficients is not. In 354 worlds drawn at random 11 of 13 false
+claims of this kind had larger p-values.
 """
 
 LEAST_SIZE = 2e-4
-"""Of the RMS force: the smallest effect that counts. What is smaller may as well be the sensor's nonlinearity."""
+"""Smallest effect that is reported, as a share of the RMS force. The sensor's nonlinearity may be as large."""
 
 
 # ---------------------------------------------------------------- the verdict, and what could have been seen
 NOT_ADJUSTED = 0.05
-"""P-value of a channel by itself, not adjusted for the search, below which it is named as what is left."""
+"""A channel is named as what is left if its p-value, not adjusted for the search, is below this."""
 
-EVEN = 0.5
-"""Adjusted p-value from which chance is the likelier explanation."""
+CHANCE_P = 0.5
+"""A channel with a larger adjusted p-value is not named: chance is the likelier explanation."""
 
 SAME_ERROR = 1.005
-"""Ratio of errors up to which they are equal: effects are fitted by whitened, not by plain, squares."""
+"""Ratio of errors up to which they count as equal. The fit minimises whitened, not plain, squares."""
 
 HARMLESS = 1.1
-"""Ratio of errors up to which an effect inside runs may move what runs differ by, where that is most of the error."""
+"""Largest ratio of errors between runs with an effect that lowers the error within runs."""
 
 HALVED = 0.5
-"""Ratio of held-out errors below which an effect of weak evidence is sure enough to move what runs differ by."""
+"""Ratio of held-out errors below which an effect of weak evidence is allowed `HARMLESS` too."""
 
 LACK_OF_FIT = 0.05
-"""P-value of the lack of fit from which the error is called larger than the scatter of repeats."""
+"""The error is larger than the scatter of repeats if the p-value of the lack of fit is below this."""
 
 UNSTEADY = 0.2
-"""Share of an offset by which it may differ from run to run and still be one offset."""
+"""An offset differs between runs if its standard deviation between them exceeds this share of it."""
 
-POWER_SOUGHT = 0.8
-"""Chance with which the smallest effect is found."""
+TARGET_POWER = 0.8
+"""Power (probability of detection) at the smallest effect."""
 
-COUNTED = 1.25
-"""Factor on the smallest effect that counts; with a standard error of a fifth it is found with `POWER_SOUGHT`."""
+SIZE_MARGIN = 1.25
+"""Factor on `LEAST_SIZE`: with a standard error of a fifth, the effect is then found with `TARGET_POWER`."""
 
 REAL_SHARE = 0.1
-"""Of a variable's variance: a share at a level that is a real one."""
+"""Least share of a variable's variance at a level at which it varies."""
 
-CLEARLY = 3.0
-"""Times the mean square of finer levels: what varies less between groups does so because it varies within them."""
+REAL_RATIO = 3.0
+"""Least ratio of the mean square of a variable at a level to that of finer levels: less is variation within groups."""
 
-MATERIAL = 0.02
-"""Of the force: scatter between units that would matter if it were an effect."""
+MATERIAL_SCATTER = 0.02
+"""Scatter between units, as a share of the force, that would matter if it were an effect."""
 
 LEAST_POWER = 0.3
-"""Of the size, with which its margin is taken to grow at least."""
+"""Least exponent with which the margin of an effect is taken to increase with its size."""
 
 FEW_UNITS = 30
-"""Groups of a level below which a sandwich covariance is itself uncertain, and has degrees of freedom of its own."""
+"""With fewer groups at a level the sandwich covariance gets Satterthwaite's degrees of freedom."""
 
 LEAST_SPARE_RUNS = 0.5
-"""Runs that the model must leave over for their scatter to be known at all."""
+"""Fewest residual degrees of freedom between runs with which their scatter is estimated."""
 
 NEAR_TESTED_SPEED = 0.05
-"""Relative difference within which a speed counts as a tested one."""
+"""Relative difference within which a speed counts as tested."""

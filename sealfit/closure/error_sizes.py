@@ -1,4 +1,4 @@
-"""How large the residual is, at which level it sits, and how small it could be: errors, noise floor, lack of fit."""
+"""Size of the residual and its level: errors, noise floor and lack of fit."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 
 SHAPES = 3
-"""Shapes along strokes that repeats are asked for: a slope, a bend and a wave."""
+"""Number of shapes along strokes in the lack-of-fit test: Legendre polynomials of degree 1 to 3."""
 
-RANK = 1e-9  # of the largest singular value of a tangent, below which it holds nothing
+RANK = 1e-9  # Relative singular value below which a direction of a tangent is zero.
 
 
 def errors(rows: Rows, residual: np.ndarray) -> dict[str, float]:
-    """Return rmse_N, rmse_runs_N, max_abs_N and mean_abs_pct of a residual, shape (n,), each file weighing the same."""
+    """Return rmse_N, rmse_runs_N, max_abs_N and mean_abs_pct of a residual, shape (n,), with equal weight per file."""
     weight = rows.weight
     run = pd.factorize(rows.table["run_id"])[0]
     per_run = np.bincount(run, weight)
@@ -36,7 +36,7 @@ def errors(rows: Rows, residual: np.ndarray) -> dict[str, float]:
 
 
 def without_repeat_pattern(rows: Rows, residual: np.ndarray) -> np.ndarray:
-    """Return the residual less what every run's first, second, third repeat have in common, shape (n,)."""
+    """Return the residual less the mean pattern over first, second, third repeats, shape (n,)."""
     repeat = pd.factorize(rows.table["repeat"])[0]
     if repeat.max() == 0:
         return residual
@@ -48,10 +48,9 @@ def without_repeat_pattern(rows: Rows, residual: np.ndarray) -> np.ndarray:
 
 
 def pure_error(rows: Rows, residual: np.ndarray) -> tuple[float, float] | None:
-    """Return (variance, df) of one bin about its run's mean over repeats; None where no run has repeats.
+    """Return (variance, df) of a bin about its run's mean over repeats; None without repeats.
 
-    What the repeats have in common at a place is the run's true shape and does not count; nor does the pattern that all
-    runs show from one repeat to the next.
+    The mean shape over the repeats of a run and the mean pattern from one repeat to the next are not part of it.
     """
     table = rows.table
     clean = without_repeat_pattern(rows, residual)
@@ -66,9 +65,9 @@ def pure_error(rows: Rows, residual: np.ndarray) -> tuple[float, float] | None:
 
 
 def noise_floor(fitted: Fitted) -> float | None:
-    """Return the RMSE that the true mean would have on these bins, from repeats of a run alone; None without repeats.
+    """Return the RMSE of the true mean on these bins, from the repeats of runs; None without repeats.
 
-    What set-ups of runs differ by is not in it: without runs made twice it cannot be told from a lack of fit.
+    It does not contain the scatter of set-ups, which cannot be distinguished from lack of fit without replicated runs.
     """
     pure = pure_error(fitted.rows, fitted.residual)
     return None if pure is None else float(np.sqrt(pure[0]))
@@ -79,13 +78,13 @@ def lack_of_fit(fitted: Fitted) -> float | None:
 
     The smallest p-value is multiplied by the number of tests (Bonferroni).
     """
-    means = _lack_of_means(fitted)
-    tests = [p for p in (means, *_lack_of_shapes(fitted)) if p is not None]
+    means = _p_of_run_means(fitted)
+    tests = [p for p in (means, *_p_of_shapes(fitted)) if p is not None]
     return None if means is None else min(1.0, len(tests) * min(tests))
 
 
-def _lack_of_shapes(fitted: Fitted) -> list[float]:
-    """Return the p-values of a slope, a bend and a wave along strokes, which repeats of a run have in common.
+def _p_of_shapes(fitted: Fitted) -> list[float]:
+    """Return the p-values of shapes along strokes that the repeats of a run have in common.
 
     Each is one number per stroke, the coefficient of a Legendre polynomial, so that noise may be correlated within
     strokes.
@@ -113,10 +112,10 @@ def _lack_of_shapes(fitted: Fitted) -> list[float]:
     return found
 
 
-def _lack_of_means(fitted: Fitted) -> float | None:
+def _p_of_run_means(fitted: Fitted) -> float | None:
     """Return the p-value of run means against the scatter of files within runs (F test); None without repeats.
 
-    What a piece of rubber moves as a whole is scatter, not lack of fit, and is taken out with the model.
+    The scatter of specimens is not lack of fit and is removed with the model.
     """
     rows = fitted.rows
     clean = without_repeat_pattern(rows, fitted.residual)
@@ -125,7 +124,7 @@ def _lack_of_means(fitted: Fitted) -> float | None:
     spread = np.sqrt(fitted.scatter.level_variance("file", files["force"].to_numpy()) + 1e-300)
     noise = fitted.scatter.noise_sd(files["force"].to_numpy())
     per_file = len(rows.table) / len(files)
-    scale = np.asarray(np.sqrt(spread**2 + noise**2 * fitted.scatter.alike / per_file))
+    scale = np.asarray(np.sqrt(spread**2 + noise**2 * fitted.scatter.design_effect / per_file))
     files["z"] = files["residual"] / scale
     by_run = files.groupby("run_id")["z"]
     count = by_run.transform("count").to_numpy()
@@ -137,17 +136,17 @@ def _lack_of_means(fitted: Fitted) -> float | None:
     first = ~files["run_id"].duplicated().to_numpy()
     root = np.sqrt(count[first])
     size = mean[first] * root
-    left, rank = _left_of_model(fitted, files["force"].to_numpy(), size, np.flatnonzero(first), root / scale[first])
+    left, rank = _residual_of_model(fitted, files["force"].to_numpy(), size, np.flatnonzero(first), root / scale[first])
     df_fit = float(runs - rank)
     if df_pure < 1 or df_fit < 1:
         return None
     return float(fdtrc(df_fit, df_pure, (left @ left / df_fit) / max(pure / df_pure, 1e-300)))
 
 
-def _left_of_model(
+def _residual_of_model(
     fitted: Fitted, force: np.ndarray, size: np.ndarray, chosen: np.ndarray, factor: np.ndarray
 ) -> tuple[np.ndarray, int]:
-    """Return what a model, and every specimen that scatters, leave of one number per run; and how many they take out.
+    """Return the residual of one number per run left by model and specimens, and their rank.
 
     Parameters
     ----------
@@ -156,9 +155,9 @@ def _left_of_model(
     force : ndarray, shape (files,)
         The model's mean force at each file of a run.
     size, factor : ndarray, shape (runs,)
-        The numbers, and what a file's tangent is multiplied by there.
+        The numbers, and the factor on a file's tangent.
     chosen : ndarray, shape (runs,)
-        Number of a file of each run.
+        Index of a file of each run.
     """
     rows = fitted.rows
     number = rows.table.groupby(["run_id", rows.codes("file")], sort=False).ngroup().to_numpy()
@@ -169,10 +168,10 @@ def _left_of_model(
     tangent = Tangent(fitted.jacobian.layout.of(place), means[chosen] * factor[:, None])
     if not any(c.level == "specimen" and c.variance > 0 for c in fitted.scatter.components):
         basis = tangent.orthonormal(RANK)
-        return basis.freed(size), basis.shape[1]
+        return basis.project_out(size), basis.shape[1]
     own = OwnColumns(rows.codes("specimen")[place], force[chosen] * factor)
-    basis = tangent.orthonormal(RANK, freed=own.freed)
-    return basis.freed(own.freed(size)), basis.shape[1] + own.count
+    basis = tangent.orthonormal(RANK, project_out=own.project_out)
+    return basis.project_out(own.project_out(size)), basis.shape[1] + own.count
 
 
 def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.DataFrame:

@@ -1,4 +1,4 @@
-"""Which forms may act where a candidate does, richer laws of aging among them, and the values to try."""
+"""The forms that are fitted for a candidate, richer aging laws among them, and the grids of their parameters."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pandas as pd
 from scipy.special import fdtrc
 
 from sealfit.closure.channels import CALENDAR, FINER, Channel, even_knots, scaled
-from sealfit.closure.criteria import FREE_DF, JACKKNIFE_UNITS, KNOTS_APART, MOST_KNOTS, REACH, SEARCHES, UNITS_PER_KNOT
+from sealfit.closure.criteria import FREE_DF, JACKKNIFE_UNITS, KNOTS_APART, MOST_KNOTS, SEARCHES, SPANS, UNITS_PER_KNOT
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.linearised import Proposal, middles
 from sealfit.closure.ripples import Peak, common_wavelength, pass_shifts
@@ -23,25 +23,26 @@ from sealfit.fit.joint.model import Term, mean_derivatives, shape_of
 from sealfit.fit.joint.rows import Rows
 
 # ---------------------------------------------------------------- forms
-# Which forms may act where a candidate does, and the values to try for what is not linear in them.
+# The forms that are fitted for a candidate, and the grids of their nonlinear parameters.
 
-MOST_PLACES = 60  # between neighbouring values that are tried
+MOST_PLACES = 60  # Largest number of places of a jump on a grid.
 
 NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1}
-"""Of mu_s, mu_c, v_s and sigma_2, those that the speeds of a series determine, by the form of its curve."""
+"""Number of mu_s, mu_c, v_s and sigma_2 that the speeds of a series determine, by the form of its curve."""
 
 PHASES = tuple(np.arange(4) * np.pi / 4)
+"""Phases of a ripple that are tried, in rad."""
 
 
 def terms_of(
     candidate: Candidate, channels: Mapping[str, Channel], fitted: Fitted, effects: Mapping[str, Effect]
 ) -> Iterator[tuple[Term, dict]]:
-    """Yield every form that may act where a candidate does, with the values to try for each searched parameter.
+    """Yield every form that fits a candidate, with a grid for each nonlinear parameter.
 
     Parameters
     ----------
     candidate : Candidate
-        What acts on what, as the search found it.
+        The candidate of the search.
     channels : mapping
         Channels by name.
     fitted : Fitted
@@ -52,7 +53,7 @@ def terms_of(
     target = (candidate.acts_on, candidate.operation)
     if candidate.pair:
         pair = [channels[name] for name in candidate.channels]
-        alone = fitted.scatter.knows("specimen") or all(c.unit != "specimen" for c in pair)
+        alone = fitted.scatter.estimates("specimen") or all(c.unit != "specimen" for c in pair)
         alone = alone and all(room_along(c, fitted) > 0 for c in pair)
         yield from _terms_of_pair(*pair, target, effects, alone=alone)
         return
@@ -61,14 +62,14 @@ def terms_of(
     knots = min(MOST_KNOTS, candidate.test_result.units // UNITS_PER_KNOT)
     for term, grid in _terms_of_single(channel, target, channels, fitted, effects, knots):
         fits = len(term.effect.parameters) <= room_along(channel, fitted)
-        if fits or len(term.channels) > 1 or term.smoothness is not None:  # a smoothing spline has fewer than its knots
+        if fits or len(term.channels) > 1 or term.smoothness is not None:  # a smoothing spline has fewer effective df
             yield term, grid
 
 
 def room_along(channel: Channel, fitted: Fitted) -> int:
-    """Return how many numbers of an effect along a channel its settings can hold beside those of the declared model.
+    """Return how many parameters of an effect the settings of a channel determine beside those of the declared model.
 
-    Eq. 14 has up to four numbers along speed and Eq. 15 three along days; along any other channel there is a level.
+    Eq. 14 has up to four parameters along speed and Eq. 15 three along days; along other channels there is a constant.
     """
     declared = fitted.model.declared
     own = 1
@@ -87,7 +88,7 @@ def _terms_of_single(
     effects: Mapping[str, Effect],
     knots: int,
 ) -> Iterator[tuple[Term, dict]]:
-    """Yield every form of one channel on a quantity, with the values to try for each searched parameter."""
+    """Yield every form of one channel on a quantity, with a grid for each nonlinear parameter."""
     name = channel.name
     for effect in effects.values():
         if effect.periodic:
@@ -104,27 +105,26 @@ def _terms_of_single(
             fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
             grids = grid_of(effect, np.abs(channel.values))
             yield Term(effect, effect.reads, *target, fixed=fixed), grids
-            if target == ("mu", "multiply") and ("mu", "add") in effect.acts_on:  # the search tries the factor for both
+            if target == ("mu", "multiply") and ("mu", "add") in effect.acts_on:  # the search tests the factor only
                 yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids
     if name != "direction":
         yield free_term(channel, *target, knots=knots), {}
 
 
 def _may_follow(effect: Effect, channel: Channel, fitted: Fitted) -> bool:
-    """Whether a form of any channel may follow this one."""
+    """Whether a form for any channel is fitted to this one."""
     if not channel.numeric or channel.name == "direction" or not _in_domain(effect, channel.values):
         return False
-    if effect.id == "offset_slope":  # the offset is an effect of its own inside strokes, or is in the model
+    if effect.id == "offset_slope":  # not along strokes, and not if the offset is in the model
         has_offset = any(term.effect.id == "zero_offset" for term in fitted.model.terms)
         return FINER[channel.unit] > FINER["stroke"] and not has_offset
     return channel.name not in CALENDAR or effect.along_calendar
 
 
 def _all_read(effect: Effect, channels: Mapping[str, Channel], rows: Rows, effects: Mapping[str, Effect]) -> bool:
-    """Whether an effect has what it reads.
+    """Whether the campaign has the channels that an effect reads.
 
-    A channel that does not vary (the one load of a campaign) may stay what it is, unless that makes of the effect
-    another one under a longer name.
+    Some of them may be constant (the one load of a campaign), unless the effect is then the same as another one.
     """
     varying = {name for name in effect.reads if name in channels or name == CHANNEL}
     still = set(effect.reads) - varying
@@ -139,8 +139,8 @@ def _terms_of_pair(
 ) -> Iterator[tuple[Term, dict]]:
     """Yield the forms of a pair of channels: products, or a slope for each category.
 
-    Forms that also hold what each channel does `alone` would be given the specimens' scatter where that is not known,
-    and the Stribeck curve where few speeds leave no room beside it.
+    Forms with main effects need `alone`. They would otherwise explain the specimens' scatter if that is not known, or
+    the Stribeck curve if there are few speeds.
     """
     if not (one.numeric and other.numeric):
         number, category = (one, other) if one.numeric else (other, one)
@@ -157,7 +157,7 @@ def _terms_of_pair(
             inputs = {CHANNEL: x.values, SECOND: z.values, **fixed}
             with np.errstate(all="ignore"):
                 good = np.isfinite(effect.shape(inputs, **effect.start())).all()
-            if good and (effect.id not in ("product", "bilinear") or x is one):  # the same either way round
+            if good and (effect.id not in ("product", "bilinear") or x is one):  # symmetric in the two
                 yield Term(effect, (x.name, z.name), *target, fixed=fixed), {}
     for effect in effects.values():
         if set(effect.reads) == {one.name, other.name} and target in effect.acts_on:
@@ -170,16 +170,16 @@ def _terms_of_pair(
 def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = FREE_DF + 1) -> Term:
     """Return the free shape of a channel: one level per category, or a spline.
 
-    A spline of up to five knots at quantiles is as it is; one of more has them evenly and is held smooth.
+    A spline of up to five knots has them at quantiles and no penalty; one of more has even knots and a penalty.
 
     Parameters
     ----------
     channel : Channel
         The channel.
     acts_on, operation : str
-        What it acts on, and how.
+        The target.
     knots : int
-        How many the spline may have; five at least.
+        Largest number of knots; five at least.
     """
     if channel.numeric:
         places = _knots(np.unique(channel.values), max(knots, FREE_DF + 1))
@@ -193,7 +193,7 @@ def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = FR
 
 
 def _knots(distinct: np.ndarray, count: int) -> tuple[float, ...]:
-    """Return `count` knots for rising values of a channel, or these themselves where no more of them lie apart."""
+    """Return `count` knots for sorted values of a channel, or the distinct values if there are no more."""
     distinct = distinct[np.r_[True, np.diff(scaled(distinct)) > KNOTS_APART]]
     if distinct.size <= count:
         knots = distinct
@@ -209,7 +209,7 @@ def _knots(distinct: np.ndarray, count: int) -> tuple[float, ...]:
 def periodic_terms(
     fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
 ) -> Iterator[tuple[Term, dict, Candidate]]:
-    """Yield the ways in which a periodic component may act, with the values to try, and a candidate for each.
+    """Yield the terms that a periodic component may be, each with its grid and a candidate.
 
     Parameters
     ----------
@@ -225,9 +225,9 @@ def periodic_terms(
     rows = fitted.rows
     effect = effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"]
     both = np.unique(np.sign(rows.speed)).size == 2
-    ways = [("force", "add")] if peak.sign_symmetric else []
+    targets = [("force", "add")] if peak.sign_symmetric else []
     if not both or not peak.sign_symmetric:
-        ways += [("mu", "multiply"), ("force", "multiply")]
+        targets += [("mu", "multiply"), ("force", "multiply")]
     fixed: dict = {"x_ref": 0.0}
     phases, lengths = PHASES, (peak.wavelength,)
     if not peak.common_phase:
@@ -240,21 +240,21 @@ def periodic_terms(
         p.name: (lengths if p.name == "lambda_" or p.name.startswith("lambda") else phases) for p in effect.nonlinear
     }
     units = rows.groups.starts["file"].size
-    for way in ways:
-        if way in effect.acts_on:
+    for target in targets:
+        if target in effect.acts_on:
             test_result = ScoreTestResult(0.0, 2, units, 0.0)
-            candidate = Candidate((peak.axis,), *way, "file", np.empty((0, 0)), test_result, p_value=peak.p_value)
-            yield Term(effect, (peak.axis,), *way, fixed=fixed), names, candidate
+            candidate = Candidate((peak.axis,), *target, "file", np.empty((0, 0)), test_result, p_value=peak.p_value)
+            yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
 
 
 def reference(values: np.ndarray) -> float:
-    """Return a channel's reference value: its mean, to three digits, so that it reads well."""
+    """Return a channel's reference value: its mean, rounded to three digits."""
     mean = float(np.mean(values))
     return float(f"{mean:.3g}")
 
 
 def _in_domain(effect: Effect, values: np.ndarray) -> bool:
-    """Whether a form gives numbers at every value of the channel."""
+    """Whether a form is finite at every value of the channel."""
     sample = np.unique(values)[:: max(1, np.unique(values).size // 50)]
     with np.errstate(all="ignore"):
         result = effect.shape({CHANNEL: sample, "direction": 1.0, "x_ref": reference(values)}, **effect.start())
@@ -262,12 +262,12 @@ def _in_domain(effect: Effect, values: np.ndarray) -> bool:
 
 
 def _within_reach(effect: Effect, values: np.ndarray) -> Effect:
-    """Return a form whose places lie inside the channel's range and whose widths do not exceed a few of its spans.
+    """Return a form with places inside the channel's range and widths of at most a few of its ranges.
 
-    A bump far outside is a bent line and a constant under another name.
+    A peak far outside is not distinguishable from a curve with a constant.
     """
     low, high, span = float(values.min()), float(values.max()), float(np.ptp(values)) or 1.0
-    limits = {"inside": (low, high), "between": (low, high), "span": (span / 1000, REACH * span)}
+    limits = {"inside": (low, high), "between": (low, high), "span": (span / 1000, SPANS * span)}
     parameters = []
     for p in effect.parameters:
         if p.search in limits:
@@ -278,7 +278,7 @@ def _within_reach(effect: Effect, values: np.ndarray) -> Effect:
 
 
 def grid_of(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
-    """Return the values to try for each parameter that is searched, from those of the channel, shape (n,)."""
+    """Return the grid of each nonlinear parameter, from the values of the channel, shape (n,)."""
     span = float(np.ptp(values)) or 1.0
     grids = {}
     for p in effect.nonlinear:
@@ -299,35 +299,36 @@ def grid_of(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
 
 
 def describe(term: Term) -> str:
-    """Return an effect in words, e.g. "ripple along displacement_mm, on force"."""
+    """Return the label of an effect, e.g. "ripple along displacement_mm, added to force"."""
     label = term.effect.label.replace("{x}", term.channels[0]).replace("{z}", term.channels[-1])
     return f"{label}, {'added to' if term.operation == 'add' else 'factor on'} {term.acts_on}"
 
 
 # ---------------------------------------------------------------- richer laws
-# Has the aging another law? The richer laws of the catalogue, refitted whole, against the declared one.
+# Richer aging laws: each of the catalogue is fitted jointly and tested against the declared one.
 #
-# The declared law bends: with a and b free it takes up most of what a floor or an induction time does, and what is left
-# in its tangent space is a small part, so that a dozen specimens say little of it. Each richer law is therefore fitted
-# jointly from several starts, its scatter of specimens its own. With n specimens, p numbers of the declared law and q
-# more, the restricted deviances D give the ratio of what is left between specimens,
+# The declared law is flexible: with a and b free it explains most of the effect of a floor or an induction time. The
+# part orthogonal to its tangent space is small, and a dozen specimens give little evidence of it. Each richer law is
+# therefore fitted jointly from several starts, with its own estimate of the specimens' scatter. With n specimens, p
+# parameters of the declared law and q more, the restricted deviances D give the ratio of the residual variances between
+# specimens,
 #
 # .. math:: \log \frac{S_0}{S_1} = \frac{1}{n} \Big(D_0 - D_1 + n \log \frac{n - p}{n - p - q} - q \Big), \qquad
 #           F = \Big(\frac{S_0}{S_1} - 1\Big) \frac{n - p - q}{q}
 #
-# or, where that is smaller, F = t^2 / q of its amplitude: near a bound of its numbers either alone may say too much.
+# or, if that is smaller, F = t^2 / q of its amplitude: near a bound either alone may be too large.
 
 AGING = "aging_days"
 TARGET = ("mu", "multiply")
-FEWEST = 2  # numbers more than the declared law that a richer one has: an amplitude and a day
-ROWS = 2  # of each stroke: aging moves strokes as a whole
-STARTS = 4  # days from which a law's own number is sought
+FEWEST = 2  # Additional parameters of a richer law: an amplitude and a day.
+ROWS = 2  # Rows per stroke: aging changes strokes as a whole.
+STARTS = 4  # Start values of a law's nonlinear parameter, in days.
 
 
 def richer_laws(
     fitted: Fitted, channels: Mapping[str, Channel], effects: Mapping[str, Effect]
 ) -> list[tuple[Candidate, Proposal]]:
-    """Return each richer law of aging with its test, adjusted for how many there are; none for 30 specimens or more.
+    """Return each richer aging law with its test, adjusted for their number; none with 30 specimens or more.
 
     Parameters
     ----------
@@ -345,15 +346,15 @@ def richer_laws(
     known = {t.effect.id for t in fitted.model.terms}
     laws = [e for e in effects.values() if e.physical and e.reads == (AGING,) and TARGET in e.acts_on]
     laws = [e for e in laws if e.id not in known and len(e.linear) == 1 and e.nonlinear]
-    if specimens - fitted.model.declared.numbers_of_mu <= FEWEST:
+    if specimens - fitted.model.declared.mu_parameter_count <= FEWEST:
         return []
     rows = fitted.rows.sparse(ROWS)
     before = reestimated(fit(fitted.model, rows, fitted.scatter, turns=1))
-    found = [_judged(fitted, before, effect, len(laws)) for effect in laws]
+    found = [_law_test(fitted, before, effect, len(laws)) for effect in laws]
     return [f for f in found if f is not None]
 
 
-def _judged(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[Candidate, Proposal] | None:
+def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[Candidate, Proposal] | None:
     """Return one law's candidate and proposal."""
     term = Term(effect, effect.reads, *TARGET, fixed={})
     after = _best(before, term)
@@ -365,12 +366,12 @@ def _judged(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[
     )
     gain = min(before.deviance, without.deviance) - after.deviance
     units = fitted.rows.groups.starts["specimen"].size
-    q, left = len(effect.parameters), units - fitted.model.declared.numbers_of_mu
+    q, left = len(effect.parameters), units - fitted.model.declared.mu_parameter_count
     error = left - q
     if error < 1:
         return None
     amplitude = effect.linear[0]
-    at = after.model.place(place).start + [p.name for p in effect.parameters].index(amplitude)
+    at = after.model.term_slice(place).start + [p.name for p in effect.parameters].index(amplitude)
     ratio = np.exp((gain + units * np.log(left / error) - q) / units)
     t = after.model.values[place][amplitude] / np.sqrt(max(after.covariance[at, at], 1e-300))
     f = max(min((ratio - 1) * error / q, t**2 / q), 0.0)
@@ -380,13 +381,13 @@ def _judged(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[
     column = project(fitted, (fitted.slope(*TARGET) * shape)[:, None])[:, 0]
     adjusted = float(min(1.0, (SEARCHES + 1) * laws * p_value))
     test = SmallSampleTest(TARGET, np.empty((0, q)), 0.0, gain, float(np.log(max(p_value, 1e-300))), 1.0, error)
-    test_result = ScoreTestResult(gain, q, units, test.log_p, few=test)
+    test_result = ScoreTestResult(gain, q, units, test.log_p, small_sample=test)
     candidate = Candidate((AGING,), *TARGET, "specimen", shape[:, None], test_result, adjusted)
     return candidate, Proposal(term, values, "specimen", units, gain, adjusted, column, candidate.key)
 
 
 def _best(before: Fitted, term: Term) -> Fitted | None:
-    """Return the law fitted jointly from several days, the best of them."""
+    """Return the best joint fit of the law from several start values."""
     effect, rows = term.effect, before.rows
     days = np.unique(rows.days[rows.days > 0])
     amplitude, number = effect.linear[0], effect.nonlinear[0].name

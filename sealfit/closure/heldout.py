@@ -1,4 +1,4 @@
-"""Rows held out: whole groups, blocks of the calendar or whole settings, and whether the others cover them."""
+"""Held-out rows: whole groups, calendar blocks or whole settings, and whether the other rows cover them."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from sealfit.closure.criteria import BEYOND, BLOCKS_OF_A_FOLD, LEAST_GROUPS_HELD_OUT, MOST_HELD_OUT, SAME_SETTING
+from sealfit.closure.criteria import BLOCKS_OF_A_FOLD, LEAST_GROUPS_HELD_OUT, LEAST_HELD_OUT, OUTSIDE, SAME_SETTING
 from sealfit.fit.joint.rows import LEVELS, Rows
 
 
 def heldout_level(rows: Rows) -> str:
-    """Return the level whose groups are held out: run, or file or stroke where there are fewer than six."""
+    """Return the level whose groups are held out: run, or file or stroke if there are fewer than six."""
     for level in ("run", "file"):
         if rows.groups.starts[level].size >= LEAST_GROUPS_HELD_OUT:
             return foldable(rows, level)
@@ -21,8 +21,8 @@ def heldout_level(rows: Rows) -> str:
 def foldable(rows: Rows, level: str) -> str:
     """Return a level, or the next finer one at which conditions keep some groups while others are held out.
 
-    A condition with one file and no law that reaches it cannot be predicted without that file: its strokes are held
-    out then, and say how well these very files are predicted.
+    A condition with one file and no aging law cannot be predicted without that file. Its strokes are held out then, and
+    the error is that of predicting the same files.
     """
     for finer in reversed(LEVELS[: LEVELS.index(level) + 1]):
         start = rows.groups.starts[finer]
@@ -34,9 +34,9 @@ def foldable(rows: Rows, level: str) -> str:
 
 
 def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,): whole groups, dealt so that each condition keeps most of its own.
+    """Yield masks of the rows held out, shape (n,): whole groups, spread so that each condition keeps most of its own.
 
-    Day 0 and the last day are never held out with all their groups, as a law is not asked to extrapolate.
+    Day 0 and the last day always keep a group, so that the aging law does not have to extrapolate.
     """
     start = rows.groups.starts[level]
     count = min(count, start.size)
@@ -50,11 +50,11 @@ def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]
 
 
 def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]:
-    """Return masks of the rows held out, shape (n,): groups that follow one another in the campaign's calendar.
+    """Return masks of the rows held out, shape (n,): blocks of groups that are consecutive in the calendar.
 
-    Neighbours in time resemble each other, and so do the conditions that were tested one after the other: with groups
-    left out here and there any wavy line through the calendar seems to be confirmed. Where a block would hold all of a
-    condition that cannot be predicted without, blocks are made shorter, and a fold holds several that lie apart.
+    Neighbours in time are correlated, and so are conditions tested one after the other. With single groups held out,
+    any smooth curve through the calendar would be confirmed. If a block contains a whole condition that cannot be
+    predicted without it, blocks are shortened, and a fold has several of them that are apart.
     """
     start = rows.groups.starts[level]
     count = min(count, start.size)
@@ -63,13 +63,13 @@ def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]
     masks: list[np.ndarray] = []
     for parts in BLOCKS_OF_A_FOLD:
         masks = list(_masks(rows, level, place * min(count * parts, start.size) // start.size % count))
-        if np.any(masks, axis=0).mean() > MOST_HELD_OUT:
+        if np.any(masks, axis=0).mean() > LEAST_HELD_OUT:
             break
     return masks
 
 
 def _masks(rows: Rows, level: str, number: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,), from the fold of each group; no edge condition loses all groups."""
+    """Yield masks of the rows held out, shape (n,), from the fold of each group; edge conditions keep a group."""
     start, code = rows.groups.starts[level], rows.codes(level)
     condition = rows.condition[start]
     for k in range(number.max() + 1):
@@ -79,7 +79,7 @@ def _masks(rows: Rows, level: str, number: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _without_lost_edges(out: np.ndarray, condition: np.ndarray, rows: Rows) -> np.ndarray:
-    """Return what is held out less the edge conditions that would be held out whole, shape of `out`."""
+    """Return what is held out, without edge conditions that would lose all groups, shape of `out`."""
     for c in np.unique(condition[out]):
         if not (~out & (condition == c)).any() and _edge(rows, c):
             out = out & (condition != c)
@@ -96,7 +96,7 @@ def _edge(rows: Rows, condition: int) -> bool:
 
 
 def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.ndarray:
-    """Return which of the rows held out lie inside what the other rows cover, shape (n,): the rest are extrapolated.
+    """Return which held-out rows are covered by the other rows, shape (n,); the rest are extrapolated.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.nda
     out : ndarray of bool, shape (n,)
         Which are held out.
     channels : iterable of str
-        What the effects of the model read.
+        Channels of the effects in the model.
     """
     inside = out.copy()
     series = rows.conditions["series"].to_numpy()[rows.condition]
@@ -115,7 +115,7 @@ def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.nda
         seen = here & ~out
         tested = np.unique(rows.condition[seen])
         lawful = rows.has_aging and tested.size > 1
-        days = rows.days[seen | (~out & (rows.days == 0))]  # unaged rubber starts every series
+        days = rows.days[seen | (~out & (rows.days == 0))]  # every series starts from unaged rubber
         new = here & out & ~np.isin(rows.condition, tested)
         if not lawful:
             inside &= ~new
@@ -133,16 +133,16 @@ def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.nda
 
 
 def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return which values lie beyond those seen, by more than measured numbers of one setting differ."""
+    """Return which values lie outside the range of those seen, by more than values of one setting differ."""
     low, high = float(seen.min()), float(seen.max())
-    slack = BEYOND * (high - low) + SAME_SETTING * max(abs(low), abs(high))
+    slack = OUTSIDE * (high - low) + SAME_SETTING * max(abs(low), abs(high))
     return (values < low - slack) | (values > high + slack)
 
 
 def whole_settings(rows: Rows, values: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,): everything at one inner setting of a channel, one after the other.
+    """Yield masks of the rows held out, shape (n,): all rows at one inner setting of a channel, one setting at a time.
 
-    A free shape through every setting fits those it was given, and says nothing of what lies between them.
+    A free shape may fit every setting it has seen and still not predict those between them.
     """
     for setting in np.unique(values)[1:-1]:
         out = _without_lost_edges(values == setting, rows.condition, rows)

@@ -1,4 +1,4 @@
-"""Intervals of the joint model: parameters of effects, and the mean force at points."""
+"""Intervals of the joint model: for parameters of effects and for the mean force at points."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ PHASES = {"A": "phi", "B": "phi_2"}
 
 
 class Sandwich(NamedTuple):
-    """Covariance of the fitted numbers that whole groups of a level show, whatever it is that these differ in."""
+    """Sandwich covariance of the parameters from whole groups of a level."""
 
     covariance: np.ndarray  # (p, p)
     information: Sequence[tuple[np.ndarray, np.ndarray]]
-    """Of each group the numbers it depends on, shape (k,), and their information, shape (k, k); empty if many."""
+    """Per group the parameters it depends on, shape (k,), and their information, (k, k); empty with many groups."""
 
 
 def degrees_of_freedom(fitted: Fitted) -> float:
-    """Return the degrees of freedom of the coarsest level that scatters: units there less the levels they estimate.
+    """Return the degrees of freedom of the coarsest level that scatters: its units less the parameters they estimate.
 
-    0 where the model has as many numbers as there are runs: nothing then shows how runs scatter.
+    0 if the model has as many parameters as there are runs: the scatter of runs is then not estimable.
     """
     groups = fitted.rows.groups
     white = fitted.whitening(fitted.friction[:, None])[:, 0]
@@ -50,7 +50,7 @@ def degrees_of_freedom(fitted: Fitted) -> float:
 
 
 def t_quantile(df: float) -> float:
-    """Return the two-sided 95 % quantile of Student's t; NaN for no degrees of freedom."""
+    """Return the two-sided 95 % quantile of Student's t; NaN for 0 degrees of freedom."""
     return float(stdtrit(df, 0.975))
 
 
@@ -61,9 +61,9 @@ def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
 
 
 def sandwiches(fitted: Fitted) -> list[Sandwich]:
-    """Return the sandwich covariances of whole files, runs and specimens, and of one level with many groups at most.
+    """Return the sandwich covariances of specimens, runs and files, down to the first level with many groups.
 
-    Specimens and runs may differ in numbers that no variance component holds, such as v_s.
+    Specimens and runs may differ in parameters that have no variance component, such as v_s.
     """
     found, rows, white = [], fitted.rows, fitted.white_jacobian
     for level in reversed(LEVELS[1:]):
@@ -86,14 +86,14 @@ def sandwiches(fitted: Fitted) -> list[Sandwich]:
 def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Interval]:
     """Return {parameter: (value, lo95, hi95)} of one effect.
 
-    The wider of two standard errors counts: that of the fitted scatter, and the one that whole units of the effect's
-    own level show, so that an effect which itself scatters between units is not given too short an interval.
+    The larger of two standard errors is used: by the variance components, and by the sandwich of the units of the
+    effect's level. An effect that scatters between units would otherwise get too short an interval.
     """
     term = fitted.model.terms[number]
     held = term.fixed.get("held", {})
-    place = fitted.model.place(number)
+    place = fitted.model.term_slice(number)
     variance = np.diag(robust_covariance(fitted, level))[place]
-    if not held:  # a wave is finer than the shapes in which files differ, which the fitted scatter holds against it
+    if not held:  # the variance components describe coarser shapes than a wave
         variance = np.maximum(variance, np.diag(fitted.covariance)[place])
     units = fitted.rows.groups.starts[level].size
     reach = t_quantile(max(units - variance.size - 1, 2)) * np.sqrt(variance)
@@ -102,13 +102,13 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Inter
     for p, r in zip(term.effect.parameters, reach, strict=True):
         low, high = held.get(p.name, (values[p.name] - r, values[p.name] + r))
         result[p.name] = (values[p.name], float(low), float(high))
-    return waves_upright(result)
+    return normalised_waves(result)
 
 
-def waves_upright(intervals: dict[str, Interval]) -> dict[str, Interval]:
-    """Return intervals with the amplitude of every sine positive and its phase above -pi and at most pi.
+def normalised_waves(intervals: dict[str, Interval]) -> dict[str, Interval]:
+    """Return intervals with the amplitude of every sine positive and its phase in (-pi, pi].
 
-    -A at a phase is A half a turn on: without a choice, where the position is counted from decides on the sign.
+    An amplitude -A is the same as A with the phase shifted by pi.
     """
     made = dict(intervals)
     for amplitude, phase in PHASES.items():
@@ -130,21 +130,21 @@ def mean_se(tangent: Tangent, covariance: np.ndarray) -> np.ndarray:
 
 
 def mean_half_width(tangent: Tangent, covariance: np.ndarray, df: float, others: Sequence[Sandwich]) -> np.ndarray:
-    """Return half the 95 % interval of the model's force, shape (n,): the widest of several.
+    """Return half the 95 % interval of the model's force, shape (n,): the largest of several.
 
-    One is that of the variance components. The others are those of whole groups, each with the degrees of freedom by
-    Satterthwaite that its groups leave at this point; one group that decides on a force alone says nothing of it.
+    One uses the variance components. The others are sandwiches of whole groups, each with Satterthwaite's degrees of
+    freedom at this point. They are not used where one group alone determines the force.
 
     Parameters
     ----------
     tangent : Tangent, shape (n, p)
-        Of the model at the points.
+        Tangent of the model at the points.
     covariance : ndarray, shape (p, p)
-        By the variance components.
+        Covariance by the variance components.
     df : float
         Its degrees of freedom.
     others : sequence of Sandwich
-        By whole groups.
+        Sandwich covariances of whole groups.
     """
     half = t_quantile(df) * mean_se(tangent, covariance)
     for covariance_of_groups, information in others:

@@ -1,4 +1,4 @@
-"""Forms fitted to the residual in the tangent space of the current model: exact in amplitudes, a grid over the rest."""
+"""Forms fitted to the residual in the tangent space of the model: amplitudes exactly, other parameters on a grid."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.closure.criteria import IDENTIFIABLE, PAIR
+from sealfit.closure.criteria import IDENTIFIABLE, PAIR_PENALTY
 from sealfit.closure.score_test import Candidate, project
 from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.joint.estimate import Fitted, effective_df
 from sealfit.fit.joint.model import Term, mean_derivatives
-from sealfit.fit.joint.prior import likely_smoothness, penalised, roughness_of
+from sealfit.fit.joint.prior import penalised, reml_smoothness, roughness_of
 from sealfit.fit.joint.rows import Rows
 
-PART = 32  # points of a grid whitened at once
+PART = 32  # Grid points that are whitened at once.
 UNNAMED = (SMOOTH, SURFACE)
 ZERO_OFFSET = (("direction",), "force", "add")
 PREFERRED = ("mu", "mu_c", "mu_s", "force", "v_s", "sigma_2", "a", "b", "mu_0")
@@ -26,35 +26,35 @@ PREFERRED = ("mu", "mu_c", "mu_s", "force", "v_s", "sigma_2", "a", "b", "mu_0")
 
 @dataclass(frozen=True)
 class Proposal:
-    """A term with start values, how much it explains, and, once refitted, the joint fit."""
+    """A term with start values, what it explains, and the joint fit once it is refitted."""
 
     term: Term
     values: Mapping[str, float]
-    unit: str  # level of its whole units
+    unit: str  # level of its units of evidence
     units: int
     chi2: float
     p_value: float
     column: np.ndarray  # (n,) what it adds to the force, whitened and projected
-    source: tuple  # key of the candidate it stands for
-    linear_size: float | None = None  # of a free shape that is held smooth, before it is refitted
+    source: tuple  # key of its candidate
+    linear_size: float | None = None  # effective degrees of freedom of a penalised shape before it is refitted
     fitted: Fitted | None = None
 
     @cached_property
     def size(self) -> float:
-        """How many numbers it is worth: its parameters, fewer where a free shape is held smooth."""
+        """Effective degrees of freedom: its number of parameters, or fewer for a penalised free shape."""
         if self.linear_size is None:
             return float(len(self.term.effect.parameters))
         return self.linear_size if self.fitted is None else effective_df(self.fitted, len(self.fitted.model.terms) - 1)
 
     @property
     def bic_penalty(self) -> float:
-        """Schwarz's price of its parameters, and of being one of the many pairs of channels."""
-        pair = PAIR if SECOND in self.term.effect.reads else 0.0
+        """BIC penalty of its parameters; pairs of channels have an additional one, as there are many."""
+        pair = PAIR_PENALTY if SECOND in self.term.effect.reads else 0.0
         return self.size * np.log(max(self.units, 2)) + pair
 
     @property
     def bic(self) -> float:
-        """Twice the negative log likelihood plus the price; smaller is better."""
+        """Deviance plus the BIC penalty; smaller is better."""
         return (self.fitted.deviance if self.fitted is not None else -self.chi2) + self.bic_penalty
 
     @property
@@ -64,20 +64,20 @@ class Proposal:
 
     @property
     def rank(self) -> tuple:
-        """Order among equals: mechanism, closed form, free shape; then fewer parameters; then what it acts on, and how.
+        """Sort key among equals: physical effect, closed form, free shape; then fewer parameters; then the target.
 
-        A mechanism names first how it usually acts.
+        A physical effect lists its usual target first.
         """
         effect = self.term.effect
         kind = 0 if effect.physical else 2 if effect.id in UNNAMED else 1
-        offset = self.source == ZERO_OFFSET  # an amplifier is off more often than friction by direction
-        target = -1 if offset else PREFERRED.index(self.term.acts_on)
-        way = (self.term.acts_on, self.term.operation)
-        return (kind, self.size, target, effect.acts_on.index(way) if effect.physical else 0)
+        is_offset = self.source == ZERO_OFFSET  # amplifier offsets are commoner than one-sided friction
+        position = -1 if is_offset else PREFERRED.index(self.term.acts_on)
+        target = (self.term.acts_on, self.term.operation)
+        return (kind, self.size, position, effect.acts_on.index(target) if effect.physical else 0)
 
 
 class Linearised:
-    """Terms fitted to the residual in the tangent space of a model: amplitudes exact, a grid over the rest.
+    """Fits terms to the residual in the tangent space of a model: amplitudes exactly, other parameters on a grid.
 
     Parameters
     ----------
@@ -87,10 +87,10 @@ class Linearised:
 
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
-        self._kept: tuple[tuple, np.ndarray] | None = None  # shapes are the same on every quantity a form may act on
+        self._kept: tuple[tuple, np.ndarray] | None = None  # shapes are the same for every target
 
     def __call__(self, term: Term, search: Mapping[str, tuple], candidate: Candidate) -> list[Proposal]:
-        """Return the term at the best point of its grid; nothing where none of it is left here."""
+        """Return the term at the best point of its grid; an empty list if none of it is identifiable."""
         fitted, effect = self.fitted, term.effect
         points = [dict(zip(search, point, strict=True)) for point in itertools.product(*search.values())]
         point, most, shape = self._best(term, points, self._shapes(term, points))
@@ -125,7 +125,7 @@ class Linearised:
         return points[best], float(chi2[best]), shapes[:, best * count : (best + 1) * count]
 
     def _shapes(self, term: Term, points: list[dict[str, float]]) -> np.ndarray:
-        """Return the shape per unit of each amplitude at every point, shape (n, points * amplitudes), made once."""
+        """Return the shapes per unit amplitude at every point, shape (n, points * amplitudes), from a cache."""
         key = (term.effect.id, term.channels, points, term.fixed)
         if self._kept is None or self._kept[0] != key:
             self._kept = (key, self._made(term, points))
@@ -139,7 +139,7 @@ class Linearised:
 
 
 def _between(term: Term, point: Mapping[str, float], search: Mapping[str, tuple], rows: Rows) -> list[dict[str, float]]:
-    """Return the points of a jump's places that lie between the best one's neighbours on a grid that left some out."""
+    """Return the places of a jump between the best grid point's neighbours that the grid left out."""
     jump = next((p.name for p in term.effect.nonlinear if p.search == "between"), None)
     if jump is None:
         return []
@@ -151,21 +151,21 @@ def _between(term: Term, point: Mapping[str, float], search: Mapping[str, tuple]
 
 
 def middles(values: np.ndarray) -> np.ndarray:
-    """Return the places halfway from one value of a channel to the next: where a jump may lie."""
+    """Return the midpoints between neighbouring values of a channel, where a jump may lie."""
     distinct = np.unique(values)
     return (distinct[1:] + distinct[:-1]) / 2
 
 
 def _smooth(term: Term, left: np.ndarray, residual: np.ndarray) -> tuple[Term, np.ndarray, float]:
-    """Return a free shape as smooth as the residual wants it, its amplitudes, and how many numbers it is worth."""
+    """Return a free shape with estimated smoothness, its amplitudes, and its effective degrees of freedom."""
     normal, gradient, rough = left.T @ left, left.T @ residual, roughness_of(term)
-    smoothness = likely_smoothness(normal, gradient, rough)
+    smoothness = reml_smoothness(normal, gradient, rough)
     amplitude, size = penalised(normal, gradient, smoothness * rough)
     return replace(term, smoothness=smoothness), amplitude, size
 
 
 def _explained(fitted: Fitted, columns: np.ndarray, count: int) -> np.ndarray:
-    """Return the sum of squares that each `count` neighbouring columns of the force explain, shape (points,)."""
+    """Return the sum of squares that each group of `count` columns of the force explains, shape (points,)."""
     good = np.isfinite(columns).all(axis=0)
     white = fitted.whitening(np.where(good, columns, 0.0))
     taken = fitted.basis.against(white)

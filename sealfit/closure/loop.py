@@ -1,4 +1,4 @@
-"""Close the loop: before, what is missing, after, and what is left, as closure.json and its tables."""
+"""Close the loop: the models before and after, the effects added, and what is left, as closure.json and tables."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, silent, varies_within
-from sealfit.closure.criteria import ALIKE, JACKKNIFE_UNITS, PARTLY
+from sealfit.closure.criteria import JACKKNIFE_UNITS, PART_WITHIN, RIVAL_CORRELATION
 from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import covered, folds, heldout_level
 from sealfit.closure.output import channel_table, curve_table, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
-from sealfit.closure.selection import Selection, Start, grow, numbered, predict_rows, steady_samples
+from sealfit.closure.selection import Selection, Start, numbered, predict_rows, select_effects, steady_samples
 from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -30,7 +30,7 @@ from sealfit.progress import timed
 
 @dataclass(frozen=True)
 class Closure:
-    """closure.json as a dict, the model that predict needs, the loop's tables, and the after-model on all bins."""
+    """closure.json as a dict, the model record for `predict`, the tables, and the after-model fitted to all bins."""
 
     document: dict
     model: dict
@@ -53,13 +53,13 @@ def close_loop(
     bins : DataFrame
         Table `bins`.
     traces : DataFrame or sequence of StoredTraces
-        Table `traces`, or where it lies: the raw samples, for what is finer than the bins.
+        Table `traces`, the raw samples, or where it is stored.
     config : Config
         The rig.
     workers : int
-        Processes for the folds, and for the spectra of many samples.
+        Processes for the folds and for the spectra of many samples.
     on_progress : callable, optional
-        Told in words what is being done.
+        Called with a line on what is being done.
     """
     say = on_progress or silent
     effects = dict(EFFECTS)
@@ -71,10 +71,10 @@ def close_loop(
     columns, counted = list(bins.columns), numbered(bins.reset_index(drop=True))
     del bins
     rows = make_rows(counted, has_aging=config.aging)
-    del counted  # much of the memory: `rows` holds all of it
+    del counted  # it takes much memory, and `rows` contains it
     start = None
     for part in subsamples(rows, config.loop.seed):
-        if not part.whole and start is None:  # all strokes tell where to begin better than those that are searched
+        if not part.whole and start is None:  # a start from all strokes is better than from those searched
             say("the declared model on all strokes")
             with timed("declared model", rows=part.every.force.size, of="bins, merged"):
                 declared = fit_declared(part.every)
@@ -83,29 +83,29 @@ def close_loop(
         fine = part.rows if part.coarse is not part.rows else None
         with timed("search", rows=part.coarse.force.size, of="bins, merged"):
             begin = None if part.whole else start
-            grown = grow(part.coarse, heldout.samples, context, fine=fine, start=begin)
+            selection = select_effects(part.coarse, heldout.samples, context, fine=fine, start=begin)
         if not part.whole:
-            grown, on_all_strokes = reselect_on_all(grown, part.every, heldout.samples, config, say)
+            selection, on_all_strokes = reselect_on_all(selection, part.every, heldout.samples, config, say)
         say("before and after on all rows")
         with timed("before and after", rows=rows.force.size, of="bins"):
-            before, after = _on_all(rows, grown)
-        if not part.whole and (more := missed_by_subsample(on_all_strokes, grown, config)):
+            before, after = _on_all(rows, selection)
+        if not part.whole and (more := missed_by_subsample(on_all_strokes, selection, config)):
             say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
             continue
         say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
         with timed("held out", rows=len(heldout.masks), of="folds"):
-            held_before, held_after, found = heldout.forces(grown, say)
-            if found is not None and not _found_again(grown, found):
-                grown, after, held_after = _all_refused(grown, say), before, held_before
-            ends = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
-            grown, ends = _no_worse(grown, ends, heldout, say)
+            held_before, held_after, found = heldout.forces(selection, say)
+            if found is not None and not _found_in_folds(selection, found):
+                selection, after, held_after = _all_refused(selection, say), before, held_before
+            models = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
+            selection, models = _only_gains(selection, models, heldout, say)
         break
-    before, after, held_before, held_after = ends.before, ends.after, ends.held_before, ends.held_after
-    drawn = _drawn_tables(grown, before, after, config)
-    document = closure_document(grown, ends, heldout.level, config, effects)
-    bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their order again
+    before, after, held_before, held_after = models.before, models.after, models.held_before, models.held_after
+    drawn = _drawn_tables(selection, before, after, config)
+    document = closure_document(selection, models, heldout.level, config, effects)
+    bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their original order
     tables = {
-        "effects": effect_table([e for e in document["effects"] if not e["candidate"]], grown.added),
+        "effects": effect_table([e for e in document["effects"] if not e["candidate"]], selection.added),
         "residuals_before": _residual_table(bins, before, held_before),
         "residuals_after": _residual_table(bins, after, held_after),
         **drawn,
@@ -113,30 +113,30 @@ def close_loop(
     return Closure(document, to_record(before, after, config), tables, after)
 
 
-def _drawn_tables(grown: Selection, before: Fitted, after: Fitted, config: Config) -> dict[str, pd.DataFrame]:
-    """Return the tables that need no held-out folds, which workers may be at meanwhile."""
-    levels = [level_table("before", before, list(grown.first)), level_table("after", after, list(grown.last))]
+def _drawn_tables(selection: Selection, before: Fitted, after: Fitted, config: Config) -> dict[str, pd.DataFrame]:
+    """Return the tables that do not depend on the folds."""
+    levels = [level_table("before", before, list(selection.first)), level_table("after", after, list(selection.last))]
     return {
         "levels": pd.concat(levels, ignore_index=True),
-        "channels": channel_table(grown, before, after),
+        "channels": channel_table(selection, before, after),
         "shapes": shape_table(after, config),
         "curves": curve_table(before, after),
     }
 
 
-def _on_all(rows: Rows, grown: Selection) -> tuple[Fitted, Fitted]:
-    """Return before and after, refitted to rows as they are, held ripples included; once where nothing was added."""
-    if grown.before.rows is rows:
-        return grown.before, grown.after
-    before = fit(grown.before.model, rows, grown.before.scatter, turns=2)
-    if not grown.added:
+def _on_all(rows: Rows, selection: Selection) -> tuple[Fitted, Fitted]:
+    """Return before and after, refitted to all rows with ripples free; twice the same if nothing was added."""
+    if selection.before.rows is rows:
+        return selection.before, selection.after
+    before = fit(selection.before.model, rows, selection.before.scatter, turns=2)
+    if not selection.added:
         return before, before
-    model = replace(grown.after.model, terms=tuple(a.proposal.term for a in grown.added))
-    return before, fit(model, rows, grown.after.scatter, turns=2)
+    model = replace(selection.after.model, terms=tuple(a.proposal.term for a in selection.added))
+    return before, fit(model, rows, selection.after.scatter, turns=2)
 
 
 class _HeldOut:
-    """The folds: everything fitted and searched again without some groups, and asked for them."""
+    """Cross-validation: the loop is repeated without some groups, and these are predicted."""
 
     def __init__(self, rows: Rows, part: Subsample, samples: pd.DataFrame, context: Context) -> None:
         self.rows, self.part, self.samples, self.context = rows, part, samples, context
@@ -146,27 +146,26 @@ class _HeldOut:
 
     @property
     def repeats(self) -> bool:
-        """Whether the search is repeated in each fold: without a fifth of few runs it has not the power to find much.
+        """Whether the search is repeated in each fold.
 
-        Then what the whole campaign shows is refitted without each fold.
+        With few runs a fold has too little power; the effects of the full campaign are then refitted in each fold.
         """
         return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
 
     def forces(
-        self, grown: Selection, say: Callable[[str], None]
+        self, selection: Selection, say: Callable[[str], None]
     ) -> tuple[np.ndarray, np.ndarray, Sequence[Model] | None]:
-        """Return each row's force, before and after, by fits that did not see its group; NaN if never held out.
+        """Return each row's force before and after, by fits without its group (NaN if never held out), and the models.
 
-        With them comes what each repeated search ended with; None where no search is repeated.
-
-        Where the search is repeated, a fold searches for as many rounds as the whole campaign took to find its last
-        effect. It has less to see by: it would go on for many rounds after small effects that it refuses.
+        The models are those of the repeated searches; None if the search is not repeated. A repeated search has as many
+        rounds as the full campaign needed for its last effect: with less power it would go on for many rounds with
+        small effects that it refuses.
         """
-        if not (grown.added and self.repeats):
-            before = self.refitted(grown.before)
-            return before, self.refitted(grown.after) if grown.added else before, None
-        rounds = max(a.round for a in grown.added)
-        parts = run_map(_held_out, _Folds(self, grown.before, rounds), workers=self.context.workers)
+        if not (selection.added and self.repeats):
+            before = self.refitted(selection.before)
+            return before, self.refitted(selection.after) if selection.added else before, None
+        rounds = max(a.round for a in selection.added)
+        parts = run_map(_held_out, _Folds(self, selection.before, rounds), workers=self.context.workers)
         before, after = np.full(self.rows.force.size, np.nan), np.full(self.rows.force.size, np.nan)
         models = []
         for k, (out, (*forces, model)) in enumerate(zip(self.masks, parts, strict=True)):
@@ -176,7 +175,7 @@ class _HeldOut:
         return before, after, models
 
     def refitted(self, fitted: Fitted) -> np.ndarray:
-        """Return each row's force by a model's fits to the other folds, shape (n,); NaN if never held out."""
+        """Return each row's force by a model refitted without its fold, shape (n,); NaN if never held out."""
         force = np.full(self.rows.force.size, np.nan)
         folds = _Folds(self, fitted, rounds=0)
         for out, (own, *_) in zip(self.masks, map(_held_out, folds), strict=True):
@@ -184,7 +183,7 @@ class _HeldOut:
         return force
 
     def covered(self, model: Model) -> np.ndarray:
-        """Return which rows were held out and lie inside what the others cover, shape (n,)."""
+        """Return which rows were held out and are covered by the others, shape (n,)."""
         channels = [name for term in model.terms for name in term.channels]
         found = np.zeros(self.rows.force.size, dtype=bool)
         for out in self.masks:
@@ -194,20 +193,20 @@ class _HeldOut:
 
 @dataclass(frozen=True)
 class _Fold:
-    """One fold: the rows and samples the fit may see, and those it is asked for."""
+    """One fold: rows and samples to fit to, and rows to predict."""
 
     train: Rows
     fine: Rows | None
-    every: Rows | None  # where `train` is of some runs only: all the fit may see
+    every: Rows | None  # all rows to fit to, if `train` has some runs only
     seen: pd.DataFrame
     test: Rows
     context: Context
     start: Start
-    rounds: int  # of the search; without any, `start` is refitted
+    rounds: int  # of the search; with 0, `start` is refitted
 
 
 class _Folds(Sequence):
-    """The folds of a campaign, each made when it is asked for: it holds most of the campaign."""
+    """The folds of a campaign. Each is created on access, as it contains most of the campaign."""
 
     def __init__(self, campaign: _HeldOut, before: Fitted, rounds: int) -> None:
         self.campaign, self.start, self.rounds = campaign, Start(before.model, before.scatter), rounds
@@ -225,7 +224,7 @@ class _Folds(Sequence):
             return rows.subset(~rows.table["stroke_id"].isin(gone).to_numpy())
 
         fine, seen = None, own.samples.head(0)
-        if self.rounds:  # without a search, neither is looked at
+        if self.rounds:  # not needed without a search
             fine = kept(part.rows) if part.coarse is not part.rows else None
             seen = own.samples[~own.samples["stroke_id"].isin(gone)]
         every = None if part.whole else kept(part.every)
@@ -235,9 +234,9 @@ class _Folds(Sequence):
 
 
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
-    """Return the forces before and after at a fold's rows, the same without a search, and the model after."""
+    """Return the forces before and after at a fold's rows (equal without a search), and the model after."""
     if fold.rounds:
-        part = grow(fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds)
+        part = select_effects(fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds)
         before, after = part.before, part.after
     else:
         before = after = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
@@ -250,67 +249,68 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
     return first, first if after is before else force(after), after.model
 
 
-def _found_again(grown: Selection, found: Sequence[Model]) -> bool:
+def _found_in_folds(selection: Selection, found: Sequence[Model]) -> bool:
     """Whether a fold found one of the effects again, or the evidence for one is not weak.
 
-    A fold that finds nothing predicts as the declared model does: its error is equal, and says nothing for one.
+    A fold that finds nothing predicts as the declared model does, so its error is no evidence for an effect.
     """
-    if not all(item.weak for item in grown.added):
+    if not all(item.weak for item in selection.added):
         return True
-    rows = grown.after.rows
+    rows = selection.after.rows
     known = [pair for model in found for pair in zip(model.terms, model.values, strict=True)]
     shapes = [shape_of(term, values, rows) for term, values in known if "shift" not in term.fixed]
-    terms = [item.proposal.term for item in grown.added]
-    own = [shape_of(term, values, rows) for term, values in zip(terms, grown.after.model.values, strict=True)]
-    return any(_alike(one, other) for one in own for other in shapes)
+    terms = [item.proposal.term for item in selection.added]
+    own = [shape_of(term, values, rows) for term, values in zip(terms, selection.after.model.values, strict=True)]
+    return any(_same_shape(one, other) for one in own for other in shapes)
 
 
-def _all_refused(grown: Selection, say: Callable[[str], None]) -> Selection:
-    """Return a selection without effects: those of weak evidence that no fold found again."""
-    say("left out, as no fold found them again: " + "; ".join(describe(a.proposal.term) for a in grown.added))
-    reason = "its evidence is weak, and the search finds it in no fold that lacks a part of the data"
-    refused = [RefusedEffect(a.proposal.term, a.proposal.p_value, reason) for a in grown.added]
-    return replace(grown, after=grown.before, added=(), refused=(*grown.refused, *refused))
+def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:
+    """Return a selection without its effects, which are refused: their evidence is weak and no fold found them."""
+    say("removed, because no fold found them again: " + "; ".join(describe(a.proposal.term) for a in selection.added))
+    reason = "its evidence is weak, and the repeated search finds it in no fold"
+    refused = [RefusedEffect(a.proposal.term, a.proposal.p_value, reason) for a in selection.added]
+    return replace(selection, after=selection.before, added=(), refused=(*selection.refused, *refused))
 
 
-def _alike(one: np.ndarray, other: np.ndarray) -> bool:
+def _same_shape(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two shapes are correlated, or the same constant."""
     one, other = one - one.mean(), other - other.mean()
     size = np.linalg.norm(one) * np.linalg.norm(other)
-    return size == 0 or abs(one @ other) > ALIKE * size
+    return size == 0 or abs(one @ other) > RIVAL_CORRELATION * size
 
 
-def _no_worse(
-    grown: Selection, ends: BeforeAfter, heldout: _HeldOut, say: Callable[[str], None]
+def _only_gains(
+    selection: Selection, models: BeforeAfter, heldout: _HeldOut, say: Callable[[str], None]
 ) -> tuple[Selection, BeforeAfter]:
-    """Return the end of the loop with the first effects alone, as many as lower the error in sample and held out.
+    """Return the result without the last effects that do not lower the error in sample and held out.
 
-    What is left out was significant: it is put on record as refused, and the verdict says that something is left or,
-    where its evidence is weak, that these files cannot tell.
+    A removed effect was significant. It is recorded as refused; the verdict is `unexplained` or, if its evidence is
+    weak, `cannot_tell`.
     """
     refused = []
-    while grown.added and not ends.gains(_around(grown.added), weak=any(a.weak for a in grown.added)):
-        last = grown.added[-1].proposal
-        say(f"left out, as the error is no lower with it: {describe(last.term)}")
-        reason = "with it the error is no lower, in sample or held out"
+    while selection.added and not models.gains(_level_of(selection.added), weak=any(a.weak for a in selection.added)):
+        last = selection.added[-1].proposal
+        say(f"removed, because it does not lower the error: {describe(last.term)}")
+        reason = "it does not lower the error, in sample or on held-out data"
         refused.append(RefusedEffect(last.term, last.p_value, reason))
-        model = grown.after.model.without_term(len(grown.added) - 1)
-        own = fit(model, grown.after.rows, grown.after.scatter, turns=2) if model.terms else grown.before
-        grown = replace(grown, after=own, added=grown.added[:-1])
-        _, after = _on_all(ends.before.rows, grown)
-        if not grown.added:
-            ends = replace(ends, after=ends.before, held_after=ends.held_before)
+        model = selection.after.model.without_term(len(selection.added) - 1)
+        own = fit(model, selection.after.rows, selection.after.scatter, turns=2) if model.terms else selection.before
+        selection = replace(selection, after=own, added=selection.added[:-1])
+        _, after = _on_all(models.before.rows, selection)
+        if not selection.added:
+            models = replace(models, after=models.before, held_after=models.held_before)
         else:
-            ends = replace(ends, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model))
-    return replace(grown, refused=(*grown.refused, *refused), worse=tuple(r for r in refused if not r.weak)), ends
+            models = replace(models, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model))
+    strong = tuple(r for r in refused if not r.weak)
+    return replace(selection, refused=(*selection.refused, *refused), worse=strong), models
 
 
-def _around(added: Sequence[AcceptedEffect]) -> str | None:
-    """Return the coarsest level within whose groups the effects vary; None where one differs between specimens.
+def _level_of(added: Sequence[AcceptedEffect]) -> str | None:
+    """Return the coarsest level within whose groups the effects vary; None if one differs between specimens.
 
-    What varies inside a run changes nothing that runs differ by, and that may be most of the error.
+    An effect within runs does not change the error between runs, which may be the largest part.
     """
-    levels = [varies_within(a.proposal, PARTLY) for a in added]
+    levels = [varies_within(a.proposal, PART_WITHIN) for a in added]
     return None if None in levels else max(levels, key=LEVELS.index)
 
 

@@ -1,9 +1,8 @@
-"""From a channel that orders the residual to the effect that explains it: the catalogue, closed forms, free shapes.
+"""From a channel that explains the residual to an effect: physical effects, closed forms, free shapes.
 
-Every form that may act there is fitted to the residual in the tangent space (exact in its amplitudes, a grid over the
-rest), the best few are refitted jointly with the physics, and the likelihood less Schwarz's price per parameter
-decides.
-Where rivals do equally well, a named mechanism comes before a closed form, and that before a free shape.
+Every form is fitted to the residual in the tangent space, exactly in its amplitudes and on a grid in its nonlinear
+parameters. The best few are refitted jointly with the model, and the BIC decides. Of equal forms a physical effect is
+preferred to a closed form, and a closed form to a free shape.
 """
 
 from __future__ import annotations
@@ -16,16 +15,16 @@ import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel
 from sealfit.closure.criteria import (
-    ALIKE,
-    BEHIND,
-    CONTENDER,
-    DOMINANT,
+    CONTENDER_SHARE,
+    EQUAL_BIC,
     HALF_OF_CALENDAR,
-    HELD,
-    OVERTURNED,
-    RIVAL,
+    LARGE_CHANGE,
+    MOST_RELATIVE_ERROR,
+    REFIT_MARGIN,
+    RIVAL_BIC,
+    RIVAL_CORRELATION,
     SAME_EFFECT,
-    TIED,
+    SCATTER_FALL,
 )
 from sealfit.closure.forms import periodic_terms, terms_of
 from sealfit.closure.intervals import robust_covariance
@@ -34,13 +33,13 @@ from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.joint.estimate import Fitted, fit, reestimated
-from sealfit.fit.joint.search import linear_solved, search_nonlinear
+from sealfit.fit.joint.search import search_nonlinear, solve_linear
 from sealfit.fit.joint.whitening import Scatter, Whitening
 
-REFITTED = 8  # proposals refitted jointly
-FORMS_EACH = 2  # of each further quantity
-LIKELIEST = 3  # refitted first, to see whether an effect had stood in most of the scatter
-CALENDAR_RIVALS = 2  # refitted as rivals where something else comes first
+REFITTED = 8  # Proposals that are refitted jointly.
+FORMS_EACH = 2  # Proposals that are refitted for each further quantity.
+LIKELIEST = 3  # Proposals that are refitted first, to see whether most of the scatter was the missing effect.
+CALENDAR_RIVALS = 2  # Calendar proposals that are refitted as rivals of others.
 LINEAR = "linear"
 
 
@@ -51,31 +50,31 @@ def propose(
     effects: Mapping[str, Effect],
     also: Sequence[Proposal] = (),
 ) -> list[Proposal]:
-    """Return jointly refitted proposals for what orders the residual most, best first.
+    """Return jointly refitted proposals for the channels that explain most of the residual, best first.
 
     Parameters
     ----------
     fitted : Fitted
         The current model.
     significant : sequence of Candidate
-        Candidates accepted by the search, strongest first.
+        Significant candidates, strongest first.
     channels : mapping
         Channels by name.
     effects : mapping
         The catalogue, the user's own effects included.
     also : sequence of Proposal, optional
-        Proposals found in another way.
+        Further proposals.
     """
     linearised = Linearised(fitted)
     forms = [(t, search, c) for c in _contenders(significant) for t, search in terms_of(c, channels, fitted, effects)]
-    forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # a shape made once serves every quantity
+    forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # all quantities share a shape
     found = [*also, *(p for form in forms for p in linearised(*form))]
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
     others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
     if not (calendar and others and max(p.chi2 for p in others) >= HALF_OF_CALENDAR * max(p.chi2 for p in calendar)):
-        return named_among(fitted, _spread(found))
-    # Conditions are tested one after the other and the calendar follows them: what was set or measured comes first.
-    others, calendar = (_refitted(fitted, part) for part in (_spread(others), _spread(calendar)[:CALENDAR_RIVALS]))
+        return named_among(fitted, _best_few(found))
+    # Conditions are tested one after the other, so the calendar is correlated with them: other channels come first.
+    others, calendar = (_refitted(fitted, part) for part in (_best_few(others), _best_few(calendar)[:CALENDAR_RIVALS]))
     return _ordered(fitted, others) + sorted(calendar, key=lambda p: p.bic)
 
 
@@ -95,25 +94,25 @@ def propose_ripples(fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: 
     """
     linearised = Linearised(fitted)
     found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(*form)]
-    return named_among(fitted, _spread(found))
+    return named_among(fitted, _best_few(found))
 
 
 def named_among(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
-    """Return proposals, which have values to start from, fitted jointly with the physics: first the one to report."""
+    """Return proposals, fitted jointly with the model from their start values: first the one to report."""
     return _ordered(fitted, _refitted(fitted, found))
 
 
 def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
-    """Yield the candidates worth a form: those that explain nearly as much as the strongest, each once.
+    """Yield the candidates that explain nearly as much as the strongest, each once.
 
-    A form that starts at zero would take a constant offset in along with its own shape, so the offset comes first.
+    A constant offset comes first: a form that starts at zero would contain it.
     """
     if not significant:
         return
     best = next((c for c in significant if c.key == ZERO_OFFSET), significant[0])
     seen = set()
     for candidate in significant:
-        if candidate.chi2 < CONTENDER * best.chi2 or candidate.key in seen:
+        if candidate.chi2 < CONTENDER_SHARE * best.chi2 or candidate.key in seen:
             continue
         if best.channels == ("direction",) and (candidate.pair or "direction" not in candidate.channels):
             continue
@@ -121,14 +120,14 @@ def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
         yield candidate
 
 
-def _spread(found: list[Proposal]) -> list[Proposal]:
-    """Return the few best, each effect and target once, no effect on more than two; the best free shape among them.
+def _best_few(found: list[Proposal]) -> list[Proposal]:
+    """Return the few best proposals to refit, the best free shape among them.
 
-    A grid is coarse, so a mechanism gets the benefit of the doubt until it has been refitted. So does every other
-    quantity that explains nearly as much: what is missing bends the model it is looked for in.
+    Each effect is kept at most once per target and on at most two. A grid is coarse, so physical effects get a margin.
+    Every further quantity that explains nearly as much is kept: the missing effect biases the model it is tested on.
     """
     kept: list[Proposal] = []
-    ranked = sorted(found, key=lambda p: p.bic - TIED * p.term.effect.physical)
+    ranked = sorted(found, key=lambda p: p.bic - EQUAL_BIC * p.term.effect.physical)
     for proposal in ranked:
         kind = _kind(proposal)
         same = [p for p in kept if _kind(p) == kind]
@@ -137,7 +136,7 @@ def _spread(found: list[Proposal]) -> list[Proposal]:
         if len(kept) < REFITTED or (not proposal.named and not same):
             kept.append(proposal)
     known, most = {_target(p) for p in kept}, max((p.chi2 for p in found), default=0.0)
-    for target in dict.fromkeys(_target(p) for p in ranked if p.chi2 >= CONTENDER * most):
+    for target in dict.fromkeys(_target(p) for p in ranked if p.chi2 >= CONTENDER_SHARE * most):
         if target not in known:
             kept += [p for p in ranked if _target(p) == target][:FORMS_EACH]
     return kept
@@ -148,45 +147,45 @@ def _target(proposal: Proposal) -> tuple[str, str]:
 
 
 def _kind(proposal: Proposal) -> tuple[str, int]:
-    """What counts as one form."""
+    """Return what identifies a form: its id and number of parameters."""
     return proposal.term.effect.id, len(proposal.term.effect.parameters)
 
 
 def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
-    """Return proposals best first; in front of its equals the one that leaves earlier effects alone, then by rank."""
+    """Return proposals best first; among equals, first those that leave earlier effects unchanged, then by rank."""
     if not found:
         return []
     found = sorted(found, key=lambda p: p.bic)
     best = found[0]
-    equals = [p for p in found if p.bic - best.bic < TIED or _simpler(p, best)]
-    held = [p for p in equals if determined(p)]
-    fewest = min((p.size for p in held), default=0)
-    held += [p for p in equals if p.term.effect.physical and p not in held and p.size <= fewest]
-    alike = [p for p in found if p.fitted.deviance - best.fitted.deviance < TIED]
-    if not any(p.term.effect.id == LINEAR for p in alike):  # a straight line shows no mechanism
-        own = [p for p in alike if _own_mechanism(p)]
+    equals = [p for p in found if p.bic - best.bic < EQUAL_BIC or _simpler(p, best)]
+    candidates = [p for p in equals if determined(p)]
+    fewest = min((p.size for p in candidates), default=0)
+    candidates += [p for p in equals if p.term.effect.physical and p not in candidates and p.size <= fewest]
+    equal_fits = [p for p in found if p.fitted.deviance - best.fitted.deviance < EQUAL_BIC]
+    if not any(p.term.effect.id == LINEAR for p in equal_fits):  # a straight line shows no mechanism
+        own = [p for p in equal_fits if _is_specific(p)]
         least = min((p.fitted.deviance for p in own), default=0.0)
-        held += [p for p in own if p.fitted.deviance - least < 2 * TIED and p not in held]
-    if held:
-        first = min(held, key=lambda p: (_overturns(fitted, p), p.rank, p.bic))
+        candidates += [p for p in own if p.fitted.deviance - least < 2 * EQUAL_BIC and p not in candidates]
+    if candidates:
+        first = min(candidates, key=lambda p: (_changes_earlier(fitted, p), p.rank, p.bic))
     else:
-        first = next((p for p in found if p.bic - best.bic < RIVAL and determined(p)), best)
+        first = next((p for p in found if p.bic - best.bic < RIVAL_BIC and determined(p)), best)
     return [first, *(p for p in found if p is not first)]
 
 
-def _own_mechanism(proposal: Proposal) -> bool:
-    """Whether a form is the mechanism of just these channels: it need not pay then for what the data leave open."""
+def _is_specific(proposal: Proposal) -> bool:
+    """Whether a form is a physical effect of just these channels; the BIC penalty is not decisive then."""
     effect = proposal.term.effect
     return effect.physical and CHANNEL not in effect.reads
 
 
-def _overturns(fitted: Fitted, proposal: Proposal) -> bool:
+def _changes_earlier(fitted: Fitted, proposal: Proposal) -> bool:
     """Whether a proposal changes an amplitude of an earlier effect by more than a third.
 
-    Two effects that take from each other what both explain read worse than one beside the other.
+    Two effects that explain the same structure are harder to interpret than two separate ones.
     """
     return any(
-        abs(now[p.name] - then[p.name]) > OVERTURNED * abs(then[p.name])
+        abs(now[p.name] - then[p.name]) > LARGE_CHANGE * abs(then[p.name])
         for term, then, now in zip(fitted.model.terms, fitted.model.values, proposal.fitted.model.values, strict=False)
         for p in term.effect.parameters
         if p.linear
@@ -194,30 +193,30 @@ def _overturns(fitted: Fitted, proposal: Proposal) -> bool:
 
 
 def determined(proposal: Proposal) -> bool:
-    """Whether the data hold the form's own numbers: a time constant known to worse than half of itself is not one.
+    """Whether the data determine the nonlinear parameters of a form, to half of their value or better.
 
-    Such a form is a straight line or a constant under another name, and the plain one says so better.
+    Otherwise the form is not distinguishable from a straight line or a constant.
     """
     fitted, effect = proposal.fitted, proposal.term.effect
-    first = fitted.model.place(len(fitted.model.terms) - 1).start
+    first = fitted.model.term_slice(len(fitted.model.terms) - 1).start
     covariance = np.maximum(fitted.covariance, robust_covariance(fitted, proposal.unit))
     for k, parameter in enumerate(effect.parameters):
         if parameter.linear or parameter.name == "phi":
             continue
         error = float(np.sqrt(covariance[first + k, first + k]))
-        if error > HELD * abs(fitted.model.values[-1][parameter.name]):
+        if error > MOST_RELATIVE_ERROR * abs(fitted.model.values[-1][parameter.name]):
             return False
     return True
 
 
 def _simpler(proposal: Proposal, best: Proposal) -> bool:
-    """Whether a proposal adds what the best one does, hardly worse, and says it more simply.
+    """Whether a proposal adds nearly the same force as the best one, fits nearly as well, and is simpler.
 
-    A quantity of the declared model comes before a gain of the whole force.
+    A quantity of the declared model is preferred to a factor on the whole force.
     """
     gain = (best.term.acts_on, best.term.operation) == ("force", "multiply") and proposal.term.acts_on != "force"
     plain = proposal.rank[:2] < best.rank[:2] or proposal.source == ZERO_OFFSET or gain
-    return plain and correlation(proposal, best) > SAME_EFFECT and proposal.bic - best.bic < 2 * TIED
+    return plain and correlation(proposal, best) > SAME_EFFECT and proposal.bic - best.bic < 2 * EQUAL_BIC
 
 
 def correlation(one: Proposal, other: Proposal) -> float:
@@ -227,49 +226,49 @@ def correlation(one: Proposal, other: Proposal) -> float:
 
 
 def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
-    """Return the proposals that these data cannot tell from the chosen one: they add much the same to the force."""
+    """Return the proposals that these data cannot distinguish from the chosen one: they add nearly the same force."""
     return [p for p in found if p is not chosen and not _identical(p, chosen) and _rival(p, chosen)]
 
 
 def _rival(proposal: Proposal, chosen: Proposal) -> bool:
-    alike = correlation(proposal, chosen)
-    return alike > SAME_EFFECT or (alike > ALIKE and proposal.bic - chosen.bic < RIVAL)
+    similarity = correlation(proposal, chosen)
+    return similarity > SAME_EFFECT or (similarity > RIVAL_CORRELATION and proposal.bic - chosen.bic < RIVAL_BIC)
 
 
 def _identical(one: Proposal, other: Proposal) -> bool:
-    """Whether two proposals are one equation under two names, on the same channels and quantity."""
+    """Whether two proposals are the same equation, on the same channels and quantity."""
     return one.term.key()[1:] == other.term.key()[1:] and abs(one.bic - other.bic) < 1e-3
 
 
 def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
-    """Return proposals fitted jointly with the physics, best first; those in reach with a scatter of their own.
+    """Return proposals fitted jointly with the model, best first; scatter is re-estimated for those near the best.
 
-    What is in reach shows under the scatter of the best: there a rival has no room left to hide what it lacks. Where an
-    effect had stood in most of the scatter, as the few likeliest tell, all are fitted under theirs alone.
+    Nearness is the BIC under the scatter of the best. If most of the former scatter was the missing effect, as the few
+    likeliest proposals show, all are fitted under the re-estimated one.
     """
     if not found:
         return []
     likeliest = sorted(found, key=lambda p: p.bic)
     refitted = sorted((_joint(fitted, p) for p in likeliest[:LIKELIEST]), key=lambda p: p.bic)
     best, alone = _reestimated(refitted[0]), _reestimated(refitted[0], noise=True)
-    if refitted[0].fitted.deviance - alone.fitted.deviance > DOMINANT:
-        refitted = sorted(_from_anew(fitted, likeliest, alone.fitted.scatter), key=lambda p: p.bic)
+    if refitted[0].fitted.deviance - alone.fitted.deviance > SCATTER_FALL:
+        refitted = sorted(_refitted_under(fitted, likeliest, alone.fitted.scatter), key=lambda p: p.bic)
         best = _reestimated(refitted[0])
     elif len(found) > LIKELIEST:
         refitted = sorted([*refitted, *(_joint(fitted, p) for p in likeliest[LIKELIEST:])], key=lambda p: p.bic)
         best = best if refitted[0].term is best.term else _reestimated(refitted[0])
     least = min(best.bic, refitted[0].bic)
     scatter = best.fitted.scatter
-    near = [_deviance_under(p.fitted, scatter) + p.bic_penalty < least + BEHIND for p in refitted[1:]]
+    near = [_deviance_under(p.fitted, scatter) + p.bic_penalty < least + REFIT_MARGIN for p in refitted[1:]]
     own = [_reestimated(p) for p, n in zip(refitted[1:], near, strict=True) if n]
     far = [p for p, n in zip(refitted[1:], near, strict=True) if not n]
     return [best, *own, *far[:LIKELIEST]]
 
 
 def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:
-    """Return a proposal fitted jointly with the physics, under the current scatter."""
+    """Return a proposal fitted jointly with the model, under the current scatter."""
     model = fitted.model.with_term(proposal.term, proposal.values)
-    model = linear_solved(model, fitted.rows, fitted.scatter, fitted.friction)
+    model = solve_linear(model, fitted.rows, fitted.scatter, fitted.friction)
     return replace(proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction))
 
 
@@ -277,10 +276,10 @@ def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
     return replace(proposal, fitted=reestimated(proposal.fitted, noise=noise))
 
 
-def _from_anew(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
-    """Yield proposals fitted under another scatter, v_s and b sought anew: what was missing may have bent them away.
+def _refitted_under(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
+    """Yield proposals fitted under another scatter, with a new search for v_s and b, which may have been biased.
 
-    They are sought with the likeliest effect on each quantity; its other effects begin where that ended.
+    The search is made with the likeliest effect on each quantity; further effects on it start from its result.
     """
     rows, friction = fitted.rows, fitted.friction
     begun: dict[tuple[str, str], np.ndarray] = {}
@@ -288,7 +287,7 @@ def _from_anew(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> I
         model = fitted.model.with_term(proposal.term, proposal.values)
         target = _target(proposal)
         if target in begun:
-            model = linear_solved(replace(model, theta=begun[target]), rows, scatter, friction)
+            model = solve_linear(replace(model, theta=begun[target]), rows, scatter, friction)
         else:
             model = search_nonlinear(model, rows, scatter)
         anew = fit(model, rows, scatter, turns=0, friction=friction)

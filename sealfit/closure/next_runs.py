@@ -1,4 +1,4 @@
-"""Which runs to make next: where rival models differ most, and effects that this campaign cannot see."""
+"""Runs to make next: where rival models differ most, and for effects that these runs cannot show."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from sealfit.fit.joint.rows import POWER, Rows, sliding_power
 from sealfit.fit.joint.search import bounds_of
 
 # ---------------------------------------------------------------- aliases
-# Effects that this campaign cannot see: what they do, the current model takes up whole.
+# Effects that are not distinguishable from the model with these runs.
 #
-# An offset of the sensor in a campaign that runs one way is friction; a drift along it, with one specimen tested
-# after the other, is aging. No residual shows them, so they are looked for in the design: of an alias, less than 1 % is
-# left after projection on the tangent space of the model, whatever its numbers and whichever quantity it acts on.
+# A sensor offset in a campaign with one direction is the same as friction; a drift over time, with one specimen tested
+# after the other, is the same as aging. The residual does not contain them, so the design is searched for them: of an
+# alias, less than 1 % is left after projection off the tangent space of the model, for all its parameters and targets.
 
-SIZE = 0.01  # of the force's RMS that an alias is given
-NEGLIGIBLE = 1e-6  # RMS of a shape of amplitude 1, below which it does nothing here
+SIZE = 0.01  # Assumed size of an alias, as a share of the RMS force.
+NEGLIGIBLE = 1e-6  # A shape of amplitude 1 with a smaller RMS has no effect here.
 
 
 @dataclass(frozen=True)
 class Alias:
-    """An effect that is there without a trace: a model that holds it, and one without it that gives the same forces."""
+    """An effect, the model with it, and the model without it that gives the same forces."""
 
     term: Term
     holding: Model
@@ -41,7 +41,7 @@ class Alias:
 
 
 def find_aliases(fitted: Fitted, effects: Mapping[str, Effect], taken: tuple[str, ...]) -> list[Alias]:
-    """Return the mechanisms of the catalogue that the model takes up whole in this campaign.
+    """Return the physical effects that are not distinguishable from the model with these runs.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def find_aliases(fitted: Fitted, effects: Mapping[str, Effect], taken: tuple[str
     effects : mapping
         The catalogue.
     taken : tuple of str
-        Channels that make a condition: what differs between series is the model's own already.
+        Channels that define a condition: the model already has parameters per series.
     """
     known = set(fitted.rows.channels) - set(taken)
     own = [e for e in effects.values() if e.physical and CHANNEL not in e.reads and set(e.reads) <= known]
@@ -59,7 +59,7 @@ def find_aliases(fitted: Fitted, effects: Mapping[str, Effect], taken: tuple[str
         first = None
         for *form, left in (f for target in effect.acts_on for f in _at_grid(fitted, effect, target)):
             if left >= IDENTIFIABLE:
-                break  # it shows there, and the rest of its grid need not be looked at
+                break  # it is distinguishable there
             first = first or form
         else:
             found += [_alias(fitted, *first)] if first else []
@@ -69,11 +69,11 @@ def find_aliases(fitted: Fitted, effects: Mapping[str, Effect], taken: tuple[str
 def _at_grid(
     fitted: Fitted, effect: Effect, target: tuple[str, str]
 ) -> Iterator[tuple[Term, dict[str, float], np.ndarray, float]]:
-    """Yield a form over the grid of its nonlinear numbers: its values, what it adds, and the share that is left."""
+    """Yield a form at each grid point of its nonlinear parameters: term, values, column, and share that is left."""
     rows = fitted.rows
     values = {name: rows.values(name) for name in effect.reads}
     if any(v.dtype.kind != "f" or (np.ptp(v) == 0 and name != "direction") for name, v in values.items()):
-        return  # what does not vary is no effect here
+        return  # a constant has no effect here
     slope = fitted.slope(*target)
     if np.abs(slope).max() <= 0:
         return
@@ -86,7 +86,7 @@ def _at_grid(
             column = slope * shape
             if np.isfinite(shape).all() and (column**2).mean() > NEGLIGIBLE**2 * (slope**2).mean():
                 white = fitted.whitening(column[:, None])[:, 0]
-                left = fitted.basis.freed(white)
+                left = fitted.basis.project_out(white)
                 amplitudes = {n: float(n == name) for n in effect.linear}
                 yield term, {**at, **amplitudes}, column, float(left @ left / (white @ white))
 
@@ -104,22 +104,22 @@ def _alias(fitted: Fitted, term: Term, values: Mapping[str, float], column: np.n
 
 
 # ---------------------------------------------------------------- next runs
-# Which runs to make next: where rival models differ most, found by computing them, tested combinations or not.
+# Runs to make next: where rival models differ most, at tested and untested combinations of channels.
 
-BEYOND = 0.5  # of a channel's range by which a run may go beyond what was tested
-SHOWN = 0.5  # of its size by which a run must show an effect to be worth making for it
-TIE = 1e-9  # relative: closer than that, only rounding tells runs apart
-ROWS = 4  # of each stroke at which forces are compared
+BEYOND = 0.5  # Share of a channel's range by which a run may exceed it.
+SHOWN = 0.5  # Least share of an effect's size that a proposed run must show.
+TIE = 1e-9  # Relative difference below which two runs differ by rounding only.
+ROWS = 4  # Rows per stroke at which forces are compared.
 
 
-def next_runs(grown: Selection, config: Config, effects: Mapping[str, Effect]) -> list[dict]:
-    """Return for each effect with rivals the run that would tell it from the nearest one, and for what cannot be seen
-    here the run that would show it.
+def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect]) -> list[dict]:
+    """Return for each effect the run that would distinguish it from its nearest rival, and for each alias the run that
+    would show it.
 
     Parameters
     ----------
-    grown : Selection
-        The end of the loop.
+    selection : Selection
+        The result of the loop.
     config : Config
         The rig.
     effects : mapping
@@ -128,86 +128,85 @@ def next_runs(grown: Selection, config: Config, effects: Mapping[str, Effect]) -
     Returns
     -------
     list of dict
-        `why` in words and `conditions`: the run's condition and the channels to set, of one run each.
+        `why`, a text, and `conditions`: the condition and the channels of one run.
     """
     wanted = []
-    for item in grown.added:
+    for item in selection.added:
         for rival in item.rivals[:1]:
             chosen = item.proposal
             channels = (*chosen.term.channels, *rival.term.channels)
-            found = where_apart(chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, config)
+            found = largest_difference(chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, config)
             if found is not None:
                 wanted.append(
                     {
-                        "why": f"tells {describe(item.proposal.term)} from {describe(rival.term)}: "
+                        "why": f"would distinguish {describe(item.proposal.term)} from {describe(rival.term)}: "
                         f"they differ there by {found[1]:.3g} {config.units.unit('force')}",
                         "conditions": found[0],
                     }
                 )
-    if grown.unsure is not None:
-        wanted.append(_replicates(grown.unsure, config))
-    if grown.after.rows.has_aging and not grown.after.scatter.knows("specimen"):
-        wanted.append(_second_specimen(grown.after.rows, config))
-    return [*wanted, *_unseen(grown.after, config, effects)]
+    if selection.inconclusive is not None:
+        wanted.append(_replicate_of(selection.inconclusive, config))
+    if selection.after.rows.has_aging and not selection.after.scatter.estimates("specimen"):
+        wanted.append(_second_specimen(selection.after.rows, config))
+    return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
 
 
 def _second_specimen(rows: Rows, config: Config) -> dict:
-    """Return the condition to test on a second specimen where nothing shows how specimens scatter: the last one."""
+    """Return the condition (the last one) to test on a second specimen if the scatter of specimens is not known."""
     k = int(np.argmax(rows.days))
     return {
-        "why": "would show how specimens scatter, which this campaign leaves unknown and every interval leaves out: "
+        "why": "would show the scatter of specimens, which is unknown in this campaign and in no interval: "
         "a second specimen of a tested condition",
         "conditions": {name: _plain(rows.table[name].iloc[k]) for name in config.condition},
     }
 
 
-def _unseen(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> Iterator[dict]:
-    """Yield the run that would show each effect that the model takes up whole here; one for those of like channels."""
+def _runs_for_aliases(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> Iterator[dict]:
+    """Yield the run that would show each alias; one run for aliases of the same channels."""
     taken = tuple(name for name in (*config.condition, *config.rubber) if name != "aging_days")
-    alike: dict[tuple[str, ...], list[Alias]] = {}
+    by_channel: dict[tuple[str, ...], list[Alias]] = {}
     for alias in find_aliases(fitted, effects, taken):
-        alike.setdefault(alias.term.channels, []).append(alias)
-    for channels, aliases in alike.items():
+        by_channel.setdefault(alias.term.channels, []).append(alias)
+    for channels, aliases in by_channel.items():
         first = aliases[0]
-        found = where_apart(first.holding, first.lacking, fitted.rows, channels, config)
+        found = largest_difference(first.holding, first.lacking, fitted.rows, channels, config)
         if found is not None and found[1] > SHOWN * first.size_N:
             names = " or ".join(describe(a.term) for a in aliases)
             yield {
-                "why": f"would show {names}: in this campaign the model takes it up whole",
+                "why": f"would show {names}, which is not distinguishable from the model with these runs",
                 "conditions": found[0],
             }
 
 
-def _replicates(item: AcceptedEffect, config: Config) -> dict:
-    """Return the condition to repeat on a new specimen: where an effect that too few specimens show is largest."""
+def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
+    """Return the condition to repeat on a new specimen: where an effect shown by too few specimens is largest."""
     fitted = item.proposal.fitted
     k = int(np.argmax(np.abs(added_force(item.proposal))))
     count = fitted.rows.groups.starts["specimen"].size
     few = "one specimen is" if count == 1 else f"{count} specimens are"
     return {
-        "why": f"{few} too few to tell {describe(item.proposal.term)} from how specimens scatter: "
+        "why": f"{few} too few to distinguish {describe(item.proposal.term)} from the scatter of specimens: "
         "test a second specimen of the same conditions, here first",
         "conditions": {name: _plain(fitted.rows.table[name].iloc[k]) for name in (*config.condition, "speed_mm_s")},
     }
 
 
-def where_apart(
+def largest_difference(
     chosen: Model, rival: Model, rows: Rows, channels: Sequence[str], config: Config
 ) -> tuple[dict, float] | None:
-    """Return the run at which two models differ most, and by how much (force unit); None if nowhere.
+    """Return the run at which two models differ most, and the difference (force unit); None if they do not differ.
 
-    Every tested run is tried with each combination of low, usual and high values of the channels, which the effects
-    read that tell the models apart: what always went together in the campaign (a condition and the calendar) is taken
-    apart here.
+    Every tested run is tried with each combination of low, median and high values of the channels of their effects, so
+    that channels which were confounded in the campaign (a condition and the calendar) are separated.
     """
     rows = rows.sparse(ROWS)
     channels = tuple(dict.fromkeys(channels))
     best: tuple[dict, float] | None = None
     for changes in ({}, *_combinations(chosen, rows, channels)):
-        moved = _moved(rows, changes)
+        moved = _rows_with(rows, changes)
         apart = np.abs(evaluate(chosen, moved, jacobian=False)[0] - evaluate(rival, moved, jacobian=False)[0])
         apart = np.where(np.isfinite(apart), apart, 0.0)
-        k = int(np.argmax(apart >= apart.max() * (1 - TIE)))  # the first of those that only rounding tells apart
+        k = int(np.argmax(apart >= apart.max() * (1 - TIE)))  # the first of those equal but for rounding
         if apart[k] > (0.0 if best is None else best[1] * (1 + TIE)):
             names = dict.fromkeys((*config.condition, "speed_mm_s", *channels))
             where = {name: _plain(moved.table[name].iloc[k]) for name in names if name in moved.table}
@@ -216,7 +215,7 @@ def where_apart(
 
 
 def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterator[dict[str, object]]:
-    """Yield values to set each channel to; a channel that makes a condition's own parameters is left alone."""
+    """Yield combinations of values of the channels; days are kept without an aging law."""
     values: dict[str, list] = {}
     for name in channels:
         own = rows.values(name)
@@ -237,8 +236,8 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
         yield dict(zip(values, point, strict=True))
 
 
-def _moved(rows: Rows, changes: Mapping[str, object]) -> Rows:
-    """Return rows with channels set to other values; time follows the speed."""
+def _rows_with(rows: Rows, changes: Mapping[str, object]) -> Rows:
+    """Return rows with channels set to other values; time is scaled with the speed."""
     if not changes:
         return rows
     table = rows.table.assign(**changes)
@@ -252,7 +251,7 @@ def _moved(rows: Rows, changes: Mapping[str, object]) -> Rows:
         if "time_s" not in changes:
             table["time_s"] = rows.table["time_s"] * np.abs(rows.speed / speed)
     if "aging_days" in changes:
-        days = np.where(rows.days > 0, float(changes["aging_days"]), rows.days)  # unaged rubber has no law of its own
+        days = np.where(rows.days > 0, float(changes["aging_days"]), rows.days)  # unaged rubber stays unaged
         table["aging_days"] = days
     if "load_N" in changes:
         load = np.full_like(rows.load, float(changes["load_N"]))

@@ -1,4 +1,4 @@
-"""What the loop leaves behind: the fitted model as plain data, and the tables that the report draws."""
+"""Output of the loop: the fitted model as plain data, and the tables for the plots."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from sealfit.store.paths import needed
 from sealfit.tables import CHANNELS, CURVES, SHAPES
 
 # ---------------------------------------------------------------- model record
-# The fitted model as plain data: what `predict` needs, written to OUT/model.json.
+# The fitted model as plain data for `predict`, written to OUT/model.json.
 
 
 def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
-    """Return both fitted models with covariance, scatter and tested ranges as JSON-able values."""
+    """Return both fitted models with covariance, scatter and tested ranges as JSON values."""
     rows = after.rows
     return {
         "schema": 1,
@@ -64,7 +64,7 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
         "scatter": {
             "s0": float(after.scatter.s0),
             "g": float(after.scatter.g),
-            "alike": float(after.scatter.alike),
+            "alike": float(after.scatter.design_effect),
             "shape": float(after.scatter.shape),
             "components": [
                 {"level": c.level, "kind": c.kind, "variance": float(c.variance)} for c in after.scatter.components
@@ -76,7 +76,7 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
 
 
 def _without_effects(config: Config) -> Config:
-    """Return the config without the folder of the user's own effects: whoever predicts names theirs."""
+    """Return the config without the folder of user effects, which is an argument of a prediction."""
     return config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
 
 
@@ -103,7 +103,7 @@ def _plain(value: object) -> object:
 
 
 def _ranges(rows: Rows) -> dict:
-    """Return what was tested: the range of each numeric channel, the set of each category."""
+    """Return the tested range of each numeric channel and the tested values of each category."""
     ranges: dict = {}
     for name in rows.channels:
         values = np.abs(rows.speed) if name == "speed_mm_s" else rows.values(name)
@@ -128,7 +128,7 @@ def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[
     Parameters
     ----------
     record : dict
-        As `to_record` returned it; nothing in it is run.
+        As returned by `to_record`; none of it is executed.
     own : mapping of str to Effect, optional
         The user's own effects, by id.
 
@@ -163,18 +163,18 @@ def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[
 
 
 # ---------------------------------------------------------------- plot tables
-# Tables that the report draws of the loop: residual by channel, effect shapes, force against speed.
+# Tables for the plots of the loop: residual by channel, effect shapes, force against speed.
 
-GROUPS = 12  # groups of a numeric channel in the residual plot
-POINTS = 60  # points of a drawn curve
+GROUPS = 12  # Groups of a numeric channel in the residual plot.
+POINTS = 60  # Points of a plotted curve.
 
 
-def channel_table(grown: Selection, before: Fitted, after: Fitted) -> pd.DataFrame:
+def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.DataFrame:
     """Return the mean residual by channel, before and after, with standard errors from whole files."""
     rows = before.rows
     files = rows.codes("file")
     records = []
-    for name, known in grown.channels.items():
+    for name, known in selection.channels.items():
         values = rows.values(name) if name != "speed_mm_s" else np.abs(rows.speed)
         if known.numeric:
             edges = np.unique(np.quantile(values, np.linspace(0, 1, GROUPS + 1)))
@@ -202,11 +202,11 @@ def channel_table(grown: Selection, before: Fitted, after: Fitted) -> pd.DataFra
 
 
 def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
-    """Return each effect's shape along its channel with a 95 % band, and the free shape beside it."""
+    """Return each effect's shape along its channel with a 95 % band, and the corresponding free shape."""
     records: list[dict] = []
     reach = t_quantile(degrees_of_freedom(after))
     for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True)):
-        place = after.model.place(number)
+        place = after.model.term_slice(number)
         covariance = (robust_covariance(after, "file") if "held" in term.fixed else after.covariance)[place, place]
         inputs, x, labels = _along(term, after)
         value = np.asarray(term.effect.shape(inputs, **values), dtype=float)
@@ -254,7 +254,7 @@ def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
 
 
 def _usual(values: np.ndarray, *, pair: bool) -> float | str:
-    """Return where a second channel is held in a plot: its mean, nine tenths up for a pair, or the first category."""
+    """Return the value of a second channel in a plot: its mean, the 90 % quantile for a pair, or a category."""
     if values.dtype.kind != "f":
         return str(np.unique(values)[0])
     size = np.abs(values)
@@ -262,7 +262,7 @@ def _usual(values: np.ndarray, *, pair: bool) -> float | str:
 
 
 def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
-    """Return the free shape fitted in place of an effect, level with it on average; None for periodic or level ones."""
+    """Return the free shape fitted instead of an effect, with the same mean; None for periodic effects and levels."""
     term = after.model.terms[number]
     if len(term.channels) != 1 or term.effect.periodic or term.effect.id in (SMOOTH, LEVELS) or np.isnan(x).any():
         return None
@@ -283,16 +283,16 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     rows = after.rows
     channels = {name for term in (*before.model.terms, *after.model.terms) for name in term.channels}
     read = [name for name in rows.table.columns if name in {*CURVES.names(), *channels}]
-    way = np.sign(rows.speed)
-    moving = np.flatnonzero(way != 0)
-    order = moving[np.lexsort((-way[moving], rows.condition[moving]))]  # of a condition, what moves forwards first
-    cuts = np.flatnonzero(np.diff(rows.condition[order]) | (np.diff(way[order]) != 0)) + 1
+    direction = np.sign(rows.speed)
+    sliding = np.flatnonzero(direction != 0)
+    order = sliding[np.lexsort((-direction[sliding], rows.condition[sliding]))]  # forward strokes first
+    cuts = np.flatnonzero(np.diff(rows.condition[order]) | (np.diff(direction[order]) != 0)) + 1
     own = {name: pd.Series(rows.values(name), name=name) for name in open_columns(rows.table)}
     columns = {name: _averaged(own.get(name, rows.table[name]), np.split(order, cuts)) for name in read}
     speeds = [np.abs(rows.speed[chosen]) for chosen in np.split(order, cuts)]
     counts = [POINTS if own.max() > 1.02 * own.min() else 1 for own in speeds]
     first = order[np.r_[0, cuts]]
-    points = pd.DataFrame({**columns, "direction": way[first]}).loc[np.repeat(np.arange(first.size), counts)]
+    points = pd.DataFrame({**columns, "direction": direction[first]}).loc[np.repeat(np.arange(first.size), counts)]
     along = [np.geomspace(own.min(), own.max(), count) for own, count in zip(speeds, counts, strict=True)]
     points = points.assign(speed_mm_s=points["direction"].to_numpy() * np.concatenate(along), file="")
     points = points.reset_index(drop=True)
@@ -310,7 +310,7 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
 
 
 def _averaged(column: pd.Series, groups: list[np.ndarray]) -> list:
-    """Return the mean of a numeric channel in each group of rows, or the commonest of a category."""
+    """Return the mean of a numeric channel, or the most frequent category, in each group of rows."""
     if pd.api.types.is_float_dtype(column) or column.name in ("repeat", "stroke"):
         return [float(column.iloc[rows].mean()) for rows in groups]
     number, names = pd.factorize(column, sort=True)

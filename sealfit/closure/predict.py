@@ -1,8 +1,8 @@
 """Force at new points, before and after, with 95 % intervals of the mean and of one new measurement.
 
-The mean is that of the population: average specimen, set-up and repeat gain, every random effect at zero. Its
-interval holds the parameters' uncertainty, in which the scatter of specimens, runs and files already stands; that of
-a measurement adds one draw of each level and the noise of a bin. The sensor's accuracy stands apart (GUM, type B).
+The mean is that of the population, with all random effects (specimen, set-up, repeat) at zero. Its interval has the
+uncertainty of the parameters, which includes the scatter of specimens, runs and files. The interval of a measurement
+adds one draw of each level and the noise of a bin. The sensor's accuracy is not included (GUM, type B).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sealfit.fit.joint.whitening import Component, Scatter
 from sealfit.ingest.categorical import add_keys
 from sealfit.ingest.quality import NO_VALUE
 
-BEYOND = 1e-6  # relative slack before a value counts as outside the tested range
+BEYOND = 1e-6  # Relative tolerance of the tested range.
 ANSWERS = (
     "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N", "meas_lo95_N", "meas_hi95_N",
 )  # fmt: skip
@@ -38,7 +38,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     Parameters
     ----------
     model : dict
-        What the loop recorded (OUT/model.json).
+        The model record (OUT/model.json).
     points : DataFrame
         Condition columns, signed `speed_mm_s`, and every channel that the after-model reads; grouping columns such as
         `specimen_id` are ignored.
@@ -48,8 +48,8 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     Raises
     ------
     RequestError
-        If a condition column, the speed or a channel of the after-model is missing altogether, or the model holds an
-        effect of the user's own that is not in `own`.
+        If a condition column, the speed or a channel of the after-model is missing, or the model has a user effect that
+        is not in `own`.
     """
     before, after, conditions = from_record(model, own)
     config = Config.model_validate(model["config"])
@@ -61,10 +61,10 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     answer = pd.DataFrame({name: np.full(len(table), np.nan) for name in ANSWERS})
     if not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
         for k in np.flatnonzero(good):
-            notes[k].append("how specimens scatter is not known: the intervals are those of the tested ones")
+            notes[k].append("the scatter of specimens is not known: intervals hold for the tested ones")
     if model["df"] == 0:
         for k in np.flatnonzero(good):
-            notes[k].append("no interval: the model has as many numbers as there are runs; test repeats or more speeds")
+            notes[k].append("no interval: as many parameters in the model as runs; test repeats or more speeds")
     extrapolated = _outside(table, conditions, code, model, notes, after)
     if good.any():
         at = point_rows(
@@ -95,7 +95,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
 
 
 def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -> pd.DataFrame:
-    """Return the points with every column the model reads: given, derived, or the campaign's only value."""
+    """Return the points with every column that the model reads: given, derived, or the only tested value."""
     ranges = model["ranges"]
     table = _with_derived(points.assign(file=""), model)
     needed = [*config.condition, *([] if not config.rubber else config.rubber)]
@@ -124,7 +124,7 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
 
 
 def _with_derived(table: pd.DataFrame, model: dict) -> pd.DataFrame:
-    """Return the points with speed and load as numbers and with what follows from their columns."""
+    """Return the points with speed and load as numbers, and with derived columns."""
     for name in ("speed_mm_s", "load_N"):
         if name in table:
             table[name] = pd.to_numeric(table[name], errors="coerce")
@@ -146,7 +146,7 @@ def _is_range(tested: object) -> bool:
 def _conditions(
     before: Model, after: Model, conditions: pd.DataFrame, table: pd.DataFrame, notes: list, config: Config
 ) -> tuple[Model, Model, pd.DataFrame, np.ndarray]:
-    """Return the models over tested and asked-for conditions, and each point's condition; -1 where none reaches it."""
+    """Return the models with the conditions of the points added, and each point's condition; -1 if it has none."""
     keys = add_keys(table, config)
     days = pd.to_numeric(table["aging_days"], errors="coerce") if config.aging else pd.Series(0.0, table.index)
     known = {name: k for k, name in enumerate(conditions["condition"])}
@@ -164,8 +164,8 @@ def _conditions(
             lawful = [c for c in like if declared.index["a_c"][c] >= 0]
             if not lawful or not days.iloc[k] >= 0:
                 notes[k].append(
-                    f"condition {name} was not tested and no fitted law reaches it: ask for a tested one, "
-                    "or for other days of a tested series with three or more days"
+                    f"condition {name} was not tested and has no fitted aging law: give a tested condition, "
+                    "or other days of a tested series with three or more days"
                 )
                 continue
             known[name] = len(names)
@@ -187,7 +187,7 @@ def _conditions(
 
 
 def _check_values(table: pd.DataFrame, after: Model, model: dict, notes: list) -> None:
-    """Note every point with a cell that the model cannot use."""
+    """Add a note to every point with an invalid cell."""
     speed = table["speed_mm_s"].to_numpy(dtype=float)
     for k in np.flatnonzero(~np.isfinite(speed) | (speed == 0)):
         notes[k].append("speed_mm_s must be a signed number other than 0 (the model holds in sliding)")
@@ -209,7 +209,7 @@ def _check_values(table: pd.DataFrame, after: Model, model: dict, notes: list) -
 def _outside(
     table: pd.DataFrame, conditions: pd.DataFrame, code: np.ndarray, model: dict, notes: list, after: Model
 ) -> np.ndarray:
-    """Return which points lie beyond what was tested, and note how (the point is answered all the same)."""
+    """Return which points are extrapolated; some get a note. They are predicted all the same."""
     ranges = model["ranges"]
     outside = np.zeros(len(table), dtype=bool)
     tested_count = len(model["conditions"]["condition"])
@@ -225,7 +225,7 @@ def _outside(
         if tested.size < SPEEDS_BETWEEN and not (np.abs(speed[k] / tested - 1) < NEAR_TESTED_SPEED).any():
             outside[k] = True
             notes[k].append(
-                f"too few speeds to know the friction between them: tested were {', '.join(f'{v:g}' for v in tested)}"
+                f"too few speeds for the friction between them; tested: {', '.join(f'{v:g}' for v in tested)}"
             )
     read = {"speed_mm_s"} | {name for term in after.terms for name in term.channels}
     if model["has_load"]:
@@ -242,7 +242,7 @@ def _outside(
 
 
 def _of_unknown_phase(after: Model, force: np.ndarray) -> np.ndarray:
-    """Return the variance of ripples whose phase is each file's own and unknown for a new one, shape (n,)."""
+    """Return the variance of ripples with a phase per pass, which is unknown for a new one, shape (n,)."""
     total = np.zeros_like(force)
     for term, values in zip(after.terms, after.values, strict=True):
         if "shift" in term.fixed:

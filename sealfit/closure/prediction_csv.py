@@ -1,4 +1,4 @@
-"""P.csv and Q.csv: the points asked for, and the same rows with their answers."""
+"""P.csv and Q.csv: the points to predict, and the same rows with predictions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ANSWERS = (
 
 @dataclass(frozen=True)
 class Points:
-    """Rows as they were written, and the same with numbers where a column holds numbers only."""
+    """Rows as text, and with numbers in numeric columns."""
 
     path: Path
     text: pd.DataFrame
@@ -41,7 +41,7 @@ def read_points(path: Path) -> Points:
     Raises
     ------
     RequestError
-        If there is no such file, or it is not such a CSV; it names the line.
+        If the file does not exist or is not such a CSV; with the line.
     """
     try:
         raw = existing_file(path, "table of points").read_text("utf-8-sig")
@@ -70,7 +70,7 @@ def read_points(path: Path) -> Points:
 
 
 def _names_of_points(names: list[str], path: Path) -> list[str]:
-    """Return the names of the columns of points, refused where they cannot be that."""
+    """Return the names of the columns of points, checked."""
     if not any(names):
         raise RequestError("is empty.", file=path, fix="Give a line of column names, then one row per point.")
     if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
@@ -125,7 +125,7 @@ def _numbers(cells: pd.Series) -> pd.Series:
 
 
 def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
-    """Write the rows as they were given plus their answers to `output`, whole or not at all; return the counts.
+    """Write the given rows and their predictions to `output`, completely or not at all; return the counts.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
         raise RequestError(f"there is no folder {output.parent} for --output.", fix="Make it first.")
     if output.is_dir():
         raise RequestError(f"--output {output} is a folder.", fix="Give a file name.")
-    # `answers` keeps the rows and their order; the cells of the points are written as they were given.
+    # `answers` has the same rows in the same order; the cells of the points are written unchanged.
     table = pd.concat([points.text, answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
     staged = output.with_name(f".{output.name}.{os.getpid()}")
     try:

@@ -1,8 +1,8 @@
-"""Effects asked again: what was named while others were still missing may read otherwise beside them.
+"""Renaming of effects that were named while others were still missing.
 
-While an effect is missing it stands in the scatter, and one that is named then is told from its rivals less well than
-the data allow: a factor from an added force, a line from a logarithm. Where a second effect of one channel is found,
-the first was not its whole shape: one effect that does as well as the two says so better.
+A missing effect is part of the scatter, so an effect named then is not well distinguished from its rivals: a factor
+from an added force, a line from a logarithm. If a second effect of one channel is found, the first was not its whole
+shape: one effect that fits as well replaces the two.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ import pandas as pd
 
 from sealfit.closure.channels import Channel
 from sealfit.closure.confirm import AcceptedEffect, Context, confirmed
-from sealfit.closure.criteria import RIVAL, TIED
+from sealfit.closure.criteria import EQUAL_BIC, RIVAL_BIC
 from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.naming import propose
 from sealfit.closure.score_test import Candidate, ScoreTests
-from sealfit.closure.search import of_channel, search_pairs
+from sealfit.closure.search import channel_candidates, search_pairs
 from sealfit.fit.joint.estimate import Fitted, fit
 
 ALONG_STROKES = ("time_s", "distance_mm", "displacement_mm")
-"""Channels that move together along every stroke, one a multiple of the other where the speed is steady."""
+"""Channels that are proportional to one another along every stroke at a steady speed."""
 
 
 @dataclass(frozen=True)
 class Renaming:
-    """What naming an effect anew needs besides the model.
+    """What renaming an effect needs besides the model.
 
     Parameters
     ----------
@@ -44,11 +44,11 @@ class Renaming:
     samples: pd.DataFrame
     context: Context
 
-    def all_but_last(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-        """Return a fit and its effects with each but the last named anew beside all the others.
+    def earlier_renamed(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
+        """Return a fit and its effects, each but the last renamed given all others.
 
-        One that keeps its name was confirmed while others were missing: it goes if beside them it gains nothing
-        on held-out data.
+        An effect that keeps its name was confirmed while others were missing. It is removed if it has no gain on
+        held-out data given the others.
         """
         for item in added[:-1]:
             number = next(k for k, a in enumerate(added) if a is item)
@@ -56,76 +56,76 @@ class Renaming:
             if name is None:
                 continue
             without = self._without(fitted, number)
-            proposals = self._anew(fitted, number, without, [name], item.proposal.p_value)
-            # While it is missing, what stood for most of the residual may rank too low on a grid to be refitted.
-            if not proposals or proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL:
+            proposals = self._proposals_on(fitted, number, without, [name], item.proposal.p_value)
+            # A grid may rank the right form of a large missing effect too low for it to be refitted.
+            if not proposals or proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL_BIC:
                 continue
             same = proposals[0].term.key() == item.proposal.term.key()
             better = self._confirmed(without, proposals[:1] if same else proposals, item.round)
             others = [*added[:number], *added[number + 1 :]]
-            if better is None and self._as_it_is(without, fitted, number, item) is None:
+            if better is None and self._unchanged(without, fitted, number, item) is None:
                 fitted, added = fit(without.model, fitted.rows, fitted.scatter, turns=2), others
             elif better is not None and better.proposal.term.key() != item.proposal.term.key():
                 fitted = fit(better.proposal.fitted.model, fitted.rows, fitted.scatter, turns=2)
                 added = [*others, better]
         return fitted, added
 
-    def _as_it_is(self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect) -> AcceptedEffect | None:
-        """Return an effect of a fit with its own name, confirmed beside the others; None where it is not."""
+    def _unchanged(self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect) -> AcceptedEffect | None:
+        """Return an effect of a fit with its own name, confirmed given the others; None if it is not confirmed."""
         model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
         own = fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
         return self._confirmed(without, [replace(item.proposal, fitted=own)], item.round)
 
-    def one_for_two(
-        self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect, *, awaited: bool = False
+    def merged_with_earlier(
+        self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect, *, pending: bool = False
     ) -> tuple[list[AcceptedEffect], AcceptedEffect]:
-        """Return earlier effects and a new one that is not in `fitted` yet.
+        """Return the earlier effects and a new one that is not in `fitted` yet, merged with an earlier one if possible.
 
-        An earlier effect goes where one alone does as well as it and the new one: a shape of the same channel or of
-        one that moves along with it, or a product of two channels. While another is `awaited`, beside which alone
-        the new one shows, only effects of its own channel are asked.
+        Two effects are merged if a single one fits as well: a shape of the same channel or of a proportional one, or a
+        product of two channels. While the other effect of a masked pair is `pending`, only effects of the new one's own
+        channel are merged with it.
         """
         for number, earlier in enumerate(added):
-            if awaited and self._channel(earlier) != self._channel(new):
+            if pending and self._channel(earlier) != self._channel(new):
                 continue
-            one = self._instead(fitted, number, earlier, new)
+            one = self._single_effect(fitted, number, earlier, new)
             if one is not None:
                 return [*added[:number], *added[number + 1 :]], one
         return added, new
 
-    def _instead(
+    def _single_effect(
         self, fitted: Fitted, number: int, earlier: AcceptedEffect, new: AcceptedEffect
     ) -> AcceptedEffect | None:
-        """Return one effect that does as well as an earlier and a new one; None where there is none.
+        """Return one effect that fits as well as an earlier and a new one; None if there is none.
 
-        Two forms of one channel that are no mechanism are one shape in two pieces: then it is enough that the one
-        fits as well, whatever the number of its knots.
+        Two forms of one channel that are no physical effects are one shape: then the single effect only has to fit as
+        well, whatever its number of parameters.
         """
         names = self._channel(earlier), self._channel(new)
         if None in names:
             return None
         without = self._without(fitted, number)
         p_value = min(earlier.proposal.p_value, new.proposal.p_value)
-        proposals = self._anew(fitted, number, without, self._near(*names), p_value)
+        proposals = self._proposals_on(fitted, number, without, self._channels_near(*names), p_value)
         proposals = sorted([*proposals, *self._products(without, names, p_value)], key=lambda p: p.bic)
         two = new.proposal.bic + earlier.proposal.bic_penalty
-        better = [p for p in proposals[:1] if p.bic < two + TIED]
+        better = [p for p in proposals[:1] if p.bic < two + EQUAL_BIC]
         pieces = names[0] == names[1] and not any(a.proposal.term.effect.physical for a in (earlier, new))
         if pieces and not better:
             penalties = new.proposal.bic_penalty + earlier.proposal.bic_penalty
-            fitting = [p for p in proposals if p.bic - p.bic_penalty < two - penalties + RIVAL]
+            fitting = [p for p in proposals if p.bic - p.bic_penalty < two - penalties + RIVAL_BIC]
             better = sorted(fitting, key=lambda p: p.bic)[:1]
         return self._confirmed(without, better, new.round) if better else None
 
-    def _near(self, *names: str) -> list[str]:
-        """Return the channels of two effects and, where both vary along strokes, those of every stroke."""
+    def _channels_near(self, *names: str) -> list[str]:
+        """Return the channels of two effects; if both vary along strokes, all channels that do."""
         found = list(dict.fromkeys(names))
         if all(self.channels[name].unit == "sample" for name in names):
             found += [name for name in ALONG_STROKES if name in self.channels and name not in found]
         return found
 
     def _products(self, without: Fitted, names: tuple[str, str], p_value: float) -> Sequence[Proposal]:
-        """Return forms of two channels together; none for one channel."""
+        """Return forms of two channels together; none if both are the same channel."""
         if names[0] == names[1]:
             return ()
         rng = np.random.default_rng(self.context.config.loop.seed)
@@ -137,21 +137,21 @@ class Renaming:
         model = fitted.model.without_term(number)
         return fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
 
-    def _anew(
+    def _proposals_on(
         self, fitted: Fitted, number: int, without: Fitted, names: Sequence[str], p_value: float
     ) -> Sequence[Proposal]:
-        """Return what may stand in the place of a term on some channels, from the fit `without` it."""
+        """Return proposals that may replace a term, on some channels, from the fit `without` it."""
         finest: dict[tuple, Candidate] = {}
-        judge = ScoreTests(without)
-        for c in (c for name in names for c in of_channel(judge, self.channels[name])):
+        tests = ScoreTests(without)
+        for c in (c for name in names for c in channel_candidates(tests, self.channels[name])):
             if c.key not in finest or c.test_result.df > finest[c.key].test_result.df:
                 finest[c.key] = replace(c, p_value=p_value)
         found = sorted(finest.values(), key=lambda c: -c.chi2)
         own, values = fitted.model.terms[number], fitted.model.values[number]
-        there = {p.name: (values[p.name],) for p in own.effect.nonlinear}
-        alike = next((c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None)
-        as_it_is = Linearised(without)(own, there, alike) if alike is not None else ()
-        return propose(without, found, self.channels, self.context.effects, as_it_is)
+        at_own_values = {p.name: (values[p.name],) for p in own.effect.nonlinear}
+        same_target = next((c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None)
+        own_form = Linearised(without)(own, at_own_values, same_target) if same_target is not None else ()
+        return propose(without, found, self.channels, self.context.effects, own_form)
 
     def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> AcceptedEffect | None:
         self.context.say(f"  round {number} again:")

@@ -1,4 +1,4 @@
-"""closure.json: the verdict, errors, effects with intervals, what could have been seen, and what is left."""
+"""closure.json: the verdict, errors, effects with intervals, sensitivity, and what is left."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pandas as pd
 from sealfit.closure.after import reference_of
 from sealfit.closure.channels import FINER, Channel, incomplete_channels, unit_of
 from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, about_means
-from sealfit.closure.criteria import EVEN, HALVED, HARMLESS, LACK_OF_FIT, NOT_ADJUSTED, SAME_ERROR, UNSTEADY
+from sealfit.closure.criteria import CHANCE_P, HALVED, HARMLESS, LACK_OF_FIT, NOT_ADJUSTED, SAME_ERROR, UNSTEADY
 from sealfit.closure.error_sizes import errors, lack_of_fit, noise_floor, scatter_list
 from sealfit.closure.forms import describe, free_term
 from sealfit.closure.intervals import effect_intervals
@@ -20,7 +20,7 @@ from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
-from sealfit.closure.sensitivity import LEVEL_NAMES, cannot_tell, sensitivity
+from sealfit.closure.sensitivity import LEVEL_NAMES, sensitivity, undetectable_variables
 from sealfit.config import Config
 from sealfit.effects.contract import Effect, fill_unit
 from sealfit.fit.joint.estimate import Fitted, effective_df, fit
@@ -34,16 +34,16 @@ SLOTS = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
 
 @dataclass(frozen=True)
 class BeforeAfter:
-    """The model before and after on all rows, and the forces by fits that did not see a row's unit."""
+    """The models before and after on all rows, and the forces by fits without a row's unit."""
 
     before: Fitted
     after: Fitted
     held_before: np.ndarray  # (n,) NaN where never held out
     held_after: np.ndarray
-    covered: np.ndarray  # (n,) whether the rest of the campaign covers the row: what it does not is extrapolated
+    covered: np.ndarray  # (n,) whether the other rows cover the row; else it is extrapolated
 
     def heldout_rmse_N(self, held: np.ndarray, *, extrapolated: bool = False) -> float | None:
-        """Return the error of forces held out, on rows that the rest of the campaign covers or on the others."""
+        """Return the held-out error, on rows that the other rows cover or on extrapolated ones."""
         rows = self.before.rows
         chosen = np.isfinite(held) & (self.covered != extrapolated)
         weight = rows.weight[chosen]
@@ -52,21 +52,21 @@ class BeforeAfter:
         return float(np.sqrt(weight @ (rows.force - held)[chosen] ** 2 / weight.sum()))
 
     def gains(self, around: str | None, *, weak: bool) -> bool:
-        """Whether after has no higher errors than before, in sample and held out.
+        """Whether the model after has no larger errors than that before, in sample and held out.
 
-        Weak evidence needs a lower error held out: an equal one says nothing for it. Where a level is named, this
-        is asked of the errors about the means of its groups, and the whole ones are not higher by much:
-        `HARMLESS`. That needs evidence that is not weak, or a held-out error about these means that is halved.
+        With weak evidence the held-out error must be lower. If a level is given, the errors about the means of its
+        groups are compared, and the whole errors may be larger by `HARMLESS`. This needs evidence that is not
+        weak, or a held-out error about the means that is halved.
         """
         whole = self._ratios(None)
         inside = whole if around is None else self._ratios(around)
         if max(inside) > SAME_ERROR or (weak and inside[1] >= 1):
             return False
-        sure = not weak or inside[1] < HALVED
-        return max(whole) <= (HARMLESS if sure else SAME_ERROR)
+        strong = not weak or inside[1] < HALVED
+        return max(whole) <= (HARMLESS if strong else SAME_ERROR)
 
     def _ratios(self, around: str | None) -> tuple[float, float]:
-        """Return after's error over before's, in sample and held out; 1 for the second where nothing was held out."""
+        """Return the ratio of the errors after and before, in sample and held out (1 if nothing was held out)."""
         rows, weight = self.before.rows, self.before.rows.weight
         inside = [weight @ about_means(f.residual, rows, around) ** 2 for f in (self.before, self.after)]
         known = np.isfinite(self.held_before) & np.isfinite(self.held_after) & self.covered
@@ -80,57 +80,57 @@ class BeforeAfter:
 
 
 def closure_document(
-    grown: Selection, ends: BeforeAfter, heldout_unit: str, config: Config, effects: Mapping[str, Effect]
+    selection: Selection, models: BeforeAfter, heldout_unit: str, config: Config, effects: Mapping[str, Effect]
 ) -> dict:
     """Return closure.json."""
-    after, units = ends.after, config.units
+    after, units = models.after, config.units
     numbers = {}
-    for name, fitted, held in (("before", ends.before, ends.held_before), ("after", after, ends.held_after)):
+    for name, fitted, held in (("before", models.before, models.held_before), ("after", after, models.held_after)):
         found = errors(fitted.rows, fitted.residual)
         numbers[name] = {
             "rmse_N": found["rmse_N"],
             "rmse_runs_N": found["rmse_runs_N"],
-            "heldout_rmse_N": ends.heldout_rmse_N(held),
-            "heldout_extrapolated_rmse_N": ends.heldout_rmse_N(held, extrapolated=True),
+            "heldout_rmse_N": models.heldout_rmse_N(held),
+            "heldout_extrapolated_rmse_N": models.heldout_rmse_N(held, extrapolated=True),
             "max_abs_N": found["max_abs_N"],
             "mean_abs_pct": found["mean_abs_pct"],
             "lack_of_fit_p": lack_of_fit(fitted),
         }
     floor, scatter = noise_floor(after), scatter_list(after)
     quality = fit_quality(numbers["after"], floor)
-    seen = sensitivity(grown, config.loop.family_error)
-    untold = set(cannot_tell(grown, seen, scatter))
-    only_doubted = grown.unsure is not None and not grown.added
-    if grown.worse or (grown.left is not None and not only_doubted):
+    seen = sensitivity(selection, config.loop.family_error)
+    undetectable = set(undetectable_variables(selection, seen, scatter))
+    only_inconclusive = selection.inconclusive is not None and not selection.added
+    if selection.worse or (selection.left is not None and not only_inconclusive):
         verdict = "unexplained"
-    elif grown.added:
+    elif selection.added:
         verdict = "closed"
-    elif only_doubted:
+    elif only_inconclusive:
         verdict = "cannot_tell"
     else:
-        weak = any(item.weak for item in grown.refused)
-        unseen = untold and quality["state"] != "within_scatter"
+        weak = any(item.weak for item in selection.refused)
+        unseen = undetectable and quality["state"] != "within_scatter"
         verdict = "cannot_tell" if weak or unseen else "nothing_missing"
     return {
         "schema": 1,
         "verdict": verdict,
         "fit_quality": quality,
-        "sensitivity": [{**entry, "cannot_tell": entry["variable"] in untold} for entry in seen],
-        "refused": [_refused(item, after.rows) for item in grown.refused],
+        "sensitivity": [{**entry, "cannot_tell": entry["variable"] in undetectable} for entry in seen],
+        "refused": [_refused(item, after.rows) for item in selection.refused],
         "units": {slot: units.of(slot) for slot in SLOTS},
         "noise_floor_N": floor,
         **numbers,
         "heldout_unit": heldout_unit,
-        "effects": effect_entries(after, grown, config),
+        "effects": effect_entries(after, selection, config),
         "scatter": scatter,
-        "left": left_entry(grown, numbers["after"]["rmse_N"], floor),
-        "next_runs": next_runs(grown, config, effects),
+        "left": left_entry(selection, numbers["after"]["rmse_N"], floor),
+        "next_runs": next_runs(selection, config, effects),
         "incomplete_channels": incomplete_channels(after.rows),
     }
 
 
 def fit_quality(errors_after: Mapping, floor_N: float | None) -> dict:
-    """Return closure.json's `fit_quality`: whether the error is what repeats scatter by, or how many times that."""
+    """Return closure.json's `fit_quality`: whether the error exceeds the scatter of repeats, and their ratio."""
     p_value = errors_after["lack_of_fit_p"]
     if floor_N is None or p_value is None:
         return {"state": "unknown", "ratio": None, "p_value": None}
@@ -150,19 +150,19 @@ def _refused(item: RefusedEffect, rows: Rows) -> dict:
     }
 
 
-def effect_entries(after: Fitted, grown: Selection, config: Config) -> list[dict]:
-    """Return closure.json's `effects`: one per term of the after-model, then what is a candidate only."""
-    entries = [_entry(after, number, item, config) for number, item in enumerate(grown.added)]
-    if grown.unsure is not None:
-        alone = grown.unsure.proposal.fitted
-        entries.append({**_entry(alone, len(alone.model.terms) - 1, grown.unsure, config), "candidate": True})
+def effect_entries(after: Fitted, selection: Selection, config: Config) -> list[dict]:
+    """Return closure.json's `effects`: one per term of the after-model, then the inconclusive candidate."""
+    entries = [_entry(after, number, item, config) for number, item in enumerate(selection.added)]
+    if selection.inconclusive is not None:
+        alone = selection.inconclusive.proposal.fitted
+        entries.append({**_entry(alone, len(alone.model.terms) - 1, selection.inconclusive, config), "candidate": True})
     return entries
 
 
 def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> dict:
     """Return the entry of one effect of a fit's model."""
     term, proposal = after.model.terms[number], item.proposal
-    own_phase = "shift" in term.fixed  # each pass has a phase of its own: there is not one to print
+    own_phase = "shift" in term.fixed  # each stroke direction of a file has its own
     intervals = effect_intervals(after, number, proposal.unit)
     parameters = [
         {
@@ -175,7 +175,7 @@ def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> 
     ]
     return {
         "id": term.effect.id,
-        "label": describe(term) + (", its phase each pass's own" if own_phase else ""),
+        "label": describe(term) + (", separate phase per stroke" if own_phase else ""),
         "level": effect_level(term, after.rows),
         "channels": channels_of(term, after.rows),
         "acts_on": term.acts_on,
@@ -205,7 +205,7 @@ def _number(value: float) -> float | None:
 
 
 def channels_of(term: Term, rows: Rows) -> list[str]:
-    """Return the channels an effect uses; an unsigned force along a channel of whole files uses direction too."""
+    """Return the channels of an effect; an unsigned force along a channel of whole files has direction too."""
     names = list(term.channels)
     both_ways = rows.speed.min() < 0 < rows.speed.max()
     coarse = all(FINER[unit_of(rows.values(name), rows)] > FINER["stroke"] for name in names)
@@ -221,7 +221,7 @@ def effect_level(term: Term, rows: Rows) -> str:
 
 
 def _smoothness(after: Fitted, number: int) -> str:
-    """Return how smooth a free shape is, to follow its equation; "" for other effects."""
+    """Return a text with the effective degrees of freedom of a penalised free shape; "" for other effects."""
     if after.model.terms[number].smoothness is None:
         return ""
     return f"; smooth, {effective_df(after, number):.1f} effective degrees of freedom"
@@ -237,7 +237,7 @@ def form_of(term: Term) -> str:
 
 
 def parameter_unit(unit: str, term: Term, units: Units) -> str:
-    """Return a parameter's true unit: {x} and {z} are the channels', {y} that of what the effect gives."""
+    """Return a parameter's unit: {x} and {z} stand for those of the channels, {y} for that of the effect."""
     channel, second = units.of(term.channels[0]), units.of(term.channels[-1])
     if term.operation == "multiply":
         given = ""
@@ -275,48 +275,47 @@ def effect_table(entries: Sequence[dict], added: Sequence[AcceptedEffect]) -> pd
     return pd.DataFrame(records, columns=names)
 
 
-def left_entry(grown: Selection, rmse_N: float, floor_N: float | None) -> dict:
-    """Return closure.json's `left`: the error above the floor, and the strongest structure that is still there.
+def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> dict:
+    """Return closure.json's `left`: the error above the noise floor, and the strongest structure in the residual.
 
-    Where nothing is significant any more but effects were added, the channel that orders most of what is left is named
-    with its p-value: it is not significant. An effect that lowered no error is left, too.
+    This is what is still significant, or an effect that was removed because it lowered no error. If there is neither
+    but effects were added, it is the channel that explains most of the residual, which is not significant.
     """
     above = float(np.sqrt(max(rmse_N**2 - floor_N**2, 0.0))) if floor_N is not None else None
-    left = grown.left
-    if left is None and grown.worse:
-        item, rows = grown.worse[-1], grown.after.rows
+    left = selection.left
+    if left is None and selection.worse:
+        item, rows = selection.worse[-1], selection.after.rows
         names = " ".join(channels_of(item.term, rows))
         return {"rmse_N": above, "level": effect_level(item.term, rows), "channel": names, "p_value": item.p_value}
-    if left is None and grown.added:
-        left = _unsteady_offset(grown) or _largest(
-            grown.after, [c for c in grown.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < EVEN]
-        )
+    if left is None and selection.added:
+        last = [c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < CHANCE_P]
+        left = _unsteady_offset(selection) or _largest(selection.after, last)
     if isinstance(left, Peak):
         return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
     if left is not None:
-        names = [grown.channels[n].unit for n in left.channels if n in grown.channels]
+        names = [selection.channels[n].unit for n in left.channels if n in selection.channels]
         level = LEVEL_NAMES[min(names or [left.unit], key=FINER.get)]
         if left.channels[0] == "direction" and len(left.channels) > 1:
-            level = LEVEL_NAMES[max(names, key=FINER.get)]  # it is the other channel that tells offsets apart
+            level = LEVEL_NAMES[max(names, key=FINER.get)]  # offsets differ along the other channel
         return {"rmse_N": above, "level": level, "channel": " ".join(left.channels), "p_value": left.p_value}
-    smallest = min((c.p_value for c in grown.last), default=None)
+    smallest = min((c.p_value for c in selection.last), default=None)
     return {"rmse_N": above, "level": None, "channel": None, "p_value": smallest}
 
 
-def _unsteady_offset(grown: Selection) -> Candidate | None:
-    """Return the category that orders most of an offset between directions which differs from run to run; else None.
+def _unsteady_offset(selection: Selection) -> Candidate | None:
+    """Return the category that explains most of an offset between directions that differs between runs, or None.
 
-    Each condition is given an offset of its own first, as that would hide what a set-up does to it. The p-value is
-    adjusted over the categories.
+    An offset per condition is fitted first, because it would mask the influence of a set-up. The p-value is adjusted
+    over the categories.
     """
-    fitted = grown.after
+    fitted = selection.after
     rows = fitted.rows
     amplitude = max(
         (abs(v["A"]) for t, v in zip(fitted.model.terms, fitted.model.values, strict=True) if t.effect.id == OFFSET),
         default=0.0,
     )
     variance = sum(c.variance for c in fitted.scatter.components if c.kind == "offset" and c.level == "run")
-    categories = [c for c in grown.channels.values() if not c.numeric and not c.grouping]
+    categories = [c for c in selection.channels.values() if not c.numeric and not c.grouping]
     if amplitude == 0 or np.sqrt(variance) < UNSTEADY * amplitude or not categories:
         return None
     if 2 <= len(rows.conditions) <= rows.groups.starts["file"].size / 3:
@@ -328,7 +327,7 @@ def _unsteady_offset(grown: Selection) -> Candidate | None:
 
 
 def _largest(fitted: Fitted, candidates: Sequence[Candidate]) -> Candidate | None:
-    """Return the candidate that explains most of the residual's sum of squares."""
+    """Return the candidate with the largest explained sum of squares."""
     best, most = None, 0.0
     root = np.sqrt(fitted.rows.weight)
     for candidate in candidates:

@@ -1,4 +1,4 @@
-"""Ripples first: they are found and confirmed on the raw samples, and nothing slow changes what is seen there."""
+"""Selection of ripples, which comes first: they are found and confirmed on the raw samples, without slow effects."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ class Ripples:
     Parameters
     ----------
     samples : DataFrame
-        Steady samples, as `steady_samples` gives them.
+        Steady samples, as returned by `steady_samples`.
     context : Context
-        Levels of error, rounds, folds; processes for the spectra of many samples.
+        Error rate, rounds, folds; processes for the spectra of many samples.
 
     Attributes
     ----------
     samples : DataFrame
         The samples with `residual_N`: the force less the ripples added so far.
     added : list of AcceptedEffect
-        Those confirmed.
+        Confirmed ripples.
     refused : list of RefusedEffect
-        Those significant but not confirmed.
+        Significant ripples that are not confirmed.
     found : Peak or None
-        The significant one that is not in the model yet and may still be.
+        The significant ripple that is not in the model yet.
     """
 
     def __init__(self, samples: pd.DataFrame, context: Context) -> None:
@@ -45,14 +45,14 @@ class Ripples:
         self.found = self._find()
 
     def added_to(self, fitted: Fitted, fine: Rows | None) -> Fitted:
-        """Return a fit with every ripple that is significant and holds on data it was not fitted to.
+        """Return a fit with every ripple that is significant and confirmed on held-out data.
 
         Parameters
         ----------
         fitted : Fitted
             The declared model.
         fine : Rows, optional
-            Rows to fit ripples to; on the rows of `fitted` they are then held as found there.
+            Rows to fit ripples to; they are then fixed on the rows of `fitted`.
         """
         if self.found is None:
             return fitted
@@ -65,7 +65,7 @@ class Ripples:
                 self.found = None
                 break
             self.added.append(accepted)
-            found = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
+            found = accepted.proposal.fitted  # under its own scatter: the former one contains the missing effect
             own = fit(found.model, own.rows, found.scatter, turns=2)
             self.samples = without_ripples(self.samples, own)
             self.found = self._find(own.model)
@@ -83,7 +83,7 @@ class Ripples:
 
 
 def _held(model: Model) -> Model:
-    """Return a model whose terms no fit moves."""
+    """Return a model whose terms are fixed."""
     terms = [
         replace(t, fixed={**t.fixed, "held": {name: (value, value) for name, value in v.items()}})
         for t, v in zip(model.terms, model.values, strict=True)
@@ -92,9 +92,9 @@ def _held(model: Model) -> Model:
 
 
 def without_ripples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
-    """Return the samples with `residual_N`: force less the effects of a model that has no others than ripples.
+    """Return the samples with `residual_N`: the force less the effects of a model with ripples only.
 
-    Everything slow is taken out of each stroke by the spectrum itself; what is periodic is evaluated at the samples.
+    Ripples are evaluated at the samples. Slow changes are removed from each stroke by the spectrum itself.
     """
     rows = fitted.rows
     strokes = rows.table.iloc[rows.groups.starts["stroke"]]

@@ -1,4 +1,4 @@
-"""Ripples: periodic force along displacement or time, sought on the raw samples of the steady windows."""
+"""Search for ripples, periodic forces along displacement or time, in the raw samples of the steady windows."""
 
 from __future__ import annotations
 
@@ -10,74 +10,75 @@ import pandas as pd
 from scipy.special import betaincc, gammaincc
 
 from sealfit.closure.criteria import ABOVE_BACKGROUND, LEAST_FILES_OF_RIPPLE, LOBE, SHARED_PHASE
-from sealfit.closure.spectrum import Spectrum, Strokes, alike, background, smooth_background, spectra_of, tops
+from sealfit.closure.spectrum import Spectrum, Strokes, background, effective_count, smooth_background, spectra_of, tops
 from sealfit.fit.joint.model import passes
 from sealfit.fit.joint.rows import Rows
 
 # ---------------------------------------------------------------- ripple
-# Ripples: periodic force along displacement or time, sought on the raw samples of the steady windows.
+# Ripples are periodic forces along displacement or time. They are searched in the samples of the steady windows.
 #
-# Bins hide what is finer than they are, so every stroke's own samples are transformed: :math:`Z_u(f)` is the complex
-# amplitude of unit u (a file) at frequency f. A ripple of the rig has one phase everywhere, so
-# :math:`R = |\sum_u Z_u|^2 / \sum_u |Z_u|^2` is large; with phases that fall as they like, R is exponential with mean
-# 1. Where each file has an origin of its own only the power is shared: it is held against the local background
-# spectrum.
+# Bins are too coarse for short waves, so the samples of every stroke are transformed: :math:`Z_u(f)` is the complex
+# amplitude of unit u (a file) at frequency f. A ripple of the rig has the same phase in all files, so
+# :math:`R = |\sum_u Z_u|^2 / \sum_u |Z_u|^2` is large; with random phases R is exponential with mean 1. If each file
+# has an origin of its own, only the power is common, and it is tested against the local background of the spectrum.
 
 
 @dataclass(frozen=True)
 class Peak:
-    """One periodic component: along which axis, its wavelength, how it acts and how surely it is there."""
+    """A periodic component: its axis, wavelength, mode and evidence."""
 
     axis: str  # displacement_mm | time_s
     wavelength: float
-    sign_symmetric: bool  # True: same force both ways (added force); False: follows the direction (factor)
+    sign_symmetric: bool  # True: same force in both directions (added force); False: signed (factor)
     common_phase: bool
     statistic: float
-    p_value: float  # adjusted over the frequencies, axes and ways of acting looked at
+    p_value: float  # adjusted over frequencies, axes and modes
     amplitude: float  # in force units, mean over units
-    energy: float  # squared amplitudes, all passes that reach the frequency: of the largest sure wave along the axis
+    energy: float  # sum of squared amplitudes over passes, of the largest significant wave along the axis
 
 
-AXES = ("displacement_mm", "time_s")  # time is the rival of displacement: mains, servo
+AXES = ("displacement_mm", "time_s")  # in time: mains, servo
 
 
 def find_ripple(
     samples: pd.DataFrame, *, common_phase: bool, known: Sequence[tuple[str, float]] = (), workers: int = 1
 ) -> Peak | None:
-    """Return the strongest periodic component of the samples' residual, or None where there is none to test.
+    """Return the strongest periodic component of the samples' residual, or None if none can be tested.
 
     Parameters
     ----------
     samples : DataFrame
-        Steady samples, those of a stroke one after the other: stroke_id, direction, unit, the axes, `residual_N`.
+        Steady samples, ordered by stroke: stroke_id, direction, unit, the axes, `residual_N`.
     common_phase : bool
         Whether displacement means the same place in every file (`position_origin = "rig"`).
     known : sequence of (axis, wavelength)
-        Components already in the model: what is left around them is their own scatter from file to file.
+        Components in the model. Near them the residual contains their scatter between files.
     workers : int
-        Processes to use where there are many samples.
+        Number of processes, used with many samples.
     """
     peaks, locked = [], []
     for spectrum in spectra_of(samples, AXES, known, workers=workers):
         if common_phase and spectrum.axis == "displacement_mm":
             peaks += _coherent(spectrum)
-        elif spectrum.axis == "time_s":  # which counts from the start of every stroke: a wave may be locked to that
+        elif spectrum.axis == "time_s":  # a wave may be locked to the start of the strokes
             locked = _coherent(spectrum)
         peaks.append(_incoherent(spectrum))
     if not peaks:
         return None
-    # What is periodic in time shows in displacement too, speed by speed, and the other way round: where both are sure,
-    # the axis along which it is the same wave in all files holds more of it.
-    sure = [peak for peak in peaks if peak.p_value < SHARED_PHASE]
-    best = max(sure, key=lambda p: p.energy) if sure else min(peaks, key=lambda p: (p.p_value, -p.statistic))
-    # A phase that all files share says more than power alone.
+    # A wave in time is also seen along displacement, at each speed, and vice versa. If both are significant, the axis
+    # along which it is the same wave in all files has more energy.
+    significant = [peak for peak in peaks if peak.p_value < SHARED_PHASE]
+    best = (
+        max(significant, key=lambda p: p.energy) if significant else min(peaks, key=lambda p: (p.p_value, -p.statistic))
+    )
+    # A common phase is stronger evidence than power.
     shared = [p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED_PHASE]
     best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
 
 
 def _coherent(spectrum: Spectrum) -> list[Peak]:
-    """Return the best peak of each way of acting: the same force both ways, or following the direction."""
+    """Return the best peak of each mode: the same force in both directions, or with the sign of the direction."""
     peaks = []
     for common in spectrum.common:
         total = np.abs(common.total) ** 2
@@ -94,28 +95,28 @@ def _coherent(spectrum: Spectrum) -> list[Peak]:
 
 
 def _coherence_p(statistic: float, units: int) -> float:
-    """Return P(R >= statistic) for random phases: R/n is Beta(1, n - 1) where amplitudes are alike."""
+    """Return P(R >= statistic) for random phases: R/n is Beta(1, n - 1) for equal amplitudes."""
     return float(betaincc(1, max(units - 1, 1), min(statistic / units, 1.0)))
 
 
 def _incoherent(spectrum: Spectrum) -> Peak:
-    """Return the best peak of power shared by all units whatever their phases.
+    """Return the best peak of the mean power of all units, whatever their phases.
 
-    The mean of U units' powers, each on its own scale, is Gamma(U) about the background; where units share a texture
-    of the track, as if there were fewer of them.
+    The mean of U units' powers, each on its own scale, is Gamma(U) about the background. If units share a texture of
+    the track, their effective number is smaller.
     """
     open_power = np.where(spectrum.taken, np.nan, spectrum.power)
     ratio = spectrum.power / smooth_background(open_power, spectrum.frequency, spectrum.count)
-    count = np.minimum(spectrum.count, alike(np.where(spectrum.taken, np.nan, ratio)))
-    with np.errstate(divide="ignore"):  # -inf: beyond doubt
+    count = np.minimum(spectrum.count, effective_count(np.where(spectrum.taken, np.nan, ratio)))
+    with np.errstate(divide="ignore"):  # -inf for a p-value of 0
         own = np.log(gammaincc(count, ratio * count))
     peaks = tops(spectrum.power) & ~spectrum.taken
     k = int(np.argmin(np.where(peaks, own, 1.0)))
     p = float(np.exp(own[k])) * spectrum.frequency.size
     wavelength = _refined(spectrum.power, spectrum.frequency, k)
     energy = spectrum.amplitude**2 * spectrum.count * (1 - 1 / np.maximum(ratio, 1.0))
-    sure = peaks & (own < np.log(SHARED_PHASE / spectrum.frequency.size))
-    sure[k] = True
+    significant = peaks & (own < np.log(SHARED_PHASE / spectrum.frequency.size))
+    significant[k] = True
     return Peak(
         spectrum.axis,
         wavelength,
@@ -124,7 +125,7 @@ def _incoherent(spectrum: Spectrum) -> Peak:
         float(ratio[k]),
         p,
         float(spectrum.amplitude[k]),
-        float(energy[sure].max()),
+        float(energy[significant].max()),
     )
 
 
@@ -134,23 +135,23 @@ def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
     k = first + int(np.argmax(power[first : k + LOBE + 1]))
     if 0 < k < power.size - 1:
         left, middle, right = power[k - 1 : k + 2]
-        bend = left - 2 * middle + right
-        if bend < 0:
-            shift = 0.5 * (left - right) / bend
+        curvature = left - 2 * middle + right
+        if curvature < 0:
+            shift = 0.5 * (left - right) / curvature
             return float(1 / (frequency[k] + shift * (frequency[1] - frequency[0])))
     return float(1 / frequency[k])
 
 
 # ---------------------------------------------------------------- stroke phases
-# The wave of each pass at one wavelength, from the raw samples: a sharp wavelength, and the phases of the passes.
+# The wave of each pass at one wavelength, from the raw samples: the exact wavelength, and the phases of the passes.
 #
-# A pass is a file in one direction. A stroke's residual is taken as a parabola plus a sine and a cosine of its place,
-# by least squares weighted with a Hann window (ends weigh little, where a stroke starts and stops); the strokes of a
-# pass share the sine and the cosine. No grid of bins or frequencies limits it, and a wave of a few periods is not
-# mistaken for its trend.
+# A pass is a file in one direction. A parabola, a sine and a cosine of the place are fitted to a stroke's residual by
+# least squares weighted with a Hann window, which gives the ends of the stroke little weight. The strokes of a pass
+# share the sine and the cosine. The resolution is not limited by bins or frequencies, and a wave of a few periods is
+# separated from the trend.
 
-MOST_NUMBERS = 1 << 14  # of samples times wavelengths that are computed at once
-AROUND = np.linspace(-0.5, 0.5, 101)  # periods per stroke on each side of a peak that are looked at once more
+MOST_NUMBERS = 1 << 14  # Samples times wavelengths that are computed at once.
+AROUND = np.linspace(-0.5, 0.5, 101)  # Periods per stroke on each side of a peak that are refined.
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ class Waves:
     direction: np.ndarray  # (p,)
     square: np.ndarray  # (p, m, 2, 2)
     product: np.ndarray  # (p, m, 2)
-    total: np.ndarray  # (p,) sum of squares of the residual freed of its trend
+    total: np.ndarray  # (p,) sum of squares of the residual without its trend
     middle: np.ndarray  # (p,) mean of the strokes' mean places
 
     @property
@@ -181,7 +182,7 @@ def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
     Parameters
     ----------
     samples : DataFrame
-        Samples of a stroke one after the other: stroke_id, unit, direction, the axis, `residual_N`.
+        Samples ordered by stroke: stroke_id, unit, direction, the axis, `residual_N`.
     lengths : ndarray, shape (m,)
         Wavelengths in the unit of the axis.
     axis : str
@@ -193,9 +194,11 @@ def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
 def _waves(strokes: Strokes, lengths: np.ndarray) -> Waves:
     square, product = np.zeros((strokes.size.size, lengths.size, 2, 2)), np.zeros((strokes.size.size, lengths.size, 2))
     total, middle = np.zeros((2, strokes.size.size))
-    for size in np.unique(strokes.size).tolist():  # those of one size at once, as far as they fit into the cache
-        alike = np.flatnonzero(strokes.size == size)
-        for some in np.array_split(alike, min(alike.size, -(-alike.size * size * lengths.size // MOST_NUMBERS))):
+    for size in np.unique(strokes.size).tolist():  # strokes of one size together, in parts that fit the cache
+        same_size = np.flatnonzero(strokes.size == size)
+        for some in np.array_split(
+            same_size, min(same_size.size, -(-same_size.size * size * lengths.size // MOST_NUMBERS))
+        ):
             place, value = strokes.together(some)
             square[some], product[some], total[some] = _normal_equations(place, value, lengths)
             middle[some] = place.mean(axis=1)
@@ -227,7 +230,7 @@ def _normal_equations(
 
 
 def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tuple[float, float]:
-    """Return the wavelength near a peak that explains most where each pass has its own phase, and its standard error.
+    """Return the wavelength near a peak that explains most with a phase per pass, and its standard error.
 
     The error is a jackknife over files.
     """
@@ -243,28 +246,27 @@ def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tu
 
 
 def _top(lengths: np.ndarray, power: np.ndarray) -> float:
-    """Return where a sampled curve is highest, by the parabola through its highest point and two neighbours."""
+    """Return the maximum of a sampled curve, by the parabola through its highest point and two neighbours."""
     k = int(np.clip(np.argmax(power), 1, power.size - 2))
     left, middle, right = power[k - 1 : k + 2]
-    bend = left - 2 * middle + right
-    if bend >= 0:
+    curvature = left - 2 * middle + right
+    if curvature >= 0:
         return float(lengths[k])
-    return float(lengths[k] + 0.25 * (left - right) / bend * (lengths[k + 1] - lengths[k - 1]))
+    return float(lengths[k] + 0.25 * (left - right) / curvature * (lengths[k + 1] - lengths[k - 1]))
 
 
 def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis: str) -> np.ndarray:
-    """Return per file how far its two halves hold the same wave: the product of their amplitudes, shape (files,).
+    """Return per file the scalar product of the amplitudes of its two halves, shape (files,).
 
-    Few files could not reach the level of a sign test: then each pass, a file in one direction, is told by itself.
-
-    Without a wave the phases of the halves are unrelated, and the sign is as often negative as positive.
+    Without a wave the phases of the halves are independent, and both signs are equally likely. With too few files for a
+    sign test the products are per pass (a file in one direction).
 
     Parameters
     ----------
     samples : DataFrame
         As for `waves_of`.
     first : ndarray of bool, shape (n,)
-        Which samples make the first half.
+        Whether a sample belongs to the first half.
     wavelength : float
         In the unit of the axis.
     axis : str
@@ -279,10 +281,10 @@ def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis:
 
 
 def pass_shifts(samples: pd.DataFrame, rows: Rows, wavelength: float, axis: str) -> dict[str, float]:
-    """Return per pass how far its own origin lies from the wave's, in the unit of the axis.
+    """Return per pass the shift of its origin from that of the wave, in the unit of the axis.
 
-    Of the origins a wavelength apart the one nearest the pass's middle is taken, so that the phase there holds
-    whatever becomes of the wavelength.
+    Of the possible origins the one nearest to the middle of the pass is taken. A change of the wavelength then does not
+    change the phase there.
     """
     strokes = rows.table.iloc[rows.groups.starts["stroke"]]
     names = dict(zip(strokes["stroke_id"], passes(strokes), strict=True))

@@ -1,4 +1,4 @@
-"""Does a channel order the residual? Free shapes of every channel and of pairs, on every quantity they may act on."""
+"""Search for channels that explain the residual: free shapes of channels and pairs, acting on every quantity."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from sealfit.closure.channels import (
     flip_level,
     free_columns,
     kinks,
-    off_zero,
     scatter_level,
+    shifted_from_zero,
     unit_of,
 )
 from sealfit.closure.criteria import (
@@ -32,10 +32,10 @@ from sealfit.closure.criteria import (
     LEAST_UNITS_OF_SLOPES,
     LOGARITHMIC_SPAN,
     MOST_CATEGORIES,
-    RARE,
+    PAIR_FACTOR,
     SEARCHES,
 )
-from sealfit.closure.score_test import Candidate, ScoreTests, judged
+from sealfit.closure.score_test import Candidate, ScoreTests, adjust_all
 from sealfit.closure.small_sample_test import log_p_of
 from sealfit.effects.free import BENDS, evenly
 from sealfit.fit.joint.estimate import Fitted
@@ -43,7 +43,7 @@ from sealfit.fit.joint.rows import POWER, Rows
 from sealfit.fit.joint.variance_components import orthonormal
 
 # ---------------------------------------------------------------- search
-# Does any channel order the residual? Free shapes of every channel, on every quantity they may act on.
+# Does any channel explain the residual? A free shape of every channel is tested on every quantity it may act on.
 
 TARGETS = (
     ("mu", "multiply"),
@@ -56,56 +56,56 @@ TARGETS = (
     ("a", "multiply"),
     ("b", "multiply"),
 )
-MOST_NUMBERS = 1 << 22  # of columns on all rows that are projected at once: 34 MB
+MOST_NUMBERS = 1 << 22  # Numbers in the columns that are projected at once: 34 MB.
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 
 
-def search(judge: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
+def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
     """Return every candidate with its adjusted p-value, strongest evidence first.
 
     Parameters
     ----------
-    judge : Judge
-        Of the current model.
+    tests : ScoreTests
+        Score tests of the current model.
     channels : sequence of Channel
-        Where to look.
+        Channels to search.
     rng : Generator
         For the sign flips.
     """
-    candidates = [c for channel in channels for c in of_channel(judge, channel)]
-    return judged(judge, candidates, rng) if candidates else []
+    candidates = [c for channel in channels for c in channel_candidates(tests, channel)]
+    return adjust_all(tests, candidates, rng) if candidates else []
 
 
-def of_channel(judge: ScoreTests, channel: Channel) -> Iterator[Candidate]:
-    """Yield the candidates of one channel, not adjusted for any search."""
-    rows = judge.fitted.rows
+def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidate]:
+    """Yield the candidates of one channel, with p-values that are not adjusted."""
+    rows = tests.fitted.rows
     if channel.name == "direction":
-        yield from _of_shapes(judge, channel, np.ones((rows.force.size, 1)), TARGETS)
+        yield from _shape_candidates(tests, channel, np.ones((rows.force.size, 1)), TARGETS)
         return
-    few = channel.numeric and channel.unit == "specimen" and rows.groups.starts["specimen"].size < JACKKNIFE_UNITS
-    shapes = free_columns(channel, FEW_DF if few else FREE_DF)
+    few_units = channel.numeric and channel.unit == "specimen" and rows.groups.starts["specimen"].size < JACKKNIFE_UNITS
+    shapes = free_columns(channel, FEW_DF if few_units else FREE_DF)
     widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
-    yield from _of_shapes(judge, channel, shapes, TARGETS, widths)
-    if few:
+    yield from _shape_candidates(tests, channel, shapes, TARGETS, widths)
+    if few_units:
         for kink in kinks(channel).T:
-            yield from _of_shapes(judge, channel, kink[:, None], MAIN_TARGETS)
+            yield from _shape_candidates(tests, channel, kink[:, None], MAIN_TARGETS)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
     fine = channel.numeric and channel.name not in CALENDAR and units >= FINE_UNITS
     if fine and np.unique(channel.values).size > 2 * FINE_DF:
-        yield from _of_shapes(judge, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
+        yield from _shape_candidates(tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
 
 
-def _of_shapes(
-    judge: ScoreTests,
+def _shape_candidates(
+    tests: ScoreTests,
     channel: Channel,
     shapes: np.ndarray,
     targets: Sequence[tuple[str, str]],
     widths: Sequence[int] = (),
 ) -> Iterator[Candidate]:
-    """Yield the candidates of a channel's columns, by the first so many of them, on every target that may take them."""
-    fitted, rows = judge.fitted, judge.fitted.rows
+    """Yield the candidates of a channel's columns on every target, one for each number of columns in `widths`."""
+    fitted, rows = tests.fitted, tests.fitted.rows
     if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
-        return  # too few speeds to know the Stribeck curve: what depends on speed may be just that
+        return  # with few speeds a dependence on speed may be the Stribeck curve
     both_ways = rows.speed.min() < 0 < rows.speed.max()
     slopes, places = [], []
     for acts_on, operation in targets:
@@ -120,18 +120,18 @@ def _of_shapes(
     variants: tuple[np.ndarray, ...] = ()
     for number, (acts_on, operation, own) in enumerate(places):
         if number % together == 0:
-            variants = judge.variants(np.column_stack(slopes[number : number + together]), channel.unit)
+            variants = tests.variants(np.column_stack(slopes[number : number + together]), channel.unit)
         first = number % together * own.shape[1]
         unit = channel.unit
         names = (channel.name,)
         unsigned = both_ways and (acts_on, operation) == ("force", "add") and channel.name != "direction"
-        if unsigned and FINER[channel.unit] > FINER["stroke"]:  # it shows only between directions
+        if unsigned and FINER[channel.unit] > FINER["stroke"]:  # it is seen only as a difference between directions
             names = ("direction", channel.name)
             unit = min(unit, _direction_unit(rows), key=FINER.get)
         level = flip_level(unit, rows)
         between = level if channel.grouping else scatter_level([channel], rows)
         for width in dict.fromkeys(widths or (own.shape[1],)):
-            test_result = judge([v[:, first : first + width] for v in variants], between, level, (acts_on, operation))
+            test_result = tests([v[:, first : first + width] for v in variants], between, level, (acts_on, operation))
             if test_result is not None:
                 yield Candidate(names, acts_on, operation, level, own[:, :width], test_result)
 
@@ -141,7 +141,7 @@ def _direction_unit(rows: Rows) -> str:
 
 
 def _declared(fitted: Fitted, acts_on: str) -> bool:
-    """Whether the declared model holds the quantity here; mu_c alone is mu where no Stribeck curve is fitted."""
+    """Whether the declared model has the quantity; without a Stribeck curve, mu_c is mu."""
     needs = {"mu_s": "v_s", "mu_c": "v_s", "v_s": "v_s", "sigma_2": "sigma_2", "a": "a_c", "b": "b_c"}.get(acts_on)
     return needs is None or bool((fitted.model.declared.index[needs] >= 0).any())
 
@@ -152,67 +152,69 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool) ->
     if channel.grouping:
         return both_ways and (acts_on, operation) == ("force", "add")
     if channel.name == "speed_mm_s":
-        return acts_on in ("mu", "a")  # mu_s, mu_c, v_s and sigma_2 are themselves the dependence on speed
+        return acts_on in ("mu", "a")  # mu_s, mu_c, v_s and sigma_2 describe the dependence on speed
     return not (channel.name == "load_N" and acts_on == "force")
 
 
 # ---------------------------------------------------------------- pairs
-# Pairs of channels, for an effect that shows only in two of them together.
+# Pairs of channels, for effects that are interactions.
 #
-# Looked at where no single channel orders the residual. The columns of a pair are mixed terms alone: what either
-# channel does by itself was tested before and is none of the pair's.
+# They are searched where no single channel explains the residual. The columns of a pair are interaction terms only:
+# the main effects of both channels have been tested before.
 
-BEHIND = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}  # along it each acts
-ALONE = {"direction", "run_order", "elapsed_h"}  # direction has its own tests; the calendar drifts by itself
+# The variable whose influence each coefficient describes.
+VARIABLE_OF = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
+# Direction has tests of its own, and the calendar interacts with nothing.
+NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}
 
 
 def search_pairs(
-    judge: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
+    tests: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
 ) -> list[Candidate]:
-    """Return candidates of two channels, adjusted over these and the single ones, strongest evidence first.
+    """Return candidates of two channels, with p-values adjusted over single channels and pairs, strongest first.
 
     Parameters
     ----------
-    judge : Judge
-        Of the current model.
+    tests : ScoreTests
+        Score tests of the current model.
     channels : sequence of Channel
-        Where to look.
+        Channels to search.
     singles : sequence of Candidate
-        What the search of single channels has tried on this model.
+        Candidates of the search of single channels on this model.
     rng : Generator
         For the sign flips.
     """
-    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _of_pair(judge, *pair)]
+    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _pair_candidates(tests, *pair)]
     if not found:
         return []
-    pairs = [c for c in judged(judge, [*found, *singles], rng) if c.pair]
-    return [replace(c, p_value=min(1.0, RARE * c.p_value)) for c in pairs]
+    pairs = [c for c in adjust_all(tests, [*found, *singles], rng) if c.pair]
+    return [replace(c, p_value=min(1.0, PAIR_FACTOR * c.p_value)) for c in pairs]
 
 
-def pairs_in_disguise(
-    judge: ScoreTests, significant: Sequence[Candidate], channels: Mapping[str, Channel]
+def equivalent_pairs(
+    tests: ScoreTests, significant: Sequence[Candidate], channels: Mapping[str, Channel]
 ) -> list[Candidate]:
-    """Return the pairs that a channel's change of a or of v_s may stand for.
+    """Return the pairs that are equivalent to a single channel acting on a, b, v_s or sigma_2.
 
-    a is how mu changes with days, v_s how it changes with speed. The pair explains the same significant structure, so
-    it is tried beside the single channel whatever its own p-value; the fits decide.
+    a describes how mu changes with days, v_s how it changes with speed. The pair explains the same structure, so it is
+    fitted as well as the single channel, whatever its own p-value. The fits decide.
 
     Parameters
     ----------
-    judge : Judge
-        Of the current model.
+    tests : ScoreTests
+        Score tests of the current model.
     significant : sequence of Candidate
-        What the search has accepted on it.
+        Its significant candidates.
     channels : mapping
         Channels by name.
     """
     best: dict[frozenset, list[Candidate]] = {}
     for single in significant:
-        pair = frozenset((*single.channels, BEHIND.get(single.acts_on)))
+        pair = frozenset((*single.channels, VARIABLE_OF.get(single.acts_on)))
         if single.pair or len(pair) != 2 or not pair <= channels.keys() or pair in best:
             continue
         members = _usable([channels[name] for name in sorted(pair)])
-        found = _of_pair(judge, *members) if len(members) == 2 else []
+        found = _pair_candidates(tests, *members) if len(members) == 2 else []
         strongest = [max(own, key=lambda c: c.chi2) for t in MAIN_TARGETS if (own := [c for c in found if _on(c, t)])]
         best[pair] = [
             replace(c, test_result=c.test_result._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value)
@@ -229,15 +231,15 @@ def _usable(channels: Sequence[Channel]) -> list[Channel]:
     return [
         c
         for c in channels
-        if not (c.grouping or c.name in ALONE) and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
+        if not (c.grouping or c.name in NOT_IN_PAIRS) and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
     ]
 
 
-def _of_pair(judge: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
+def _pair_candidates(tests: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
     blocks = mixed_columns(one, other)
     if not blocks:
         return []
-    fitted, finer = judge.fitted, min(one.unit, other.unit, key=FINER.get)
+    fitted, finer = tests.fitted, min(one.unit, other.unit, key=FINER.get)
     between = scatter_level((one, other), fitted.rows)
     level = flip_level(finer, fitted.rows)
     shapes = np.column_stack(blocks)
@@ -246,9 +248,9 @@ def _of_pair(judge: ScoreTests, one: Channel, other: Channel) -> list[Candidate]
     for target in MAIN_TARGETS:
         if "load_N" in (one.name, other.name) and target[0] == "force":
             continue
-        variants = judge.variants(shapes * fitted.slope(*target)[:, None], finer)
+        variants = tests.variants(shapes * fitted.slope(*target)[:, None], finer)
         for block, first, last in zip(blocks, ends[:-1], ends[1:], strict=True):
-            test_result = judge([v[:, first:last] for v in variants], between, level, target)
+            test_result = tests([v[:, first:last] for v in variants], between, level, target)
             if test_result is not None:
                 names = (one.name, other.name)
                 found.append(Candidate(names, *target, level, block, test_result, pair=True))
@@ -256,10 +258,10 @@ def _of_pair(judge: ScoreTests, one: Channel, other: Channel) -> list[Candidate]
 
 
 def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
-    """Return the mixed terms of two channels, blocks of shape (n, k) to be judged each; none for two categories.
+    """Return the interaction terms of two channels, blocks of shape (n, k) that are tested one by one.
 
-    The plain product, also of logarithms where a channel spans enough for them to matter: what either does alone may
-    hold nearly all of a product, and the rest depends on its exact shape. Then bent terms, for what is no product.
+    The first are products, also of logarithms for channels with a wide range: main effects explain most of a product,
+    and the rest depends on its exact shape. The last is a block of nonlinear terms. Two categories have none.
     """
     if not (one.numeric or other.numeric):
         return []
@@ -278,11 +280,11 @@ def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
 
 
 def _scales(channel: Channel) -> list[np.ndarray]:
-    """Return a channel, centred, and its logarithm where that is another shape (from 0 on, moved by its least)."""
+    """Return a channel, centred, and its logarithm if the range is wide (values from 0 on are shifted first)."""
     x = channel.values
     scales = [x]
     if x.min() >= 0 and x.max() > LOGARITHMIC_SPAN * x[x > 0].min(initial=np.inf):
-        scales.append(np.log(off_zero(x)))
+        scales.append(np.log(shifted_from_zero(x)))
     return [_centred(x) / max(float(np.ptp(x)), 1e-300) for x in scales]
 
 
@@ -295,51 +297,52 @@ def _centred(values: np.ndarray) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- masked pairs
-# Two effects that hide each other: each stands in the other's error, and neither passes a test of its own.
+# Two effects that mask each other: each is part of the other's error, and neither is significant alone.
 #
-# Looked at where nothing else is significant, in few units. The pairs are simple ones only: two straight lines (an
-# offset, for the direction) that share a channel or of which one is of the direction, and a line along strokes with its
-# change along a coarser channel. Both columns must move each unit along one direction, so that a unit is one number;
-# then
+# They are searched in few units, where nothing else is significant. Only simple pairs are tested: two straight lines
+# (an offset, for the direction) that share a channel or of which one is of the direction, and a line along strokes with
+# its change along a coarser channel. Both columns must change each unit along one direction, so that a unit is one
+# number; then
 #
 # .. math:: F = \frac{(RSS_0 - RSS_{12}) / 2}{RSS_{12} / (d - 2)}
 #
-# holds both against what the units scatter by beside them, exactly where that scatter is normal and alike. P-values are
-# adjusted for the number of pairs (Bonferroni). A pair counts where each of the two is significant given the other.
+# tests both against the residual scatter of the units. The test is exact if that scatter is normal with one variance.
+# P-values are adjusted for the number of pairs (Bonferroni). In a significant pair each of the two is significant given
+# the other.
 
 OF_DIRECTION = (("force", "add"), ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
-SEPARATE = 1e-3  # singular value of two columns of length 1 below which they are one
+LEAST_SINGULAR = 1e-3  # Two unit columns with a smaller singular value are collinear.
 
 
 class MaskedPair(NamedTuple):
-    """Two effects that hide each other: what the tests say of both together, and the keys of their candidates."""
+    """Two effects that mask each other: their joint test and the keys of their candidates."""
 
     p_value: float  # adjusted
     chi2: float  # whitened sum of squares they explain
-    keys: tuple[tuple, ...]  # of those not in the model yet
+    keys: tuple[tuple, ...]  # of those that are not in the model yet
 
     def without(self, key: tuple) -> MaskedPair:
-        """Return what is left once one of them is in the model."""
+        """Return the pair without the one that is now in the model."""
         return MaskedPair(self.p_value, 0.0, tuple(k for k in self.keys if k != key))
 
 
 def search_masked_pairs(
-    judge: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate], alpha: float
+    tests: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate], alpha: float
 ) -> list[MaskedPair]:
     """Return the pairs that are significant jointly, most significant first.
 
     Parameters
     ----------
-    judge : Judge
-        Of the current model.
+    tests : ScoreTests
+        Score tests of the current model.
     channels : mapping
         Channels by name.
     candidates : sequence of Candidate
-        What the searches of single channels and of pairs have tried on this model.
+        Candidates of the searches of single channels and of pairs on this model.
     alpha : float
         Level of the search, and of each of the two given the other.
     """
-    tested = [(two, _tested(judge, two, level)) for two, level in _pairs(judge, channels, candidates)]
+    tested = [(two, _joint_test(tests, two, level)) for two, level in _pairs(tests, channels, candidates)]
     tested = [(two, test) for two, test in tested if test is not None]
     found = [
         MaskedPair(min(1.0, SEARCHES * len(tested) * float(np.exp(joint))), chi2, tuple(c.key for c in two))
@@ -350,11 +353,11 @@ def search_masked_pairs(
 
 
 def _pairs(
-    judge: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate]
+    tests: ScoreTests, channels: Mapping[str, Channel], candidates: Sequence[Candidate]
 ) -> Iterator[tuple[tuple[Candidate, Candidate], str]]:
-    """Yield the pairs to be tested and the level of their units."""
-    rows = judge.fitted.rows
-    straight = [c for c in candidates if c.columns.shape[1] == 1 and c.sure]
+    """Yield the pairs to test and the level of their units."""
+    rows = tests.fitted.rows
+    straight = [c for c in candidates if c.columns.shape[1] == 1 and c.claimable]
     between = {c.channels: [channels[n] for n in c.channels if n != "direction"] for c in straight}
     level = {id(c): scatter_level(between[c.channels] or [channels["direction"]], rows) for c in straight}
     lines = [c for c in straight if not c.pair and (c.acts_on, c.operation) in _targets(c)]
@@ -362,13 +365,13 @@ def _pairs(
     products = [c for c in straight if c.pair]
     for one, other in (*itertools.combinations(lines, 2), *itertools.product(lines, products)):
         shared = level[id(one)] == level[id(other)]
-        few = LEAST_UNITS_OF_SLOPES <= rows.groups.starts[level[id(one)]].size < JACKKNIFE_UNITS
-        if shared and few and _together(one, other, channels):
+        few_units = LEAST_UNITS_OF_SLOPES <= rows.groups.starts[level[id(one)]].size < JACKKNIFE_UNITS
+        if shared and few_units and _is_simple_pair(one, other, channels):
             yield (one, other), level[id(one)]
 
 
-def _together(line: Candidate, other: Candidate, channels: Mapping[str, Channel]) -> bool:
-    """Whether a line and another, or a product, are one of the simple pairs."""
+def _is_simple_pair(line: Candidate, other: Candidate, channels: Mapping[str, Channel]) -> bool:
+    """Whether a line and another line, or a product, are a simple pair (see above)."""
     name = line.channels[-1]
     if not other.pair:
         return name == other.channels[-1] or ("direction",) in (line.channels, other.channels)
@@ -382,41 +385,41 @@ def _targets(candidate: Candidate) -> Sequence[tuple[str, str]]:
     return OF_DIRECTION if candidate.channels == ("direction",) else MAIN_TARGETS
 
 
-def _tested(judge: ScoreTests, two: tuple[Candidate, Candidate], level: str) -> tuple[float, float, float] | None:
-    """Return log p of two candidates jointly, the larger of each given the other, and what they explain; else None.
+def _joint_test(tests: ScoreTests, two: tuple[Candidate, Candidate], level: str) -> tuple[float, float, float] | None:
+    """Return log p of two candidates jointly, the larger log p of one given the other, and their chi-squared.
 
-    None is where they are no pair. Of all variants in which they must hold, what says least.
+    Of several variants the weakest result counts. None if they are no pair.
     """
-    fitted = judge.fitted
+    fitted = tests.fitted
     columns = np.column_stack([c.columns * fitted.slope(c.acts_on, c.operation)[:, None] for c in two])
     unit = min((c.unit for c in two), key=lambda name: fitted.rows.groups.starts[name].size)
     white = fitted.whitening(columns)
-    numbers = judge.few[level].along(_larger(white, fitted.rows.groups, level))
+    numbers = tests.cluster_tests[level].along(_larger_column(white, fitted.rows.groups, level))
     found = []
-    for left in judge.variants(columns, unit):
+    for left in tests.variants(columns, unit):
         own = fitted.rows.groups.sums(numbers.direction[:, None] * left, level)
         if ((own**2).sum(axis=0) <= CONSTANT_IN_RUNS * (left**2).sum(axis=0)).any() or not left.any(axis=0).all():
             return None
         made = numbers.root @ own
         made = made / np.sqrt((made**2).sum(axis=0))
-        basis = orthonormal(made, SEPARATE)
+        basis = orthonormal(made, LEAST_SINGULAR)
         if basis.shape[1] < 2 or numbers.df - 2 < LEAST_ERROR_DF_OF_RUNS:
             return None
         joint = log_p_of(numbers.values[None, :], basis, 0.0, numbers.df)[0]
-        given = max(_given(numbers.values, *made.T[order], numbers.df) for order in ([0, 1], [1, 0]))
-        found.append((joint, given, -float(((orthonormal(left, SEPARATE).T @ fitted.white_residual) ** 2).sum())))
+        given = max(_conditional_log_p(numbers.values, *made.T[order], numbers.df) for order in ([0, 1], [1, 0]))
+        found.append((joint, given, -float(((orthonormal(left, LEAST_SINGULAR).T @ fitted.white_residual) ** 2).sum())))
     joint, given, chi2 = np.max(found, axis=0).tolist()
     return joint, given, -chi2
 
 
-def _given(values: np.ndarray, one: np.ndarray, other: np.ndarray, df: int) -> float:
+def _conditional_log_p(values: np.ndarray, one: np.ndarray, other: np.ndarray, df: int) -> float:
     """Return log p of one column of independent numbers given another, all of shape (d,), the columns of length 1."""
     rest = one - (one @ other) * other
     left = values - (values @ other) * other
     return float(log_p_of(left[None, :], rest[:, None] / np.linalg.norm(rest), 0.0, df - 1)[0])
 
 
-def _larger(white: np.ndarray, groups, level: str) -> np.ndarray:
-    """Return in each unit the larger of two columns, shape (n,): the direction along which both may move it."""
+def _larger_column(white: np.ndarray, groups, level: str) -> np.ndarray:
+    """Return the larger of two columns in each unit, shape (n,): the direction along which both may change it."""
     size = groups.sums(white**2, level)
     return white[np.arange(len(white)), size.argmax(axis=1)[groups.codes[level]]]

@@ -1,4 +1,4 @@
-"""Round after round: search, name, confirm, add, refit, drop what became needless, until nothing is left."""
+"""The rounds of the loop: search, name, confirm, add, refit and remove effects until nothing significant is left."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel, channels_of
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
-from sealfit.closure.criteria import DOUBTFUL, HALF_OF_CALENDAR, TRIES, WEAK
+from sealfit.closure.criteria import HALF_OF_CALENDAR, MOST_PROPOSALS, PAIRS_FROM_P, WEAK_P
 from sealfit.closure.forms import AGING, richer_laws
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import propose, rivals
@@ -22,7 +22,7 @@ from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import (
     MAIN_TARGETS,
     MaskedPair,
-    pairs_in_disguise,
+    equivalent_pairs,
     search,
     search_masked_pairs,
     search_pairs,
@@ -34,11 +34,11 @@ from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter
 from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
 
-SAMPLED = ("displacement_mm", "time_s", "force_N")  # what the ripple search reads of a sample
+SAMPLED = ("displacement_mm", "time_s", "force_N")  # columns of the samples that the ripple search reads
 
 
 class Start(NamedTuple):
-    """The declared model as it was fitted to more rows, and their scatter."""
+    """The declared model fitted to more rows, and their scatter."""
 
     model: Model
     scatter: Scatter
@@ -46,31 +46,31 @@ class Start(NamedTuple):
 
 @dataclass(frozen=True)
 class Selection:
-    """The end of the loop on some rows: both fits, what was added, and what the last searches found."""
+    """The result of the loop on some rows: both fits, the added effects, and the candidates of the searches."""
 
     before: Fitted
     after: Fitted
     added: tuple[AcceptedEffect, ...]
     first: tuple[Candidate, ...]  # candidates on the declared model
     last: tuple[Candidate, ...]  # candidates on the final one
-    left: Candidate | Peak | None  # what is still significant
-    unsure: AcceptedEffect | None  # the best form of what too few specimens show; not in any model
+    left: Candidate | Peak | None  # still significant, in no model
+    inconclusive: AcceptedEffect | None  # best form of an effect that too few specimens show; in no model
     channels: Mapping[str, Channel] = field(default_factory=dict)
-    refused: tuple[RefusedEffect, ...] = ()  # significant, and in no model
-    worse: tuple[RefusedEffect, ...] = ()  # of these, what was in the model and lowered no error
+    refused: tuple[RefusedEffect, ...] = ()  # significant, in no model
+    worse: tuple[RefusedEffect, ...] = ()  # those of them that were removed because they lowered no error
 
 
-class _Shown(NamedTuple):
-    """What the searches show on one model."""
+class _SearchResult(NamedTuple):
+    """The result of all searches on one model."""
 
-    claimable: list[Candidate]  # single channels, sure and not doubted
+    claimable: list[Candidate]  # single channels that may be claimed
     laws: list[tuple[Candidate, Proposal]]  # richer laws of aging
-    pairs: list[Candidate]  # pairs of channels; none where a single one is sure enough
+    pairs: list[Candidate]  # pairs of channels; none if a single channel is significant enough
     significant: list[Candidate]  # single channels and pairs, strongest evidence first
-    hidden: list[MaskedPair]  # effects that hide each other
+    masked: list[MaskedPair]  # effects that mask each other
 
 
-def grow(
+def select_effects(
     rows: Rows,
     samples: pd.DataFrame,
     context: Context,
@@ -79,33 +79,33 @@ def grow(
     start: Start | None = None,
     rounds: int | None = None,
 ) -> Selection:
-    """Return the model grown until no channel orders its residual.
+    """Add effects until no channel explains the residual, and return the result.
 
     Parameters
     ----------
     rows : Rows
-        Bins as arrays, merged along their strokes where there are many.
+        Bins as arrays, merged along their strokes if there are many.
     samples : DataFrame
         Steady samples for the ripple search: as `steady_samples` gives them.
     context : Context
-        Levels of error, rounds, folds, and the catalogue.
+        Error rate, rounds, folds, and the catalogue.
     fine : Rows, optional
-        The bins as they are, to fit ripples to, which merged bins would blur; they are held as found there.
+        Bins that are not merged, to which ripples are fitted; they are then fixed.
     start : Start, optional
-        Where the fit of the declared model begins, so that it need not search again.
+        Start of the fit of the declared model, which then needs no search.
     rounds : int, optional
-        Rounds after which a fold's search ends: nothing is asked then but what effects it adds, not for what is left.
+        Rounds after which the search of a fold ends. What is left is not determined then.
     """
-    growth = _Growth(rows, samples, context, fine, start)
+    loop = _Loop(rows, samples, context, fine, start)
     last_round = context.config.loop.max_rounds + 2 if rounds is None else rounds
-    for number in range(len(growth.added) + 1, last_round + 1):
-        if growth.has_ended(number):
+    for number in range(len(loop.added) + 1, last_round + 1):
+        if loop.run_round(number):
             break
-    return growth.selection(whole=rounds is None)
+    return loop.selection(whole=rounds is None)
 
 
-class _Growth:
-    """The loop while it goes on: the model, what was added and refused, and what the searches show on the model."""
+class _Loop:
+    """State of the loop: the model, the effects added and refused, and the search results on the model."""
 
     def __init__(
         self, rows: Rows, samples: pd.DataFrame, context: Context, fine: Rows | None, start: Start | None
@@ -115,72 +115,72 @@ class _Growth:
         ripples = Ripples(samples, context)
         self.before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
         self.channels = {c.name: c for c in channels_of(rows, self.context.config)}
-        self.judge = ScoreTests(self.before)
-        self.last = self.first = self.searched()
+        self.tests = ScoreTests(self.before)
+        self.last = self.first = self.search_single()
         self.fitted = ripples.added_to(self.before, fine)
         self.added = list(ripples.added)
-        self.ripple, self.samples, self.not_confirmed = ripples.found, ripples.samples, ripples.refused
+        self.ripple, self.samples, self.unconfirmed = ripples.found, ripples.samples, ripples.refused
         self.renaming = Renaming(self.channels, self.samples, context)
         self.refused: set[tuple] = set()
         self.left: Candidate | Peak | None = None
-        self.hidden: list[MaskedPair] = []  # effects that hide each other, until both are in the model
-        self.renamed = False  # whether earlier effects have been named anew
-        self.shown: _Shown | None = None
+        self.masked: list[MaskedPair] = []  # effects that mask each other, until both are in the model
+        self.renamed = False  # whether earlier effects have been renamed
+        self.found: _SearchResult | None = None
 
     @property
     def alpha(self) -> float:
-        """Level of error of the whole search."""
+        """Family-wise error rate of the search."""
         return self.context.config.loop.family_error
 
-    def searched(self) -> tuple[Candidate, ...]:
-        """Return every candidate of a single channel on the present model."""
-        return tuple(search(self.judge, list(self.channels.values()), self.rng))
+    def search_single(self) -> tuple[Candidate, ...]:
+        """Return every candidate of a single channel on the current model."""
+        return tuple(search(self.tests, list(self.channels.values()), self.rng))
 
-    def ask(
+    def confirm(
         self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
     ) -> AcceptedEffect | None:
-        """Return the first of some proposals that held-out data confirm; what they refuse is added to `failed`."""
+        """Return the first proposal that held-out data confirm; a refused one is appended to `failed`."""
         return confirmed(base, proposals, self.samples, self.context, number, failed)
 
-    def has_ended(self, number: int) -> bool:
-        """Search, name and confirm once; return whether nothing is left to be done."""
-        if self.fitted is not self.judge.fitted:
-            self.judge, self.shown = ScoreTests(self.fitted), None
-            self.last = self.searched()
-        if self.shown is None:  # else the last round refused what it was shown, and the model is as it was
-            self.shown = self.look(number)
-            if self.adds_two_of_direction(number):
+    def run_round(self, number: int) -> bool:
+        """Search, name and confirm once; return whether the loop is finished."""
+        if self.fitted is not self.tests.fitted:
+            self.tests, self.found = ScoreTests(self.fitted), None
+            self.last = self.search_single()
+        if self.found is None:  # else the last round added nothing
+            self.found = self.search_model(number)
+            if self.add_pair_of_direction(number):
                 return False
         open_ = self.open_candidates()
         if not open_ or number > self.context.config.loop.max_rounds:
-            return not self.renames()
-        claimable, laws = self.shown.claimable, [p for _, p in self.shown.laws]
-        open_ += [c for c in _standing_for(open_, claimable) if c.key not in self.refused]
+            return not self.rename_earlier()
+        claimable, laws = self.found.claimable, [p for _, p in self.found.laws]
+        open_ += [c for c in _related_candidates(open_, claimable) if c.key not in self.refused]
         proposals = propose(self.fitted, open_, self.channels, self.context.effects, laws)
-        accepted = self.ask(self.fitted, proposals, number, self.not_confirmed)
+        accepted = self.confirm(self.fitted, proposals, number, self.unconfirmed)
         if accepted is None:
-            self.refused |= {p.source for p in proposals[:TRIES]} or {c.key for c in open_}
-            self.hidden = []
+            self.refused |= {p.source for p in proposals[:MOST_PROPOSALS]} or {c.key for c in open_}
+            self.masked = []
         else:
             self.add(accepted)
         return False
 
-    def look(self, number: int) -> _Shown:
-        """Return what the present model lacks."""
-        shown = _shown(self.judge, self.last, self.channels, self.context.effects, self.alpha, self.rng)
-        tried = f"{len(self.last)} candidates on {len(self.channels)} channels, {len(shown.pairs)} on pairs of them"
+    def search_model(self, number: int) -> _SearchResult:
+        """Return the result of all searches on the current model."""
+        found = _search_all(self.tests, self.last, self.channels, self.context.effects, self.alpha, self.rng)
+        tried = f"{len(self.last)} candidates on {len(self.channels)} channels, {len(found.pairs)} on pairs of them"
         self.context.say(
-            f"round {number}: {tried}; {len(shown.significant)} significant, {len(shown.hidden)} hide each other"
+            f"round {number}: {tried}; {len(found.significant)} significant, {len(found.masked)} mask each other"
         )
-        return shown
+        return found
 
-    def adds_two_of_direction(self, number: int) -> bool:
-        """Whether two effects of the direction, which hid each other, were added."""
-        two = next((pair for pair in self.shown.hidden if {key[0] for key in pair.keys} == {("direction",)}), None)
-        if self.hidden or two is None:
+    def add_pair_of_direction(self, number: int) -> bool:
+        """Add two effects of the direction that mask each other; return whether that was done."""
+        two = next((pair for pair in self.found.masked if {key[0] for key in pair.keys} == {("direction",)}), None)
+        if self.masked or two is None:
             return False
-        awaited = _awaited([two], self.shown.claimable)
-        both = _both(self.fitted, awaited, self.channels, self.context.effects, self.ask, number)
+        pending = _pending_candidates([two], self.found.claimable)
+        both = _confirmed_pair(self.fitted, pending, self.channels, self.context.effects, self.confirm, number)
         if both:
             later, earlier = both
             own = earlier.proposal.fitted
@@ -191,187 +191,187 @@ class _Growth:
         return bool(both)
 
     def open_candidates(self) -> list[Candidate]:
-        """Return what is significant and not refused; those of effects that hide each other where nothing else is."""
-        shown = self.shown
-        if not (self.hidden or shown.significant):
-            self.hidden = [pair for pair in shown.hidden if self.refused.isdisjoint(pair.keys)]
-        significant = _awaited(self.hidden, (*shown.claimable, *shown.pairs)) or list(shown.significant)
-        significant += [c for c, _ in shown.laws if c.p_value <= self.alpha and c.sure]
+        """Return the significant candidates that are not refused; if there are none, those of masked pairs."""
+        found = self.found
+        if not (self.masked or found.significant):
+            self.masked = [pair for pair in found.masked if self.refused.isdisjoint(pair.keys)]
+        significant = _pending_candidates(self.masked, (*found.claimable, *found.pairs)) or list(found.significant)
+        significant += [c for c, _ in found.laws if c.p_value <= self.alpha and c.claimable]
         self.left = significant[0] if significant else self.ripple
-        significant += pairs_in_disguise(self.judge, significant, self.channels)
+        significant += equivalent_pairs(self.tests, significant, self.channels)
         return [c for c in significant if c.key not in self.refused]
 
-    def renames(self) -> bool:
-        """Name earlier effects anew beside the later ones, once; return whether one has another name."""
+    def rename_earlier(self) -> bool:
+        """Rename earlier effects given the later ones, once; return whether a name changed."""
         if self.renamed or len(self.added) < 2:
             return False
         self.renamed, before = True, self.added
-        self.fitted, self.added = self.renaming.all_but_last(self.fitted, self.added)
+        self.fitted, self.added = self.renaming.earlier_renamed(self.fitted, self.added)
         if self.added is before:
             return False
-        self.fitted, self.added = _drop_needless(self.fitted, self.added)
+        self.fitted, self.added = _remove_redundant(self.fitted, self.added)
         rounds = {a.round for a in self.added}
         self.refused |= {a.proposal.source for a in before if a.round not in rounds}
         return True
 
     def add(self, accepted: AcceptedEffect) -> None:
-        """Add an effect; drop what it makes needless."""
+        """Add an effect and remove earlier ones that it makes redundant."""
         source = accepted.proposal.source
-        self.hidden = [pair.without(source) for pair in self.hidden if source in pair.keys]
-        awaited = any(pair.keys for pair in self.hidden)
-        earlier, accepted = self.renaming.one_for_two(self.fitted, self.added, accepted, awaited=awaited)
+        self.masked = [pair.without(source) for pair in self.masked if source in pair.keys]
+        pending = any(pair.keys for pair in self.masked)
+        earlier, accepted = self.renaming.merged_with_earlier(self.fitted, self.added, accepted, pending=pending)
         added = [*earlier, accepted]
-        own = accepted.proposal.fitted  # under its own scatter: in that of before stands what was missing
-        self.fitted, self.added = _drop_needless(fit(own.model, self.rows, own.scatter, turns=2), added)
-        # What came and went does not come again.
+        own = accepted.proposal.fitted  # under its own scatter: the former one contains the missing effect
+        self.fitted, self.added = _remove_redundant(fit(own.model, self.rows, own.scatter, turns=2), added)
+        # A removed effect is not added again.
         self.refused |= {a.proposal.source for a in added if all(a is not k for k in self.added)}
 
     def selection(self, *, whole: bool) -> Selection:
-        """Return the end of the loop; without what is left where not the whole campaign was searched."""
+        """Return the result of the loop; for a fold, without what is left."""
         added = tuple(self.added)
         after = self.fitted if added else self.before
         found = Selection(self.before, after, added, self.first, self.last, None, None, self.channels)
         if not whole:
             return found
-        left, unsure = self.left, None
-        if isinstance(left, Candidate) and left.key in self.refused and left.p_value > WEAK:
+        left, inconclusive = self.left, None
+        if isinstance(left, Candidate) and left.key in self.refused and left.p_value > WEAK_P:
             left = None  # it is listed as refused
-        laws = self.shown.laws
-        doubtful = [c for c in (*self.last, *(c for c, _ in laws)) if c.p_value <= self.alpha and not c.sure]
-        if left is None and doubtful:
-            proposals = propose(self.fitted, doubtful, self.channels, self.context.effects, [p for _, p in laws])
+        laws = self.found.laws
+        tested = (*self.last, *(c for c, _ in laws))
+        unclaimable = [c for c in tested if c.p_value <= self.alpha and not c.claimable]
+        if left is None and unclaimable:
+            proposals = propose(self.fitted, unclaimable, self.channels, self.context.effects, [p for _, p in laws])
             others = tuple(rivals(proposals[0], proposals))
-            left = doubtful[0]
-            unsure = AcceptedEffect(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
-        return replace(found, left=left, unsure=unsure, refused=tuple(self.not_confirmed))
+            left = unclaimable[0]
+            inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
+        return replace(found, left=left, inconclusive=inconclusive, refused=tuple(self.unconfirmed))
 
 
-def _shown(
-    judge: ScoreTests,
+def _search_all(
+    tests: ScoreTests,
     last: Sequence[Candidate],
     channels: Mapping[str, Channel],
     effects: Mapping[str, Effect],
     alpha: float,
     rng: np.random.Generator,
-) -> _Shown:
-    """Return what a model lacks by the search of single channels, `last`, and by those that come after it."""
-    doubted = _doubted(last, alpha)
-    claimable = _claimable(last, doubted)
+) -> _SearchResult:
+    """Return the result of all searches on a model; `last` is that of single channels."""
+    inconsistent = _inconsistent_channels(last, alpha)
+    claimable = _claimable(last, inconsistent)
     significant = [c for c in claimable if c.p_value <= alpha]
     aged = not significant or any(c.channels == (AGING,) for c in significant)
-    laws = richer_laws(judge.fitted, channels, effects) if aged else []
-    if significant and significant[0].p_value <= DOUBTFUL:
-        return _Shown(claimable, laws, [], significant, [])
-    pairs = _claimable(search_pairs(judge, list(channels.values()), last, rng), doubted)
+    laws = richer_laws(tests.fitted, channels, effects) if aged else []
+    if significant and significant[0].p_value <= PAIRS_FROM_P:
+        return _SearchResult(claimable, laws, [], significant, [])
+    pairs = _claimable(search_pairs(tests, list(channels.values()), last, rng), inconsistent)
     level = alpha * min((c.p_value for c in significant), default=1.0)
     significant = sorted([*significant, *(c for c in pairs if c.p_value <= level)], key=lambda c: c.p_value)
     level = alpha * min((c.p_value for c in significant), default=1.0)
-    hidden = search_masked_pairs(judge, channels, [*claimable, *pairs], level)
-    return _Shown(claimable, laws, pairs, significant, hidden)
+    masked = search_masked_pairs(tests, channels, [*claimable, *pairs], level)
+    return _SearchResult(claimable, laws, pairs, significant, masked)
 
 
-def _both(
+def _confirmed_pair(
     fitted: Fitted,
     two: Sequence[Candidate],
     channels: Mapping[str, Channel],
     effects: Mapping[str, Effect],
-    ask: Callable[..., AcceptedEffect | None],
+    confirm: Callable[..., AcceptedEffect | None],
     number: int,
 ) -> list[AcceptedEffect]:
-    """Return two effects, each confirmed beside the other, as neither predicts held-out data alone; nothing if not."""
+    """Return two effects of which each is confirmed given the other; an empty list if they are not."""
     if len(two) < 2:
         return []
     first, second = two
     base = propose(fitted, [first], channels, effects)[0].fitted
-    later = ask(base, propose(base, [second], channels, effects), number, [])
+    later = confirm(base, propose(base, [second], channels, effects), number, [])
     if later is None:
         return []
     alone = later.proposal.fitted.model.without_term(len(fitted.model.terms))
     base = fit(alone, fitted.rows, fitted.scatter, turns=1)
-    earlier = ask(base, propose(base, [first], channels, effects), number, [])
+    earlier = confirm(base, propose(base, [first], channels, effects), number, [])
     return [] if earlier is None else [later, earlier]
 
 
-def _doubted(candidates: Sequence[Candidate], alpha: float) -> set[str]:
-    """Return the channels along which a few specimens differ: it may be their scatter, whatever quantity it acts on.
+def _inconsistent_channels(candidates: Sequence[Candidate], alpha: float) -> set[str]:
+    """Return the significant channels whose slopes are not consistent between two to four specimens.
 
-    The strongest evidence on mu or the force counts, as on a wrong quantity the same effect looks different in each.
+    Their strongest candidate on mu or the force decides: on a wrong quantity the same effect differs by specimen.
     """
     strongest: dict[str, Candidate] = {}
     for c in candidates:  # strongest evidence first
         if c.p_value <= alpha and (c.acts_on, c.operation) in MAIN_TARGETS:
             strongest.setdefault(c.channels[-1], c)
-    return {name for name, c in strongest.items() if not c.agrees} - {"direction"}
+    return {name for name, c in strongest.items() if not c.consistent} - {"direction"}
 
 
-def _claimable(candidates: Sequence[Candidate], doubted: set[str]) -> list[Candidate]:
-    """Return the candidates that are sure and of no doubted channel, whatever they act on."""
-    return [c for c in candidates if c.sure and doubted.isdisjoint(c.channels)]
+def _claimable(candidates: Sequence[Candidate], inconsistent: set[str]) -> list[Candidate]:
+    """Return the candidates that may be claimed and are of no inconsistent channel."""
+    return [c for c in candidates if c.claimable and inconsistent.isdisjoint(c.channels)]
 
 
-def _awaited(hidden: Sequence[MaskedPair], candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return the straight candidates of hidden pairs that are not in the model yet, with the p-value of the pair."""
-    pairs = {key: pair for pair in reversed(hidden) for key in pair.keys}
+def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return the linear candidates of masked pairs that are not in the model yet, with the p-value of the pair."""
+    pairs = {key: pair for pair in reversed(masked) for key in pair.keys}
     found = []
     for c in candidates:
         if c.key in pairs and c.columns.shape[1] == 1:
-            chi2 = max(c.chi2, *(pair.chi2 for pair in hidden if c.key in pair.keys))
+            chi2 = max(c.chi2, *(pair.chi2 for pair in masked if c.key in pair.keys))
             p_value = min(c.p_value, pairs[c.key].p_value)
             found.append(replace(c, test_result=c.test_result._replace(chi2=chi2), p_value=p_value))
-    found = [c for c in found if c.evidence > 0]  # else the effects in the model hold it
+    found = [c for c in found if c.evidence > 0]  # else it is explained by effects in the model
     return sorted(found, key=lambda c: c.p_value)
 
 
-def _standing_for(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
-    """Return candidates that may be what the significant ones show, though chance alone might explain them.
+def _related_candidates(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
+    """Return further candidates that may explain the same structure as the significant ones.
 
-    That a channel orders the residual is shown once; on which quantity it acts is for the forms to tell, so the same
-    channel on others comes along. So do conditions that explain half of what the calendar does on the same quantity:
-    they are tested one after the other, so the calendar follows them, and a dozen specimens may not say so.
+    The same channel on other quantities is one: the fits decide on which it acts. Conditions that explain half of what
+    the calendar does on the same quantity are others: they are tested one after the other, so the calendar is
+    correlated with them, and a dozen specimens may give too little evidence.
     """
     found = []
     keys = {c.key for c in significant}
-    for shown in significant:
+    for strong in significant:
         for c in candidates:
-            alike = (c.acts_on, c.operation) == (shown.acts_on, shown.operation)
-            behind = shown.channels[0] in CALENDAR and c.unit == "specimen" and alike
-            beside = (
-                c.channels[-1:] == shown.channels[-1:] and not shown.pair and c.columns.shape == shown.columns.shape
+            same_target = (c.acts_on, c.operation) == (strong.acts_on, strong.operation)
+            condition = strong.channels[0] in CALENDAR and c.unit == "specimen" and same_target
+            same_channel = (
+                c.channels[-1:] == strong.channels[-1:] and not strong.pair and c.columns.shape == strong.columns.shape
             )
-            if (behind or beside) and c.key not in keys and c.chi2 >= HALF_OF_CALENDAR * shown.chi2:
-                found.append(replace(c, p_value=shown.p_value))
+            if (condition or same_channel) and c.key not in keys and c.chi2 >= HALF_OF_CALENDAR * strong.chi2:
+                found.append(replace(c, p_value=strong.p_value))
                 keys.add(c.key)
     return found
 
 
-def _drop_needless(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-    """Return the fit without effects that a later one has made needless, by Schwarz's price; the weakest first.
+def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
+    """Return the fit without effects that a later one has made redundant by the BIC; the weakest is removed first.
 
-    What one of two alike leaves may be needless too, so each is asked again when another has gone. A ripple was
-    judged on the raw samples, which bins cannot overrule.
+    After a removal all are tested again. Ripples are kept: they were tested on the raw samples.
     """
-    asked: set[int] = set()
+    kept: set[int] = set()
     while True:
-        # Far from needless: no refit is wanted to see that.
+        # An effect with a larger Wald statistic is not redundant, and is not refitted.
         size = {
             k: _wald_statistic(fitted, k) - 2 * a.proposal.bic_penalty
             for k, a in enumerate(added[:-1])
             if not a.proposal.term.effect.periodic
         }
-        k = min((k for k in size if size[k] <= 0 and k not in asked), key=size.__getitem__, default=None)
+        k = min((k for k in size if size[k] <= 0 and k not in kept), key=size.__getitem__, default=None)
         if k is None:
             return fitted, added
         without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
         if without.deviance - fitted.deviance < added[k].proposal.bic_penalty:
             fitted = fit(without.model, fitted.rows, fitted.scatter, turns=1)
-            added, asked = [*added[:k], *added[k + 1 :]], set()
+            added, kept = [*added[:k], *added[k + 1 :]], set()
         else:
-            asked.add(k)
+            kept.add(k)
 
 
 def _wald_statistic(fitted: Fitted, number: int) -> float:
-    """Return the squared standardised size of an effect's amplitudes, all together."""
-    at = fitted.model.place(number).start
+    """Return the Wald statistic of an effect's amplitudes."""
+    at = fitted.model.term_slice(number).start
     effect, values = fitted.model.terms[number].effect, fitted.model.values[number]
     places = [at + k for k, p in enumerate(effect.parameters) if p.linear]
     amplitude = np.array([values[p.name] for p in effect.parameters if p.linear])
@@ -379,7 +379,7 @@ def _wald_statistic(fitted: Fitted, number: int) -> float:
 
 
 def numbered(bins: pd.DataFrame) -> pd.DataFrame:
-    """Return `bins` with `stroke_id`, a number per stroke that samples and every part of the rows share."""
+    """Return `bins` with `stroke_id`, a number per stroke that samples and all subsets of the rows share."""
     return bins.assign(stroke_id=bins.groupby(["file", "stroke"], sort=False).ngroup().to_numpy())
 
 
@@ -389,7 +389,7 @@ def steady_samples(traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows) ->
     Parameters
     ----------
     traces : DataFrame or sequence of StoredTraces
-        Table `traces`, the samples of a stroke one after the other, or where it lies: then it is read part by part.
+        Table `traces`, its samples ordered by stroke; or where it is stored, to be read part by part.
     rows : Rows
         Rows made from `numbered` bins.
 

@@ -1,10 +1,9 @@
-"""What a campaign could have shown: for each variable the smallest effect that it would have found.
+"""Sensitivity of a campaign: the smallest effect of each variable that it would have found.
 
 The effect is a factor on mu, linear in the variable at one of the levels at which it varies, or an offset force for the
-direction. It is put into the residual, the scatter is estimated anew, as part of the effect is taken for scatter, and
-the search's own tests are asked: the size is sought that exceeds the critical value of the whole search with 80 %
-chance (noncentral F). Of what follows the search the least size that counts is asked, and that weak evidence must lower
-the held-out error; naming is not.
+direction. It is added to the residual, and the scatter is re-estimated, because part of the effect is taken for
+scatter. The smallest effect exceeds the critical value of the whole search with a power of 80 % (noncentral F). It must
+also have the least size that is reported and, with weak evidence, lower the held-out error. Naming is not considered.
 """
 
 from __future__ import annotations
@@ -18,25 +17,25 @@ from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri
 from sealfit.closure.channels import Channel, scatter_level
 from sealfit.closure.confirm import about_means
 from sealfit.closure.criteria import (
-    CLEARLY,
     CONSTANT_IN_RUNS,
-    COUNTED,
     JACKKNIFE_UNITS,
-    LARGE,
+    LARGE_SHARE,
     LEAST_FALL,
     LEAST_POWER,
     LEAST_SIZE,
     LEAST_UNITS_OF_SLOPES,
-    MATERIAL,
-    POWER_SOUGHT,
+    MATERIAL_SCATTER,
+    REAL_RATIO,
     REAL_SHARE,
     SEARCHES,
-    WEAK,
+    SIZE_MARGIN,
+    TARGET_POWER,
+    WEAK_P,
 )
-from sealfit.closure.score_test import Candidate, ScoreTests, critical_few, critical_many, project
+from sealfit.closure.score_test import Candidate, ScoreTests, critical_many, critical_small_sample, project
 from sealfit.closure.selection import Selection
 from sealfit.closure.small_sample_test import (
-    WAYS,
+    N_VARIANCES,
     ClusterTests,
     ContrastTest,
     SmallSampleTest,
@@ -51,61 +50,62 @@ from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening
 
 TINY = 1e-6
-"""Of the force: an effect that changes no estimate."""
+"""Size of an effect, as a share of the force, that changes no estimate."""
 
 STEPS = 6
-"""Sizes tried, each nearer to the one found with `POWER_SOUGHT`, until it is `CLOSE` (difference of logarithms)."""
+"""Most sizes that are tried to reach `TARGET_POWER`."""
 
 CLOSE = 0.03
+"""Relative error of the size at which the iteration ends."""
 
 WANTED_PCT = 1.0
-"""Of the friction: the effect that `files_needed` refers to."""
+"""Effect to which `files_needed` refers, in percent of the friction force."""
 
 SPECIMEN, SPECIMENS = "specimen_id", "specimen"
 FRICTION = ("mu", "multiply")
 
 ASIDE = ("run_order", "elapsed_h", "repeat")
-"""Channels of the order of tests: what they show is no reason to doubt the model of friction."""
+"""Channels that describe the order of the tests. They do not make the verdict `cannot_tell`."""
 
 LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
 
 
-def sensitivity(grown: Selection, alpha: float) -> list[dict]:
-    """Return per variable and level: variable, level, acts_on, smallest_N, smallest_pct and files_needed.
+def sensitivity(selection: Selection, alpha: float) -> list[dict]:
+    """Return an entry per variable and level: variable, level, acts_on, smallest_N, smallest_pct, files_needed.
 
-    A variable that varies at several levels has an entry for each, of an effect that follows it at that level only.
+    A variable that varies at several levels has an entry for each, for an effect at that level only.
 
     Parameters
     ----------
-    grown : Selection
-        The end of the loop, with the candidates of its last search.
+    selection : Selection
+        The result of the loop, with the candidates of its last search.
     alpha : float
         Family-wise level of the search.
 
     Returns
     -------
     list of dict
-        `smallest_N` is the RMS over all rows of the smallest effect found with 80 % chance, `smallest_pct` the same in
-        percent of the RMS force; None where the variable cannot be tested in this campaign. `files_needed` is how many
-        files, made like these, would show an effect of 1 % of the force.
+        `smallest_N` is the RMS over all rows of the smallest effect that is found with a power of 80 %, `smallest_pct`
+        the same in percent of the RMS force; None if the variable cannot be tested in this campaign. `files_needed` is
+        the number of files, made like these, that would show an effect of 1 % of the force.
     """
-    fitted = grown.after
+    fitted = selection.after
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))
     files, specimens = (rows.groups.starts[level].size for level in ("file", "specimen"))
-    search = _Search(grown, alpha)
+    search = _Search(selection, alpha)
     entries = []
-    for name, channel in grown.channels.items():
+    for name, channel in selection.channels.items():
         target = ("force", "add") if name == "direction" or channel.grouping else FRICTION
-        own = [c for c in grown.last if (c.channels[-1], c.acts_on, c.operation) == (name, *target) and not c.pair]
+        own = [c for c in selection.last if (c.channels[-1], c.acts_on, c.operation) == (name, *target) and not c.pair]
         own = sorted(own, key=lambda c: c.columns.shape[1])[:1]  # a straight line
-        for level, part in _parts(grown, channel, own):
+        for level, part in _parts(selection, channel, own):
             smallest = None
             if own:
                 effect = part * fitted.slope(*target)
                 effect *= force / np.sqrt(rows.weight @ effect**2)
                 times = search.smallest(own[0], effect)
                 times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
-                smallest = force * float(max(times, COUNTED * LEAST_SIZE)) if times < 1 else None
+                smallest = force * float(max(times, SIZE_MARGIN * LEAST_SIZE)) if times < 1 else None
             if smallest is None:
                 units = rows.groups.starts[scatter_level([channel], rows)].size
                 if channel.unit == "sample" and specimens > 1:
@@ -123,7 +123,7 @@ def sensitivity(grown: Selection, alpha: float) -> list[dict]:
                     "files_needed": needed,
                 }
             )
-    if len(rows.conditions) < specimens < LEAST_UNITS_OF_SLOPES:  # they may differ, and no variable says how
+    if len(rows.conditions) < specimens < LEAST_UNITS_OF_SLOPES:  # no variable describes how specimens differ
         needed = int(np.ceil(files * LEAST_UNITS_OF_SLOPES / specimens))
         unknown = {"variable": SPECIMEN, "level": "condition", "acts_on": "mu", "smallest_N": None}
         entries.append({**unknown, "smallest_pct": None, "files_needed": needed})
@@ -131,21 +131,21 @@ def sensitivity(grown: Selection, alpha: float) -> list[dict]:
 
 
 def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
-    """Return by how much an effect at a level, shape (n,), must be multiplied to lower the error as weak evidence must.
+    """Return the factor on an effect at a level, shape (n,), with which it lowers the error by `LEAST_FALL`.
 
-    Only what the declared model does not take up of it lowers the error; both are taken about the means of the groups
-    inside which the effect varies.
+    Only the part that the declared model does not explain lowers the error. Effect and error are taken about the means
+    of the groups within which the effect varies.
     """
     rows = fitted.rows
     around = dict(zip(LEVEL_NAMES, (*LEVELS, None), strict=True))[level]
     own = project(fitted, effect[:, None])[:, 0] / fitted.whitening.unit
     size, left = (float(np.sqrt(rows.weight @ about_means(x, rows, around) ** 2)) for x in (own, fitted.residual))
-    return COUNTED * left * float(np.sqrt(1 / (1 - LEAST_FALL) ** 2 - 1)) / size if size > 0 else np.inf
+    return SIZE_MARGIN * left * float(np.sqrt(1 / (1 - LEAST_FALL) ** 2 - 1)) / size if size > 0 else np.inf
 
 
-def _parts(grown: Selection, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
-    """Yield each level at which a channel has a real share of its variance, and its first column's part there."""
-    groups, weight = grown.after.rows.groups, grown.after.rows.weight
+def _parts(selection: Selection, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
+    """Yield each level at which a channel varies, and the part of its first column at that level."""
+    groups, weight = selection.after.rows.groups, selection.after.rows.weight
     if not own or not channel.numeric or channel.name == "direction":
         yield channel.unit, (own[0].columns[:, 0] if own else None)
         return
@@ -157,7 +157,7 @@ def _parts(grown: Selection, channel: Channel, own: Sequence[Candidate]) -> Iter
         parts[level] = means[k] - means[k + 1]
         square = weight @ parts[level] ** 2
         each = square / max(sizes[k] - sizes[k + 1], 1)  # mean square
-        if square > REAL_SHARE * (weight @ column**2) and each > CLEARLY * finer:
+        if square > REAL_SHARE * (weight @ column**2) and each > REAL_RATIO * finer:
             real.append(level)
         finer = max(finer, each)
     if len(real) < 2:
@@ -167,36 +167,37 @@ def _parts(grown: Selection, channel: Channel, own: Sequence[Candidate]) -> Iter
 
 
 class _Search:
-    """The last search of a loop, asked what it would say of an effect that is put into the residual.
+    """The tests of the last search, applied to an effect that is added to the residual.
 
-    The effect is in the residual when scatter is estimated, and raises it; and what of it differs between units stands
-    in the variance it is held against. Where the noise has been looser or quieter by chance counts as in the search:
-    the variance of a contrast in few units is moderated, and that of scores of many is 1 or more.
+    The effect raises the estimated scatter, and its differences between units raise the variance that it is tested
+    against. Variances are treated as in the search: those of contrasts in few units are moderated, and those of the
+    scores of many units are 1 or more.
     """
 
-    def __init__(self, grown: Selection, alpha: float) -> None:
-        self.fitted, self.channels, self.candidates = grown.after, grown.channels, grown.last
+    def __init__(self, selection: Selection, alpha: float) -> None:
+        self.fitted, self.channels, self.candidates = selection.after, selection.channels, selection.last
         self.level, self.units = alpha / SEARCHES, {}
-        judgements = [c.test_result for c in grown.last]
-        slopes = [j.slopes for j in judgements if j.slopes]
-        few = [test for c in grown.last if (test := self._few_again(c)) is not None]
-        many = [j for j in judgements if j.few is None and not j.slopes]
-        self.contrasts = WAYS * sum(own[0].slope.size for own in slopes)
+        results = [c.test_result for c in selection.last]
+        slopes = [j.slopes for j in results if j.slopes]
+        small_sample = [test for c in selection.last if (test := self._retested(c)) is not None]
+        many = [j for j in results if j.small_sample is None and not j.slopes]
+        self.contrasts = N_VARIANCES * sum(own[0].slope.size for own in slopes)
         tests = [test for own in slopes for test in own]
         self.moderated = {id(t): m for t, m in zip(tests, moderated(tests), strict=True)}
-        lines = [c for c in grown.last if c.test_result.slopes and not c.pair and (c.acts_on, c.operation) == FRICTION]
-        self.lines = np.column_stack([c.columns[:, 0] for c in lines] or [np.ones(grown.after.force.size)])
-        self.lines = self.lines * grown.after.slope(*FRICTION)[:, None]
+        lines = [c for c in selection.last if c.test_result.slopes and c.key[1:] == FRICTION and not c.pair]
+        self.lines = np.column_stack([c.columns[:, 0] for c in lines] or [np.ones(selection.after.force.size)])
+        self.lines = self.lines * selection.after.slope(*FRICTION)[:, None]
         self.many = len(many)
         self.critical_many = critical_many(many, self.level / 2, np.random.default_rng(0)) if many else 0.0
-        self.critical_few = {}
-        for name in {test.level for test in few}:
-            level = self.level / (1 if name == SPECIMENS else WAYS)  # runs are tested in two ways, by slopes as well
-            self.critical_few[name] = critical_few(self.fitted, [t for t in few if t.level == name], level)
+        self.critical_small_sample = {}
+        for name in {test.level for test in small_sample}:
+            level = self.level / (1 if name == SPECIMENS else N_VARIANCES)  # runs are also tested by slopes
+            own = [t for t in small_sample if t.level == name]
+            self.critical_small_sample[name] = critical_small_sample(self.fitted, own, level)
 
-    def _few_again(self, candidate: Candidate) -> SmallSampleTest | None:
-        """Return a candidate's test on few units at the last model, which may hold fewer effects than were searched."""
-        known, target = candidate.test_result.few, (candidate.acts_on, candidate.operation)
+    def _retested(self, candidate: Candidate) -> SmallSampleTest | None:
+        """Return a candidate's small-sample test on the final model, which may have fewer effects."""
+        known, target = candidate.test_result.small_sample, (candidate.acts_on, candidate.operation)
         if known is None:
             return None
         if known.level not in self.units:
@@ -205,17 +206,17 @@ class _Search:
         return self.units[known.level].test(project(self.fitted, columns), target)
 
     def surer(self, times: float, candidate: Candidate) -> float:
-        """Return the factor on an effect found with `POWER_SOUGHT` that makes it strong evidence; infinite for few.
+        """Return the factor on an effect, found with `TARGET_POWER`, with which its evidence is not weak.
 
-        The p-value of few units falls too slowly for that.
+        Infinite for few units, whose p-value falls too slowly.
         """
         if candidate.test_result.units < JACKKNIFE_UNITS:
             return np.inf
-        found, strong = (-ndtri(p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK))
-        return times * float((strong + ndtri(POWER_SOUGHT)) / (found + ndtri(POWER_SOUGHT)))
+        found, strong = (-ndtri(p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK_P))
+        return times * float((strong + ndtri(TARGET_POWER)) / (found + ndtri(TARGET_POWER)))
 
     def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
-        """Return the factor on an effect, shape (n,) with which it is found with `POWER_SOUGHT`; infinite for never."""
+        """Return the factor on an effect, shape (n,), that gives it `TARGET_POWER`; infinite if there is none."""
         size, margin, before = TINY, self.margin(candidate, TINY * effect, self.fitted), None
         for _ in range(STEPS):
             if not 0 < margin < np.inf:
@@ -231,31 +232,31 @@ class _Search:
         return size
 
     def margin(self, candidate: Candidate, effect: np.ndarray, fitted: Fitted) -> float:
-        """Return how many times as long as needed an effect is."""
-        judge = ScoreTests(fitted)
-        white = fitted.basis.freed(fitted.whitening(np.column_stack([self.fitted.residual, effect])))
+        """Return the ratio of an effect to the size that is needed."""
+        tests = ScoreTests(fitted)
+        white = fitted.basis.project_out(fitted.whitening(np.column_stack([self.fitted.residual, effect])))
         noise, effect = (replace(fitted, white_residual=column) for column in white.T)
         for one in (noise, effect):
             one.__dict__["basis"] = fitted.basis
         channel = self.channels[candidate.channels[-1]]
         columns = candidate.columns * noise.slope(candidate.acts_on, candidate.operation)[:, None]
-        variants = judge.variants(columns, channel.unit)
+        variants = tests.variants(columns, channel.unit)
         if all(enough_specimens(noise, left).all() for left in variants):
             return self._by_units(candidate, noise, effect, variants)
-        large = min(float(least_share(effect, left).max()) for left in variants) / LARGE
+        large = min(float(least_share(effect, left).max()) for left in variants) / LARGE_SHARE
         return min(large, self._by_units(candidate, noise, effect, variants))
 
     def _by_units(self, candidate: Candidate, noise: Fitted, effect: Fitted, variants: Sequence[np.ndarray]) -> float:
-        """Return the margin by the units' own scatter."""
+        """Return the margin by the tests against the units' scatter."""
         channel, test_result = self.channels[candidate.channels[-1]], candidate.test_result
-        few = test_result.few
-        by_few = 0.0 if few is None else min(self._by_few(noise, effect, left, few) for left in variants)
+        known = test_result.small_sample
+        by_test = 0.0 if known is None else min(self._by_one_test(noise, effect, left, known) for left in variants)
         if test_result.slopes:
-            tail = self.level / self.contrasts / (1 if few is None else WAYS)
+            tail = self.level / self.contrasts / (1 if known is None else N_VARIANCES)
             pairs = zip(variants, test_result.slopes, strict=True)
-            return max(by_few, min(self._by_slopes(noise, effect, left, test, tail) for left, test in pairs))
-        if few is not None:
-            return by_few
+            return max(by_test, min(self._by_slopes(noise, effect, left, test, tail) for left, test in pairs))
+        if known is not None:
+            return by_test
         level = candidate.unit if channel.grouping else scatter_level([channel], noise.rows)
         return min(self._by_many(noise, effect, left, level, candidate) for left in variants)
 
@@ -268,8 +269,8 @@ class _Search:
         prior = (df * variance - known.df * known.variance) / np.maximum(prior_df, 1e-9)
         others = contrast_test(effect, project(effect, self.lines), known.level)
         for along in (False, True) if others is not None else ():
-            alike = others.variance[others.along == along]  # the effect stands in the scatter of other contrasts
-            prior[known.along == along] *= np.exp(np.mean(np.log1p(alike))) if alike.size else 1.0
+            others_variance = others.variance[others.along == along]  # the effect enlarges it
+            prior[known.along == along] *= np.exp(np.mean(np.log1p(others_variance))) if others_variance.size else 1.0
         own = variance * test.variance / known.variance
         share = test.df / (prior_df + test.df)
         both = (1 - share) * prior + share * own
@@ -282,11 +283,11 @@ class _Search:
         ]
         return float(np.nanmax(margins))
 
-    def _by_few(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: SmallSampleTest) -> float:
-        if known.level not in self.critical_few:
+    def _by_one_test(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: SmallSampleTest) -> float:
+        if known.level not in self.critical_small_sample:
             return 0.0
         units = (ClusterTests(one, known.level) for one in (noise, effect))
-        return _by_numbers(*units, left, known.target, np.exp(self.critical_few[known.level]))
+        return _by_numbers(*units, left, known.target, np.exp(self.critical_small_sample[known.level]))
 
     def _by_many(self, noise: Fitted, effect: Fitted, left: np.ndarray, level: str, candidate: Candidate) -> float:
         basis = orthonormal(left)
@@ -298,8 +299,8 @@ class _Search:
         units, k = scores.shape
         sums = noise.rows.groups.sums
         own, added = (float((sums(seen / length * f.unit_residual(level), level) ** 2).sum()) for f in (noise, effect))
-        own *= max(1.0, k / float((scores**2).sum()))  # not quieter than noise is on average
-        beyond = ndtri(POWER_SOUGHT) * np.sqrt(own)
+        own *= max(1.0, k / float((scores**2).sum()))  # not smaller than the noise is on average
+        beyond = ndtri(TARGET_POWER) * np.sqrt(own)
         share = 1 - betaincinv((units - k) / 2, k / 2, np.exp(self.critical_many))
         margin = length / (np.sqrt(units * share * (own + added)) + beyond)
         if units < JACKKNIFE_UNITS:
@@ -322,7 +323,7 @@ def _by_numbers(
     tail: float,
     least: float = 0.0,
 ) -> float:
-    """Return the margin by the F test of one number a unit, at a p-value; 0 where columns are not one number a unit."""
+    """Return the margin by the F test of one number per unit, at a p-value; 0 if the columns are not that."""
     test, added = (units.test(left, target) for units in (noise, effect))
     if test is None or test.share <= least:
         return 0.0
@@ -335,52 +336,52 @@ def _by_numbers(
 
 
 def _margin(length: np.ndarray, quiet: np.ndarray, differs: np.ndarray, k: int, df: np.ndarray, tail: float):
-    """Return how many times as long as needed an effect is, by F with k and df degrees of freedom at a p-value.
+    """Return the ratio of an effect to the size needed, by F with k and df degrees of freedom at a p-value.
 
-    It is held against a variance: `quiet` without it, and what it adds to that itself.
+    It is tested against a variance: `quiet` without the effect, plus `differs`, which the effect adds itself.
     """
     critical = fdtri(k, df, 1 - tail)
-    return np.abs(length) / np.sqrt(quiet * ncfdtrinc(k, df, 1 - POWER_SOUGHT, critical) + k * critical * differs)
+    return np.abs(length) / np.sqrt(quiet * ncfdtrinc(k, df, 1 - TARGET_POWER, critical) + k * critical * differs)
 
 
 def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
-    """Return a fit under the scatter that is estimated where its residual holds an effect."""
+    """Return a fit under the scatter that is estimated with an effect added to its residual."""
     rows, friction, residual = fitted.rows, fitted.friction, fitted.residual + effect
     scatter = estimate_scatter(rows, residual, friction, fitted.jacobian, fitted.scatter)
     whitening = Whitening(scatter, friction, rows.groups)
     return replace(fitted, scatter=scatter, whitening=whitening, white_jacobian=whitening.of(fitted.jacobian))
 
 
-def cannot_tell(grown: Selection, entries: Sequence[dict], scatter: Sequence[dict]) -> list[str]:
-    """Return the variables of which this campaign could not have told; empty where it could.
+def undetectable_variables(selection: Selection, entries: Sequence[dict], scatter: Sequence[dict]) -> list[str]:
+    """Return the variables whose effects are not detectable in this campaign.
 
-    A variable cannot be told if no effect of it can reach the required p-value, and it varies along strokes, is the
-    direction, or varies between fewer than five specimens; or if the units that it varies between scatter by much, and
-    an effect that explains all of that would not have been seen.
+    An effect is not detectable if it cannot reach the required p-value, and the variable varies along strokes, is the
+    direction, or varies between fewer than five specimens; or if the units between which it varies scatter strongly,
+    and an effect that explains all of that scatter would not have been found.
 
     Parameters
     ----------
-    grown : Selection
-        The end of the loop.
+    selection : Selection
+        The result of the loop.
     entries : sequence of dict
-        As `sensitivity` gives them.
+        As returned by `sensitivity`.
     scatter : sequence of dict
         closure.json's `scatter`.
     """
-    starts = grown.after.rows.groups.starts
-    open_ = []
+    starts = selection.after.rows.groups.starts
+    undetectable = []
     for entry in entries:
         if entry["variable"] == SPECIMEN:
-            open_.append(SPECIMEN)
+            undetectable.append(SPECIMEN)
             continue
-        channel: Channel = grown.channels[entry["variable"]]
+        channel: Channel = selection.channels[entry["variable"]]
         if channel.grouping or channel.name in ASIDE or entry["level"] != LEVEL_NAMES[channel.unit]:
             continue
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
         own = [s for s in scatter if channel.unit != "sample" and starts[s["level"]].size == starts[channel.unit].size]
-        much = any(s["sd_rel"] > MATERIAL and s["sd_N"] < smallest for s in own)
-        few = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS_OF_SLOPES
-        decisive = channel.unit == "sample" or channel.name == "direction" or few
+        much = any(s["sd_rel"] > MATERIAL_SCATTER and s["sd_N"] < smallest for s in own)
+        few_specimens = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS_OF_SLOPES
+        decisive = channel.unit == "sample" or channel.name == "direction" or few_specimens
         if much or (decisive and not np.isfinite(smallest)):
-            open_.append(channel.name)
-    return open_
+            undetectable.append(channel.name)
+    return undetectable

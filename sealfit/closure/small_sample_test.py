@@ -1,4 +1,4 @@
-"""Few units: does one number per specimen or run, or a slope in each, follow a channel beyond their own scatter?"""
+"""Tests in few units: a slope in each, or one number per specimen or run, against the scatter between units."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from scipy.optimize import brentq
 from scipy.special import chdtrc, fdtrc, log_ndtr, polygamma, psi, stdtr
 
 from sealfit.closure.criteria import (
-    AGREE,
-    CLOSELY,
-    DIFFER,
+    CONSISTENT_P,
+    CONSISTENT_P_IF_DIFFERENT,
+    DIFFERENT_P,
     KNOWN_DF,
-    LARGE,
+    LARGE_SHARE,
     LARGEST_LEVERAGE,
     LEAST_DF,
     LEAST_ERROR_DF,
@@ -33,56 +33,57 @@ from sealfit.fit.joint.variance_components import orthonormal
 from sealfit.fit.joint.whitening import Whitening
 
 # ---------------------------------------------------------------- contrasts
-# Contrasts in few units: does the same slope show in all of them, beyond the scatter of the units' own slopes?
+# Contrasts in few units: the mean slope is tested against the scatter of the units' own slopes.
 #
-# A contrast is one column L of the force, whitened, projected on what the current model leaves open, and of length 1.
+# A contrast is one column L of the force, whitened, projected off the tangent space of the model, and of length 1.
 # Unit u (a specimen, or a run or file where there are few specimens) gives the score :math:`s_u = L_u^T r_u`, and
-# :math:`\hat\beta = \sum_u s_u`. Units may have slopes of their own, so that their scores scatter more than the noise
-# inside them says. The variance of :math:`\hat\beta` is therefore taken from the units,
+# :math:`\hat\beta = \sum_u s_u`. Units may have slopes of their own, so that their scores scatter more than by
+# noise. The variance of :math:`\hat\beta` is therefore estimated from the units,
 #
 # .. math:: V = \sum_u \frac{(s_u - h_u \hat\beta)^2}{1 - h_u}, \quad h_u = L_u^T L_u ,
 #
 # (CR2; Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181) with Satterthwaite's degrees of freedom. With a dozen
-# units V is uncertain. What all contrasts of a kind show of it is a prior for each of them: moderated t (Smyth 2004,
-# doi:10.2202/1544-6115.1027). Contrasts overlap, so the prior counts for no more degrees of freedom than their scores
-# have independent directions. An effect stands in the scatter of all contrasts but its own, so V alone is tried as
-# well: the p-value is twice the smaller of the two. P-values are adjusted for the number of contrasts (Bonferroni).
+# units V is uncertain. All contrasts of one kind give a prior for it: moderated t (Smyth 2004,
+# doi:10.2202/1544-6115.1027). Contrasts are correlated, so the degrees of freedom of the prior are limited by the
+# number of independent directions of their scores. An effect is part of the scatter of all other contrasts, so V alone
+# is used as well: the p-value is twice the smaller of the two. P-values are adjusted for the number of contrasts
+# (Bonferroni).
 
 MOST_DF = 1e4
-"""Degrees of freedom of a prior that the contrasts' variances do not contradict: as good as known."""
+"""Largest degrees of freedom of a prior. With more, the variance counts as known."""
 
-WAYS = 2
-"""Variances that a contrast is held against: moderated, and its own. Each has half of the error."""
+N_VARIANCES = 2
+"""Number of variances that a contrast is tested against: moderated, and its own. Each has half of the error rate."""
 
 
 class ContrastTest(NamedTuple):
-    """Contrasts of one candidate: estimates, their variances from the units, and what the prior needs."""
+    """Contrasts of one candidate: estimates, their variances from the units, and data for the prior."""
 
     level: str  # of the units
-    slope: np.ndarray  # (m,) estimates, in standard errors of the fitted scatter
-    variance: np.ndarray  # (m,) of the estimates, from the units' own scatter; about 1 where only the noise scatters
+    slope: np.ndarray  # (m,) estimates, in standard errors by the fitted scatter
+    variance: np.ndarray  # (m,) of the estimates, from the units; about 1 if only noise scatters
     df: np.ndarray  # (m,) Satterthwaite degrees of freedom of the variance
-    along: np.ndarray  # (m,) whether the contrast lies inside strokes
+    along: np.ndarray  # (m,) whether the contrast varies within strokes
     deviations: np.ndarray  # (units, m) of the scores
-    agree: np.ndarray  # (m,) whether the few specimens in which the units lie have the same slope
+    consistent: np.ndarray  # (m,) whether two to four specimens have the same slope
 
 
 class Prior(NamedTuple):
-    """Variance that contrasts of a kind share, and for how many degrees of freedom it counts."""
+    """Prior variance of contrasts of one kind, and its degrees of freedom."""
 
     variance: float
     df: float
 
 
 def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest | None:
-    """Return the contrasts of projected columns, each by itself; None with too few units.
+    """Return the contrasts of projected columns, one by one; None with too few units.
 
     Parameters
     ----------
     fitted : Fitted
         The current model at its optimum.
     left : ndarray, shape (n, k)
-        Columns of the force, whitened and projected; columns of zeros are left out.
+        Columns of the force, whitened and projected; columns of zeros are ignored.
     level : str
         Level of the units.
     """
@@ -115,11 +116,11 @@ def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
 
 
 def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return whether up to four specimens show the same slope along each whitened column, shape (n, m) -> (m,).
+    """Return whether up to four specimens have the same slope along each whitened column, shape (n, m) -> (m,).
 
-    From `LEAST_UNITS_OF_SLOPES` on they are the units themselves. Along strokes each has a slope of its own, so there
-    they must be enough, and agree closely where they differ by more than noise; or all their slopes must be larger than
-    specimens have them.
+    From `LEAST_UNITS_OF_SLOPES` specimens on they are the units of the test. Along strokes each specimen has a slope of
+    its own. There must be enough specimens there, and slopes that differ by more than noise must meet a stricter
+    level; or all slopes must be larger than the scatter of specimens can be.
     """
     found = enough_specimens(fitted, left)
     if not few_specimens(fitted):
@@ -133,9 +134,9 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
             continue
         t = slopes.mean() / max(np.std(slopes) / np.sqrt(slopes.size - 1), 1e-300)
         log_p = log_p_of_t(t, np.array(slopes.size - 1.0))
-        alike = chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFER
-        found[k] = log_p < np.log(AGREE if alike or not inside[k] else CLOSELY)
-    return found | (inside & (least_share(fitted, left) > LARGE))
+        equal_slopes = chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFERENT_P
+        found[k] = log_p < np.log(CONSISTENT_P if equal_slopes or not inside[k] else CONSISTENT_P_IF_DIFFERENT)
+    return found | (inside & (least_share(fitted, left) > LARGE_SHARE))
 
 
 def _slopes_of_specimens(fitted: Fitted, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -147,9 +148,9 @@ def _slopes_of_specimens(fitted: Fitted, left: np.ndarray) -> tuple[np.ndarray, 
 
 
 def least_share(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return what whitened columns, shape (n, m), hold of the residual in the specimen that shows least of it, (m,).
+    """Return the smallest effect of whitened columns, shape (n, m), in any specimen, shape (m,).
 
-    It is a share of the force, root mean square, and 0 where specimens differ in sign.
+    It is the RMS as a share of the force; 0 if specimens differ in sign.
     """
     sums = fitted.rows.groups.sums
     leverage, slopes = _slopes_of_specimens(fitted, left)
@@ -161,9 +162,9 @@ def least_share(fitted: Fitted, left: np.ndarray) -> np.ndarray:
 
 
 def enough_specimens(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return whether up to four specimens could agree on each whitened column at all, shape (n, m) -> (m,).
+    """Return whether up to four specimens are enough to be consistent on each whitened column, shape (n, m) -> (m,).
 
-    They are counted by their leverages. Of columns that do not lie along strokes they always could.
+    Their effective number follows from their leverages. They are always enough for columns not along strokes.
     """
     if not few_specimens(fitted):
         return np.ones(left.shape[1], dtype=bool)
@@ -173,12 +174,12 @@ def enough_specimens(fitted: Fitted, left: np.ndarray) -> np.ndarray:
 
 
 def few_specimens(fitted: Fitted) -> bool:
-    """Return whether up to four specimens were tested: too few to be the units of a slope."""
+    """Return whether there are too few specimens (up to four) to be the units of a slope."""
     return fitted.rows.groups.starts["specimen"].size < LEAST_UNITS_OF_SLOPES
 
 
 def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return whether most of each whitened column varies inside strokes, shape (n, m) -> (m,)."""
+    """Return whether most of each whitened column varies within strokes, shape (n, m) -> (m,)."""
     sums = fitted.rows.groups.sums
     between = sums(left, "stroke") ** 2 / sums(np.ones(len(left)), "stroke")[:, None]
     return between.sum(axis=0) < 0.5 * (left**2).sum(axis=0)
@@ -189,12 +190,12 @@ def slope_log_p(tests: Sequence[ContrastTest]) -> list[np.ndarray]:
     found = []
     for test, (variance, df) in zip(tests, moderated(tests), strict=True):
         logs = [log_p_of_t(test.slope / np.sqrt(v), d) for v, d in ((variance, df), (test.variance, test.df))]
-        found.append(np.minimum(np.log(WAYS) + np.minimum(*logs), 0.0))
+        found.append(np.minimum(np.log(N_VARIANCES) + np.minimum(*logs), 0.0))
     return found
 
 
 def moderated(tests: Sequence[ContrastTest]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return for each test the variances of its contrasts, moderated by all of a kind, and their degrees of freedom."""
+    """Return per test the variances of its contrasts, moderated by all of one kind, and their degrees of freedom."""
     priors = {kind: _prior(tests, *kind) for kind in {(t.level, bool(a)) for t in tests for a in t.along}}
     found = []
     for test in tests:
@@ -220,11 +221,11 @@ def _prior(tests: Sequence[ContrastTest], level: str, along: bool) -> Prior:
     known = _degrees_of_freedom(spread)
     half = known / 2
     typical = float(np.exp(mean + (psi(half) - np.log(half) if known < MOST_DF else 0.0)))
-    return Prior(typical, min(known, (_independent(deviations) - 1) * float(np.median(df))))
+    return Prior(typical, min(known, (_independent_directions(deviations) - 1) * float(np.median(df))))
 
 
 def _log_moments(variance: np.ndarray, df: np.ndarray) -> tuple[float, float]:
-    """Return mean and variance of the logarithms of true variances, sampling error taken out."""
+    """Return mean and variance of the logarithms of the true variances, without sampling error."""
     half = df / 2
     logs = np.log(np.maximum(variance, 1e-12)) - psi(half) + np.log(half)
     spread = float(np.var(logs, ddof=1) - np.mean(polygamma(1, half))) if logs.size > 1 else 0.0
@@ -240,95 +241,94 @@ def _degrees_of_freedom(spread: float) -> float:
     return float(2 * np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - spread, np.log(1e-3), np.log(MOST_DF / 2))))
 
 
-def _independent(deviations: np.ndarray) -> float:
-    """Return of how many independent directions the columns of scores behave like: (tr R)^2 / tr R^2, at least 1."""
+def _independent_directions(deviations: np.ndarray) -> float:
+    """Return the effective number of independent columns of scores: (tr R)^2 / tr R^2, at least 1."""
     size = np.sqrt((deviations**2).sum(axis=0))
-    alike = deviations[:, size > 0] / size[size > 0]
-    if alike.shape[1] == 0:
+    standardised = deviations[:, size > 0] / size[size > 0]
+    if standardised.shape[1] == 0:
         return 1.0
-    inner = alike @ alike.T  # has the same trace of its square as the matrix between columns, and is smaller
-    return float(max(alike.shape[1] ** 2 / (inner**2).sum(), 1.0))
+    inner = standardised @ standardised.T  # tr R^2 is the same for the smaller product
+    return float(max(standardised.shape[1] ** 2 / (inner**2).sum(), 1.0))
 
 
 # ---------------------------------------------------------------- small sample test
-# Few units: does one number per specimen, or per run, follow a channel, held against the units' own scatter?
+# One number per specimen, or per run, is tested against the scatter between these units.
 #
-# What acts on a quantity and is constant within a specimen shifts each specimen along one direction, the slope of that
-# quantity. With g_u that direction in specimen u (whitened, of length 1), :math:`\rho_u = g_u^T r_u` is one number a
-# specimen; what the current model has taken out of them is known, and without it they are independent and of one
-# variance if specimens scatter alike. A channel's columns then stand against what is left of them by an F test. A few
-# numbers may look quieter than they are: where runs and files explain their variance of 1, that counts as if eight more
-# had been seen (moderated F: Smyth 2004, doi:10.2202/1544-6115.1027); where it is the specimens' own, it is known from
-# nothing else.
+# An effect on a quantity that is constant within specimens shifts each specimen along one direction, the slope of that
+# quantity. With g_u that direction in specimen u (whitened, of length 1), :math:`\rho_u = g_u^T r_u` is one number per
+# specimen. What the model has removed from these numbers is known. Without it they are independent, with one variance
+# if all specimens scatter equally, and a channel's columns are tested against their residual by F. The variance of a
+# few numbers is uncertain. If runs and files explain it, it gets eight prior degrees of freedom (moderated F: Smyth
+# 2004, doi:10.2202/1544-6115.1027); if specimens scatter themselves, it has no prior.
 #
-# The same test holds what is constant in runs against their own scatter where there are few of these.
+# The same test is used for what is constant in runs, with few runs.
 #
-# A dozen specimens have too few sign flips for a search of hundreds of candidates, and a strong effect stands in its
-# own denominator there. The F test needs normal scatter instead; its p-values are adjusted by the largest over all
-# candidates in draws of such numbers with the same covariance (a rotation test: Langsrud 2005,
+# A dozen specimens have too few sign flips for a search of hundreds of candidates, and a strong effect is part of its
+# own denominator there. The F test assumes normal scatter instead. Its p-values are adjusted by the smallest over all
+# candidates in draws of normal numbers with the same covariance (a rotation test: Langsrud 2005,
 # doi:10.1007/s11222-005-4789-5).
 
-MANY = 100  # units from which their covariance is not made as a matrix
+MANY = 100  # Number of units from which their covariance is not computed as a matrix.
 
 
 class SmallSampleTest(NamedTuple):
-    """Columns seen as one number per specimen: the quantity, their span there, and how surely it is followed."""
+    """F test of columns that are one number per unit."""
 
     target: tuple[str, str]
     basis: np.ndarray  # (d, k) orthonormal
-    known: float  # degrees of freedom that the variance components count for
+    known: float  # prior degrees of freedom, from the variance components
     chi2: float  # whitened sum of squares they explain
     log_p: float  # not adjusted
-    share: float  # of the columns' sum of squares that is one number a unit
-    error_df: int  # numbers left for the units' own scatter
+    share: float  # of the columns' sum of squares that is one number per unit
+    error_df: int  # residual degrees of freedom between units
     level: str = "specimen"  # of the units
 
     @property
-    def sure(self) -> bool:
-        """Whether enough is left to show the units' own scatter."""
+    def enough_df(self) -> bool:
+        """Whether there are enough residual degrees of freedom between units."""
         return self.error_df >= (LEAST_ERROR_DF if self.level == "specimen" else LEAST_ERROR_DF_OF_RUNS)
 
 
 class Numbers(NamedTuple):
-    """One number per specimen along the direction of one quantity."""
+    """One number per unit along the direction of one quantity."""
 
-    direction: np.ndarray  # (n,) whitened slope, of length 1 in each specimen
+    direction: np.ndarray  # (n,) whitened slope, of length 1 in each unit
     taken: Tangent  # (units, p) of the model's basis along it
-    root: np.ndarray | Root  # (d, units) makes the numbers independent, with variance 1
+    root: np.ndarray | Root  # (d, units) whitens the numbers
     values: np.ndarray  # (d,), or (units,) with zeros in the other directions
     df: int  # d
-    known: float  # degrees of freedom that the variance components count for
+    known: float  # prior degrees of freedom, from the variance components
 
 
 class Root:
-    r"""A root of the inverse covariance, 1 - T T', of many units' numbers.
+    r"""Inverse root of the covariance 1 - T T' of many units' numbers.
 
-    With :math:`T^T T = V S^2 V^T` it is :math:`1 + T V [(1 - S^2)^{-1/2} - 1] S^{-2} V^T T^T`, without the directions
-    of which next to nothing is left; only matrices of the size of the model are made.
+    With :math:`T^T T = V S^2 V^T` it is :math:`1 + T V [(1 - S^2)^{-1/2} - 1] S^{-2} V^T T^T`, without the
+    directions that the model determines. All matrices have the size of the model.
 
     Parameters
     ----------
     taken : Tangent, shape (units, p)
-        T, which is nothing where `moved` is false.
+        T; 0 where `moved` is false.
     moved : ndarray of bool, shape (units,)
-        Which units the quantity moves.
+        Which units the quantity changes.
     """
 
     def __init__(self, taken: Tangent, moved: np.ndarray) -> None:
         share, axes = np.linalg.eigh(taken.gram())
         kept = 1 - share > LEAST_OWN_VARIANCE
-        grown = np.where(kept, 1 / np.sqrt(np.where(kept, 1 - share, 1.0)) - 1, -1.0)
+        factor = np.where(kept, 1 / np.sqrt(np.where(kept, 1 - share, 1.0)) - 1, -1.0)
         self.taken, self.moved, self.df = taken, moved, int(moved.sum() - (~kept).sum())
         small = share < 1e-9  # the limit of the quotient
-        self.core = (axes * np.where(small, 0.5, grown / np.where(small, 1.0, share))) @ axes.T
+        self.core = (axes * np.where(small, 0.5, factor / np.where(small, 1.0, share))) @ axes.T
 
     def __matmul__(self, numbers: np.ndarray) -> np.ndarray:
-        """Return numbers of the units, shape (units,) or (units, k), made independent."""
+        """Return whitened numbers of the units, shape (units,) or (units, k)."""
         return (numbers.T * self.moved).T + self.taken @ (self.core @ self.taken.against(numbers))
 
 
 def small_root(taken: Tangent, moved: np.ndarray) -> np.ndarray:
-    """Return the same for few units as a matrix of d rows, in the covariance's own axes, shape (d, units)."""
+    """Return the same for few units as a matrix, in the principal axes of the covariance, shape (d, units)."""
     dense = taken.toarray()
     share, axes = np.linalg.eigh(np.diag(moved.astype(float)) - dense @ dense.T)
     kept = share > LEAST_OWN_VARIANCE
@@ -336,14 +336,14 @@ def small_root(taken: Tangent, moved: np.ndarray) -> np.ndarray:
 
 
 class ClusterTests:
-    """The specimens of a fit as single numbers.
+    """Tests on one number per unit of a fit.
 
     Parameters
     ----------
     fitted : Fitted
         The current model at its optimum.
     level : str
-        Level of the units: nothing is shared between its groups but the model.
+        Level of the units. Its groups share only the model.
     """
 
     def __init__(self, fitted: Fitted, level: str = "specimen") -> None:
@@ -352,14 +352,14 @@ class ClusterTests:
 
     @cached_property
     def _residual(self) -> np.ndarray:
-        """Whitened residual less what priors and bounds have kept the fit from taking out of it, shape (n,)."""
-        return self.fitted.basis.freed(self.fitted.white_residual)
+        """Whitened residual, projected off the tangent space (priors and bounds may leave a part there), shape (n,)."""
+        return self.fitted.basis.project_out(self.fitted.white_residual)
 
     @cached_property
     def _finer(self) -> Whitening:
-        """What whitens columns where the units themselves do not scatter."""
+        """Whitening as if the units themselves did not scatter."""
         fitted, starts = self.fitted, self.fitted.rows.groups.starts
-        units = starts[self.level].size  # without repeats a run is a file, and their scatter is one
+        units = starts[self.level].size  # without repeats runs and files share their scatter
         finer = tuple(c for c in fitted.scatter.components if starts[c.level].size > units)
         return Whitening(replace(fitted.scatter, components=finer), fitted.friction, fitted.rows.groups)
 
@@ -370,12 +370,11 @@ class ClusterTests:
             slope = fitted.slope(*target)[:, None]
             white = fitted.whitening(slope)[:, 0]
             size, finer = (groups.sums(w**2, self.level) for w in (white, self._finer(slope)[:, 0]))
-            explained = float(np.mean(size[finer > 0] / finer[finer > 0]))
-            self._numbers[target] = self.along(white)._replace(known=KNOWN_DF * min(explained, 1.0))
+            self._numbers[target] = self.along(white)._replace(known=KNOWN_DF * min(mean_ratio(size, finer), 1.0))
         return self._numbers[target]
 
     def along(self, white: np.ndarray) -> Numbers:
-        """Return the units' numbers along a whitened column, shape (n,); their scatter is known from them alone."""
+        """Return the units' numbers along a whitened column, shape (n,), without prior degrees of freedom."""
         groups = self.fitted.rows.groups
         size = np.sqrt(groups.sums(white**2, self.level))
         direction = white * np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)[groups.codes[self.level]]
@@ -385,7 +384,7 @@ class ClusterTests:
         return Numbers(direction, taken, root, values, root.df if isinstance(root, Root) else values.size, 0.0)
 
     def test(self, left: np.ndarray, target: tuple[str, str]) -> SmallSampleTest | None:
-        """Return the F test of projected columns, shape (n, k), on a quantity; None with too few units for one."""
+        """Return the F test of projected columns, shape (n, k), on a quantity; None with too few units."""
         numbers = self.numbers(target)
         columns = self.fitted.rows.groups.sums(numbers.direction[:, None] * left, self.level)
         basis = orthonormal(numbers.root @ columns, 1e-3)
@@ -398,12 +397,12 @@ class ClusterTests:
         return SmallSampleTest(target, basis, numbers.known, chi2, log_p, share, d - k, self.level)
 
     def draws(self, count: int, rng: np.random.Generator) -> dict[tuple[str, str], np.ndarray]:
-        """Return numbers as chance alone would give them, for each quantity of shape (count, d), correlated as here."""
+        """Return draws of the numbers under the null hypothesis, shape (count, d), for each quantity."""
         groups, known = self.fitted.rows.groups, list(self._numbers.values())
 
         def covariance(one: Numbers, other: Numbers) -> np.ndarray:
-            alike = np.diag(groups.sums(one.direction * other.direction, self.level))
-            return one.root @ (alike - one.taken @ other.taken.toarray().T) @ other.root.T
+            shared = np.diag(groups.sums(one.direction * other.direction, self.level))
+            return one.root @ (shared - one.taken @ other.taken.toarray().T) @ other.root.T
 
         blocks = [[covariance(one, other) for other in known] for one in known]
         size, axes = np.linalg.eigh(np.block(blocks))
@@ -411,16 +410,26 @@ class ClusterTests:
         ends = np.cumsum([len(n.values) for n in known])[:-1]
         found = {}
         for (target, numbers), own in zip(self._numbers.items(), np.split(drawn, ends, axis=1), strict=True):
-            df = numbers.known  # a variance that counts for so many is as uncertain as that
+            df = numbers.known  # the prior variance is that uncertain
             scale = np.sqrt(df / rng.chisquare(df, count)) if df > LEAST_KNOWN_DF else np.ones(count)
             found[target] = own * scale[:, None]
         return found
 
 
-def log_p_of(values: np.ndarray, basis: np.ndarray, known: float, d: int | None = None) -> np.ndarray:
-    """Return the log p-value of F for rows of d independent numbers, shape (m, d), against columns (d, k) -> (m,).
+def mean_ratio(squares: np.ndarray, finer: np.ndarray) -> float:
+    """Return the mean of squares / finer, shape (units,) each, over units where `finer` is not rounding; 1 if none.
 
-    Both may have more places than d, in which neither holds anything.
+    Rounding is below 1e-30 of the largest. A derivative far from its Stribeck velocity may underflow in a unit, and the
+    ratio then overflows.
+    """
+    known = finer > 1e-30 * finer.max(initial=0.0)
+    return float(np.mean(squares[known] / finer[known])) if known.any() else 1.0
+
+
+def log_p_of(values: np.ndarray, basis: np.ndarray, known: float, d: int | None = None) -> np.ndarray:
+    """Return the log p-value of F for rows of d independent numbers, shape (m, d), and columns (d, k) -> (m,).
+
+    Both may be padded with zeros to more than d.
     """
     d, k = d or basis.shape[0], basis.shape[1]
     explained = ((values @ basis) ** 2).sum(axis=1)

@@ -1,4 +1,4 @@
-"""The spectrum of strokes along an axis, summed over units, and the background that a peak stands out of."""
+"""The spectrum of strokes along an axis, summed over units, and its local background."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from sealfit.closure.criteria import LEAST_SAMPLES_OF_STROKE, LOBE, NEIGHBOURS, 
 from sealfit.engine.run_map import run_map
 
 # ---------------------------------------------------------------- stroke signals
-# Strokes of some samples along an axis, each to be laid on an even grid.
+# Strokes along an axis, each of which is interpolated on an even grid.
 
 
 @dataclass(frozen=True)
 class Strokes:
-    """Strokes along an axis, m of them with n samples together, and the grids that they are transformed on."""
+    """The m strokes along an axis, with n samples together."""
 
-    place: np.ndarray  # (n,) along the axis, in its unit, as `residual` a stroke after the other
+    place: np.ndarray  # (n,) along the axis, in its unit, ordered by stroke
     residual: np.ndarray  # (n,) in N
     start: np.ndarray  # (m,) first sample
     size: np.ndarray  # (m,) samples
-    low: np.ndarray  # (m,) where each begins
-    span: np.ndarray  # (m,) how far it goes
+    low: np.ndarray  # (m,) start
+    span: np.ndarray  # (m,) length
     unit: np.ndarray  # (m,) number of its file
     direction: np.ndarray  # (m,)
 
     @classmethod
     def of(cls, samples: pd.DataFrame, axis: str) -> Strokes:
-        """Return the strokes of some samples that are long enough to say something of a ripple."""
+        """Return the strokes of the samples that are long enough for the search for ripples."""
         place, residual = (samples[name].to_numpy(dtype=float) for name in (axis, "residual_N"))
         stroke = samples["stroke_id"].to_numpy()
         start = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]][: stroke.size])
@@ -45,7 +45,7 @@ class Strokes:
         return cls(place, residual, start[good], size[good], low[good], (high - low)[good], unit, direction)
 
     def only(self, chosen: np.ndarray) -> Strokes:
-        """Return some strokes and their samples alone."""
+        """Return a subset of the strokes and their samples."""
         size = self.size[chosen]
         start = np.cumsum(size) - size
         own = np.repeat(self.start[chosen] - start, size) + np.arange(size.sum())
@@ -53,7 +53,7 @@ class Strokes:
         return Strokes(self.place[own], self.residual[own], start, size, *others)
 
     def on_grids(self, chosen: np.ndarray, step: float, size: int) -> np.ndarray:
-        """Return residuals of chosen strokes on even grids of `size` places from where each begins, (strokes, size)."""
+        """Return residuals of chosen strokes on even grids of `size` places from their start, (strokes, size)."""
         grid = step * np.arange(size)
         found = np.empty((chosen.size, size))
         for row, k in zip(found, chosen, strict=True):
@@ -67,21 +67,21 @@ class Strokes:
         return self.place[own][order], self.residual[own][order]
 
     def together(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return places and residuals of strokes of one size n, each sorted by place, shape (strokes, n) both."""
+        """Return places and residuals of strokes with n samples each, sorted by place, both of shape (strokes, n)."""
         own = self.start[chosen, None] + np.arange(self.size[chosen[0]])
         order = np.argsort(self.place[own], axis=1, kind="stable")
         return np.take_along_axis(self.place[own], order, 1), np.take_along_axis(self.residual[own], order, 1)
 
 
 # ---------------------------------------------------------------- background
-# The background of a spectrum, from each frequency's neighbours: what a peak stands out of.
+# The background of a spectrum at each frequency, from its neighbours.
 
 
-def alike(ratio: np.ndarray) -> np.ndarray:
-    """Return of how many independent powers a spectrum behaves like the mean, by its neighbours' spread, shape (f,).
+def effective_count(ratio: np.ndarray) -> np.ndarray:
+    """Return the effective number of independent powers in the mean at each frequency, shape (f,).
 
-    The logarithm of a mean of c powers has the variance trigamma(c); its spread is taken from the quartiles, which a
-    few peaks do not move.
+    The logarithm of a mean of c powers has the variance trigamma(c). It is estimated from the quartiles of the
+    neighbours, which are robust to a few peaks.
     """
     low, high = _quantiles(_neighbours(np.log(np.maximum(ratio, 1e-300))), (0.25, 0.75))
     spread = ((high - low) / 1.349) ** 2
@@ -90,9 +90,9 @@ def alike(ratio: np.ndarray) -> np.ndarray:
 
 
 def _quantiles(windows: np.ndarray, levels: Sequence[float]) -> list[np.ndarray]:
-    """Return quantiles of each row, NaN left out, by linear interpolation, each of shape (f,).
+    """Return quantiles of each row without NaN, by linear interpolation, each of shape (f,).
 
-    numpy's nanquantile takes the rows one by one, a hundred times slower.
+    numpy's nanquantile loops over the rows and is a hundred times slower.
     """
     ordered = np.sort(windows, axis=1)  # NaN last
     last = np.maximum(np.isfinite(windows).sum(axis=1) - 1, 0)
@@ -107,7 +107,7 @@ def _quantiles(windows: np.ndarray, levels: Sequence[float]) -> list[np.ndarray]
 
 
 def _neighbours(value: np.ndarray) -> np.ndarray:
-    """Return each frequency's neighbours, its own main lobe and what lies beyond the ends NaN, shape (f, window)."""
+    """Return the neighbours of each frequency, shape (f, window); NaN in its main lobe and beyond the ends."""
     padded = np.pad(value, NEIGHBOURS, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1).copy()
     windows[:, np.abs(np.arange(-NEIGHBOURS, NEIGHBOURS + 1)) <= LOBE] = np.nan
@@ -115,10 +115,10 @@ def _neighbours(value: np.ndarray) -> np.ndarray:
 
 
 def tops(power: np.ndarray) -> np.ndarray:
-    """Return where a spectrum is highest within a main lobe each side, both ends left out, shape (f,).
+    """Return where a spectrum has its maximum within a main lobe on each side, without both ends, shape (f,).
 
-    At the low end stand the smooth shapes of a stroke (warming, drift), which are no ripple; at the high end only the
-    strokes that are sampled most finely are left, and their noise is not that of all.
+    The low end contains the smooth shapes of a stroke (warming, drift), which are no ripple. Only the most finely
+    sampled strokes reach the high end, and their noise is not typical.
     """
     padded = np.pad(power, LOBE, constant_values=np.inf)
     highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * LOBE + 1).max(axis=1)
@@ -126,10 +126,10 @@ def tops(power: np.ndarray) -> np.ndarray:
 
 
 def smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return the background of a mean of `count` powers: a straight line in log-log through each point's neighbours.
+    """Return the background of a mean of `count` powers: a line in log-log coordinates through the neighbours.
 
-    Correlated noise falls steeply towards high frequencies, which a plain median of neighbours would take for a peak at
-    the low end. Neighbours that stand out are clipped, the peak's own main lobe left out.
+    The spectrum of correlated noise falls steeply, so a median of neighbours would give a false peak at the low end.
+    Outlying neighbours are clipped, and the main lobe of the peak is excluded.
     """
     value = np.log(np.maximum(power, 1e-300))
     place = np.log(frequency)
@@ -150,30 +150,30 @@ def smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarra
 
 
 def background(power: np.ndarray) -> np.ndarray:
-    """Return the median of each frequency's neighbours, the peak's own main lobe left out."""
+    """Return the median of each frequency's neighbours, without the main lobe of the peak."""
     return np.maximum(_quantiles(_neighbours(power), (0.5,))[0], 1e-300)
 
 
 # ---------------------------------------------------------------- spectrum
-# The spectrum of strokes along an axis, summed over units: no amplitude of a single one is kept.
+# The spectrum of strokes along an axis, summed over units. Amplitudes of single units are not kept.
 #
 # Strokes that share a grid are transformed together, and units are added block by block, so that memory does not grow
-# with the campaign. Workers may share the blocks: they are the same whoever sums them up, and so are the sums.
+# with the campaign. Blocks and sums do not depend on the number of workers.
 
-MOST_NUMBERS = 1 << 19  # of the grids of a block: 4 MB
-WORTHWHILE = 400_000  # samples from which it takes longer to transform them than to start processes and send them
-LEAST_STROKES = 3
-LEAST_FREQUENCIES = 4
-EXPONENTS = 64  # of a stroke's phase factor that are computed; the others are products of these and their powers
+MOST_NUMBERS = 1 << 19  # Grid points of a block: 4 MB.
+WORTHWHILE = 400_000  # Samples from which the transforms take longer than the start of worker processes.
+LEAST_STROKES = 3  # Fewest strokes of a spectrum.
+LEAST_FREQUENCIES = 4  # Fewest frequencies of a spectrum.
+EXPONENTS = 64  # Powers of a phase factor that are computed directly; the others are products of two.
 
 
 @dataclass(frozen=True)
 class Common:
-    """Sums over units of amplitudes that keep their phase, for one way of acting."""
+    """Sums over units of complex amplitudes, for one mode (symmetric or with the sign of the direction)."""
 
-    symmetric: bool  # True: the same force both ways; False: it follows the direction
+    symmetric: bool  # True: same force in both directions; False: with the sign of the direction
     total: np.ndarray  # (f,) complex, each unit on its own scale
-    square: np.ndarray  # (f,) of the units' powers, each on its own scale
+    square: np.ndarray  # (f,) sum of the units' powers, each on its own scale
     units: int
     amplitude: np.ndarray  # (f,) complex, mean over the passes that reach the frequency
 
@@ -188,27 +188,27 @@ class Spectrum:
     power: np.ndarray  # (f,) mean of the passes' powers, each on its own scale
     amplitude: np.ndarray  # (f,) root mean square of the passes' amplitudes
     common: tuple[Common, ...]
-    taken: np.ndarray  # (f,) within a main lobe of a component already in the model
+    taken: np.ndarray  # (f,) whether it lies in the main lobe of a component in the model
 
 
 def spectra_of(
     samples: pd.DataFrame, axes: Sequence[str], known: Sequence[tuple[str, float]] = (), *, workers: int = 1
 ) -> Iterator[Spectrum]:
-    """Return the spectra along some axes, in their order, without those of which the samples show too little.
+    """Return the spectra along some axes, without those with too few strokes or frequencies.
 
-    A stroke is freed of a parabola, tapered (Hann) and transformed on a grid that divides twice the longest stroke, so
-    that every stroke has the same frequencies whatever its sampling; the wavelength is at most half a usual stroke.
+    A parabola is subtracted from each stroke, which is then tapered (Hann) and transformed on a grid that divides twice
+    the longest stroke. All strokes have the same frequencies then. The longest wavelength is half the median stroke.
 
     Parameters
     ----------
     samples : DataFrame
         As for `sealfit.closure.ripples.find_ripple`.
     axes : sequence of str
-        Columns to look along.
+        Columns along which to search.
     known : sequence of (axis, wavelength)
-        Components already in the model.
+        Components in the model.
     workers : int
-        Processes that transform many samples.
+        Number of processes, used with many samples.
     """
     surveys = [survey for axis in axes if (survey := _survey(samples, axis)) is not None]
     workers = workers if len(samples) >= WORTHWHILE else 1
@@ -218,14 +218,14 @@ def spectra_of(
 
 @dataclass(frozen=True)
 class _Block:
-    """Strokes of whole units: what is sent to a worker. Frequencies are multiples of 1 / `longest`."""
+    """Strokes of whole units, the task of a worker. Frequencies are multiples of 1 / `longest`."""
 
     strokes: Strokes
-    points: np.ndarray  # (m,) of the grid of each stroke, if it were as long as `longest`
-    reach: np.ndarray  # (m,) how many of the frequencies each stroke reaches
-    numbers: np.ndarray  # (f,) which multiples the frequencies are
-    longest: float  # length, or time, of which all grids are parts
-    sides: np.ndarray  # directions that there are
+    points: np.ndarray  # (m,) grid points of each stroke per `longest`
+    reach: np.ndarray  # (m,) number of frequencies that each stroke reaches
+    numbers: np.ndarray  # (f,) multiples that are the frequencies
+    longest: float  # length, or time, that all grids divide
+    sides: np.ndarray  # directions
 
     def only(self, chosen: np.ndarray) -> _Block:
         own = self.strokes.only(chosen), self.points[chosen], self.reach[chosen]
@@ -234,7 +234,7 @@ class _Block:
 
 @dataclass(frozen=True)
 class _Survey:
-    """All strokes along one axis, and which of them make a block."""
+    """All strokes along one axis, and their division into blocks."""
 
     axis: str
     whole: _Block
@@ -255,14 +255,14 @@ def _survey(samples: pd.DataFrame, axis: str) -> _Survey | None:
     use = (frequency >= 2 / np.median(strokes.span)) & (reaching[: frequency.size] >= REACHED * reach.size)
     if use.sum() < LEAST_FREQUENCIES:
         return None
-    first, last = np.flatnonzero(use)[[0, -1]]  # with none between them left out, as fewer strokes reach further
+    first, last = np.flatnonzero(use)[[0, -1]]  # contiguous, as fewer strokes reach further
     reached, numbers = np.clip(reach, first, last + 1) - first, np.arange(first, last + 1)
     whole = _Block(strokes, points, reached, numbers, longest, np.unique(strokes.direction))
     return _Survey(axis, whole, _parts(strokes.unit, points))
 
 
 def _parts(unit: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """Return numbers of strokes, whole units of so many points together, those with like grids beside each other."""
+    """Return indices of strokes in blocks of whole units with a limited number of points, sorted by grid."""
     own, code = np.unique(unit, return_inverse=True)
     finest = np.zeros(own.size, dtype=int)
     np.maximum.at(finest, code, points)
@@ -273,7 +273,7 @@ def _parts(unit: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
 
 
 class _Blocks(Sequence):
-    """The blocks of all surveys, each made when it is asked for."""
+    """The blocks of all surveys, each created on access."""
 
     def __init__(self, surveys: Sequence[_Survey]) -> None:
         self.places = [(survey.whole, chosen) for survey in surveys for chosen in survey.blocks]
@@ -290,20 +290,20 @@ class _Blocks(Sequence):
 
 @dataclass(frozen=True)
 class _Sums:
-    """Sums over passes, (f,), and over units for each way of acting, the same both ways first, (ways, f)."""
+    """Sums over passes, (f,), and over units for each mode, symmetric first, (modes, f)."""
 
     count: np.ndarray
     power: np.ndarray
     square: np.ndarray
     total: np.ndarray
     scaled: np.ndarray
-    units: np.ndarray  # (ways,)
+    units: np.ndarray  # (modes,)
     amplitude: np.ndarray
 
     @classmethod
-    def none(cls, f: int, ways: int) -> _Sums:
-        total, amplitude = np.zeros((ways, f), dtype=complex), np.zeros((ways, f), dtype=complex)
-        return cls(*np.zeros((3, f)), total, np.zeros((ways, f)), np.zeros(ways), amplitude)
+    def none(cls, f: int, modes: int) -> _Sums:
+        total, amplitude = np.zeros((modes, f), dtype=complex), np.zeros((modes, f), dtype=complex)
+        return cls(*np.zeros((3, f)), total, np.zeros((modes, f)), np.zeros(modes), amplitude)
 
     def __add__(self, other: _Sums) -> _Sums:
         return _Sums(*(getattr(self, part.name) + getattr(other, part.name) for part in fields(self)))
@@ -312,7 +312,7 @@ class _Sums:
 def _sums_of(block: _Block) -> _Sums:
     sides, width = block.sides, int(block.reach.max())
     sums = _Sums.none(block.numbers.size, min(sides.size, 2))
-    if not width:  # strokes too coarse, or too short, for any of the frequencies
+    if not width:  # the strokes reach none of the frequencies
         return sums
     units, unit = np.unique(block.strokes.unit, return_inverse=True)
     passes = unit * sides.size + np.searchsorted(sides, block.strokes.direction)
@@ -328,38 +328,38 @@ def _sums_of(block: _Block) -> _Sums:
     sums.power[:width] = (power / np.maximum(mean, 1e-300)[:, :, None]).sum(axis=(0, 1))
     most = np.zeros(units.size, dtype=int)
     np.maximum.at(most, unit, block.reach)
-    for way in range(sums.units.size):
-        own = np.einsum("usf,s->uf", wave, sides) if way else wave.sum(axis=1)
+    for k in range(sums.units.size):
+        own = np.einsum("usf,s->uf", wave, sides) if k else wave.sum(axis=1)
         power = _power(own)
-        square = _medians(power, most)  # each unit weighs by its own spread, so that one noisy file does not decide
+        square = _medians(power, most)  # units are scaled, so that one noisy file does not dominate
         kept = square > 0
-        sums.total[way, :width] = (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
-        sums.scaled[way, :width] = (power[kept] / square[kept, None]).sum(axis=0)
-        sums.units[way] = own.any(axis=1).sum()
-        sums.amplitude[way, :width] = own.sum(axis=0)
+        sums.total[k, :width] = (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
+        sums.scaled[k, :width] = (power[kept] / square[kept, None]).sum(axis=0)
+        sums.units[k] = own.any(axis=1).sum()
+        sums.amplitude[k, :width] = own.sum(axis=0)
     return sums
 
 
 def _transformed(block: _Block) -> np.ndarray:
-    """Return complex amplitudes of strokes, phases counted from place 0, 0 beyond reach, (strokes, most)."""
+    """Return complex amplitudes of strokes with phases from place 0; 0 beyond their reach, (strokes, most)."""
     strokes, points, reach = block.strokes, block.points, block.reach
     found = np.zeros((reach.size, int(reach.max())), dtype=complex)
     size = np.ceil(strokes.span * points / block.longest).astype(int)
     for length, count in np.unique(np.column_stack([points, size]), axis=0):
-        alike = np.flatnonzero((points == length) & (size == count))
+        same_size = np.flatnonzero((points == length) & (size == count))
         trend, taper = _on_grid(count)
-        value = strokes.on_grids(alike, block.longest / length, count)
+        value = strokes.on_grids(same_size, block.longest / length, count)
         value -= (value @ trend) @ trend.T
-        width = int(reach[alike].max())
+        width = int(reach[same_size].max())
         wave = np.fft.rfft(value * taper, length)[:, block.numbers[0] : block.numbers[0] + width]
-        found[alike, :width] = np.where(np.arange(width) < reach[alike, None], wave, 0.0)
+        found[same_size, :width] = np.where(np.arange(width) < reach[same_size, None], wave, 0.0)
     turn = -2j * np.pi / block.longest * strokes.low[:, None]
-    many, few = np.divmod(block.numbers[: found.shape[1]], EXPONENTS)  # a product of two costs less than a power
+    many, few = np.divmod(block.numbers[: found.shape[1]], EXPONENTS)  # a product is cheaper than a power
     found *= np.exp(turn * EXPONENTS * np.arange(many[-1] + 1))[:, many]
     return found * np.exp(turn * np.arange(EXPONENTS))[:, few]
 
 
-@lru_cache(maxsize=512)  # strokes of one speed share their grids: one each for hundreds of thousands
+@lru_cache(maxsize=512)  # strokes of one speed share their grid
 def _on_grid(size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return an orthonormal basis of parabolas on an even grid, shape (size, 3), and the Hann taper, shape (size,)."""
     trend, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, size), 3))
@@ -372,11 +372,11 @@ def _power(wave: np.ndarray) -> np.ndarray:
 
 
 def _medians(values: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return the median of the first so many values of each row, shape (rows,); 0 of none."""
+    """Return the median of the first `count` values of each row, shape (rows,); 0 if there are none."""
     found = np.zeros(count.size)
     for size in np.unique(count[count > 0]):
-        alike = count == size
-        found[alike] = np.median(values[alike, :size], axis=1)
+        same_size = count == size
+        found[same_size] = np.median(values[same_size, :size], axis=1)
     return found
 
 
@@ -393,8 +393,8 @@ def _summed(
         for axis, wavelength in known:
             taken |= (axis == survey.axis) & (np.abs(frequency - 1 / wavelength) <= LOBE / longest)
         common = tuple(
-            Common(way == 0, sums.total[way], sums.scaled[way], int(units), sums.amplitude[way] / count)
-            for way, units in enumerate(sums.units)
+            Common(k == 0, sums.total[k], sums.scaled[k], int(units), sums.amplitude[k] / count)
+            for k, units in enumerate(sums.units)
         )
         amplitude = np.sqrt(sums.square / count)
         yield Spectrum(survey.axis, frequency, sums.count, sums.power / count, amplitude, common, taken)

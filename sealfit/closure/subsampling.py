@@ -1,4 +1,4 @@
-"""Subsampling of large campaigns: which runs and rows are searched, and what the full campaign says of the result."""
+"""Subsampling of large campaigns: choice of the runs and rows searched, and check of the result on all of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pandas as pd
 
 from sealfit.closure.channels import channels_of
 from sealfit.closure.confirm import AcceptedEffect, heldout_gain
-from sealfit.closure.criteria import COMPARED, RIVAL
+from sealfit.closure.criteria import MOST_RIVALS, RIVAL_BIC
 from sealfit.closure.forms import describe
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import named_among
@@ -22,41 +22,41 @@ from sealfit.fit.joint.declared import declare
 from sealfit.fit.joint.estimate import Fitted, fit, fitted_at
 from sealfit.fit.joint.rows import POWER, Rows, make_rows, merge, thin
 
-# A campaign of no more strokes is searched whole; of a larger one so many are drawn, by whole runs.
+# A campaign with no more strokes is searched in full. Of a larger one this many are drawn, by whole runs.
 STROKES = 4_000
 
-# At least so many runs are drawn, as they are the evidence of most variables.
+# Least number of runs drawn: runs are the evidence for most variables.
 RUNS = 1_000
 
-# At least so many runs are drawn for each number of the declared model.
+# Least number of runs drawn for each parameter of the declared model.
 LEAST_RUNS = 20
 
-# So many times as many strokes are drawn next where the campaign shows more than those searched do.
+# Factor on the number of strokes drawn next if the full campaign shows more than those searched.
 FURTHER = 4
 
-# The search works on about so many rows; more are merged along their strokes.
+# Approximate number of rows in a search. More rows are merged along their strokes.
 ROWS = 4_000
 
-# So many merged rows are kept of each stroke, where `MOST_ROWS` allow it.
+# Number of merged rows kept per stroke, if `MOST_ROWS` allows it.
 PER_STROKE = 8
 
-# The search works on at most so many rows.
+# Largest number of rows in a search.
 MOST_ROWS = 8_000
 
-# Where `MOST_ROWS` leave fewer rows of a stroke, some files keep `PER_STROKE`, the others one a stroke.
+# If `MOST_ROWS` allows fewer rows per stroke, some files keep `PER_STROKE` and the others one row per stroke.
 LEAST_PER_STROKE = 4
 
 
 @dataclass(frozen=True)
 class Subsample:
-    """What of a campaign is searched: some runs, or all, and their rows merged along the strokes.
+    """The part of a campaign that is searched: some or all runs, and their rows merged along the strokes.
 
-    The same objects stand where there is nothing to leave out or to merge.
+    The attributes are the same object if nothing is left out or merged.
     """
 
     rows: Rows
     coarse: Rows
-    every: Rows  # the whole campaign, merged
+    every: Rows  # the full campaign, merged
 
     @property
     def whole(self) -> bool:
@@ -65,21 +65,21 @@ class Subsample:
 
 
 def subsamples(rows: Rows, seed: int) -> Iterator[Subsample]:
-    """Yield more and more of a campaign's runs, dealt evenly over its conditions, the last time all of them.
+    """Yield larger and larger subsets of a campaign's runs, drawn evenly over its conditions; the last has all runs.
 
-    The first part bounds what a search costs by the model, not by the number of files.
+    The cost of the first search depends on the model, not on the number of files.
 
     Parameters
     ----------
     rows : Rows
-        The campaign, made of bins as `numbered` gives them.
+        The campaign, made of bins as returned by `numbered`.
     seed : int
-        Of the deal.
+        Seed of the draw.
     """
     every, most, searched_before = _merged(rows, rows, seed), STROKES, 0
     strokes, runs = (rows.groups.starts[level].size for level in ("stroke", "run"))
     while most < strokes:
-        drawn = _dealt(rows, min(max(most / strokes, RUNS / runs), 1.0), seed)
+        drawn = _rows_drawn(rows, min(max(most / strokes, RUNS / runs), 1.0), seed)
         if searched_before < np.count_nonzero(drawn) < drawn.size:
             part = rows.subset(drawn)
             yield Subsample(part, _merged(part, rows, seed), every)
@@ -89,23 +89,23 @@ def subsamples(rows: Rows, seed: int) -> Iterator[Subsample]:
 
 
 def _merged(part: Rows, campaign: Rows, seed: int) -> Rows:
-    """Return rows merged along their strokes, their conditions and declared model those of the whole campaign."""
-    few = merged_bins(part.table.drop(columns=POWER, errors="ignore"), seed)
-    if len(few) == part.force.size:
+    """Return rows merged along their strokes, with the conditions and the declared model of the full campaign."""
+    merged = merged_bins(part.table.drop(columns=POWER, errors="ignore"), seed)
+    if len(merged) == part.force.size:
         return part
-    made = make_rows(few, has_aging=campaign.has_aging, conditions=campaign.conditions)
+    made = make_rows(merged, has_aging=campaign.has_aging, conditions=campaign.conditions)
     declare(made, as_in=campaign)
     return made
 
 
-def _dealt(rows: Rows, share: float, seed: int) -> np.ndarray:
-    """Return which rows are of the runs drawn, shape (n,): one at random of every 1 / `share` beside each other.
+def _rows_drawn(rows: Rows, share: float, seed: int) -> np.ndarray:
+    """Return which rows belong to the runs drawn, shape (n,): one at random of every 1 / `share` neighbours.
 
-    At least one of each condition, and `LEAST_RUNS` of those that tell a number of the declared model.
+    At least one run of each condition is drawn, and `LEAST_RUNS` for each parameter of the declared model.
     """
     first = rows.groups.starts["run"]
     condition = rows.condition[first]
-    drawn = _one_of_each(np.lexsort([np.abs(rows.speed[first]), condition]), share, seed)
+    drawn = _one_per_group(np.lexsort([np.abs(rows.speed[first]), condition]), share, seed)
     rng = np.random.default_rng(seed)
     _fill(drawn, condition, 1, rng)
     for numbers in declare(rows).index.values():
@@ -114,7 +114,7 @@ def _dealt(rows: Rows, share: float, seed: int) -> np.ndarray:
 
 
 def _fill(drawn: np.ndarray, number: np.ndarray, least: int, rng: np.random.Generator) -> None:
-    """Draw more at random until there are so many of each number, or all; none of numbers below 0."""
+    """Draw more at random until there are `least` of each number (or all); numbers below 0 are not drawn."""
     wanted = least - np.bincount(number[drawn & (number >= 0)], minlength=number.max(initial=0) + 1)
     left = rng.permutation(np.flatnonzero(~drawn & (number >= 0)))
     left = left[np.argsort(number[left], kind="stable")]
@@ -124,59 +124,59 @@ def _fill(drawn: np.ndarray, number: np.ndarray, least: int, rng: np.random.Gene
 
 
 def merged_bins(bins: pd.DataFrame, seed: int) -> pd.DataFrame:
-    """Return the bins that the search works on: neighbours of a stroke merged where there are many.
+    """Return the bins for the search: neighbours within a stroke are merged if there are many.
 
-    Of very many strokes some files, dealt evenly over the campaign, show what happens along a stroke, in `MOST_ROWS`
-    rows; of the others the means are enough.
+    With very many strokes, some files drawn evenly over the campaign keep several rows per stroke, in `MOST_ROWS` rows
+    together. The others keep their mean only.
 
     Parameters
     ----------
     bins : DataFrame
-        As `numbered` gives them.
+        As returned by `numbered`.
     seed : int
-        Of the deal.
+        Seed of the draw.
     """
     strokes = bins["stroke_id"].nunique()
     if LEAST_PER_STROKE * strokes <= MOST_ROWS:
         return thin(bins, int(np.clip(PER_STROKE * strokes, ROWS, MOST_ROWS)))
-    finely = _files_dealt(bins, MOST_ROWS / (PER_STROKE * strokes), seed)
+    finely = _files_drawn(bins, MOST_ROWS / (PER_STROKE * strokes), seed)
     together = int(np.ceil(len(bins) / strokes / PER_STROKE))
     return merge(bins, np.where(finely, together, len(bins)))
 
 
-def _files_dealt(bins: pd.DataFrame, share: float, seed: int) -> np.ndarray:
-    """Return whether each row's file is of those drawn, shape (n,): one of every 1 / `share` beside each other."""
+def _files_drawn(bins: pd.DataFrame, share: float, seed: int) -> np.ndarray:
+    """Return whether each row's file is drawn, shape (n,): one of every 1 / `share` neighbours."""
     file = pd.factorize(bins["file"])[0]
     first = np.flatnonzero(np.diff(np.maximum.accumulate(file), prepend=-1))
-    beside = np.lexsort([pd.factorize(bins[name])[0][first] for name in ("run_id", "condition")])
-    return _one_of_each(beside, share, seed)[file]
+    order = np.lexsort([pd.factorize(bins[name])[0][first] for name in ("run_id", "condition")])
+    return _one_per_group(order, share, seed)[file]
 
 
-def _one_of_each(beside: np.ndarray, share: float, seed: int) -> np.ndarray:
-    """Return what is drawn, one at random of every 1 / `share` in the order `beside`, shape (n,)."""
-    group = np.floor(np.arange(beside.size) * share)
-    shuffled = np.lexsort((np.random.default_rng(seed).random(beside.size), group))
-    drawn = np.zeros(beside.size, dtype=bool)
-    drawn[beside[shuffled[np.flatnonzero(np.diff(group, prepend=-1))]]] = True
+def _one_per_group(order: np.ndarray, share: float, seed: int) -> np.ndarray:
+    """Return what is drawn, one at random of every 1 / `share` in an order, shape (n,)."""
+    group = np.floor(np.arange(order.size) * share)
+    shuffled = np.lexsort((np.random.default_rng(seed).random(order.size), group))
+    drawn = np.zeros(order.size, dtype=bool)
+    drawn[order[shuffled[np.flatnonzero(np.diff(group, prepend=-1))]]] = True
     return drawn
 
 
-Way = tuple[str, str]  # what an effect acts on, and how
+Target = tuple[str, str]  # (acts_on, operation)
 
 
 def reselect_on_all(
-    grown: Selection, every: Rows, samples: pd.DataFrame, config: Config, say: Callable[[str], None]
+    selection: Selection, every: Rows, samples: pd.DataFrame, config: Config, say: Callable[[str], None]
 ) -> tuple[Selection, Fitted]:
-    """Return what the search of a part came to, and its final model fitted to all strokes.
+    """Re-select the form and target of each effect on all strokes; return the result and the model fitted to them.
 
-    An effect is held against its first rivals, and what comes out against itself on the quantities that its rivals act
-    on, each time on all strokes; rivals on quantities that these rule out are none any more. A ripple was judged on
-    samples, and stays.
+    An effect is compared with its first rivals, and the best of them with itself on the targets of its rivals, each
+    time on all strokes. Rivals on targets that are excluded by this are removed. Ripples were tested on the samples and
+    are kept.
 
     Parameters
     ----------
-    grown : Selection
-        What the search of a part came to.
+    selection : Selection
+        The result of the search of a part.
     every : Rows
         The campaign, merged along the strokes.
     samples : DataFrame
@@ -184,51 +184,51 @@ def reselect_on_all(
     config : Config
         Folds and seed.
     say : callable
-        Told in words what is being done.
+        Called with a line on what is being done.
     """
-    added, after = list(grown.added), grown.after
+    added, after = list(selection.added), selection.after
     whole = fit(after.model, every, after.scatter, turns=1)
-    for first in (a for a in grown.added if a.rivals and not _periodic(a.proposal)):
+    for first in (a for a in selection.added if a.rivals and not _periodic(a.proposal)):
         item = first
         for others_of in (_first_rivals, _on_other_quantities):
             number = next(k for k, a in enumerate(added) if a is item)
-            asked = [item.proposal, *others_of(item)]
-            if len(asked) == 1:
+            compared = [item.proposal, *others_of(item)]
+            if len(compared) == 1:
                 continue
             base = fitted_at(whole.model.without_term(number), every, whole.scatter, whole.friction)
-            found = named_among(base, [_of_all(p, every) for p in asked])
-            chosen = next(p for p in asked if p.term is found[0].term)
+            found = named_among(base, [_on_full_campaign(p, every) for p in compared])
+            chosen = next(p for p in compared if p.term is found[0].term)
             if chosen is not item.proposal:
-                say(f"all strokes say {describe(chosen.term)} rather than {describe(item.proposal.term)}")
-                item, after = _instead(item, chosen, after, number, samples, config)
+                say(f"on all strokes {describe(chosen.term)} fits better than {describe(item.proposal.term)}")
+                item, after = _replaced(item, chosen, after, number, samples, config)
                 added, whole = [*added[:number], *added[number + 1 :], item], found[0].fitted
             if others_of is _on_other_quantities:
-                left = [_way(p) for p in found if p.bic - found[0].bic < RIVAL]
+                left = [_target(p) for p in found if p.bic - found[0].bic < RIVAL_BIC]
                 number = next(k for k, a in enumerate(added) if a is item)
-                added[number] = item = _with_rivals(item, [r for r in _rivals(item) if _way(r[0]) in left])
-    return replace(grown, added=tuple(added), after=after), whole
+                added[number] = item = _with_rivals(item, [r for r in _rivals(item) if _target(r[0]) in left])
+    return replace(selection, added=tuple(added), after=after), whole
 
 
 def _first_rivals(item: AcceptedEffect) -> list[Proposal]:
     """Return the first rivals of an effect."""
-    return [rival for rival in item.rivals[:COMPARED] if not _periodic(rival)]
+    return [rival for rival in item.rivals[:MOST_RIVALS] if not _periodic(rival)]
 
 
 def _on_other_quantities(item: AcceptedEffect) -> list[Proposal]:
-    """Return an effect on the quantities that its rivals act on, to begin where it stands."""
+    """Return an effect on the targets of its rivals, with its own values as start."""
     term = item.proposal.term
-    ways = (way for way in dict.fromkeys(map(_way, item.rivals)) if way != _way(item.proposal))
+    targets = (target for target in dict.fromkeys(map(_target, item.rivals)) if target != _target(item.proposal))
     return [
-        replace(item.proposal, term=replace(term, acts_on=way[0], operation=way[1]))
-        for way in ways
-        if way in term.effect.acts_on
+        replace(item.proposal, term=replace(term, acts_on=target[0], operation=target[1]))
+        for target in targets
+        if target in term.effect.acts_on
     ]
 
 
-def _instead(
+def _replaced(
     item: AcceptedEffect, chosen: Proposal, after: Fitted, number: int, samples: pd.DataFrame, config: Config
 ) -> tuple[AcceptedEffect, Fitted]:
-    """Return an effect with another proposal in its place and its own among the rivals, and the part's fit with it."""
+    """Return an effect replaced by another proposal, its own now a rival, and the fit of the part with it."""
     rows, scatter, friction = after.rows, after.scatter, after.friction
     without = fit(after.model.without_term(number), rows, scatter, turns=0, friction=friction)
     model = without.model.with_term(chosen.term, _values(chosen))
@@ -245,7 +245,7 @@ def _periodic(proposal: Proposal) -> bool:
 
 
 def _rivals(item: AcceptedEffect) -> list[tuple[Proposal, float]]:
-    """Return the rivals of an effect that are not itself, and their RMSE."""
+    """Return the rivals of an effect, without itself, and their RMSE."""
     pairs = zip(item.rivals, item.rivals_rmse_N, strict=True)
     return [(rival, rmse) for rival, rmse in pairs if rival.term.key() != item.proposal.term.key()]
 
@@ -254,36 +254,36 @@ def _with_rivals(item: AcceptedEffect, rivals: list[tuple[Proposal, float]]) -> 
     return replace(item, rivals=tuple(r for r, _ in rivals), rivals_rmse_N=tuple(rmse for _, rmse in rivals))
 
 
-def _of_all(proposal: Proposal, every: Rows) -> Proposal:
-    """Return a proposal of a part as one of all strokes, to be fitted."""
+def _on_full_campaign(proposal: Proposal, every: Rows) -> Proposal:
+    """Return a proposal of a part as one for all strokes, not fitted yet."""
     return replace(proposal, units=every.groups.starts[proposal.unit].size, values=_values(proposal), fitted=None)
 
 
-def _way(proposal: Proposal) -> Way:
+def _target(proposal: Proposal) -> Target:
     return proposal.term.acts_on, proposal.term.operation
 
 
 def _values(proposal: Proposal) -> Mapping[str, float]:
-    """Return the numbers of a fitted proposal."""
+    """Return the parameters of a fitted proposal."""
     return proposal.fitted.model.values[-1]
 
 
-def missed_by_subsample(fitted: Fitted, grown: Selection, config: Config) -> str:
-    """Return the channel that still orders the residual of all strokes, though those searched do not show it; or "".
+def missed_by_subsample(fitted: Fitted, selection: Selection, config: Config) -> str:
+    """Return the channel that still explains the residual of all strokes but not of those searched; or "".
 
-    What they show and what could not be explained there is known already.
+    Channels that were significant there are known already.
 
     Parameters
     ----------
     fitted : Fitted
         The final model, fitted to all strokes.
-    grown : Selection
-        What the search of a part came to.
+    selection : Selection
+        The result of the search of a part.
     config : Config
-        Levels of error, channels.
+        Error rate, channels.
     """
     alpha = config.loop.family_error
     found = search(ScoreTests(fitted), channels_of(fitted.rows, config), np.random.default_rng(config.loop.seed))
-    known = {c.channels for c in grown.last if c.p_value <= alpha}
-    new = (c for c in found if c.p_value <= alpha and c.sure and c.channels not in known)
+    known = {c.channels for c in selection.last if c.p_value <= alpha}
+    new = (c for c in found if c.p_value <= alpha and c.claimable and c.channels not in known)
     return ", ".join(next((c.channels for c in new), ()))

@@ -1,8 +1,7 @@
 """Physical effects, a file for each family, and the list of them.
 
-Mechanisms come first, then closed forms of any channel. Free shapes, whose size depends on the data, are built by
-`sealfit.effects.free`; the users' own effects are read by `sealfit.effects.user`. What an effect holds is in
-`contract`.
+Mechanisms come first, then closed forms of any channel. `sealfit.effects.free` builds free shapes, whose number of
+parameters depends on the data; `sealfit.effects.user` reads the effects of users; `contract` describes an effect.
 """
 
 from sealfit.effects import aging_laws, closed_forms, history, products, sensors, sliding, warming

@@ -6,28 +6,29 @@ import numpy as np
 
 from sealfit.effects.contract import AMPLITUDE, Effect, Parameter, not_negative, positive, reference
 
-GAS_CONSTANT = 8.314462618  # J/(mol K), CODATA 2018
-ZERO_C = 273.15  # K
-STANDARD_C = 23.0  # degC, standard laboratory temperature of rubber tests, ISO 23529
+# Gas constant in J/(mol K), CODATA 2018.
+GAS_CONSTANT = 8.314462618
+# 0 degrees Celsius in K.
+ZERO_C = 273.15
+# Standard laboratory temperature of rubber tests in degrees Celsius, ISO 23529.
+STANDARD_C = 23.0
 
 
 def arrhenius_aging_shape(inputs, *, A, E):
-    r"""Arrhenius acceleration of aging with temperature: the loss a, or the time b of its onset, follows the oven.
+    r"""Arrhenius acceleration of aging with temperature: of the loss a, or of the time b of its onset.
 
-    Oxidation and the breaking and joining of network bonds need an activation energy E, so their rate grows as
-    :math:`e^{-E / R T}`. A share A of the aging is of that kind; the rest, physical relaxation, is taken as the same at
-    every temperature,
+    Oxidation, scission and cross-linking of network bonds have an activation energy E, and a rate proportional to
+    :math:`e^{-E / R T}`. A share A of the aging is of that kind; the rest is assumed to be independent of temperature,
 
     .. math:: h = A [e^{E / R\, (1 / T_{ref} - 1 / T)} - 1]
 
-    with T in kelvin. A = 1 is Arrhenius' law itself, a factor :math:`e^{E / R\, (1 / T_{ref} - 1 / T)}`. On a it is the
-    rate of the loss, E positive. On b, a time, E is negative: A = 1 then shifts the whole curve of Eq. 15 along the
-    logarithm of time, which is time-temperature superposition. Unaged rubber is unchanged whatever its temperature.
+    with T in kelvin. A = 1 is Arrhenius' law, a factor :math:`e^{E / R\, (1 / T_{ref} - 1 / T)}`. On a, the rate of the
+    loss, E is positive. On b, a time, E is negative, and A = 1 shifts the curve of Eq. 15 along the logarithm of time
+    (time-temperature superposition). Unaged rubber does not change.
 
-    Two temperatures determine one number, three tell A from E; where the exponent is small, only A E is determined. The
-    declared model has an a and a b of its own for each series, and where temperature makes series they take all of it
-    up: there is something to find only where one series holds several, as with a config whose `condition` leaves it
-    out.
+    Two temperatures determine one parameter, three distinguish A and E; for a small exponent only A E is determined.
+    The declared model has a separate a and b for each series. The effect can be seen only if one series contains
+    several temperatures, that is if `condition` in the config does not list the temperature.
     """
     kelvin = positive(np.asarray(inputs["temperature_C"], dtype=float) + ZERO_C)
     at_reference = reference(inputs, "temperature_C", STANDARD_C) + ZERO_C
@@ -67,19 +68,18 @@ ARRHENIUS_AGING = Effect(
 
 
 def compression_factor_shape(inputs, *, A):
-    r"""Compression while aging: rubber held at a lower height ages, and rubs, differently.
+    r"""Compression during aging: it changes aging, or friction after aging.
 
-    A seal ages under squeeze. Strain holds the chains apart in one place and together in another while bonds form and
-    break (compression set), and shuts the surface off from air. With c the height in per cent of the original one, the
-    height taken away counts to first order,
+    A seal ages under compression. Strain changes which bonds form and break (compression set), and the surface has less
+    contact with air. With c the height in per cent of the original height, to first order,
 
     .. math:: h = A (100 - c) / 100
 
-    A is the relative change per whole height taken away, so that 80 % gives A / 5; rubber that was not compressed is
-    the reference. On a or b aging itself changes; on mu the friction of unaged rows follows their cell, too.
+    A is the relative change per full compression, so that 80 % gives A / 5; the reference is uncompressed rubber. On a
+    or b it changes aging; on mu it also changes the friction of unaged rubber with a compression.
 
-    The declared model has an a and a b of its own for each series, and where compression makes series they take up all
-    of a change of a or b: there is something to find on them only where one series holds several heights.
+    The declared model has a separate a and b for each series. An effect on a or b can be seen only if one series
+    contains several heights.
     """
     return A * (100.0 - np.asarray(inputs["compression_ratio_pct"], dtype=float)) / 100.0
 
@@ -102,9 +102,9 @@ COMPRESSION_FACTOR = Effect(
 
 
 def aging_floor_shape(inputs, *, A, t_f):
-    r"""Aging with a floor: from some day on the coefficient falls less than the logarithm says.
+    r"""Aging with a floor: after some day the coefficient falls less than by the logarithm.
 
-    Eq. 15 falls for ever; real aging ends when what reacts is used up. Beyond a day t_f part of the fall is given back,
+    Eq. 15 has no limit, but aging ends when the reactants are consumed. After a day t_f the fall is reduced,
 
     .. math:: h = A \ln(t / t_f) \quad (t > t_f), \qquad h = 0 \quad (t \le t_f)
 
@@ -135,14 +135,14 @@ AGING_FLOOR = Effect(
 
 
 def aging_induction_shape(inputs, *, A, t_i):
-    r"""Aging with an induction time: at first less happens than the logarithm says.
+    r"""Aging with an induction time: at first the coefficient falls less than by the logarithm.
 
-    Antioxidants hold oxidation off until they are spent, so the coefficient stays up for a while and then catches up
-    with Eq. 15. What it lies above the law rises from zero at day 0, is largest at t_i and dies out:
+    Antioxidants delay oxidation until they are consumed. The difference from Eq. 15 is zero at day 0, largest at t_i
+    and vanishes later:
 
     .. math:: h = A \frac{t}{t_i} e^{1 - t / t_i}
 
-    A is that largest lag.
+    A is the largest difference.
     """
     ratio = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0) / t_i
     return A * ratio * np.exp(1 - ratio)
@@ -168,16 +168,16 @@ AGING_INDUCTION = Effect(
 
 
 def aging_delay_shape(inputs, *, A, t_i, b):
-    r"""Aging that starts late: nothing happens until a day t_i, and Eq. 15 runs from there.
+    r"""Aging with a delay: Eq. 15 starts at a day t_i.
 
-    Antioxidants hold oxidation off until they are spent. The declared law runs from day 0, so what is added is the
-    difference of the two clocks,
+    Antioxidants delay oxidation until they are consumed. The declared law starts at day 0, so the effect is the
+    difference of the two laws,
 
     .. math:: h = A \left[\ln(1 + t / b) - \ln(1 + \max(t - t_i, 0) / b)\right]
 
-    which is zero at day 0 and dies out as :math:`A t_i / t`. Where A is the declared law's a (as a share of mu, for a
-    factor) and b its b, the declared law and the effect together are Eq. 15 with :math:`t - t_i` for t.
-    `aging_induction` is the smooth lag of a batch whose pieces start one after the other.
+    which is zero at day 0 and vanishes as :math:`A t_i / t`. If A is the a of the declared law (relative to mu, for a
+    factor) and b its b, the law with the effect is Eq. 15 with :math:`t - t_i` for t. `aging_induction` is a smooth
+    delay.
     """
     days = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0)
     return A * (np.log1p(days / b) - np.log1p(np.maximum(days - t_i, 0.0) / b))
@@ -207,9 +207,9 @@ AGING_DELAY = Effect(
 def stribeck_speed_aging_shape(inputs, *, A, t_0):
     r"""Stribeck speed that changes with age: the declared model has one v_s for all days of a series.
 
-    v_s marks where a film or a molecular time scale takes over from boundary friction. Hardening rubber carries less of
-    its roughness flat and relaxes more slowly, so v_s moves with age; like the coefficients it is given the logarithm
-    of time,
+    v_s is the speed of the transition from boundary friction to a film or a molecular time scale. Hardened rubber
+    conforms less to roughness and relaxes more slowly, which changes v_s. As for the coefficients, the change is a
+    logarithm of time,
 
     .. math:: h = A \ln(1 + t / t_0)
 
@@ -248,8 +248,8 @@ STRIBECK_SPEED_AGING = Effect(
 def viscosity_aging_shape(inputs, *, A, t_0):
     r"""Viscous coefficient that changes with age: the declared model has one sigma_2 for all days of a series.
 
-    What is left of the lubricant, and the rubber's own damping, change as it ages. Like the coefficients, sigma_2 is
-    given the logarithm of time,
+    The remaining lubricant and the damping of the rubber change with age. As for the coefficients, the change is a
+    logarithm of time,
 
     .. math:: h = A \ln(1 + t / t_0)
 

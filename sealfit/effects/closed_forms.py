@@ -1,4 +1,4 @@
-"""Closed forms in any channel: what a residual follows where no mechanism is known."""
+"""Closed forms in any channel, for a residual without a known mechanism."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sealfit.effects.contract import (
     positive,
     reference,
 )
-from sealfit.effects.free import left_of_wave
+from sealfit.effects.free import sine_attenuation
 
 # A closed form is of any one channel, acts anywhere and names no mechanism, unless it says otherwise.
 closed_form = partial(Effect, reads=(CHANNEL,), acts_on=ANYWHERE, physical=False)
@@ -46,10 +46,10 @@ LINEAR = closed_form(
 
 
 def linear_each_way_shape(inputs, *, A_f, A_b):
-    r"""Straight line in any channel with a slope of its own in each direction: what grows in one direction only.
+    r"""Straight line in any channel with a separate slope in each direction.
 
-    A lip that turns over or wears on one side changes the friction one way and leaves the other. A slope whose interval
-    holds zero is the direction in which nothing changes.
+    A lip that turns over or wears on one side changes the friction in one direction only. The interval of the slope in
+    the other direction then contains 0.
     """
     return np.where(np.asarray(inputs["direction"]) > 0, A_f, A_b) * deviation(inputs, CHANNEL)
 
@@ -113,16 +113,16 @@ LOG = closed_form(
     reference="{x} = {x_ref}",
     parameters=(Parameter("A", "{y}", 0.05, AMPLITUDE, "change per factor e of the channel", linear=True),),
     shape=log_shape,
-    source="Form: ours. The dependence that is alike in every decade.",
+    source="Form: ours. The dependence that is the same in every decade.",
     # By hand: ten times the reference, ln 10 = 2.302585092994046.
     worked=({"x": 30.0, "x_ref": 3.0}, {"A": 0.5}, 0.5 * 2.302585092994046),
 )
 
 
 def log_growth_shape(inputs, *, A, x_0):
-    r"""Logarithm of any channel that starts at 0: first in proportion, then alike in every decade.
+    r"""Logarithm of any channel that starts at 0: linear at first, then the same change in every decade.
 
-    The law of Eq. 15 for channels that have a zero, such as time; NaN where the channel is negative.
+    It has the form of Eq. 15, for channels with a zero, such as time; NaN where the channel is negative.
     """
     return A * np.log1p(not_negative(inputs[CHANNEL]) / x_0)
 
@@ -190,7 +190,7 @@ EXPONENTIAL_APPROACH = closed_form(
         Parameter("tau", "{x}", 1.0, (1e-6, 1e9), "scale of the approach", search="span"),
     ),
     shape=exponential_approach_shape,
-    source="Form: ours. What decays in proportion to what is left.",
+    source="Form: ours. Relaxation at a rate proportional to the remaining difference.",
     # By hand: x = tau, 1 - 1/e = 0.6321205588285577.
     worked=({"x": 3.0, "x_ref": 1.0}, {"A": 2.0, "tau": 3.0}, 2.0 * 0.6321205588285577),
 )
@@ -199,8 +199,8 @@ EXPONENTIAL_APPROACH = closed_form(
 def saturation_shape(inputs, *, A, x_half):
     r"""Saturation by a hyperbola, from 0, in any channel that is not negative.
 
-    Slower than an exponential to reach its limit: half at x_half, nine tenths at nine times that. NaN where the channel
-    is negative.
+    It approaches its limit more slowly than an exponential: half at x_half, nine tenths at nine times that. NaN where
+    the channel is negative.
     """
     x = not_negative(inputs[CHANNEL])
     return A * x / (x + x_half)
@@ -226,13 +226,11 @@ SATURATION = closed_form(
 def hyperbolic_shape(inputs, *, A, x_half):
     r"""Hyperbolic decay from A to 0, in any channel that is not negative.
 
-    What is off at the start and settles slowly: half is left at x_half, a tenth at nine times that. NaN where the
-    channel is negative.
+    It falls to a half at x_half and to a tenth at nine times that. NaN where the channel is negative.
 
-    It is a constant less `saturation`. Every coefficient, every parameter and the whole friction force hold a free
-    constant of their own, so on them the two are one form, and `saturation` has it. A force that is added has none: one
-    that starts off by A and settles at zero is this form alone, and a zero offset and a saturation otherwise. Hence it
-    acts there only. The hyperbola without a start, A (x_ref / x - 1), is `power` with n = -1.
+    It equals a constant minus `saturation`. Coefficients, parameters and the friction force have a free constant in the
+    declared model, so that the two forms are equivalent on them, and `saturation` is used. An added force has no free
+    constant; this form acts only there. The hyperbola A (x_ref / x - 1) is `power` with n = -1.
     """
     return A / (1 + not_negative(inputs[CHANNEL]) / x_half)
 
@@ -246,11 +244,11 @@ HYPERBOLIC = closed_form(
     acts_on=(("force", "add"),),
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "size at 0", linear=True),
-        Parameter("x_half", "{x}", 1.0, (1e-6, 1e9), "where half of it is left", search="span"),
+        Parameter("x_half", "{x}", 1.0, (1e-6, 1e9), "where it has fallen to one half", search="span"),
     ),
     shape=hyperbolic_shape,
-    source="Form: ours. What decays in proportion to the square of what is left.",
-    # By hand: x = 3 x_half leaves a quarter of 2.
+    source="Form: ours. Decay at a rate proportional to the square of the value.",
+    # By hand: x = 3 x_half gives a quarter of 2.
     worked=({"x": 6.0, "x_ref": 1.0}, {"A": 2.0, "x_half": 2.0}, 0.5),
 )
 
@@ -307,12 +305,12 @@ BUMP = closed_form(
 
 
 def sinusoid_shape(inputs, *, A, lambda_, phi):
-    r"""Sine of any channel: along time it is what the mains, a servo or a pump adds.
+    r"""Sine of any channel; along time it may be due to the mains, a servo or a pump.
 
-    Along position the same form is a ripple, which has a mechanism and a file of its own.
+    Along the position the same form is the physical effect `ripple`.
     """
     angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_ + phi
-    return A * np.sin(angle) * left_of_wave(inputs, CHANNEL, lambda_)
+    return A * np.sin(angle) * sine_attenuation(inputs, CHANNEL, lambda_)
 
 
 SINUSOID = closed_form(
@@ -335,18 +333,19 @@ SINUSOID = closed_form(
 )
 
 
-TURN = 4 * np.pi  # two turns either way: a phase may pass its end
+# Bounds of a phase in rad: two turns in each direction, so that a search can pass a full turn.
+TURN = 4 * np.pi
 
 
 def sinusoid_harmonics_shape(inputs, *, A, B, lambda_, phi, phi_2):
-    r"""Sine of any channel with its second harmonic: what repeats in each period but is no pure sine.
+    r"""Sine of any channel with its second harmonic.
 
-    A shaft that is bent and joined askew, or a motor's torque with its pole pairs, gives once and twice per turn. The
-    loop finds harmonics one at a time, as a ripple or a sine each with a period of its own, and does not try this form;
-    it is for simulated campaigns and for effects of one's own.
+    A bent and misaligned shaft, or the torque of a motor with its pole pairs, has components once and twice per turn.
+    The loop does not try this form, as it finds harmonics one at a time, each a ripple or sine with its own period. It
+    is for simulated campaigns and effects of users.
     """
     angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_
-    once, twice = (left_of_wave(inputs, CHANNEL, lambda_ / k) for k in (1, 2))
+    once, twice = (sine_attenuation(inputs, CHANNEL, lambda_ / k) for k in (1, 2))
     return A * np.sin(angle + phi) * once + B * np.sin(2 * angle + phi_2) * twice
 
 

@@ -1,7 +1,7 @@
-"""What an effect declares, and the one pure function it holds.
+"""The description of an effect, and its shape as one pure function.
 
-An effect is data plus a function: the search, the fit, the tables, the plots and the report read the description, so a
-new effect is one definition in the file of its family. The users' own effects follow the same contract.
+The search, the fit, the tables, the plots and the report read the description, so that a new effect is one definition
+in the file of its family. Effects of users follow the same contract.
 """
 
 from __future__ import annotations
@@ -14,21 +14,20 @@ import numpy as np
 
 from sealfit.errors import ParameterError
 
+# Stands for any numeric channel in `Effect.reads`; its values are `inputs["x"]` of the shape.
 CHANNEL = "x"
-"""In `Effect.reads`: any one numeric channel; `shape` finds it in `inputs["x"]`."""
-
+# Stands for any second channel in `Effect.reads`, after CHANNEL.
 SECOND = "z"
-"""In `Effect.reads` after CHANNEL: any second channel, for the effects of a pair."""
-
+# Allowed values of `Effect.reads` with CHANNEL.
 READS_ANY = ((CHANNEL,), (CHANNEL, "direction"), (CHANNEL, SECOND))
-"""What `Effect.reads` may be where it holds CHANNEL."""
-
+# Bounds of an amplitude with units. They are far beyond the numbers of any rig.
 AMPLITUDE = (-1e9, 1e9)
-"""Bounds of an amplitude that carries units: a free sign, and no size that a rig's numbers could reach."""
 
 Target = Literal["force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b"]
 Operation = Literal["add", "multiply"]
 TARGETS = ("force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b")
+
+# Targets of a closed form or free shape, most likely first.
 ANYWHERE: tuple[tuple[Target, Operation], ...] = (
     ("mu", "multiply"),
     ("force", "add"),
@@ -45,21 +44,20 @@ ANYWHERE: tuple[tuple[Target, Operation], ...] = (
     ("mu_s", "add"),
     ("mu_c", "add"),
 )
-"""Where a closed or free form of a channel may act, likeliest first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
     """One parameter of an effect.
 
-    In `unit`, `{x}` and `{z}` stand for the units of the channels read and `{y}` for that of what the effect gives: the
-    force's unit for a force that is added, none for a factor, the parameter's own unit for the change of a parameter;
-    `fill_unit` puts them in. A name that is a word of Python carries an underscore; `symbol` is what people read.
+    In `unit`, `{x}` and `{z}` stand for the units of the channels and `{y}` for that of the result: the unit of force
+    for an added force, none for a factor, that of the parameter for a change of it; see `fill_unit`. A name that is a
+    Python keyword ends in an underscore; `symbol` is the printed name.
 
-    `linear` marks an amplitude: the shape is proportional to it, or to the vector of all linear ones. `search` says
-    where to look for one that is not linear: numbers, or "inside" (quantiles of the channel), "between" (halfway from
-    one of its values to the next, for a jump), "span" (logarithmic, from a fraction of the channel's span to a few
-    spans), "ratio" (logarithmic, over the channel's own magnitudes).
+    `linear` marks an amplitude: the shape is linear in the vector of amplitudes. `search` gives the grid of a nonlinear
+    parameter: numbers, or "inside" (quantiles of the channel), "between" (midpoints of its neighbouring values, for a
+    jump), "span" (logarithmic, from a fraction of the channel's range to a few ranges), "ratio" (logarithmic, over the
+    magnitudes of the channel).
     """
 
     name: str
@@ -79,7 +77,7 @@ class Parameter:
 
     @property
     def symbol(self) -> str:
-        """Return the name as equations and tables print it: `lambda` for `lambda_`."""
+        """Name in equations and tables: `lambda` for `lambda_`."""
         return self.name.rstrip("_")
 
 
@@ -87,32 +85,30 @@ class Parameter:
 class Effect:
     """One physical effect, or one closed form of any channel.
 
-    `shape(inputs, **values)` is a pure function of arrays: `inputs` maps each name in `reads` to an array, shape (n,),
-    and it returns the added force, the factor minus one, or the change of the parameter, shape (n,). It is zero where
-    all amplitudes are zero, and NaN (without a warning) where the form says nothing, such as the logarithm of zero.
+    `shape(inputs, **values)` is a pure function. `inputs` maps each name in `reads` to an array, shape (n,), and
+    `<name>_ref` to a fixed reference of the channel, its mean over the campaign, which a shape gets by `reference`. The
+    shape is the added force, the factor minus one, or the change of the parameter, shape (n,). It is zero if all
+    amplitudes are zero, and NaN (without a warning) where the form is not defined, such as the logarithm of zero.
 
-    `reference` is the state in which the shape is zero, in words: there the after-model's mu_0, a and b hold. `{x}`,
+    `reference` describes the state in which the shape is zero; mu_0, a and b of the after-model refer to it. `{x}`,
     `{z}` and `{load_N}` stand for channels, `{x_ref}` and the like for fixed reference values, `{x_0}` for a parameter.
-
-    `inputs` also holds `<name>_ref`, a fixed reference per channel (its mean over the campaign), so `x_ref` for
-    CHANNEL. A shape asks for it by `reference`.
     """
 
     id: str
-    label: str  # in words; {x} stands for the channel
+    label: str  # name in reports; {x} stands for the channel
     equation: str  # LaTeX
     form: str  # the same in plain text, as closure.json prints it
     reads: tuple[str, ...]
-    acts_on: tuple[tuple[Target, Operation], ...]  # the pairs it may take, likeliest first
+    acts_on: tuple[tuple[Target, Operation], ...]  # allowed pairs, most likely first
     parameters: tuple[Parameter, ...]
     shape: Callable[..., np.ndarray]
     source: str
-    worked: tuple[Mapping[str, float], Mapping[str, float], float]  # inputs, values, result: by hand
+    worked: tuple[Mapping[str, float], Mapping[str, float], float]  # inputs, values and result of a check by hand
     physical: bool = True  # false for a closed form that names no mechanism
-    reference: str = ""  # where the shape is zero, in words
-    periodic: bool = False  # sought in the spectrum; its mean over a bin is known
-    narrow: bool = False  # may be as fine as a bin, over which its mean is computed at many places
-    along_calendar: bool = True  # false for a form that follows whatever was tested when
+    reference: str = ""  # state in which the shape is zero
+    periodic: bool = False  # searched in the spectrum; its mean over a bin has a closed form
+    narrow: bool = False  # may be as narrow as a bin; its mean over a bin needs more quadrature nodes
+    along_calendar: bool = True  # false for a form that can imitate any order of tests
 
     def __post_init__(self) -> None:
         for target, operation in self.acts_on:
@@ -128,7 +124,7 @@ class Effect:
 
     @property
     def nonlinear(self) -> tuple[Parameter, ...]:
-        """Parameters that are searched for."""
+        """Nonlinear parameters, which are searched on a grid."""
         return tuple(p for p in self.parameters if not p.linear)
 
     def start(self) -> dict[str, float]:
@@ -137,22 +133,22 @@ class Effect:
 
 
 def reference(inputs: Mapping[str, object], name: str, default: float) -> float:
-    """Return the fixed reference value of a channel, or `default` where the caller gives none.
+    """Return the fixed reference value of a channel, or `default` if `inputs` has none.
 
     Parameters
     ----------
     inputs : mapping
-        What the shape was given.
+        Inputs of the shape.
     name : str
         Channel as in `Effect.reads`.
     default : float
-        1 where the channel is divided by it (one unit of the channel), 0 where it is subtracted.
+        1 for a reference that divides the channel, 0 for one that is subtracted.
     """
     return float(inputs.get(f"{name}_ref", default))
 
 
 def positive(values) -> np.ndarray:
-    """Return `values` where they are positive and NaN elsewhere: there a form of their logarithm or power says nothing.
+    """Return `values`, with NaN for those that are not positive, as their logarithm or power is not defined.
 
     Examples
     --------
@@ -164,7 +160,7 @@ def positive(values) -> np.ndarray:
 
 
 def not_negative(values) -> np.ndarray:
-    """Return `values` where they are not negative and NaN elsewhere: there a form that starts at 0 says nothing.
+    """Return `values`, with NaN for negative ones, for forms that start at 0.
 
     Examples
     --------
@@ -176,7 +172,7 @@ def not_negative(values) -> np.ndarray:
 
 
 def deviation(inputs: Mapping[str, object], name: str) -> np.ndarray:
-    """Return a channel less its reference value, shape (n,)."""
+    """Return a channel minus its reference value, shape (n,)."""
     return np.asarray(inputs[name], dtype=float) - reference(inputs, name, 0.0)
 
 
@@ -191,14 +187,14 @@ def log_ratio_from_zero(inputs: Mapping[str, object], name: str) -> np.ndarray:
 
 
 def fill_unit(unit: str, x: str, y: str, z: str = "") -> str:
-    """Return a parameter's unit with those of the channels and of what the effect gives put in.
+    """Return a parameter's unit with the units of the channels and of the effect's result inserted.
 
     Parameters
     ----------
     unit : str
         `Parameter.unit`.
     x, y, z : str
-        Unit of the channel, of what the effect gives, and of the second channel; empty for none.
+        Units of the channel, of the result, and of the second channel; empty for none.
 
     Examples
     --------

@@ -11,31 +11,32 @@ from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effec
 from sealfit.errors import ParameterError
 
 # ---------------------------------------------------------------- averaged
-# What is left of a wave in the mean over the samples of a bin.
+# The factor by which averaging over the samples of a bin reduces a sine.
 #
 # .. math:: \frac{1}{n} \sum_k \sin(\alpha + \beta_k)
 #           = \frac{\sin(\pi w / \lambda)}{n \sin(\pi w / (n \lambda))} \sin \alpha
 #
-# for n samples that lie evenly over a width w about the phase alpha (the Dirichlet kernel): in a bin that is longer
-# than the wave hardly anything, however long it is.
+# for n samples spread evenly over a width w about the phase alpha (the Dirichlet kernel). It is small in bins that are
+# longer than the wavelength.
 
-SAMPLES = "samples"  # in an effect's inputs: how many a row is the mean of
+# Key of the inputs of an effect: number of samples in each row's mean.
+SAMPLES = "samples"
 
 
 def width_of(name: str) -> str:
-    """Return where an effect's inputs hold how far a channel goes within each row."""
+    """Return the key of the inputs of an effect with the width of each row's bin in a channel."""
     return f"{name} width"
 
 
-def left_of_wave(inputs: Mapping, name: str, wavelength: float):
-    """Return the factor by which a wave is smaller in each row's mean, shape (n,); 1 where a row is one place.
+def sine_attenuation(inputs: Mapping, name: str, wavelength: float):
+    """Return the factor by which averaging reduces a sine in each row, shape (n,); 1 if the rows are not means.
 
     Examples
     --------
     Two samples half a wave apart cancel; many over a whole wave, too.
 
     >>> given = {"x width": np.array([1.0, 2.0, 0.5]), "samples": np.array([2.0, 2.0, 1.0])}
-    >>> [round(float(f), 12) for f in left_of_wave(given, "x", 1.0)]
+    >>> [round(float(f), 12) for f in sine_attenuation(given, "x", 1.0)]
     [0.0, -1.0, 1.0]
     """
     width = inputs.get(width_of(name))
@@ -43,21 +44,22 @@ def left_of_wave(inputs: Mapping, name: str, wavelength: float):
         return 1.0
     half, samples = np.pi * np.asarray(width, float) / wavelength, np.asarray(inputs[SAMPLES], float)
     each = np.sin(half / samples)
-    alike = np.abs(each) < 1e-9  # samples whole waves apart all show the same
-    return np.where(alike, np.cos(half) * np.cos(half / samples), np.sin(half) / np.where(alike, 1.0, samples * each))
+    equal = np.abs(each) < 1e-9  # samples whole wavelengths apart have equal values
+    return np.where(equal, np.cos(half) * np.cos(half / samples), np.sin(half) / np.where(equal, 1.0, samples * each))
 
 
 # ---------------------------------------------------------------- categories
-# Free shapes of a category: a level for each, or a straight line in another channel for each.
+# Free shapes of a categorical channel: one level per category, or one straight line in another channel per category.
 #
 # .. math:: h = \sum_k d_k [x = k], \qquad h = \sum_k e_k [z = k] (x - x_{ref})
 #
-# Like the others (`sealfit.effects.free`) they name no mechanism. Levels are counted from their mean over the campaign
-# where that is given: a constant that came in with them would stand for friction.
+# They name no mechanism. If the mean of levels over the campaign is given it is subtracted, as the declared model has a
+# constant already.
 
 LEVELS, SLOPES = "levels", "slopes"
 LESS_MEAN = "; less its mean over the campaign"
-MEAN_OF_CAMPAIGN = "mean over {x} in the campaign"  # the reference of a shape less its mean
+# Reference of a shape minus its mean.
+MEAN_OF_CAMPAIGN = "mean over {x} in the campaign"
 
 
 def levels_effect(categories: Sequence[str], means: Sequence[float] | None = None) -> Effect:
@@ -175,29 +177,31 @@ def _slopes(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
 
 
 def shares(means: Sequence[float] | None, count: int) -> tuple[float, ...]:
-    """Return what is taken off a shape, by its amplitudes: their `means` over the campaign, or nothing."""
+    """Return the means to subtract from the functions of a shape: `means` over the campaign, or zeros."""
     return (0.0,) * count if means is None else tuple(float(m) for m in means)
 
 
 def listed(values: Sequence[object]) -> str:
-    """Return values in words."""
+    """Return values as a comma-separated list."""
     return ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in values)
 
 
 # ---------------------------------------------------------------- free
-# Free shapes, whose size the data decide: a smooth curve of a channel, a surface of two.
+# Free shapes, with a number of parameters that depends on the data: a smooth curve of a channel, a surface of two.
 #
-# They name no mechanism. All are rebuilt from plain data by `free_effect`, so a model file holds them whole.
+# They name no mechanism. `free_effect` builds them from plain values, which is the form in model files.
 #
 # .. math:: h = \sum_j c_j B_j(x)
 #
-# B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the knot of reference has none. Beyond the
-# outer knots the shape keeps its last value: nothing was measured there. It is counted from its mean over the campaign
-# where that is given: a constant that came in with it would stand for friction, and what scales friction would miss it.
+# B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the reference knot has none. Beyond the
+# outer knots the shape is constant, as nothing was measured there. If its mean over the campaign is given it is
+# subtracted, as the declared model has a constant already.
 
 SMOOTH, SURFACE = "smooth", "surface"
-WIDE = 20.0  # a positive channel that spans this factor is looked at on a logarithmic scale
-BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))  # powers of the two scaled channels in a free surface
+# A positive channel with at least this ratio of its largest to its smallest value is transformed by the logarithm.
+WIDE = 20.0
+# Powers of the two scaled channels in the terms of a free surface.
+BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))
 
 
 def smooth_effect(
@@ -210,8 +214,7 @@ def smooth_effect(
     knots : sequence of float
         At least two different channel values, in rising order.
     reference : float, optional
-        The shape is zero at the knot nearest to it; default: the first knot. That knot has no amplitude: a common level
-        belongs to the declared model.
+        The shape is zero at the nearest knot, which has no amplitude; default the first knot.
     means : sequence of float, optional
         Mean of each B_j over the campaign, for a shape whose mean is zero.
 
@@ -276,7 +279,7 @@ def _spline(places: tuple[float, ...], zero: int, means: tuple[float, ...], inpu
 @lru_cache(maxsize=64)
 def _cardinal(places: tuple[float, ...]):
     """Return the cardinal splines of these knots."""
-    from scipy.interpolate import CubicSpline  # here, so that the catalogue can be listed without scipy
+    from scipy.interpolate import CubicSpline  # a slow import that listing the effects does not need
 
     return CubicSpline(places, np.eye(len(places)), bc_type="natural")
 
@@ -288,19 +291,19 @@ def natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def roughness(places: tuple[float, ...], reference: float | None = None) -> np.ndarray:
-    r"""Return S with :math:`c^T S c = \int h''^2` of the spline through c at the knots, each scaled to a range of 1.
+    r"""Return S with :math:`c^T S c = \int h''^2` of the spline through c at the knots, scaled to a range of 1.
 
     Parameters
     ----------
     places : tuple of float
-        Knots; where they are positive and span a factor of 20, h'' is that in their logarithm.
+        Knots. If they are positive with a ratio of `WIDE` or more, derivatives are with respect to their logarithm.
     reference : float, optional
-        As for `smooth_effect`: its knot has no amplitude.
+        As in `smooth_effect`: its knot has no amplitude.
 
     Returns
     -------
     ndarray, shape (knots - 1, knots - 1)
-        Its null space is the straight line. A straight line in the logarithm, where that is meant.
+        Its null space are straight lines in the channel, or in its logarithm.
     """
     x = np.log(places) if places[0] > 0 and places[-1] / places[0] >= WIDE else np.array(places)
     bend = _cardinal(tuple(((x - x[0]) / (x[-1] - x[0])).tolist())).derivative(2)
@@ -313,18 +316,18 @@ def roughness(places: tuple[float, ...], reference: float | None = None) -> np.n
 
 
 def _nearest(places: Sequence[float], reference: float | None) -> int:
-    """Return the number of the knot of reference."""
+    """Return the number of the reference knot."""
     return 0 if reference is None else int(np.argmin(np.abs(np.array(places) - reference)))
 
 
 def surface_effect(x_knots: Sequence[float], z_knots: Sequence[float]) -> Effect:
-    """Return a free surface of two channels: the mixed terms of a polynomial, zero where either is in its middle.
+    """Return a free surface of two channels: the mixed terms of a polynomial, zero if either is at its middle.
 
     Parameters
     ----------
     x_knots, z_knots : sequence of float
-        Rising values of each channel that are mapped evenly to -1 to 1, straight in between and flat beyond: usual
-        values lie evenly then, whether the channel was set in steps or in decades.
+        Rising values of each channel that are mapped to even steps from -1 to 1, linear in between and constant beyond.
+        Tested values are then about evenly spaced, for channels set in steps as well as in decades.
 
     Returns
     -------
@@ -388,7 +391,7 @@ FREE: Mapping[str, tuple[Callable[..., Effect], tuple[str, ...]]] = {
 
 
 def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
-    """Return the free shape that `fixed` describes, as it stands in a model file.
+    """Return the free shape with the fixed values of a model file.
 
     Parameters
     ----------
@@ -396,12 +399,12 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
         `smooth`, `levels`, `surface` or `slopes`.
     fixed : mapping
         `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `means`, if any, for smooth
-        and levels; `x_knots` and `z_knots` for a surface. Other entries are not looked at.
+        and levels; `x_knots` and `z_knots` for a surface. Other entries are ignored.
 
     Raises
     ------
     ParameterError
-        If the id is another one, or an entry is missing or not usable.
+        If the id is unknown, or an entry is missing or invalid.
 
     Examples
     --------

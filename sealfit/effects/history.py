@@ -1,4 +1,4 @@
-"""What a contact has been through: conditioning, running-in and rest."""
+"""Effects of the history of a contact: conditioning, running-in and rest."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ def conditioning_shape(inputs, *, A, n_0):
 
     .. math:: h = A (1 - e^{-(n - 1) / n_0})
 
-    with n the repeat. A is the relative change once conditioned. The approach to a limit is chosen before a logarithm,
-    which would go on for ever, because conditioning ends; with three repeats the data can hardly tell, and `log` is in
-    the list.
+    with n the repeat. A is the relative change after conditioning. The exponential has a limit, as conditioning ends,
+    unlike a logarithm (`log`); three repeats hardly distinguish the two.
     """
     before = np.maximum(np.asarray(inputs["repeat"], dtype=float) - 1, 0.0)
     return -A * np.expm1(-before / n_0)
@@ -52,8 +51,8 @@ def run_in_shape(inputs, *, A, n_0):
 
     .. math:: h = A (1 - e^{-(n - 1) / n_0})
 
-    with n the stroke in its file. A is the relative change once run in. It starts anew in every file: what lasts from
-    file to file is a drift along the campaign, and what lasts from repeat to repeat is conditioning.
+    with n the stroke in its file. A is the relative change after run-in. It restarts in every file; a change that lasts
+    from file to file is a drift along the campaign, and one from repeat to repeat is conditioning.
     """
     before = np.maximum(np.asarray(inputs["stroke"], dtype=float) - 1, 0.0)
     return -A * np.expm1(-before / n_0)
@@ -82,14 +81,14 @@ RUN_IN = Effect(
 
 
 def rest_strengthening_shape(inputs, *, A, t_0):
-    r"""Strengthening at rest: the longer a contact has stood still, the higher its static friction.
+    r"""Strengthening at rest: static friction grows with the time of stationary contact.
 
-    Contacts creep and bonds form while the sample stands: the static coefficient grows with the logarithm of the rest,
+    Contacts creep and bonds form during rest: the static coefficient grows with the logarithm of the time at rest,
 
     .. math:: h = A \ln(1 + t / t_0)
 
-    A is the relative growth per factor e of the rest, some 0.01 to 0.05 for most solids; t_0 is the rest below which
-    nothing shows. Only where the campaign holds a column `rest_s`.
+    A is the relative growth per factor e of the time at rest, 0.01 to 0.05 for most solids; t_0 is the time at which
+    growth sets in. It needs a column `rest_s`.
     """
     return A * np.log1p(not_negative(inputs["rest_s"]) / t_0)
 

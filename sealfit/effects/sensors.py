@@ -1,26 +1,24 @@
-"""What the force sensor and the set-up add: offsets, drift and a wave along the track."""
+"""Effects of the force sensor and the set-up: offsets, drift and a ripple along the track."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from sealfit.effects.contract import AMPLITUDE, CHANNEL, Effect, Parameter, deviation
-from sealfit.effects.free import left_of_wave
+from sealfit.effects.free import sine_attenuation
 
 
 def ripple_shape(inputs, *, A, lambda_, phi):
-    r"""Ripple along the rig's position: what a screw, a guide or a worn spot adds once per turn.
+    r"""Ripple along the rig's position, due to a screw, a guide or a periodic track.
 
-    A lead screw with a pitch error, a bent shaft or an eccentric coupling pushes once per turn, so the force is
-    periodic in the rig's own coordinate, with the pitch (or a whole fraction of it, for a screw of several starts) as
-    wavelength. The push is an added force, the same both ways, when the drive strains the sensor; it follows the
-    friction when the contact's pressure or surface repeats along the track. A harmonic is a further ripple of half or a
-    third of the wavelength.
-
-    The wavelength holds within the run that it was fitted to; positions beyond it are extrapolated in phase.
+    A lead screw with a pitch error, a bent shaft or an eccentric coupling gives a force that is periodic in the rig's
+    coordinate. The wavelength is the pitch, or an integer fraction of it for a screw of several starts. It is an added
+    force, the same in both directions, if the drive strains the sensor, and a factor on friction if the pressure or the
+    surface of the contact is periodic along the track. A harmonic is a further ripple of half or a third of the
+    wavelength. Positions beyond the tested ones are extrapolated in phase.
     """
     angle = 2 * np.pi * np.asarray(inputs["displacement_mm"], dtype=float) / lambda_ + phi
-    return A * np.sin(angle) * left_of_wave(inputs, "displacement_mm", lambda_)
+    return A * np.sin(angle) * sine_attenuation(inputs, "displacement_mm", lambda_)
 
 
 RIPPLE = Effect(
@@ -51,9 +49,8 @@ RIPPLE = Effect(
 def drift_shape(inputs, *, A):
     r"""Drift of the force channel along a record: a strain-gauge bridge or its amplifier warming up.
 
-    A is the rate. The force is added as it stands, with no regard to the direction of motion: an instrument does not
-    know which way the sample slides. Time is the file's own clock, so the drift starts anew with every file that is
-    zeroed.
+    A is the rate. The added force does not depend on the direction of motion. Time is that of the file, so that the
+    drift restarts with every file.
     """
     return A * np.asarray(inputs["time_s"], dtype=float)
 
@@ -75,11 +72,10 @@ DRIFT = Effect(
 
 
 def zero_offset_shape(inputs, *, A):
-    r"""Zero offset of the force channel: a constant added force, the same both ways.
+    r"""Zero offset of the force channel: a constant added force, the same in both directions.
 
-    Seen as the half-sum of forward and backward force; with one direction only it cannot be told from friction that
-    does not depend on speed. It reads the direction because only that tells it from mu. Below the sensor's accuracy it
-    says nothing.
+    It is the half-sum of forward and backward force. Strokes in one direction do not distinguish it from friction that
+    is independent of speed, so that it reads the direction. An offset within the sensor's accuracy is not significant.
     """
     return A * np.ones_like(np.asarray(inputs["direction"], dtype=float))
 
@@ -95,17 +91,17 @@ ZERO_OFFSET = Effect(
     parameters=(Parameter("A", "{y}", 0.1, AMPLITUDE, "force shown when none acts", linear=True),),
     shape=zero_offset_shape,
     source="Form: ours. Definition of a zero offset.",
-    # By hand: the offset itself, whichever way the sample moves.
+    # By hand: the offset itself, in both directions.
     worked=({"direction": -1.0}, {"A": 0.3}, 0.3),
 )
 
 
 def offset_slope_shape(inputs, *, A, B):
-    r"""Zero offset of the force that changes with a channel, the same both ways.
+    r"""Zero offset of the force that changes with a channel, the same in both directions.
 
-    The force on a piston is the pressure times its area, so an area that is wrong by dA leaves dA p in what is taken
-    for friction: A is then the error of the area, and B that error times the reference pressure. An amplifier whose
-    zero moves with the temperature of the room does the same.
+    The force on a piston is pressure times area, so that an error dA of the area adds dA p to the measured friction. A
+    is then the error of the area, and B that error times the reference pressure. Another cause is an amplifier whose
+    zero depends on the room temperature.
     """
     return A * deviation(inputs, CHANNEL) + B
 
@@ -124,21 +120,21 @@ OFFSET_SLOPE = Effect(
     ),
     shape=offset_slope_shape,
     source="Form: ours. Force on a piston, F = p A, and definition of a zero offset.",
-    # By hand: 0.5 * (7 - 3) - 1.5, whichever way.
+    # By hand: 0.5 * (7 - 3) - 1.5, in both directions.
     worked=({"x": 7.0, "x_ref": 3.0, "direction": -1.0}, {"A": 0.5, "B": -1.5}, 0.5),
     physical=False,
 )
 
 
 def asymmetry_shape(inputs, *, A):
-    r"""Direction asymmetry: a parameter that is larger one way than the other.
+    r"""Direction asymmetry: a parameter that differs between the two directions.
 
-    A lip seal, a sample glued askew or a polished track rubs differently forward and back. With d = +1 or -1,
+    Friction of a lip seal, a misaligned sample or a polished track depends on the direction. With d = +1 or -1,
 
     .. math:: h = A d / 2
 
-    so that A is the forward value minus the backward one, relative to (or, for a change that is added, in the unit of)
-    the mean of both, and the mean keeps its meaning.
+    A is the forward value minus the backward one, relative to their mean, or in its unit for an added change. The mean
+    of the two directions does not change.
     """
     return A * np.asarray(inputs["direction"], dtype=float) / 2
 
@@ -171,15 +167,15 @@ ASYMMETRY = Effect(
 
 
 def campaign_drift_shape(inputs, *, A):
-    r"""Drift along the campaign: everything that changes a little from day to day of testing.
+    r"""Drift along the campaign: a slow change over the days of testing.
 
     A track that polishes, a sensor that ages, rubber that goes on aging in the laboratory's air:
 
     .. math:: h = A t
 
-    with t the time since the campaign's first file. A is the change per time: of friction, relative, or of the zero.
-    Along the order of runs instead of the clock it is `linear` in `run_order`. Where tests follow the calendar of aging
-    it cannot be told from the aging law.
+    with t the time since the campaign's first file. A is the change per time, relative for friction, in N for the zero.
+    A drift along the order of runs is `linear` in `run_order`. If tests follow the calendar of aging it is not
+    distinguishable from the aging law.
     """
     return A * np.asarray(inputs["elapsed_h"], dtype=float)
 

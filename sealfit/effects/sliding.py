@@ -15,12 +15,11 @@ def load_exponent_shape(inputs, *, A):
 
     .. math:: h = A \ln(N / N_{ref}), \qquad A \approx n - 1
 
-    which is what is fitted: an amplitude then has an exact, linear place in the model. What is left out is
-    :math:`\frac12 A^2 \ln^2(N / N_{ref})`, 0.7 % of friction at A = -1/6 and twice the load; `power` holds the full
-    curve.
+    which is fitted, as A is then a linear parameter. The neglected term is :math:`\frac12 A^2 \ln^2(N / N_{ref})`,
+    0.7 % of friction at A = -1/6 and twice the load; `power` is the full curve.
 
-    Where the local coefficient goes with the local pressure, :math:`\mu(p) \propto p^{n - 1}`, the load still enters by
-    the same exponent, and the pressure distribution by a constant factor that mu takes up.
+    If the local coefficient depends on the local pressure, :math:`\mu(p) \propto p^{n - 1}`, the exponent is the same,
+    and the pressure distribution gives a constant factor on mu.
     """
     return A * np.log(positive(inputs["load_N"]) / reference(inputs, "load_N", 1.0))
 
@@ -45,19 +44,19 @@ LOAD_EXPONENT = Effect(
 def stribeck_exponent_shape(inputs, *, A, v_s, n):
     r"""Stribeck exponent other than 2: friction falls with speed more gradually or more abruptly than declared.
 
-    The declared curve falls from mu_s to mu_c as a Gaussian of the speed. Nothing but custom says so: contacts whose
-    strengths or heights are spread widely let go one after the other, n near 1 or below; a film that takes over all at
-    once makes a cliff, n well above 2. What is added to the declared curve is the difference of the two decays,
+    The declared curve falls from mu_s to mu_c as a Gaussian of the speed, by convention. A wide distribution of contact
+    strengths gives n near 1 or below; the sudden formation of a film gives n well above 2. The effect is the difference
+    of the two decays,
 
     .. math:: h = A [e^{-(|v| / v_s)^n} - e^{-(v / v_s)^2}]
 
-    which is zero at rest, at v_s, far above v_s, and everywhere for n = 2. With A = mu_s - mu_c and the v_s of the
-    declared curve, declared curve and effect together are exactly :math:`\mu_c + (\mu_s - \mu_c) e^{-(|v| / v_s)^n}`.
-    As a factor on mu, A is relative to mu, and the same only as far as mu hardly changes around v_s.
+    which is zero at rest, at v_s, far above v_s, and everywhere for n = 2. With A = mu_s - mu_c and the declared v_s,
+    the curve with the effect is exactly :math:`\mu_c + (\mu_s - \mu_c) e^{-(|v| / v_s)^n}`. As a factor on mu, A is
+    relative to mu, and this is an approximation for small changes of mu around v_s.
 
-    Three numbers here and four of the declared curve need seven speeds in one direction, several on either side of v_s.
-    Near n = 2 the shape is :math:`A (2 - n) r^2 \ln r\, e^{-r^2}` with :math:`r = |v| / v_s`: there only the product
-    A (2 - n) is determined, and A and n apart only well off 2, or with A held to mu_s - mu_c.
+    Three parameters here and four of the declared curve need seven speeds in one direction, several on each side of
+    v_s. Near n = 2 the shape is :math:`A (2 - n) r^2 \ln r\, e^{-r^2}` with :math:`r = |v| / v_s`, so that only the
+    product A (2 - n) is determined.
     """
     ratio = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / v_s
     return A * (np.exp(-(ratio**n)) - np.exp(-(ratio**2)))
@@ -91,12 +90,12 @@ STRIBECK_EXPONENT = Effect(
 def log_rate_shape(inputs, *, A):
     r"""Logarithmic rate dependence: friction that changes by the same amount for every factor of the speed.
 
-    Contacts that break by thermal activation carry a stress that goes with the logarithm of the rate,
+    The stress of contacts that break by thermal activation is proportional to the logarithm of the rate,
 
     .. math:: h = A \ln(|v| / v_{ref})
 
-    A is the relative change per factor e of the speed: positive where breaking bonds decides (strengthening with rate),
-    negative where the age of the contacts does. Steady sliding only; at rest it says nothing.
+    A is the relative change per factor e of the speed: positive if the breaking of bonds dominates (strengthening with
+    rate), negative if the age of the contacts does. It is not defined at rest.
     """
     return A * np.log(positive(np.abs(inputs["speed_mm_s"])) / reference(inputs, "speed_mm_s", 1.0))
 
@@ -120,11 +119,11 @@ LOG_RATE = Effect(
 def power_viscous_shape(inputs, *, A, n):
     r"""Viscous friction by a power of the speed: shear-thinning grease, or a film that thickens with speed.
 
-    A Newtonian film of fixed thickness drags in proportion to speed, which is the declared sigma_2 v. A shear-thinning
-    film drags as :math:`|v|^n` with n < 1; one that the speed itself drags in, as under a hydrodynamic seal lip, grows
-    as the root of the speed and drags with n near 1/2.
+    The drag of a Newtonian film of constant thickness is the declared sigma_2 v. That of a shear-thinning film is
+    proportional to :math:`|v|^n` with n < 1. A hydrodynamic film, as under a seal lip, has a thickness proportional to
+    the root of the speed and n near 1/2.
 
-    A is the force at the reference speed. At n = 1 it is sigma_2 v and cannot be told from it.
+    A is the force at the reference speed. At n = 1 it is not distinguishable from sigma_2 v.
     """
     speed = np.asarray(inputs["speed_mm_s"], dtype=float)
     return A * np.sign(speed) * (np.abs(speed) / reference(inputs, "speed_mm_s", 1.0)) ** n
@@ -153,13 +152,13 @@ POWER_VISCOUS = Effect(
 def grosch_peak_shape(inputs, *, A, v_p, w):
     r"""Viscoelastic peak over log speed (Grosch): rubber friction has a maximum where its loss has one.
 
-    Asperities deform rubber at a rate that goes with the speed, and molecules adhere and let go at another; each gives
-    a bell over the logarithm of the speed, moved along by temperature as WLF says,
+    Deformation by asperities and molecular adhesion dissipate most at different rates. Each gives a bell over the
+    logarithm of the speed, shifted by temperature (WLF),
 
     .. math:: h = A \exp[-(\log_{10}(|v| / v_p) / w)^2]
 
-    A is the height of the bell, relative to the Stribeck curve or as a coefficient of friction that is added to it. A
-    peak beyond the tested speeds is a slope, and its height is not determined.
+    A is the height of the bell, relative to the Stribeck curve or as an added coefficient of friction. The height of a
+    peak beyond the tested speeds is not determined.
     """
     decades = np.log10(positive(np.abs(inputs["speed_mm_s"])) / v_p)
     return A * np.nan_to_num(np.exp(-((decades / w) ** 2)), nan=0.0)
@@ -189,13 +188,13 @@ GROSCH_PEAK = Effect(
 def humidity_shape(inputs, *, A):
     r"""Humidity of the laboratory: a film of water between rubber and track.
 
-    Water that the surfaces take up from the air weakens the adhesion between them and lubricates at speed; over the
-    humidities of a laboratory a straight line is enough,
+    Water from the air weakens adhesion and lubricates at speed. Over the humidities of a laboratory the effect is about
+    linear,
 
     .. math:: h = A (H - H_{ref})
 
-    A is the relative change per per cent of relative humidity. Only where the campaign holds a column `humidity_pct`; a
-    column of another name is found as `linear` in it.
+    A is the relative change per per cent of relative humidity. It needs a column `humidity_pct`; for another name the
+    effect is `linear`.
     """
     return A * (np.asarray(inputs["humidity_pct"], dtype=float) - reference(inputs, "humidity_pct", 0.0))
 

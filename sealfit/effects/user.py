@@ -1,7 +1,7 @@
-"""The users' own effects: Python files in a folder that the command line names (see `store.paths`).
+"""Effects of users: Python files in a folder that the command line names (see `store.paths`).
 
-The one place where Python is run. A file holds one `Effect` (or several) at its top level, as the files beside this one
-do; helpers it imports must be installed. A file whose name starts with an underscore is not read.
+This is the only place where Python of a user is run. A file defines one or more `Effect` at its top level, like the
+modules of this package. Modules it imports must be installed. Files whose name starts with an underscore are not read.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect, Paramet
 from sealfit.effects.free import FREE
 from sealfit.errors import ConfigError, ParameterError
 
-EXAMPLE = "See sealfit/effects/sensors.py for a whole one."
-TOLERANCE = 1e-9  # of a worked value, which a user may have written with ten digits
+EXAMPLE = "See sealfit/effects/sensors.py for an example."
+# Relative tolerance of a worked value, which a user may have written with ten digits.
+TOLERANCE = 1e-9
 
 
 def load_user_effects(folder: Path) -> dict[str, Effect]:
@@ -31,8 +32,8 @@ def load_user_effects(folder: Path) -> dict[str, Effect]:
     Raises
     ------
     ConfigError
-        Naming the file and what to do: if the folder is missing, a file cannot be run or holds no effect, an id exists
-        already or is not a plain name, or an effect breaks the contract (its worked value, its linearity, its shape).
+        With the file and a fix: if the folder is missing, a file cannot be run or defines no effect, an id exists
+        already or is no identifier, or an effect violates the contract (worked value, linearity, shape).
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -52,7 +53,7 @@ def load_user_effects(folder: Path) -> dict[str, Effect]:
 
 @dataclass(frozen=True)
 class FileShape:
-    """The shape of an effect that lives in a user's file: a worker process, which cannot import it, reads it again."""
+    """The shape of an effect in a user's file; a worker process, which cannot import it, reads the file again."""
 
     path: Path
     id: str
@@ -83,18 +84,18 @@ def _effects_of(path: Path) -> list[Effect]:
 
 
 def _run(path: Path) -> ModuleType:
-    # The name holds the place, so that two folders may hold files of one name and worker processes find the module.
+    # The name contains a hash of the path: two folders may have files of one name.
     name = f"sealfit_user_{sha256(str(path.resolve()).encode()).hexdigest()[:12]}_{path.stem}"
     module = ModuleType(name)
     module.__file__ = str(path)
     sys.modules[name] = module
     try:
-        # Not through the import system: that would leave compiled files in the user's folder, and believe old ones.
+        # The import system would write compiled files to the user's folder, and might use old ones.
         exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
-    except ParameterError as error:  # the contract's own words
+    except ParameterError as error:  # raised by the contract
         del sys.modules[name]
         raise ConfigError(str(error), file=path, fix=f"Fix the file. {EXAMPLE}") from error
-    except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to fix
+    except (Exception, SystemExit) as error:  # any error of the user's code
         del sys.modules[name]
         line = _line_in(path, error)
         message = f"cannot be run: {type(error).__name__}: {error}."
@@ -103,7 +104,7 @@ def _run(path: Path) -> ModuleType:
 
 
 def _line_in(path: Path, error: BaseException) -> int | None:
-    """Return the last line of the file that the error came through."""
+    """Return the last line of the file in the error's traceback."""
     if isinstance(error, SyntaxError):
         return error.lineno
     line, trace = None, error.__traceback__
@@ -124,7 +125,7 @@ def _refuse_taken(name: str, found: Mapping[str, Effect], path: Path) -> None:
 
 
 def contract_fault(effect: Effect) -> str:
-    """Return what in an effect breaks the contract, in words; empty if nothing does."""
+    """Return the violation of the contract by an effect as text, empty if there is none."""
     try:
         with np.errstate(all="ignore"):
             return _description_fault(effect) or _shape_fault(effect)

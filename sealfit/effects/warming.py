@@ -8,7 +8,7 @@ from sealfit.effects.contract import AMPLITUDE, Effect, Parameter, reference
 
 
 def warming_time_shape(inputs, *, A, tau):
-    r"""Warming by sliding, seen along time: friction falls as the contact warms, and settles.
+    r"""Warming by sliding, along time: friction falls as the contact warms, and approaches a limit.
 
     A body of heat capacity C that loses heat by conductance G, heated by the power P of friction, warms as
     :math:`\Delta T = (P / G)(1 - e^{-t / \tau})` with :math:`\tau = C / G`. Rubber friction falls with temperature
@@ -16,9 +16,9 @@ def warming_time_shape(inputs, *, A, tau):
 
     .. math:: h = -A (1 - e^{-t / \tau})
 
-    A is the share of friction lost when warm; it is negative where friction rises with temperature. Time counts from
-    the stroke's or the file's first row (design: the file's own clock); before 0 the contact is cold. The power is
-    taken as the same in every run; `warming_power` lets it follow speed and load.
+    A is the share of friction lost when warm, negative if friction rises with temperature. Time is that of the stroke
+    or the file; before 0 the contact is cold. The power is assumed to be the same in every run; in `warming_power` it
+    is proportional to speed and load.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
     return A * np.expm1(-time / tau)
@@ -45,16 +45,15 @@ WARMING_TIME = Effect(
 
 
 def warming_distance_shape(inputs, *, A, s_0):
-    r"""Warming by sliding, seen along distance: friction falls with the work done on the contact, and settles.
+    r"""Warming by sliding, along distance: friction falls with the work of friction, and approaches a limit.
 
-    At one normal force the heat that friction makes up to a distance s is its work, mu N s, whatever the speed. Where
-    the contact warms a fixed mass and gives heat to fresh, cold track at a rate that also goes with the distance slid,
-    the temperature approaches its limit over a distance instead of a time:
+    At one normal force the heat up to a distance s is the work of friction, mu N s, at any speed. If the contact warms
+    a fixed mass and loses heat to cold track in proportion to the distance slid, the temperature approaches its limit
+    over a distance instead of a time:
 
     .. math:: h = -A (1 - e^{-s / s_0})
 
-    A is the share of friction lost when warm. At one speed it cannot be told from `warming_time`; two speeds separate
-    them.
+    A is the share of friction lost when warm. Two speeds are needed to distinguish it from `warming_time`.
     """
     distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0)
     return A * np.expm1(-distance / s_0)
@@ -88,9 +87,8 @@ def warming_power_shape(inputs, *, A, tau):
 
     .. math:: h = -A \frac{N |v|}{N_{ref} v_{ref}} (1 - e^{-t / \tau})
 
-    A is the share lost when warm at the reference load and speed. For a loss that is small against 1: the form is
-    linear in the temperature and takes P without the fall of mu itself. Needs several speeds or loads to be told from
-    `warming_time`.
+    A is the share lost when warm at the reference load and speed, well below 1: the form is linear in the temperature,
+    and P is computed without the fall of mu. Several speeds or loads are needed to distinguish it from `warming_time`.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
     speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
@@ -127,15 +125,14 @@ WARMING_POWER = Effect(
 def warming_conduction_shape(inputs, *, A):
     r"""Warming limited by conduction into the rubber: friction falls with the root of speed times distance.
 
-    Rubber conducts badly: during a stroke heat enters a thin layer and nothing leaves on the far side. The surface of a
-    half-space under a steady flux q has warmed by :math:`2 q \sqrt{t / (\pi k \rho c)}` after a time t. Friction's flux
-    is :math:`q \propto \mu p |v|`, and :math:`t = s / |v|`, so
+    Rubber is a poor conductor: during a stroke heat enters a thin layer only. The surface of a half-space under a
+    constant flux q warms by :math:`2 q \sqrt{t / (\pi k \rho c)}` in a time t. The flux of friction is :math:`q \propto
+    \mu p |v|`, and :math:`t = s / |v|`, so
 
     .. math:: \Delta T \propto p |v| \sqrt{s / |v|} = p \sqrt{|v| s}, \qquad h = -A \sqrt{\frac{|v| s}{v_{ref} s_{ref}}}
 
-    A is the share of friction lost at the reference speed and distance. At one load; with several, the flux follows the
-    load: `warming_conduction_load`. Holds until the warm layer reaches the back of the sample, and for a loss that is
-    small against 1.
+    A is the share of friction lost at the reference speed and distance, at one load; `warming_conduction_load` is for
+    several loads. It is valid until the warm layer reaches the back of the sample, and for a loss well below 1.
     """
     distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(inputs, "distance_mm", 1.0)
     speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
@@ -169,9 +166,9 @@ WARMING_CONDUCTION = Effect(
 
 
 def warming_conduction_load_shape(inputs, *, A):
-    r"""Warming limited by conduction into the rubber, at several loads: as `warming_conduction`, with the flux's load.
+    r"""Warming limited by conduction into the rubber, at several loads: as `warming_conduction`, times the load.
 
-    The flux of friction is :math:`q \propto \mu p |v|`; where the contact's area stays the same, its pressure p follows
+    The flux of friction is :math:`q \propto \mu p |v|`. For a constant contact area the pressure p is proportional to
     the load, so the surface warms as :math:`N \sqrt{|v| s}` and
 
     .. math:: h = -A \frac{N}{N_{ref}} \sqrt{\frac{|v| s}{v_{ref} s_{ref}}}
@@ -220,13 +217,13 @@ WARMING_CONDUCTION_LOAD = Effect(
 def lab_temperature_shape(inputs, *, A):
     r"""Laboratory temperature: friction follows the room, a few per mille for each degree.
 
-    Above its peak over speed, rubber friction falls with temperature; over the few degrees of a laboratory a straight
-    line is enough,
+    Above its peak over speed, rubber friction falls with temperature. Over the few degrees of a laboratory the effect
+    is about linear,
 
     .. math:: h = A (T - T_{ref})
 
-    A is the relative change per degree. Only where the campaign holds a column `lab_temperature_C`; a column of another
-    name is found as `linear` in it. The aging temperature is another thing.
+    A is the relative change per degree. It needs a column `lab_temperature_C`, which is not the aging temperature; for
+    another name the effect is `linear`.
     """
     temperature = np.asarray(inputs["lab_temperature_C"], dtype=float)
     return A * (temperature - reference(inputs, "lab_temperature_C", 0.0))

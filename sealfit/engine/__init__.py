@@ -1,4 +1,4 @@
-"""How many threads linear algebra uses; imports next to nothing, as every command begins here."""
+"""Number of threads of linear algebra. It imports little, because every command imports it first."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def one_thread() -> None:
-    """Let linear algebra use one thread in this process and those it starts, unless the user has said otherwise.
+    """Set linear algebra to one thread in this process and its children, unless the user has set the variables.
 
     Its products are small, and here processes share the cores: more threads only wait for each other, and their
     rounding depends on how many there are. To be called before numpy loads.

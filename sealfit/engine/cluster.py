@@ -1,4 +1,4 @@
-"""Chunks of work on a Dask cluster that is running already, their results in order.
+"""Chunks of work on a running Dask cluster, with results in order.
 
 Nothing is kept on the cluster: a chunk is sent as bytes, and its answer comes back or, for what is large, lies on the
 file system that all workers share. So Dask may do a chunk again on another worker if one dies, as often as it likes.
@@ -24,11 +24,11 @@ from sealfit.errors import RequestError, WorkerError
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-WAITING_PER_THREAD = 2  # chunks sent ahead for every thread of the cluster: bounds what the scheduler has to hold
+WAITING_PER_THREAD = 2  # chunks submitted per thread of the cluster; bounds the memory of the scheduler
 CONNECT_S = 15.0
 EXAMPLE = "tcp://host:8786"
-LOOK_S = 1.0  # how often a wait for an answer looks whether there is anybody to give it
-ALONE_S = 60.0  # without a single worker before giving up: a batch system takes its time to start the next
+LOOK_S = 1.0  # interval between checks for workers, in s
+ALONE_S = 60.0  # time without workers before an error, in s; a batch system needs time to start the next
 
 
 class Cluster:
@@ -69,7 +69,7 @@ class Cluster:
             worker, found = next(iter(others.items()))
             raise RequestError(
                 f"the worker {worker} has sealfit {found}, here is {__version__}.",
-                fix="Install the same version everywhere: results are not to depend on where they are computed.",
+                fix="Install the same version on all workers.",
             )
 
     def require_folders(self, *folders: Path) -> None:
@@ -83,15 +83,15 @@ class Cluster:
                     )
 
     def threads(self) -> int:
-        """Return how many pieces of work the cluster can do at once, now."""
+        """Return the present number of threads of the cluster."""
         return sum(self._client.nthreads().values())
 
     def close(self) -> None:
-        """Leave the cluster; it goes on."""
+        """Disconnect from the cluster, which keeps running."""
         self._client.close()
 
     def apply(self, function: Callable[[bytes], list], chunks: Iterator[bytes]) -> Iterator[list]:
-        """Yield the list that `function` makes of each chunk.
+        """Yield the list that `function` returns for each chunk.
 
         Raises
         ------
@@ -107,7 +107,7 @@ class Cluster:
             room = max(2, WAITING_PER_THREAD * self.threads()) - len(sent)
             with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):  # a fold is large
                 for chunk in islice(chunks, max(room, 0)):
-                    # A key of its own: equal chunks of two runs are not one piece of work.
+                    # A unique key, because Dask would merge equal chunks of two runs.
                     sent.append(self._client.submit(function, chunk, key=f"sealfit-{uuid.uuid4().hex}", pure=False))
 
         try:
@@ -123,7 +123,7 @@ class Cluster:
                 fix="If memory ran out, give the workers more of it; their logs say more.",
             ) from error
         except (CancelledError, OSError) as error:
-            if sent and sent[0].status == "error":  # the work's own
+            if sent and sent[0].status == "error":  # raised by the work itself
                 raise
             raise WorkerError(
                 f"the cluster {self.scheduler} went away.", fix="Look at the scheduler, and run the command again."
@@ -133,9 +133,9 @@ class Cluster:
                 self._client.cancel(list(sent))
 
     def _result(self, future: Future) -> list:
-        """Return a chunk's answer; WorkerError where no worker is left for a while to give one."""
+        """Return the result of a chunk; WorkerError after `ALONE_S` without workers."""
         ended, alone = threading.Event(), 0.0
-        future.add_done_callback(lambda _: ended.set())  # a wait of Dask's own may lose an answer that comes as it ends
+        future.add_done_callback(lambda _: ended.set())  # Dask's wait may miss a result at its timeout
         while alone < ALONE_S:
             if ended.wait(LOOK_S):
                 try:
@@ -164,7 +164,7 @@ def _connected(scheduler: str) -> Client:
     place = re.fullmatch(r"\w+://\[?(?P<host>[^]]+)\]?:(?P<port>\d+)", address)
     if place is None:
         raise RequestError(f"'{scheduler}' is not an address of a scheduler.", fix=f"Write {EXAMPLE}, or its file.")
-    try:  # by hand first: a client that finds nobody holds the program for a minute
+    try:  # checked first, because a client without a scheduler blocks for a minute
         socket.create_connection((place["host"], int(place["port"])), timeout=CONNECT_S).close()
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:

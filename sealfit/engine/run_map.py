@@ -1,4 +1,4 @@
-"""Map work over the cores of this computer or over a Dask cluster, in order; the only file that knows which."""
+"""Map work over the cores of this computer or over a Dask cluster, with results in order."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 Given = TypeVar("Given")
 Made = TypeVar("Made")
 
-CHUNKS_PER_WORKER = 4  # enough to even out items of different cost, few enough to keep the cost of sending low
-MAX_CHUNK = 32  # so that progress is shown often
+CHUNKS_PER_WORKER = 4  # balances items of different cost against the cost of sending
+MAX_CHUNK = 32  # items; keeps the progress bar moving
 
 _cluster: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
 
@@ -46,7 +46,7 @@ def cores() -> int:
 
 @contextlib.contextmanager
 def on_cluster(scheduler: str | None, *folders: Path) -> Iterator[None]:
-    """Let every map of the block run on the cluster of a Dask scheduler; on this computer where it is None.
+    """Run every map of the block on the cluster of a Dask scheduler, or on this computer if it is None.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def run_map(
         return
     workers = min(workers, len(items)) if cluster is None else max(cluster.threads(), 1)
     size = together or max(1, min(MAX_CHUNK, len(items) // (workers * CHUNKS_PER_WORKER)))
-    # Pickled here, not by another thread later, while the caller goes on to use and change the items.
+    # Pickled here, because the caller may change the items before another thread pickles them.
     chunks = (pickle.dumps((function, items[start : start + size])) for start in range(0, len(items), size))
     if cluster is None:
         made = in_processes(_apply, chunks, workers, load=function_module(function))
@@ -120,7 +120,7 @@ def run_map(
 
 
 def function_module(function: Callable) -> str:
-    """Return the name of the module that a function, or a partial one, is found in."""
+    """Return the name of the module of a function or partial function."""
     return getattr(function, "func", function).__module__
 
 
@@ -130,16 +130,16 @@ def _apply(pickled: bytes) -> list:
 
 
 # ---------------------------------------------------------------- processes
-# Chunks of work in processes of this computer, their results in order.
+# Chunks of work in processes of this computer, with results in order.
 
-WAITING_PER_WORKER = 2  # chunks sent ahead of the one awaited: bounds the memory of results not yet taken
+WAITING_PER_WORKER = 2  # chunks submitted ahead; bounds the memory of waiting results
 # Not fork: it copies the locks of pyarrow's and BLAS's threads without the threads that free them. A fork server has
 # no threads, and has loaded what the workers need before the first of them is wanted.
 START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 
 
 def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], workers: int, *, load: str) -> Iterator[list]:
-    """Yield the list that `apply` makes of each chunk.
+    """Yield the list that `apply` returns for each chunk.
 
     Parameters
     ----------
@@ -175,12 +175,12 @@ def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], worker
             send(1)
             yield made
         finished = True
-    except (BrokenProcessPool, EOFError) as error:  # the second where it was the server that starts them
+    except (BrokenProcessPool, EOFError) as error:  # EOFError if the fork server died
         raise _died() from error
     finally:
         processes = list((executor._processes or {}).values())
         executor.shutdown(wait=finished, cancel_futures=True)
-        if not finished:  # interrupted, failed, or no longer wanted: nobody waits for what is still being computed
+        if not finished:  # interrupted or failed: pending results are discarded
             for process in processes:
                 process.terminate()
             for process in processes:
@@ -195,7 +195,7 @@ def _died() -> WorkerError:
 
 @contextlib.contextmanager
 def _no_interrupt_for_children() -> Iterator[None]:
-    """Start processes that do not see Ctrl-C: the parent stops them, so none prints a traceback of its own.
+    """Start processes that ignore Ctrl-C; the parent stops them, so that they print no traceback.
 
     A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not lost.
     """
@@ -204,7 +204,7 @@ def _no_interrupt_for_children() -> Iterator[None]:
         return
     from multiprocessing import resource_tracker
 
-    resource_tracker.ensure_running()  # here, as it lets Ctrl-C through again when it starts
+    resource_tracker.ensure_running()  # started here, because it unblocks Ctrl-C when it starts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -234,7 +234,7 @@ def _start_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent is gone, or a killed run would leave its workers waiting forever."""
+    """End this process when its parent has died, so that a killed run leaves no waiting workers."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -14,12 +14,18 @@ from sealfit.errors import FitError
 # ---------------------------------------------------------------- least squares
 # Nonlinear least squares by Levenberg-Marquardt, of one or many small problems at once, and its covariance.
 
+# Largest number of steps.
 STEPS = 2000
-SAME = 1e-13  # relative change of the sum of squares that is rounding
-SHRINKS = 0.9  # from one step to the next where they converge: the sum of squares is flat at its minimum
-DAMPING = 1e-3  # to begin with; below it a step is one of Gauss and Newton
-STUCK = 1e12  # damping above which there is no way down
-RANK = 1e-11  # singular values this small against the largest, columns scaled to length 1, are zero
+# Relative change of the sum of squares that counts as rounding.
+SAME = 1e-13
+# Steps that shrink at least by this factor still converge, though the sum of squares no longer changes.
+SHRINKS = 0.9
+# Damping of the first step. Below it a step is close to a Gauss-Newton step.
+DAMPING = 1e-3
+# Damping at which the search ends without a further decrease.
+LARGEST_DAMPING = 1e12
+# Singular values below this share of the largest count as zero, with columns scaled to length 1.
+RANK = 1e-11
 
 
 def levenberg_marquardt(
@@ -30,7 +36,7 @@ def levenberg_marquardt(
     *,
     damping: float = DAMPING,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least-squares optima that the starts lead to, and their sums of squares.
+    """Return the local least-squares optima from starting points, and their sums of squares.
 
     Parameters
     ----------
@@ -38,29 +44,29 @@ def levenberg_marquardt(
         `evaluate(x, rows)` -> weighted residual, shape (r, n), and its derivative, shape (r, p, n), of the problems
         `rows` (r,) at x (r, p).
     start : ndarray, shape (problems, p)
-        Starting points; moved inside the bounds.
+        Starting points; they are moved inside the bounds.
     low, high : ndarray, shape (p,) or (problems, p)
-        Closed bounds; infinite where there is none, equal where a number is held.
+        Closed bounds; infinite for none, equal for a fixed parameter.
     damping : float
-        Of the first step; next to none from starts that are nearly there.
+        Damping of the first step; small for starts close to the optimum.
 
     Returns
     -------
     x : ndarray, shape (problems, p)
     rss : ndarray, shape (problems,)
-        Infinite where the residual is not finite at the start.
+        Infinite if the residual is not finite at the start.
 
     Notes
     -----
-    The scale of each number is the largest norm that its column has had (More 1978, Lecture Notes in Mathematics 630,
-    105-116), and the damped step is solved for by singular values, which keeps the digits that normal equations lose.
+    The scale of each parameter is the largest norm of its column so far (More 1978, Lecture Notes in Mathematics 630,
+    105-116). The damped step is computed by singular values, more accurately than by normal equations.
     """
     low, high = np.broadcast_to(low, start.shape), np.broadcast_to(high, start.shape)
     x, todo = np.clip(start, low, high), np.arange(len(start))
     damping = np.full(len(x), damping)
     length = np.full(len(x), np.inf)  # of the last step, in standard errors
     scale = np.zeros(x.shape)
-    with np.errstate(all="ignore"):  # a trial step that overflows is a bad step, not an error
+    with np.errstate(all="ignore"):  # a trial step that overflows is rejected
         rest, slope = evaluate(x, todo)
         rss = _squares(rest)
         todo = np.flatnonzero(np.isfinite(rss))
@@ -74,21 +80,21 @@ def levenberg_marquardt(
             own_scale = np.where(scale[todo] > 0, scale[todo], 1.0)
             move = _damped(slope[todo] / own_scale[..., None] * free[..., None], rest[todo], damping[todo]) / own_scale
             trial = np.clip(at + move, low[todo], high[todo])
-            left, bends = evaluate(trial, todo)
-            gain, step = rss[todo] - _squares(left), np.linalg.norm((trial - at) * size, axis=1)
+            trial_rest, trial_slope = evaluate(trial, todo)
+            gain, step = rss[todo] - _squares(trial_rest), np.linalg.norm((trial - at) * size, axis=1)
             same, shrinks = np.abs(gain) <= SAME * rss[todo], step < SHRINKS * length[todo]
             better = (gain > 0) | (same & shrinks)
             done = same & ~(shrinks & (step > 0)) & ((damping[todo] < DAMPING) | ~better)
             moved = todo[better]
             x[moved], rest[moved], slope[moved], length[moved] = (
                 trial[better],
-                left[better],
-                bends[better],
+                trial_rest[better],
+                trial_slope[better],
                 step[better],
             )
             rss[moved] -= gain[better]
             damping[todo] = np.where(better, damping[todo] / 10, np.maximum(damping[todo], 1e-12) * 10)
-            todo = todo[~done & (damping[todo] < STUCK)]
+            todo = todo[~done & (damping[todo] < LARGEST_DAMPING)]
     return x, rss
 
 
@@ -107,15 +113,15 @@ def _squares(rest: np.ndarray) -> np.ndarray:
 def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
     """Return the derivative of `residual` at `x`, shape (n, p), by central differences of fourth order.
 
-    The step is 1e-4 of each parameter: rounding stays near 1e-12 of the derivative, and a place parameter that is a
-    hundred widths from its origin (a peak at 450 nm, 4 nm wide) still moves by a hundredth of its width only.
+    The step is 1e-4 of each parameter. Rounding errors are near 1e-12 of the derivative, and a location parameter a
+    hundred widths from the origin (a peak at 450 nm, 4 nm wide) changes by a hundredth of its width.
 
     Parameters
     ----------
     residual : callable
         (p,) -> (n,).
     x : ndarray, shape (p,)
-        Where.
+        Point of evaluation.
     """
     h = 1e-4 * np.where(x == 0, 1.0, np.abs(x))
     points = x + np.array([-2, -1, 1, 2])[:, None, None] * np.diag(h)
@@ -124,14 +130,14 @@ def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray
 
 
 def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple[np.ndarray, int]:
-    """Return (J'J)^-1, shape (p, p), and its rank; inf on the diagonal of what the tangent does not determine.
+    """Return (J'J)^-1, shape (p, p), and its rank; parameters that J does not determine have infinite variance.
 
     Parameters
     ----------
     jacobian : ndarray, shape (n, p)
-        Tangent of the weighted residual.
+        Derivative J of the weighted residual.
     free : ndarray of bool, shape (p,), optional
-        Parameters that are fitted; the others get zeros.
+        Parameters that are fitted; the others have variance 0.
     """
     p = jacobian.shape[1]
     free = np.ones(p, bool) if free is None else free
@@ -140,46 +146,54 @@ def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple
         return covariance, 0
     scale = np.linalg.norm(jacobian[:, free], axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    wide = jacobian.shape[0] < scale.size  # then only the full decomposition has the null directions; else no one asks
+    wide = jacobian.shape[0] < scale.size  # only then the null space needs the full decomposition
     _, singular, rows = np.linalg.svd(jacobian[:, free] / scale, full_matrices=wide)
     known = np.zeros(rows.shape[0], bool)
     known[: singular.size] = singular > RANK * max(singular.max(initial=0.0), 1e-300)
     inverse = (rows[known].T / singular[known[: singular.size]] ** 2) @ rows[known]
     part = inverse / np.outer(scale, scale)
-    lost = np.any(np.abs(rows[~known]) > 1e-6, axis=0)  # parameters that a null direction moves
-    part[lost, :], part[:, lost] = 0.0, 0.0
-    part[lost, lost] = np.inf
+    unknown = np.any(np.abs(rows[~known]) > 1e-6, axis=0)  # parameters that change along the null space
+    part[unknown, :], part[:, unknown] = 0.0, 0.0
+    part[unknown, unknown] = np.inf
     covariance[np.ix_(free, free)] = part
     return covariance, int(known.sum())
 
 
 # ---------------------------------------------------------------- variable projection
-# Least squares that is linear in all but one number: the linear part is solved exactly along the nonlinear one.
+# Least squares with one nonlinear parameter: the linear parameters are solved for exactly at each of its values.
 #
-# Many problems are solved together, as arrays: the conditions of a campaign, or the draws of a bootstrap.
+# Many problems are solved together as arrays: the conditions of a campaign, or the draws of a bootstrap.
 # Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036 (variable projection).
 
-DEPENDENT = 1e-13  # share of a column's variance left by the others below which it adds nothing in double precision
-CHUNK = 2_000_000  # numbers per temporary array: 16 MB
-CLOSE = 1e-9  # of the nonlinear number, a logarithm as a rule: nearer, the sum of squares is flat to its last digit
+# A column is linearly dependent if the others explain all but this share of its variance.
+DEPENDENT = 1e-13
+# Number of values in a temporary array: 16 MB.
+CHUNK = 2_000_000
+# Absolute tolerance of the nonlinear parameter (usually a logarithm) in the search. The sum of squares is constant in
+# double precision within it.
+CLOSE = 1e-9
+# Largest number of steps of this search.
 MOST_STEPS = 60
-NEXT_TO_NONE = 1e-15  # damping of steps from where the minimum is already known to half its digits
-NUDGES = 1e-3 * np.array([-2, -1, 0, 1, 2])  # of the nonlinear number: a derivative of fourth order
+# Damping of the final steps, which start from a minimum that is known to half of its digits.
+LEAST_DAMPING = 1e-15
+# Steps of the nonlinear parameter for a numerical derivative of fourth order.
+STEPS_OF_DERIVATIVE = 1e-3 * np.array([-2, -1, 0, 1, 2])
 
 
 # ---------------------------------------------------------------- the linear part
 def solve_kept(gram, moment, keep):
-    """Coefficients of the kept columns, the rest zero; gram (..., p, p) with unit diagonal, moment and keep (..., p).
+    """Return the coefficients of the columns in `keep`, (..., p), the others 0; gram (..., p, p) has unit diagonal.
 
-    Cholesky written out over the few columns, so that all problems go together; a dependent column gets zero.
+    Cholesky factorisation, written out over the columns so that all problems are solved together. A linearly dependent
+    column has coefficient 0.
     """
     p = moment.shape[-1]
     lower = [[None] * p for _ in range(p)]
     inverse, z = [None] * p, [None] * p
     for j in range(p):
-        left = gram[..., j, j] - sum((lower[j][k] ** 2 for k in range(j)), 0.0)
-        good = keep[..., j] & (left > DEPENDENT)
-        inverse[j] = np.where(good, 1 / np.sqrt(np.where(good, left, 1.0)), 0.0)
+        pivot = gram[..., j, j] - sum((lower[j][k] ** 2 for k in range(j)), 0.0)
+        good = keep[..., j] & (pivot > DEPENDENT)
+        inverse[j] = np.where(good, 1 / np.sqrt(np.where(good, pivot, 1.0)), 0.0)
         for i in range(j + 1, p):
             cross = gram[..., i, j] - sum((lower[i][k] * lower[j][k] for k in range(j)), 0.0)
             lower[i][j] = cross * inverse[j]
@@ -191,21 +205,21 @@ def solve_kept(gram, moment, keep):
 
 
 def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
-    """Exact least squares with some coefficients held at or above zero, by trying every set of zeros.
+    """Return the exact least squares with some nonnegative coefficients, by trying every active set.
 
     Parameters
     ----------
     gram : ndarray, shape (..., p, p)
-        B'B of the columns, scaled to unit diagonal (a column of zeros may keep 0).
+        B'B of the columns, scaled to unit diagonal (0 for a column of zeros).
     moment : ndarray, shape (..., p)
         B'y.
     nonnegative : sequence of bool, length p
-        Which coefficients must not be negative.
+        Which coefficients are nonnegative.
 
     Returns
     -------
     coefficients, support : ndarray, shape (..., p)
-        The optimum, and which columns are in it. Convex, so the best feasible set is the global optimum.
+        The optimum, and which columns are in it. It is global, as the problem is convex.
     """
     nonnegative = np.asarray(nonnegative, bool)
     keep = np.ones(moment.shape, bool)
@@ -216,10 +230,10 @@ def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
     g, m = gram[bad], moment[bad]
     best, support = np.zeros_like(m), np.zeros(m.shape, bool)
     explained = np.full(m.shape[:-1], -np.inf)
-    held = np.flatnonzero(nonnegative)
-    for zeros in product((False, True), repeat=held.size):
+    bounded = np.flatnonzero(nonnegative)
+    for zeros in product((False, True), repeat=bounded.size):
         subset = np.ones(m.shape[-1], bool)
-        subset[held] = ~np.array(zeros)
+        subset[bounded] = ~np.array(zeros)
         tried = solve_kept(g, m, np.broadcast_to(subset, m.shape))
         gain = np.einsum("...p,...p", tried, m)
         better = ~np.any((tried < 0) & nonnegative, axis=-1) & (gain > explained)
@@ -237,17 +251,17 @@ def project(columns, y, nonnegative, refine: int = 2) -> tuple[np.ndarray, np.nd
     moment = (transposed @ y[..., None])[..., 0]
     c, support = least_squares_of(gram, moment, nonnegative)
     rest = y - (scaled @ c[..., None])[..., 0]
-    for _ in range(refine):  # normal equations square the condition number; refining on the true residual undoes it
+    for _ in range(refine):  # iterative refinement recovers the digits that normal equations lose
         c = c + solve_kept(gram, (transposed @ rest[..., None])[..., 0], support)
         rest = y - (scaled @ c[..., None])[..., 0]
     c = np.where(nonnegative, np.maximum(c, 0.0), c)
     return c / np.where(norm > 0, norm, 1.0), np.einsum("...n,...n->...", rest, rest)
 
 
-# ---------------------------------------------------------------- one nonlinear number, many problems
+# ---------------------------------------------------------------- one nonlinear parameter, many problems
 @dataclass(frozen=True)
 class BatchFit:
-    """Optimum of each problem; u is what the basis takes, as a rule the logarithm of the nonlinear number."""
+    """Optimum of each problem; u is the argument of the basis, usually the logarithm of the nonlinear parameter."""
 
     u: np.ndarray  # (problems,)
     coefficients: np.ndarray  # (problems, p)
@@ -256,7 +270,7 @@ class BatchFit:
 
 @dataclass(frozen=True)
 class Separable:
-    """Least-squares problems that are linear in all but one number each.
+    """Least-squares problems with one nonlinear parameter each.
 
     Attributes
     ----------
@@ -265,7 +279,7 @@ class Separable:
     y, weight : ndarray, shape (problems, n)
         Measured values and 1/variance; weight 0 for padding.
     nonnegative : sequence of bool, length p
-        Coefficients held at or above zero.
+        Which coefficients are nonnegative.
     """
 
     basis: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -274,21 +288,19 @@ class Separable:
     nonnegative: Sequence[bool]
 
     def some(self, own: np.ndarray) -> Separable:
-        """Return chosen problems, by their numbers, shape (r,)."""
+        """Return the problems with some numbers, shape (r,)."""
         return replace(self, basis=lambda u, rows: self.basis(u, own[rows]), y=self.y[own], weight=self.weight[own])
 
 
 def profile(problems: Separable, u: np.ndarray, *, refine: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best weighted sum of squares and the coefficients at given nonlinear numbers.
+    """Return the least weighted sum of squares and the coefficients at given nonlinear parameters.
 
     Parameters
     ----------
-    problems : Separable
-        What is fitted.
     u : ndarray, shape (problems, g)
-        Where.
+        Nonlinear parameters.
     refine : int
-        Steps of iterative refinement; 0 is enough for a search, 2 gives all digits.
+        Steps of iterative refinement: 0 for a search, 2 for full accuracy.
 
     Returns
     -------
@@ -312,17 +324,14 @@ def profile(problems: Separable, u: np.ndarray, *, refine: int = 0) -> tuple[np.
 
 
 def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
-    """Return the least-squares optimum of each problem over its whole grid.
+    """Return the global least-squares optimum of each problem on the range of its grid.
 
-    Every local minimum of the sum of squares along the grid is refined; the best of them, or an end of the grid, is the
-    answer.
+    Every local minimum along the grid is refined. The result is the best of them, or an end of the grid.
 
     Parameters
     ----------
-    problems : Separable
-        What is fitted.
     grid : ndarray, shape (problems, g)
-        Rising nonlinear numbers, close enough that no minimum hides between two of them.
+        Rising nonlinear parameters, so close that no minimum lies between two of them.
 
     Raises
     ------
@@ -347,40 +356,40 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     every = np.arange(len(problems.y))
     problem = np.concatenate([problem, every])
     u = np.concatenate([valley, grid[every, np.argmin(rss, axis=1)]])
-    left, coefficients = (found[:, 0] for found in solved(u, problem))
-    order = np.lexsort([left, problem])
+    rss, coefficients = (found[:, 0] for found in solved(u, problem))
+    order = np.lexsort([rss, problem])
     best = order[np.unique(problem[order], return_index=True)[1]]
-    return BatchFit(u[best], coefficients[best], left[best])
+    return BatchFit(u[best], coefficients[best], rss[best])
 
 
 def _to_all_digits(problems: Separable, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Return the nonlinear numbers, shape (r,), that starts near an optimum lead to, shape (r, p + 1).
+    """Return the nonlinear parameters at full accuracy, shape (r,), from starts near the optimum, shape (r, p + 1).
 
-    Along the nonlinear number alone, the sum of squares is flat where half of its digits are known.
+    A search by the sum of squares alone gives only half of the digits.
     """
     root = np.sqrt(problems.weight)
 
     def evaluate(x, own):
-        columns = problems.basis(x[:, -1:] + NUDGES, own) * root[own][:, None, :, None]
+        columns = problems.basis(x[:, -1:] + STEPS_OF_DERIVATIVE, own) * root[own][:, None, :, None]
         below2, below, here, above, above2 = np.moveaxis(np.einsum("rgnp,rp->rgn", columns, x[:, :-1]), 1, 0)
-        along = (below2 - 8 * below + 8 * above - above2) / (12 * NUDGES[-2])
+        along = (below2 - 8 * below + 8 * above - above2) / (12 * STEPS_OF_DERIVATIVE[-2])
         slope = np.concatenate([np.swapaxes(columns[:, 2], 1, 2), along[:, None]], axis=1)
         return here - problems.y[own] * root[own], slope
 
     linear = np.tile(np.where(problems.nonnegative, 0.0, -np.inf), (len(start), 1))
     low = np.column_stack([linear, ends[:, 0]])
     high = np.column_stack([np.full(linear.shape, np.inf), ends[:, 1]])
-    return levenberg_marquardt(evaluate, start, low, high, damping=NEXT_TO_NONE)[0][:, -1]
+    return levenberg_marquardt(evaluate, start, low, high, damping=LEAST_DAMPING)[0][:, -1]
 
 
 def even_grid(low, high, per_decade: int) -> np.ndarray:
-    """Return even points from `low` to `high`, logarithms, shape (problems, g): so many or more to a factor of ten."""
+    """Return even points from `low` to `high`, natural logarithms, shape (problems, g), `per_decade` or more each."""
     points = int(np.ceil(per_decade * np.max(high - low) / np.log(10))) + 1
     return low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
 
 
 def check(y, weight) -> None:
-    """Refuse measured values and weights that cannot be fitted.
+    """Check measured values and weights.
 
     Raises
     ------

@@ -14,7 +14,8 @@ import pandas as pd
 COVARIANCE, SENSOR, EFFECTS = "covariance", "sensor_shift", "effect_shift"
 BESIDE = (COVARIANCE, SENSOR, EFFECTS)
 SPLIT = {"steady_fit": ("steady_covariance", "steady_shift"), "aging_fit": ("aging_covariance", None)}
-OF_PARAMETERS = ("quantity", "se", "lo95", "hi95", "u_sys", "reason")  # columns that rows of the other tables lack
+# Columns that rows of the other tables lack.
+OF_PARAMETERS = ("quantity", "se", "lo95", "hi95", "u_sys", "reason")
 AFTER = "_after"
 
 

@@ -211,6 +211,46 @@ def read_cells(
     ]
 
 
+def array_cells(columns: Sequence[np.ndarray], numeric: Mapping[int, str], settings: TraceFormat, file: str) -> Cells:
+    """Return the columns of a file that is not text, a row of each sample; their numbers count from 1.
+
+    Times of day, as datetime64, are seconds since the first where a number is needed, and else text in ISO 8601.
+    """
+    line = np.arange(1, len(columns[0]) + 1)
+    bad = np.zeros(len(line), bool)
+    made: dict[int, np.ndarray] = {}
+    faults: list[Fault] = []
+    for i, values in enumerate(columns):
+        if values.dtype.kind == "M":
+            values = _seconds(values) if i in numeric else _iso(values)
+        numbers = values if values.dtype.kind == "f" else _numbers(values, settings.decimal)
+        if i in numeric:
+            wrong = np.flatnonzero(~np.isfinite(numbers))
+            bad[wrong] = True
+            cells = {
+                row: "" if values[row] is None or values[row] != values[row] else str(values[row]) for row in wrong
+            }
+            faults += _cell_faults(ColumnOfFile(file, numeric[i], line, settings.decimal), wrong, cells, ())
+        plain = i in numeric or not any(cell is not None for cell in values[np.isnan(numbers)])
+        made[i] = numbers if plain or values.dtype.kind == "f" else values
+    return Cells(made, line, bad, tuple(faults))
+
+
+def _numbers(texts: np.ndarray, decimal: str) -> np.ndarray:
+    return np.array([_float(cell, decimal) for cell in texts], dtype=float)
+
+
+def _seconds(times: np.ndarray) -> np.ndarray:
+    known = times[~np.isnat(times)]
+    return (times - (known[0] if len(known) else times[0])) / np.timedelta64(1, "s")
+
+
+def _iso(times: np.ndarray) -> np.ndarray:
+    texts = np.datetime_as_string(times).astype(object)
+    texts[np.isnat(times)] = None
+    return texts
+
+
 def _fast(
     body: bytes, rows: int, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str]
 ) -> dict[int, np.ndarray] | None:
@@ -313,7 +353,10 @@ def _float(cell: str | None, decimal: str) -> float:
 
 
 def _cell_faults(
-    column: ColumnOfFile, at: np.ndarray, cells: Sequence[str | None], rows: Sequence[Sequence[str]]
+    column: ColumnOfFile,
+    at: np.ndarray,
+    cells: Sequence[str | None] | Mapping[int, str],
+    rows: Sequence[Sequence[str]],
 ) -> list[Fault]:
     def make(i: int) -> Fault:
         cell = cells[i]

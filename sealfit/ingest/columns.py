@@ -43,8 +43,7 @@ def locate(layout: Layout, width: int, settings: TraceFormat, file: str) -> dict
     """
     found: dict[int, str] = {}
     faults = []
-    for ours, column in settings.columns.items():
-        theirs = column.name
+    for ours, theirs in settings.their_columns.items():
         if isinstance(theirs, int):
             positions = [theirs - 1] if 0 < theirs <= width else []
         else:
@@ -107,7 +106,7 @@ def _missing(theirs: str | int, layout: Layout, width: int, settings: TraceForma
         reason = f"there is no column {theirs}: the lines have {width}."
         fix = "Check delimiter and positions in the rig config."
         return _fault("missing_column", reason, layout, file, theirs, fix)
-    fix = suggestion(theirs, layout.names)
+    fix = suggestion(theirs, layout.names) if layout.names else "Columns without names go by position, from 1."
     if len(layout.names) <= 1 and layout.names_line is not None:
         line = layout.header[layout.names_line - 1]
         for mark, word in ((";", '";"'), ("\t", '"tab"'), (",", '","'), (" ", '"whitespace"')):

@@ -20,11 +20,6 @@ from sealfit.store.manifest import Fingerprint, fingerprint, fingerprint_of
 # Files of a campaign folder as bytes: never one outside it, each opened once for its text and its fingerprint.
 
 _BLANK = b"\xef\xbb\xbf\xff\xfe \t\r\n\0"
-_PACKED = {
-    b"PK\x03\x04": "a zip archive or .xlsx workbook",
-    b"\x1f\x8b": "gzip",
-    b"\xd0\xcf\x11\xe0": "an .xls workbook",
-}
 
 
 class Folder:
@@ -87,7 +82,7 @@ def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
     Raises
     ------
     BadFile
-        If it is missing, outside the campaign, no file, not readable, empty, or packed.
+        If it is missing, outside the campaign, no file, not readable or empty.
     """
     return _read(Folder(campaign).inside(file), file, HEAD_BYTES if head else None)[0]
 
@@ -116,9 +111,6 @@ def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, 
         os.close(handle)
     if not raw[:64].strip(_BLANK) and not raw.strip(_BLANK):
         raise _bad_path(file, "empty_file", "is empty.", "Export it again, or take it out of runs.csv.")
-    for magic, what in _PACKED.items():
-        if raw.startswith(magic):
-            raise _bad_path(file, "binary_file", f"is {what}, not text.", "Export the trace as CSV.")
     return raw, status
 
 
@@ -156,6 +148,15 @@ _BOMS = (  # UTF-32 first: its mark begins with that of UTF-16
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
+_PACKED = {
+    b"PK\x03\x04": "a zip archive or .xlsx workbook",
+    b"\x1f\x8b": "gzip",
+    b"\xd0\xcf\x11\xe0": "an .xls workbook",
+    b"TDSm": "a TDMS file",
+    b"PAR1": "a Parquet file",
+    b"MATLAB 5.0 MAT-file": "a MAT-file",
+    b"MATLAB 7.3 MAT-file": "a MAT-file",
+}
 _ASCII = ("auto", "utf-8", "utf8", "utf_8", "latin-1")  # encodings that are ASCII where the text is
 _CONTROL = bytes(set(range(32)) - {9, 10, 12, 13}) + b"\x7f"
 
@@ -183,10 +184,11 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
     Raises
     ------
     BadFile
-        If the bytes are not text in that encoding.
+        If the bytes are not text in that encoding, or begin as files of other formats do.
     """
     if _is_plain(raw) and encoding.lower() in _ASCII:
         return raw
+    _refuse_packed(raw, file)
     if encoding == "auto":
         encoding = next((name for mark, name in _BOMS if raw.startswith(mark)), None) or _guess(raw)
     elif encoding.lower().replace("_", "-") in ("utf-8", "utf8"):
@@ -211,6 +213,13 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
     if b"\r" in raw:
         raw = raw.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     return raw
+
+
+def _refuse_packed(raw: bytes, file: str) -> None:
+    for magic, what in _PACKED.items():
+        if raw.startswith(magic):
+            fix = "Export it as CSV, or give the file the ending of its format."
+            raise _bad(file, "binary_file", f"is {what}, not text.", fix)
 
 
 def _is_plain(raw: bytes) -> bool:

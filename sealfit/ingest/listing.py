@@ -6,7 +6,7 @@ import io
 import os
 import re
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import SequenceMatcher, get_close_matches
 from fnmatch import fnmatchcase
 from itertools import islice
@@ -18,9 +18,11 @@ from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, Fault, nearest
 from sealfit.ingest.categorical import Columns, mapped
 from sealfit.ingest.columns import suggestion
-from sealfit.ingest.files import Folder, as_number, as_utf8, read_bytes, split_line
+from sealfit.ingest.files import Folder, as_number, split_line
+from sealfit.ingest.workbooks import text_of_runs
+from sealfit.store.paths import RUNS as RUNS_CSV
+from sealfit.store.paths import runs_tables
 
-RUNS_CSV = "runs.csv"
 KNOWN = (
     "run_id",
     "repeat",
@@ -44,32 +46,34 @@ class Entry:
     """The place of one trace file in the list, for messages."""
 
     file: str
-    line: int | None = None  # in runs.csv; None where the file was found by the glob
+    line: int | None = None  # in the table of runs; None where the file was found by the glob
+    table: str = RUNS_CSV
 
     def fault(self, check: str, reason: str, column: str | None = None, **rest) -> Fault:
-        """Return a fault at this entry's place: its line in runs.csv, or the file itself."""
-        place = {"file": RUNS_CSV, "line": self.line} if self.line is not None else {"file": self.file}
+        """Return a fault at this entry's place: its line in the table of runs, or the file itself."""
+        place = {"file": self.table, "line": self.line} if self.line is not None else {"file": self.file}
         return Fault(check, reason, column=column, **place, **rest)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entries(Sequence[Entry]):
-    """The trace files of a campaign in order, and the line of each in runs.csv, where there is one."""
+    """The trace files of a campaign in order, and the line of each in the table of runs, where there is one."""
 
     files: list[str]
     lines: list[int] | None = None
+    table: str = RUNS_CSV
 
     def __len__(self) -> int:
         return len(self.files)
 
     def __getitem__(self, i: int) -> Entry:
-        return Entry(self.files[i], None if self.lines is None else self.lines[i])
+        return Entry(self.files[i], None if self.lines is None else self.lines[i], self.table)
 
     def take(self, files: np.ndarray) -> Entries:
         """Return some of the files, by their numbers."""
         chosen = files.tolist()
         lines = None if self.lines is None else [self.lines[i] for i in chosen]
-        return Entries([self.files[i] for i in chosen], lines)
+        return Entries([self.files[i] for i in chosen], lines, self.table)
 
 
 def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list[Fault]]:
@@ -77,7 +81,8 @@ def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list
 
     Cells are text, those that say that there is nothing left out; errors stop the run.
 
-    runs.csv is read where there is one; otherwise the config's glob finds the files, in natural order (2 before 10).
+    The table of runs is read where there is one; otherwise the config's glob finds the files, in natural order (2
+    before 10).
 
     Raises
     ------
@@ -88,8 +93,8 @@ def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list
         what = "is not a folder." if campaign.exists() else "does not exist."
         raise _stop("missing_folder", f"the campaign folder '{campaign}' {what}", "Check the path.")
     cells: Columns = {}
-    if (campaign / RUNS_CSV).exists() or (campaign / RUNS_CSV).is_symlink():
-        entries, cells, faults = _read_runs(campaign, config)
+    if table := _runs_table(campaign, config):
+        entries, cells, faults = _read_runs(campaign, config, table)
     elif config.files.glob is not None:
         entries, faults = _by_glob(campaign, config)
     else:
@@ -111,24 +116,37 @@ def _stop(check: str, reason: str, fix: str, **place) -> CampaignError:
     return CampaignError([Fault(check, reason, fix=fix, **place)])
 
 
-def _read_runs(campaign: Path, config: Config) -> tuple[Entries, Columns, list[Fault]]:
+def _runs_table(campaign: Path, config: Config) -> str | None:
+    """Return the table of runs; None if there is none."""
+    found, named = runs_tables(campaign, config), config.files.runs_table
+    if len(found) > 1:
+        fix = "Delete or rename one, or name the one that counts: runs_table under [files] in the rig config."
+        raise _stop("several_tables", f"{' and '.join(found)} are both there.", fix, file=found[0])
+    if named is not None and not found:
+        raise _stop("missing_file", "does not exist, but files.runs_table names it.", "Check its path.", file=named)
+    return found[0] if found else None
+
+
+def _read_runs(campaign: Path, config: Config, table: str) -> tuple[Entries, Columns, list[Fault]]:
     try:
-        text = as_utf8(read_bytes(campaign, RUNS_CSV), "auto", RUNS_CSV)
+        text, delimiter = text_of_runs(campaign, table, config)
     except BadFile as error:
-        raise _stop(error.fault.check, error.fault.reason, error.fault.fix, file=RUNS_CSV) from error
+        place = {"file": table, "line": error.fault.line, "column": error.fault.column}
+        raise _stop(error.fault.check, error.fault.reason, error.fault.fix, **place) from error
     _, head = next(_lines(text), (1, ""))
-    delimiter = max(",;\t", key=head.count)
+    delimiter = delimiter or max(",;\t", key=head.count)
     names, faults = _our_names(_cells(head, delimiter) if head else [], config)
     if "file" not in names:
         fix = suggestion("file", _cells(head, delimiter) if head else [])
-        raise _stop("missing_column", "there is no such column.", fix, file=RUNS_CSV, line=1, column="file")
+        raise _stop("missing_column", "there is no such column.", fix, file=table, line=1, column="file")
     lines, columns = _rows(text, names, delimiter, faults)
     if delimiter != ",":  # decimal commas are plain here: no cell of a table of ; or tabs can be split by them
         columns = {name: mapped(column, _decimal_point) for name, column in columns.items()}
     files = [_posix(campaign, file) for file in columns.pop("file", [])]
     if not files and not any(fault.severity == "error" for fault in faults):
-        raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=RUNS_CSV)
-    return Entries(files, lines), {name: mapped(column, _said) for name, column in columns.items()}, faults
+        raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=table)
+    faults = [replace(fault, file=table) for fault in faults]
+    return Entries(files, lines, table), {name: mapped(column, _said) for name, column in columns.items()}, faults
 
 
 def _lines(text: bytes) -> Iterator[tuple[int, str]]:
@@ -255,10 +273,10 @@ def _unlisted(campaign: Path, entries: Entries, outside: set[str], config: Confi
     if config.files.glob and ".." not in config.files.glob and not config.files.glob.startswith("/"):
         found = (p for p in campaign.glob(config.files.glob) if p.is_file())
         there |= {p.relative_to(campaign).as_posix() for p in found}
-    files = there - listed - {RUNS_CSV}
+    files = there - listed - {entries.table}
     fix = "Add it to runs.csv if it is a trace."
     return [
-        Fault("not_listed", f"is not in {RUNS_CSV}.", file=f, severity="info", action="file left out", fix=fix)
+        Fault("not_listed", f"is not in {entries.table}.", file=f, severity="info", action="file left out", fix=fix)
         for f in sorted(files, key=natural)
         if not any(fnmatchcase(f, pattern) for pattern in config.files.exclude)
     ]

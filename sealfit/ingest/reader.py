@@ -12,12 +12,14 @@ import pandas as pd
 
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import BadFile, ConfigError, Fault
-from sealfit.ingest.cells import Cells, Rows, body_of, clean, read_cells, width_of
+from sealfit.ingest.cells import Cells, Rows, array_cells, body_of, clean, read_cells, width_of
 from sealfit.ingest.columns import RESERVED, SLOTS, beside, channel_columns, locate, numeric_names, required
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.file_names import TraceRef, name_parts
 from sealfit.ingest.files import Layout, as_utf8, find_layout, header_fields, read_bytes
+from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays
 from sealfit.ingest.trace_checks import speed_fault
+from sealfit.ingest.workbooks import read_sheet
 
 MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
 
@@ -86,17 +88,16 @@ def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list
         How the files are written.
     """
     opened: list[_Opened | BadFile] = []
-    alike: dict[tuple[Layout, int], list[int]] = {}
+    alike: dict[tuple, list[int]] = {}
     for i, (ref, raw) in enumerate(files):
         try:
             opened.append(_Opened.of(raw, ref.file, config.trace))
-            alike.setdefault((opened[i].layout, opened[i].width), []).append(i)
+            alike.setdefault(opened[i].alike, []).append(i)
         except BadFile as error:
             opened.append(error)
     found: list[Trace | BadFile] = list(opened)
-    for (layout, _), members in alike.items():
-        bodies = [(files[i][0].file, opened[i].body) for i in members]
-        made = read_cells(bodies, layout, config.trace, opened[members[0]].numeric)
+    for members in alike.values():
+        made = _cells([files[i][0].file for i in members], [opened[i] for i in members])
         for i, cells in zip(members, made, strict=True):
             try:
                 found[i] = _trace(cells, opened[i], files[i][0], config)
@@ -110,7 +111,8 @@ class _Opened:
     """A trace file before its cells are parsed.
 
     `body` are its data lines, `width` is the number of cells in the first of them; `ours` holds our name of each
-    position (from 0), `numeric` those that must hold numbers.
+    position (from 0), `numeric` those that must hold numbers. `settings` say how the text is written. Where the file
+    is not text, `arrays` are its columns.
     """
 
     layout: Layout
@@ -118,15 +120,71 @@ class _Opened:
     width: int
     ours: Mapping[int, str]
     numeric: Mapping[int, str]
+    settings: TraceFormat
+    arrays: tuple[np.ndarray, ...] = ()
+    faults: tuple[Fault, ...] = ()
 
     @classmethod
     def of(cls, raw: bytes, file: str, settings: TraceFormat) -> _Opened:
-        text = as_utf8(raw, settings.encoding, file)
-        layout = find_layout(text, settings, file)
-        body = body_of(text, layout, settings, file)
-        width = width_of(body, settings.delimiter)
+        if kind_of(file, settings) in OF_ARRAYS:
+            found = read_arrays(raw, file, settings)
+            layout, body, width = Layout(found.header, found.names, None, 0, 1), b"", len(found.columns)
+            arrays, faults = found.columns, found.faults
+        else:
+            text, layout, settings = _text(raw, file, settings)
+            body = body_of(text, layout, settings, file)
+            width = width_of(body, settings.delimiter)
+            arrays, faults = (), ()
         ours, must = locate(layout, len(layout.names) or width, settings, file), numeric_names(settings)
-        return cls(layout, body, width, ours, {i: name for i, name in ours.items() if name in must})
+        numeric = {i: name for i, name in ours.items() if name in must}
+        return cls(layout, body, width, ours, numeric, settings, arrays, faults)
+
+    @property
+    def alike(self) -> tuple:
+        """Files for which this is equal are parsed in one go."""
+        return self.layout, self.width, self.settings.delimiter, bool(self.arrays)
+
+
+def _cells(files: Sequence[str], opened: Sequence[_Opened]) -> list[Cells]:
+    """Return the cells of files that are alike."""
+    first = opened[0]
+    if not first.arrays:
+        bodies = [(file, one.body) for file, one in zip(files, opened, strict=True)]
+        return read_cells(bodies, first.layout, first.settings, first.numeric)
+    made = []
+    for file, one in zip(files, opened, strict=True):
+        cells = array_cells(one.arrays, one.numeric, one.settings, file)
+        made.append(replace(cells, faults=(*one.faults, *cells.faults)))
+    return made
+
+
+def _text(raw: bytes, file: str, settings: TraceFormat, *, head: bool = False) -> tuple[bytes, Layout, TraceFormat]:
+    """Return a file of text or a sheet of a workbook as UTF-8, its layout, and the settings with its delimiter."""
+    if kind_of(file, settings) == "csv":
+        text = as_utf8(raw, settings.encoding, file, head=head)
+        return text, find_layout(text, settings, file), settings
+    sheet = read_sheet(raw, file, settings.sheet, decimal=settings.decimal, head=head)
+    settings = settings.model_copy(update={"delimiter": "tab"})
+    layout = find_layout(sheet.text, settings, file)
+    sheet.check(layout.first_line, file)
+    return sheet.text, layout, settings
+
+
+def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | str]:
+    """Return what the header lines of a trace file say.
+
+    Raises
+    ------
+    BadFile
+        If the file cannot be read.
+    """
+    settings = config.trace
+    raw = read_bytes(campaign, file, head=kind_of(file, settings) == "csv")
+    if kind_of(file, settings) in OF_ARRAYS:
+        header = read_arrays(raw, file, settings, head=True).header
+    else:
+        header = _text(raw, file, settings, head=True)[1].header
+    return header_fields(header, settings)
 
 
 def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trace:

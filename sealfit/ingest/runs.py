@@ -51,9 +51,9 @@ from sealfit.ingest.file_names import (
     names_speak,
     unmatched,
 )
-from sealfit.ingest.files import as_utf8, find_layout, header_fields, read_bytes
+from sealfit.ingest.formats import require_libraries
 from sealfit.ingest.listing import Entries, list_entries
-from sealfit.ingest.reader import read_trace
+from sealfit.ingest.reader import read_header, read_trace
 from sealfit.ingest.start_times import add_order, join_date_and_time
 from sealfit.ingest.trace_checks import measured_speed, speed_factor
 
@@ -81,6 +81,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
         _stop_at_errors(faults)  # nothing can be said of files that are not there, and none outside is opened
     if not entries:
         raise CampaignError([*faults, _nothing_left()])
+    require_libraries(entries.files, config.trace)
     kept, named, found = _named(entries, config)
     faults += found
     entries, cells = _kept(kept, entries, cells)
@@ -159,7 +160,7 @@ def _config_faults(config: Config) -> list[Fault]:
             "cannot be a condition column: it differs within a condition.",
             "Take it out of condition.",
         )
-    named = {ours: theirs.name for ours, theirs in settings.columns.items() if isinstance(theirs.name, str)}
+    named = {ours: theirs for ours, theirs in settings.their_columns.items() if isinstance(theirs, str)}
     for ours, theirs in named.items() if settings.names == "none" else ():
         fix = "Give its position, counted from 1, or names = 'header'."
         add(f"trace.columns.{ours}", theirs, "is a name, but the files have none.", fix)
@@ -227,8 +228,7 @@ def _headers(campaign: Path, entries: Entries, config: Config) -> Columns:
 def _header(campaign: Path, file: str, config: Config) -> Mapping[str, float | str]:
     """Return what the header lines say; nothing of a file that cannot be read: reading it will say why."""
     try:
-        text = as_utf8(read_bytes(campaign, file, head=True), config.trace.encoding, file, head=True)
-        found = header_fields(find_layout(text, config.trace, file).header, config.trace)
+        found = read_header(campaign, file, config)
     except BadFile:
         return {}
     return {name: value for name, value in found.items() if not name.startswith("_") and value != ""}
@@ -318,6 +318,6 @@ def _missing(entries: Entries, columns: Columns, needed: _Needed) -> list[Fault]
         elif len(rows):
             reason = "there is no such column in runs.csv, file names, header lines or traces."
             fix = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."
-            place = {"file": "runs.csv" if entries.lines is not None else None, "column": name, "fix": fix.strip()}
+            place = {"file": entries.table if entries.lines is not None else None, "column": name, "fix": fix.strip()}
             faults.append(Fault("missing_column", reason, **place))
     return faults

@@ -1,4 +1,4 @@
-"""Laws of aging: Eq. 15, in the form that data determine and in the one that is printed, and its rivals."""
+"""Laws of aging: Eq. 15, in its identifiable form and as printed, and its rivals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from sealfit.errors import ParameterError
 
 # ---------------------------------------------------------------- aging
-# The aging law (Eq. 15), in the form that data determine and in the form that is printed.
+# The aging law (Eq. 15), in its identifiable form and as printed.
 
 
 def _checked(days, b):
@@ -23,19 +23,19 @@ def _checked(days, b):
 
 
 def aging_law(days, *, mu_0, a, b):
-    r"""Coefficient (or force) after aging, in the unit of `mu_0`.
+    r"""Return the coefficient (or force) after aging, shape (n,), in the unit of `mu_0`.
 
     .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b)
 
-    This is Eq. 15 with c = -a ln b, the only c for which mu(0) = mu_0. Eq. 15 itself has one parameter too many: with
-    mu_0 fitted as well, only mu_0 - c is determined.
+    This is Eq. 15 with c = -a ln b, the only c for which mu(0) = mu_0. As printed, Eq. 15 is not identifiable: only
+    mu_0 - c is determined.
 
     Parameters
     ----------
     days : float or ndarray, shape (n,)
-        Aging time t in days, from 0.
+        Aging time t in days, at least 0.
     mu_0, a, b : float or ndarray
-        Value of the unaged rubber; loss per e-fold of time, same unit; time after which the loss sets in, in days.
+        Value of the unaged rubber; loss per factor e of time, same unit; time at which the loss sets in, in days.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def aging_law(days, *, mu_0, a, b):
 
 
 def aging_constant(a, b):
-    """The c of Eq. 15 that belongs to the identifiable law, c = -a ln b, in the unit of `a`.
+    """Return the constant of Eq. 15 for the identifiable law, c = -a ln b, in the unit of `a`.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def aging_constant(a, b):
 
 
 def aging_law_as_printed(days, *, mu_0, a, b, c):
-    r"""Coefficient after aging as Eq. 15 is printed, with its four parameters.
+    r"""Return the coefficient after aging by Eq. 15 as printed, with four parameters.
 
     .. math:: \mu(t) = \mu_0 - a \ln(t + b) - c
 
@@ -89,16 +89,16 @@ def aging_law_as_printed(days, *, mu_0, a, b, c):
 
 
 # ---------------------------------------------------------------- losses
-# Shapes that the loss of friction by aging may have over time: Eq. 15 and its rivals.
+# Shapes of the loss of friction over aging time: Eq. 15 and its rivals.
 #
 # All are :math:`\mu(t) = \mu_0 - a\, \varphi(t)` with :math:`\varphi(0) = 0`:
 #
 # - ``log``, Eq. 15: :math:`\ln(1 + t/b)`. Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102.
-# - ``stretched``: :math:`1 - e^{-(t/\tau)^\beta}`, a floor of :math:`\mu_0 - a` that is approached as relaxation in a
-#   glassy or cross-linked network is. Kohlrausch 1854, Ann. Phys. 167, 56-82, doi:10.1002/andp.18541670103.
-# - ``power``: :math:`t^n` with t in days; n = 1/2 where diffusion sets the pace. Findley, Lai & Onaran 1976, Creep and
+# - ``stretched``: :math:`1 - e^{-(t/\tau)^\beta}`, with the limit :math:`\mu_0 - a`, as in the relaxation of glassy or
+#   cross-linked networks. Kohlrausch 1854, Ann. Phys. 167, 56-82, doi:10.1002/andp.18541670103.
+# - ``power``: :math:`t^n` with t in days; n = 1/2 for diffusion. Findley, Lai & Onaran 1976, Creep and
 #   Relaxation of Nonlinear Viscoelastic Materials, chapter 2.
-# - ``induction``: :math:`\ln(1 + \max(t - t_i, 0)/b)`, nothing before the stabiliser is used up. For induction periods
+# - ``induction``: :math:`\ln(1 + \max(t - t_i, 0)/b)`, no loss before the stabiliser is consumed. For induction periods
 #   of elastomers: Celina 2013, Polym. Degrad. Stab. 98(12), 2419-2429, doi:10.1016/j.polymdegradstab.2013.06.024.
 
 
@@ -109,19 +109,19 @@ class Loss:
     Attributes
     ----------
     name : str
-        As above.
+        Name as above.
     form : str
         Equation in plain text.
     parameters : tuple of str
-        Its own numbers, all positive: times in days, exponents.
+        Names of its parameters, all positive: times in days, and exponents.
     units : tuple of str
-        Of these.
+        Their units.
     value : callable
-        (days, own numbers) -> phi, broadcast.
+        (days, *parameters) -> phi, broadcast.
     time : callable
-        (phi, own numbers) -> days until the loss is phi; inf where it is never reached.
+        (phi, *parameters) -> days until the loss is phi; inf if it is not reached.
     slopes : callable
-        (days, own numbers) -> derivative of phi along ln t, and along the logarithm of each own number; broadcast.
+        (days, *parameters) -> derivatives of phi with respect to ln t and the logarithm of each parameter, broadcast.
     """
 
     name: str
@@ -159,8 +159,8 @@ def _stretched_time(phi, tau, beta):
 def _stretched_slopes(days, tau, beta):
     ratio = np.asarray(days, float) / tau
     power = ratio**beta
-    bend = beta * power * np.exp(-power)
-    return bend, -bend, bend * np.log(np.where(ratio > 0, ratio, 1.0))
+    slope = beta * power * np.exp(-power)
+    return slope, -slope, slope * np.log(np.where(ratio > 0, ratio, 1.0))
 
 
 def _power(days, n):
@@ -173,8 +173,8 @@ def _power_time(phi, n):
 
 def _power_slopes(days, n):
     days = np.asarray(days, float)
-    bend = n * days**n
-    return bend, bend * np.log(np.where(days > 0, days, 1.0))
+    slope = n * days**n
+    return slope, slope * np.log(np.where(days > 0, days, 1.0))
 
 
 def _induction(days, b, t_i):

@@ -1,13 +1,13 @@
-r"""The dynamic LuGre model (Eqs. 1 to 7): friction force for any speed history, over any pressure distribution.
+r"""The dynamic LuGre model (Eqs. 1 to 7): friction force for any history of the speed and any pressure distribution.
 
 .. math::
     \dot z = v - \frac{|v|}{g(v)} z, \quad g(v) = \frac{N}{\sigma_0} [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}], \quad
     F = \sigma_0 z + \sigma_1 \dot z + \sigma_2 v
 
-Every element of the contact carries the share :math:`f_n / F_n` of sigma_0 and sigma_1, as Eqs. 5 to 7 have it: all
-then have the same deflection, and the distribution cancels. It matters where friction depends on the local pressure,
-:math:`\mu \propto p^{n-1}`: elements under less pressure reach their limit over another distance, and the force no
-longer rises along one exponential.
+Every element of the contact has the share :math:`f_n / F_n` of sigma_0 and sigma_1 (Eqs. 5 to 7). All elements then
+have the same deflection, and the distribution cancels. If friction depends on the local pressure, :math:`\mu \propto
+p^{n-1}`, elements under different pressure slide after different distances, and the force does not rise as one
+exponential.
 
 Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10.1109/9.376053; Wu et al. 2020, Polymers
 12(1), 102, doi:10.3390/polym12010102.
@@ -26,22 +26,24 @@ from sealfit.errors import ParameterError
 from sealfit.physics.pressure import Contact
 from sealfit.physics.stribeck import stribeck_decay
 
-RTOL, ATOL = 1e-9, 1e-12  # of the solver; the second times the largest deflection
-LEAST_STEPS = 200  # of the solver: a speed may turn round between two times that are asked for
+# Relative tolerance of the solver, and its absolute tolerance as a multiple of the largest deflection.
+RTOL, ATOL = 1e-9, 1e-12
+# Smallest number of steps of the solver. It has to resolve a reversal of the speed between two output times.
+LEAST_STEPS = 200
 
 
 @dataclass(frozen=True)
 class Bristles:
-    """What the bristles do along a history.
+    """Force, deflection and heat along a history of the speed.
 
     Attributes
     ----------
     force_N : ndarray, shape (n,)
         Friction force.
     deflection_mm : ndarray, shape (n,)
-        Mean deflection z, each element weighing by its stiffness.
+        Mean deflection z in mm, weighted by stiffness.
     heat_mW : ndarray, shape (n,)
-        Power turned into heat, in mW: that of the force less what the bristles store.
+        Dissipated power in mW: the power of the force minus that stored in the bristles.
     """
 
     force_N: np.ndarray
@@ -50,7 +52,7 @@ class Bristles:
 
 
 def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
-    r"""Deflection of the bristles in steady sliding, g(v) of Eqs. 3 and 6, in mm.
+    r"""Return the deflection of the bristles in steady sliding, g(v) of Eqs. 3 and 6, in mm.
 
     .. math:: g(v) = \frac{N}{\sigma_0} [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}]
 
@@ -85,7 +87,7 @@ def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
 
 @dataclass(frozen=True)
 class LuGre:
-    """The numbers of the dynamic LuGre model.
+    """The parameters of the dynamic LuGre model.
 
     Attributes
     ----------
@@ -94,7 +96,7 @@ class LuGre:
     sigma_0, sigma_1, sigma_2 : float
         Stiffness in N/mm, damping of the bristles in N s/mm, viscous coefficient in N s/mm.
     contact : Contact, optional
-        Where friction depends on the local pressure.
+        Contact with pressure-dependent friction.
     """
 
     mu_s: float
@@ -106,33 +108,33 @@ class LuGre:
     contact: Contact | None = None
 
     def limit_mm(self, speed_mm_s, load_N: float) -> np.ndarray:
-        """Return every element's deflection in steady sliding, shape (..., elements), as `bristle_limit`."""
+        """Return the elements' deflection in steady sliding in mm, shape (..., elements), by `bristle_limit`."""
         numbers = {"mu_s": self.mu_s, "mu_c": self.mu_c, "v_s": self.v_s, "sigma_0": self.sigma_0}
         return np.asarray(bristle_limit(speed_mm_s, load_N, **numbers))[..., None] * self.elements(load_N)[1]
 
     def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return each element's share of the load and its mu over that at the reference, as `Contact.elements`."""
+        """Return each element's share of the load and factor on mu, by `Contact.elements`."""
         return (np.ones(1), np.ones(1)) if self.contact is None else self.contact.elements(load_N)
 
 
 def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_mm: float = 0.0) -> Bristles:
-    """Friction force of the dynamic LuGre model along a history of the speed (Eqs. 1 to 7), in N.
+    """Return the friction force of the dynamic LuGre model along a history of the speed (Eqs. 1 to 7), in N.
 
-    A speed given as numbers is constant between two times, and each step is then exact; one given as a function is
-    followed by a stiff solver (LSODA).
+    An array of speeds is constant between times, and each step is exact. A function of the time is integrated by a
+    stiff solver (LSODA).
 
     Parameters
     ----------
     time_s : ndarray, shape (n,)
         Rising times in s.
     speed_mm_s : ndarray, shape (n,), or callable
-        Speed in mm/s, signed: number k holds until time k, the first at the first time. Or a function of the time.
+        Signed speed in mm/s: value k from time k - 1 to time k. Or a function of the time.
     load_N : float
         Normal load in N.
     model : LuGre
-        Its numbers.
+        Parameters.
     deflection_mm : float
-        Of all bristles at the first time; 0: relaxed.
+        Initial deflection of all bristles in mm.
 
     Returns
     -------
@@ -146,13 +148,13 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
 
     Notes
     -----
-    The heat is never negative with sigma_1 = 0. With damping it is for every history if, and only if,
-    sigma_2 >= sigma_1 (mu_s - mu_c) / mu_c: Barahanov & Ortega 2000, IEEE Trans. Automatic Control 45(4), 830-832,
-    doi:10.1109/9.847131.
+    The heat is not negative with sigma_1 = 0. With damping this is true for every history if and only if sigma_2 >=
+    sigma_1 (mu_s - mu_c) / mu_c (Barahanov & Ortega 2000, IEEE Trans. Automatic Control 45(4), 830-832,
+    doi:10.1109/9.847131).
 
     Examples
     --------
-    From rest at 2 mm/s: the force comes up over 0.25 mm, here half of it in one step.
+    From rest at 2 mm/s the force rises over a length of 0.25 mm; the first step reaches half of its final value.
 
     >>> import numpy as np
     >>> model = LuGre(mu_s=0.5, mu_c=0.5, v_s=5.0, sigma_0=100.0)
@@ -162,7 +164,9 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
     """
     time = np.asarray(time_s, float)
     if time.ndim != 1 or not time.size or not (np.diff(time) > 0).all():
-        raise ParameterError("time_s must be one row of rising times.", fix="Sort the rows and drop repeated times.")
+        raise ParameterError(
+            "time_s must be one-dimensional and increasing.", fix="Sort the rows and drop repeated times."
+        )
     if not (model.sigma_1 >= 0 and model.sigma_2 >= 0):
         raise ParameterError(f"sigma_1 = {model.sigma_1:g}, sigma_2 = {model.sigma_2:g}: neither can be negative.")
     share = model.elements(load_N)[0]
@@ -182,7 +186,7 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
 
 
 def _stepped(time: np.ndarray, speed: np.ndarray, limit: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return every element's deflection, shape (n, elements), exact where the speed is constant between times."""
+    """Return every element's deflection, shape (n, elements), exact for a speed that is constant between times."""
     slid = np.abs(speed) * np.diff(time, prepend=time[0])
     kept, end = np.exp(-slid[:, None] / limit), np.sign(speed)[:, None] * limit
     paths = []
@@ -196,7 +200,7 @@ def _stepped(time: np.ndarray, speed: np.ndarray, limit: np.ndarray, start: np.n
 
 def _solved(time: np.ndarray, speed: Callable, limit: Callable, start: np.ndarray) -> np.ndarray:
     """Return every element's deflection at the times, shape (n, elements), by a stiff solver."""
-    from scipy.integrate import solve_ivp  # here, so that the other equations can be used without it
+    from scipy.integrate import solve_ivp  # a slow import that only this function needs
 
     def rate(t: float, z: np.ndarray) -> np.ndarray:
         v = float(speed(t))
@@ -212,6 +216,6 @@ def _solved(time: np.ndarray, speed: Callable, limit: Callable, start: np.ndarra
     )  # fmt: skip
     if not found.success:
         raise ParameterError(
-            f"the speed cannot be followed: {found.message}", fix="Give it without jumps, or as numbers."
+            f"the speed cannot be integrated: {found.message}", fix="Give it without jumps, or as an array."
         )
     return found.y.T

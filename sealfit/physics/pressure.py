@@ -9,7 +9,8 @@ import numpy as np
 
 from sealfit.errors import ParameterError
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)  # 64: exact to rounding for all four, up to decay of about 50
+# Gauss-Legendre nodes and weights. 64 are exact to rounding for all four distributions, up to a decay of about 50.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
 def _inside(zeta_mm, width_mm):
@@ -27,7 +28,7 @@ def uniform(zeta_mm, load_N, *, width_mm):
     Parameters
     ----------
     zeta_mm : float or ndarray, shape (n,)
-        Place in the contact, 0 <= zeta <= L, in mm.
+        Position in the contact, 0 <= zeta <= L, in mm.
     load_N : float
         Total load F_n in N.
     width_mm : float
@@ -65,7 +66,7 @@ def exponential(zeta_mm, load_N, *, width_mm, decay=1.0):
 
     .. math:: f_n = \frac{\lambda F_n}{L (1 - e^{-\lambda})} e^{-\lambda\zeta/L}
 
-    Parameters and errors as `uniform`; `decay` is lambda, without unit. Zero is the limit, `uniform`; negative rises.
+    Parameters and errors as `uniform`; `decay` is lambda, dimensionless. At 0 it is `uniform`; below 0 it increases.
 
     Examples
     --------
@@ -108,13 +109,13 @@ class Contact:
     Attributes
     ----------
     pressure : callable
-        One of `PRESSURES`, or another of the same arguments, in N/mm.
+        One of `PRESSURES`, or another function with the same arguments, in N/mm.
     width_mm : float
         Contact width L in mm.
     exponent : float
-        n, of the friction force over the load; 1: friction does not depend on the pressure. Rubber: 2/3 to 1.
+        n; 1 for friction independent of the pressure, 2/3 to 1 for rubber.
     reference_N_mm : float, optional
-        Load per width at which mu_s and mu_c hold; default: the mean of the load at hand.
+        Load per width at which mu_s and mu_c are defined; default the mean of the present load.
     shape : mapping
         Further arguments of the distribution, such as `decay`.
     """
@@ -126,7 +127,7 @@ class Contact:
     shape: Mapping[str, float] = field(default_factory=dict)
 
     def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return each element's share of the load, and its mu over that at the reference, of shape (elements,) each.
+        """Return each element's share of the load and its mu relative to the reference, shape (elements,) each.
 
         Raises
         ------

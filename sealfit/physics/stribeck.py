@@ -8,14 +8,14 @@ from sealfit.errors import ParameterError
 
 
 def stribeck_decay(speed_mm_s, v_s):
-    r"""Share of the static rise that is left at a speed, between 1 (at rest) and 0 (fast).
+    r"""Return the decay of the static rise mu_s - mu_c with speed, from 1 at rest to 0 at high speed.
 
     .. math:: E = e^{-(v / v_s)^2}
 
     Parameters
     ----------
     speed_mm_s : float or ndarray
-        Sliding speed v in mm/s; its sign does not matter.
+        Sliding speed v in mm/s, of either sign.
     v_s : float or ndarray
         Stribeck speed in mm/s, broadcast against the speed.
 
@@ -41,7 +41,7 @@ def stribeck_decay(speed_mm_s, v_s):
 
 
 def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
-    r"""Friction force of the distributed LuGre model in steady sliding (Eq. 14), in N.
+    r"""Return the friction force of the distributed LuGre model in steady sliding (Eq. 14), in N.
 
     .. math:: F = N [\mu_c + (\mu_s - \mu_c) e^{-(v / v_s)^2}] \mathrm{sgn}\,v + \sigma_2 v
 
@@ -55,7 +55,7 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
     Returns
     -------
     float or ndarray, shape (n,)
-        Force in N, odd in the speed and with its sign for the usual, non-negative coefficients.
+        Force in N, an odd function of the speed, with its sign for nonnegative coefficients.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
 
     Notes
     -----
-    Steady sliding only: sigma_0 and sigma_1 have no part, and F(0) = 0, not breakaway.
+    In steady sliding sigma_0 and sigma_1 have no effect. F(0) = 0 is not the break-away force.
     Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10.1109/9.376053;
     Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102, Eq. 14.
 
@@ -75,7 +75,7 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
     """
     speed, load = np.asarray(speed_mm_s, float), np.asarray(load_N, float)
     if np.any(load < 0):
-        raise ParameterError(f"load_N = {np.min(load):g}: a normal load presses; it cannot be negative.")
+        raise ParameterError(f"load_N = {np.min(load):g}: a normal load cannot be negative.")
     mu_s, mu_c = np.asarray(mu_s, float), np.asarray(mu_c, float)
     mu = mu_c + (mu_s - mu_c) * stribeck_decay(speed, v_s)
     return load * mu * np.sign(speed) + np.asarray(sigma_2, float) * speed

@@ -27,15 +27,15 @@ from sealfit.report.notation import (
     together,
     true_units,
 )
-from sealfit.report.summary import WITHIN
-from sealfit.report.words import PARTS, acts, meaning, target_html
+from sealfit.report.summary import level_words
+from sealfit.report.words import acts, meaning, target_html
 
 MOST_TESTS = 40
 FREE = {
-    "smooth": "a free smooth shape",
-    "levels": "a level of its own for each category",
-    "surface": "a free smooth surface",
-    "slopes": "a slope of its own for each category",
+    "smooth": "free smooth shape",
+    "levels": "one level per category",
+    "surface": "free smooth surface",
+    "slopes": "one slope per category",
 }
 
 
@@ -43,11 +43,11 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
     """Return the rows of the table before and after: label, note, before, after, change."""
     unit, held = config.units.unit("force"), closure.get("heldout_unit") or "run"
     rows = (
-        ("heldout_rmse_N", f"rms error on {held}s the fit did not see", unit),
-        ("rmse_N", "rms error, all bins, in sample", unit),
-        ("rmse_runs_N", "rms error of the run means, in sample", unit),
+        ("heldout_rmse_N", f"rms error, held-out {held}s", unit),
+        ("rmse_N", "rms error of all bins, in sample", unit),
+        ("rmse_runs_N", "rms error of run means, in sample", unit),
         ("max_abs_N", "largest error of a bin", unit),
-        ("mean_abs_pct", "mean absolute error, of the measured run mean", "%"),
+        ("mean_abs_pct", "mean absolute error, relative to the run mean", "%"),
     )
     found = []
     for key, label, of in rows:
@@ -61,12 +61,12 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
 
 
 def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
-    """Return a row per variable and level: label, level and the smallest effect that the campaign would have shown."""
+    """Return a row per variable and level: label, level and the smallest detectable effect."""
     unit = config.units.unit("force")
     return [
         {
             "variable": channel_label(entry["variable"], config.units),
-            "level": WITHIN[entry["level"]],
+            "level": level_words(entry["level"]),
             "smallest": of_unit(number(entry["smallest_N"], 2), unit) if known(entry["smallest_N"]) else "none",
             "share": of_unit(number(entry["smallest_pct"], 2), "%") if known(entry["smallest_pct"]) else NOTHING,
             "files": f"{entry['files_needed']:,}" if known(entry["files_needed"]) else NOTHING,
@@ -76,7 +76,7 @@ def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
 
 
 def refused_rows(closure: Mapping, config: Config) -> list[dict]:
-    """Return what was found and is in no model: its label, p-value and the reason."""
+    """Return the significant effects that were not accepted: label, p-value and reason."""
     return [
         {
             "label": f"{entry['id']} along {joined([channel_label(c, config.units) for c in entry['channels']])}",
@@ -93,7 +93,7 @@ def _change(before: float, after: float) -> str:
 
 
 def effect_cards(closure: Mapping, config: Config) -> list[dict]:
-    """Return every effect, added or candidate, with all that is said about it."""
+    """Return every effect, added or candidate, with the content of its card."""
     cards = []
     for index, effect in enumerate(closure["effects"]):
         label = effect_label(effect, config.units)
@@ -111,7 +111,7 @@ def effect_cards(closure: Mapping, config: Config) -> list[dict]:
                 "given": "factor minus one" if effect["operation"] == "multiply" else f"added {_added(effect, config)}",
                 "form": effect["form"],
                 "reference": effect.get("reference") or "",
-                "level": PARTS.get(effect["level"], effect["level"]),
+                "level": level_words(effect["level"]),
                 "channels": channels,
                 "parameters": [_parameter(p, effect) for p in effect["parameters"]],
                 "p": p_value(effect.get("p_value")),
@@ -168,10 +168,10 @@ def _rival(rival: Mapping, config: Config) -> Markup:
 
 
 def scatter_rows(closure: Mapping, config: Config) -> list[dict]:
-    """Return the scatter that is no structure, by level."""
+    """Return the variance components by level."""
     return [
         {
-            "level": PARTS.get(entry["level"], entry["level"]),
+            "level": level_words(entry["level"]),
             "sd": number(entry.get("sd_N"), 2),
             "share": f"{number(100 * entry['sd_rel'], 2)} %" if known(entry.get("sd_rel")) else NOTHING,
             "df": number(entry.get("df"), 2) if known(entry.get("df")) else NOTHING,
@@ -181,7 +181,7 @@ def scatter_rows(closure: Mapping, config: Config) -> list[dict]:
 
 
 def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config: Config) -> list[dict]:
-    """Return what each channel orders of the residual, before and after, the most significant first."""
+    """Return the part of the residual that each variable explains, before and after, the most significant first."""
     tested = levels[levels["channel"].notna()]
     if tested.empty:
         return []
@@ -191,7 +191,7 @@ def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config:
         words = joined([channel_words(part, config.units) for part in split_channels(row.channel, names)])
         entry = rows.setdefault(
             (row.channel, row.level),
-            {"channel": words, "level": PARTS.get(row.level, row.level), "rank": 1.0}
+            {"channel": words, "level": level_words(row.level), "rank": 1.0}
             | {f"{what}_{stage}": NOTHING for what in ("sd", "p") for stage in ("before", "after")},
         )
         entry[f"sd_{row.stage}"] = number(row.sd_N, 2)
@@ -204,7 +204,7 @@ def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config:
 
 
 def next_runs(closure: Mapping, config: Config) -> list[dict]:
-    """Return why and where to measure next."""
+    """Return the recommended runs: the reason and the conditions."""
     names, found = ConditionNames.of(config), []
     for entry in closure.get("next_runs") or []:
         wanted = entry.get("conditions")

@@ -14,7 +14,7 @@ from sealfit.ingest.categorical import UNAGED
 from sealfit.units import Units
 
 # ---------------------------------------------------------------- numbers
-# Numbers as people read them: a value rounded to its uncertainty, a minus that is a minus, nothing invented.
+# Numbers for readers: a value rounded to its uncertainty, and a typographic minus sign.
 
 NOTHING = "–"
 THIN = "\u202f"  # narrow no-break space: between thousands, and around the cross of a power of ten
@@ -50,7 +50,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def given(value: float | None, digits: int = 3) -> str:
-    """Return a number that somebody set, without the zeros that a measured one would need.
+    """Return a number that was set, without trailing zeros.
 
     Examples
     --------
@@ -145,7 +145,7 @@ def p_value(p: float | None) -> str:
 
 
 def of_unit(text: str, unit: str) -> str:
-    """Return a number with its unit, which no line break parts.
+    """Return a number with its unit, without a line break between them.
 
     Examples
     --------
@@ -174,7 +174,7 @@ def _power(value: float) -> int:
 
 
 def power_of_ten(power: int) -> str:
-    """Return an exponent as it is written above the line.
+    """Return an exponent in superscript.
 
     Examples
     --------
@@ -264,7 +264,7 @@ def _split(name: str) -> tuple[str | None, str]:
 
 
 def plain(text: object) -> str:
-    """Return text for a plot as it stands: a dollar sign in a column's name starts no formula."""
+    """Return text for a plot, with dollar signs escaped."""
     return str(text).replace("$", r"\$")
 
 
@@ -275,7 +275,7 @@ def short(text: object, longest: int = 34) -> str:
 
 
 def true_units(text: str, units: Units) -> str:
-    """Return a sentence with every slot's name put as its true quantity and unit.
+    """Return a sentence with each slot's name replaced by its quantity and unit.
 
     Examples
     --------
@@ -314,9 +314,9 @@ def channel_words(name: str, units: Units) -> str:
 
 
 def split_channels(text: str | None, known: Collection[str]) -> list[str]:
-    """Return the channels whose names, joined by spaces, `text` is.
+    """Return the channel names that `text` joins by spaces.
 
-    A column's own name may hold spaces, so the names that are known decide where to cut.
+    A column name may contain spaces, so the text is cut at the names in `known`.
 
     Examples
     --------
@@ -332,7 +332,7 @@ def split_channels(text: str | None, known: Collection[str]) -> list[str]:
 
 
 def effect_label(effect: Mapping, units: Units) -> str:
-    """Return an effect's label in words, slots by their true quantity; how it acts is said elsewhere.
+    """Return an effect's label in words, slots by their quantity, without the target.
 
     Examples
     --------
@@ -345,13 +345,13 @@ def effect_label(effect: Mapping, units: Units) -> str:
 
 
 def quantity_words(name: str) -> str:
-    """Return what a fit's statistic is called."""
+    """Return the name of a statistic of a fit."""
     return _STATISTICS.get(name, name.removesuffix("_N").replace("_", " "))
 
 
 @dataclass(frozen=True)
 class ConditionNames:
-    """How conditions and series are spelled: values with units, the order said once.
+    """Short names of conditions and series: values with units.
 
     Examples
     --------
@@ -370,14 +370,14 @@ class ConditionNames:
         return cls((*config.condition, *rubber), config.units)
 
     def __call__(self, text: object) -> str:
-        """Return a condition or series as the tables spell it, in short."""
+        """Return the short name of a condition or series."""
         parts = self.parts(text)
         if not parts:
             return str(text)
         return " · ".join(self._value(name, value) for name, value in parts.items())
 
     def parts(self, text: object) -> dict[str, str]:
-        """Return {column: value} of a condition as the tables spell it; empty if it is not spelled so (unaged)."""
+        """Return {column: value} of a condition's name; empty for "unaged"."""
         marks = "|".join(re.escape(name) for name in sorted(self.columns, key=len, reverse=True))
         pieces = re.split(rf"(?:^|, )({marks})=", str(text))
         if pieces[0]:
@@ -393,7 +393,7 @@ class ConditionNames:
 
     @property
     def key(self) -> str:
-        """What the values stand for, in their order; "" for a single one, which needs no telling apart."""
+        """The names of the values, in their order; "" for a single one."""
         if len(self.columns) < 2:
             return ""
         return " · ".join(channel_words(name, self.units) for name in self.columns)

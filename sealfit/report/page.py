@@ -1,4 +1,4 @@
-"""One self-contained report.html: its tables and sentences, and every plot as an image inside it."""
+"""The self-contained report.html: tables, sentences and embedded plots."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from sealfit.report.words import left_over, verdict, with_left_channels
 from sealfit.tables import SCHEMAS
 
 # ---------------------------------------------------------------- facts
-# Facts about the campaign, its quality and its provenance, as plain values for the page.
+# Campaign, data quality and provenance, as plain values for the page.
 
-MOST_FINDINGS = 400  # listed in the page; all of them stand in quality.parquet
-MOST_INPUTS = 2000  # listed with their hashes; all of them stand in inputs.parquet
+MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
+MOST_INPUTS = 2000  # listed with their hashes; inputs.parquet has all
 SEVERITIES = ("error", "warning", "info")
 
 
@@ -51,18 +51,22 @@ def campaign_facts(tables: Mapping[str, pd.DataFrame], config: Config) -> list[s
         repeats = used.groupby("run_id")["file"].nunique()
         low, high = int(repeats.min()), int(repeats.max())
         facts.append(
-            "no repeats" if high == 1 else f"{low} repeats a run" if low == high else f"{low} to {high} repeats a run"
+            "no repeats"
+            if high == 1
+            else f"{low} repeats per run"
+            if low == high
+            else f"{low} to {high} repeats per run"
         )
         speed = used["speed_set_mm_s"].where(used["speed_set_mm_s"].notna(), used["speed_mm_s"].abs()).astype(float)
         facts.append(f"{units.quantity('speed')} {_range(speed)} {units.unit('speed')}")
         if used["direction"].nunique() > 1:
-            facts[-1] += ", both ways"
+            facts[-1] += ", both directions"
         if used["load_N"].notna().any():
             facts.append(f"{units.quantity('load')} {_range(used['load_N'], 4)} {units.unit('load')}")
         else:
             force = units.quantity("force")
             what = "forces are" if force == "friction force" else f"{force} is"
-            facts.append(f"no load given: {what} fitted in place of coefficients")
+            facts.append(f"no load given: {what} fitted instead of coefficients")
     left_out = int((inputs["status"] == "left out").sum()) if len(inputs) else 0
     return [*facts, f"{count(left_out, 'file')} left out"] if left_out else facts
 
@@ -73,7 +77,7 @@ def _range(values: pd.Series, digits: int = 3) -> str:
 
 
 def quality_counts(quality: pd.DataFrame) -> list[dict]:
-    """Return how many findings there are of each check, severity and action, the worst first."""
+    """Return the number of findings per check, severity and action, the most severe first."""
     if quality.empty:
         return []
     keys = quality[["check", "severity", "action"]].fillna("").astype(str)
@@ -93,7 +97,7 @@ def quality_counts(quality: pd.DataFrame) -> list[dict]:
 
 
 def quality_findings(quality: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
-    """Return the findings worth listing (all but what is only said), the worst first, and how many rows that takes.
+    """Return the findings other than mere information, the most severe first, and the number of rows.
 
     What many files share is one row with a count and examples.
     """
@@ -129,7 +133,7 @@ def _finding(group: list[Fault], config: Config) -> dict:
 
 
 def provenance_facts(provenance: Mapping) -> dict:
-    """Return provenance.json with every key that the page reads, in a form fit to print."""
+    """Return provenance.json with every key that the page reads."""
     config = provenance.get("config") or {}
     campaign = str(provenance.get("campaign") or "")
     every = provenance.get("inputs") or []
@@ -159,7 +163,7 @@ def provenance_facts(provenance: Mapping) -> dict:
 
 
 def complete(tables: Mapping[str, pd.DataFrame], names: tuple[str, ...]) -> dict[str, pd.DataFrame]:
-    """Return every table of `names`; one without rows, with its columns, in place of one that is missing."""
+    """Return every table of `names`; an empty one with its columns replaces a missing one."""
     found = {}
     for name in names:
         frame = tables.get(name)
@@ -177,19 +181,19 @@ TABLES = (
     "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves",
 )  # fmt: skip
 FITS = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
-BEFORE = "{}_before"  # name of such a table without the loop's effects, beside that of the after-model
+BEFORE = "{}_before"  # name of such a table without the loop's effects
 VERDICTS = {
     "closed": "Closed",
     "nothing_missing": "Nothing missing",
     "unexplained": "Unexplained",
     "cannot_tell": "Cannot tell",
-    None: "Not closed yet",
+    None: "Loop not run",
 }
 
 
 @dataclass(frozen=True)
 class Report:
-    """The page, and its plots by name for whoever saves them as files."""
+    """The page, and its plots by name."""
 
     html: str
     figures: dict[str, Drawn]
@@ -206,7 +210,7 @@ def build_report(
     Parameters
     ----------
     tables : mapping of str to DataFrame
-        Tables of OUT by name, as `sealfit.tables` describes them; what is missing or empty is said to be so.
+        Tables of OUT by name, as in `sealfit.tables`; they may be missing or empty.
     closure : mapping or None
         closure.json, or None where the loop was not run.
     provenance : mapping
@@ -217,7 +221,7 @@ def build_report(
     Returns
     -------
     Report
-        The page asks for nothing outside itself. Figures are drawn once; the page shows their panels.
+        The page loads nothing. Figures are drawn once; the page shows their panels.
     """
     tables, closure = answered(tables, closure)
     plots = draw_all(tables, closure, config)
@@ -233,17 +237,17 @@ def build_report(
 def answered(
     tables: Mapping[str, pd.DataFrame], closure: Mapping | None
 ) -> tuple[dict[str, pd.DataFrame], Mapping | None]:
-    """Return tables and closure.json as the figures and the page take them: see `with_answer`, `with_left_channels`."""
-    tables = with_answer(tables)
+    """Return tables and closure.json as the figures and the page use them; see `with_after_fits`."""
+    tables = with_after_fits(tables)
     if closure is not None:
         closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
     return tables, closure
 
 
-def with_answer(tables: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Return the report's tables, with the fits of the after-model in place of those before where there are any.
+def with_after_fits(tables: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Return the report's tables, with the fits after the loop in place of those before it, if there are any.
 
-    Those before then stand under their names and `_before`.
+    Those before then have the suffix `_before`.
     """
     complete = page.complete(tables, TABLES)
     if not len(tables.get("steady_fit_after", ())):
@@ -280,7 +284,7 @@ def _content(
         "next_runs": next_runs(closure, config) if closure else [],
         "tests": channel_tests(tables["levels"], tables["channels"]["channel"].dropna(), config),
         "more_channels": max(0, tables["channels"]["channel"].nunique() - MOST_CHANNELS),
-        "parameter_tables": sorted(fitted, key=lambda table: table.single),  # how well the fits do comes last
+        "parameter_tables": sorted(fitted, key=lambda table: table.single),  # goodness of fit comes last
         "aging_fitted": len(tables["aging_fit"]) > 0,
         "aging": config.aging,
         "laws": law_rows(tables["aging_laws"], before["aging_laws"]),
@@ -300,7 +304,7 @@ def _content(
 
 
 def _images(plot: Plot, drawn: Drawn) -> dict:
-    """Return a plot as the template draws it: every panel an image of its own, so that they flow with the page."""
+    """Return a plot for the template: every panel a separate image."""
     panels = [
         {
             "src": data_uri(image.svg),

@@ -1,4 +1,4 @@
-"""The fitted parameters and laws of aging as tables to read, each value with its interval."""
+"""Tables of the fitted parameters and aging laws, each value with its interval."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from sealfit.report.notation import (
 from sealfit.report.style import MOST_ROWS, natural, spread
 
 # ---------------------------------------------------------------- law tables
-# The joint laws of aging as rows to read: what each says, and the evidence for it.
+# Rows of the joint aging laws: form, parameters and evidence.
 
-MOST_LAWS = 4  # of each quantity
+MOST_LAWS = 4  # listed per quantity
 
 
 def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> list[dict]:
-    """Return the likeliest laws of each quantity, and separate laws, as plain values for the page.
+    """Return the laws with the lowest BIC of each quantity, and the separate laws, as plain values for the page.
 
     Parameters
     ----------
     aging_laws : DataFrame
         Table `aging_laws`, perhaps empty.
     before : DataFrame, optional
-        The same without the loop's effects: its likeliest law follows that of `aging_laws`.
+        The same without the loop's effects; its best law follows that of `aging_laws`.
     """
     found = []
     earlier = {} if before is None else {row["key"]: row for row in law_rows(before) if row["chosen"]}
@@ -74,7 +74,7 @@ def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> li
 
 
 def _with_interval(by: pd.DataFrame, name: str) -> str:
-    """Return a parameter with its interval, or that these data do not determine it."""
+    """Return a parameter with its interval, or "not identified"."""
     if name not in by.index:
         return NOTHING
     row = by.loc[name]
@@ -85,7 +85,7 @@ def _with_interval(by: pd.DataFrame, name: str) -> str:
 
 
 # ---------------------------------------------------------------- parameters
-# The fitted parameters as tables to read: a row per condition or series, each parameter with interval and u_sys.
+# Tables of the fitted parameters: a row per condition or series, each parameter with its interval and u_sys.
 
 STATISTICS = (
     "rmse_N", "rmse", "max_error_pct", "specimen_sd_pct", "reduced_chi2", "lack_of_fit_p", "df",
@@ -93,14 +93,14 @@ STATISTICS = (
 )  # fmt: skip
 ENDS = ("value", "lo95", "hi95")
 MOST_BREAK_AWAYS = 600
-HIDDEN = ("covariance", "sensor_shift", "effect_shift")  # for programs; they stand in the Parquet tables
+HIDDEN = ("covariance", "sensor_shift", "effect_shift")  # not shown: for programs that read the Parquet tables
 
 Rows = dict[tuple[str, str], dict]  # of one condition or series, by parameter and unit
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One parameter of one row; `words` stands in its place where these data do not determine it."""
+    """One parameter of one row; `words` replaces the values where it is not identified."""
 
     value: str = NOTHING
     interval: str = NOTHING
@@ -111,9 +111,9 @@ class Cell:
 
 @dataclass(frozen=True)
 class ParameterTable:
-    """A table ready to be written: heads of the key columns, (symbol, unit) of each parameter, rows, notes.
+    """A table for the page: heads of the key columns, (symbol, unit) of each parameter, rows, notes.
 
-    A row is its keys, its cells, and what there is to say about it: why a parameter is not identified, remarks.
+    A row has keys, cells and a note: why a parameter is not identified, or a remark.
     """
 
     title: str
@@ -121,8 +121,8 @@ class ParameterTable:
     groups: tuple[tuple[Markup, str], ...]
     rows: tuple[tuple[tuple[str | Markup, ...], tuple[Cell, ...], Markup], ...]
     single: bool = False  # values only: statistics have neither interval nor u_sys
-    note: str = ""  # which of how many there are, where they are too many
-    compared: bool = False  # whether cells say what they were before
+    note: str = ""  # the number of rows shown, where there are too many
+    compared: bool = False  # whether cells have the value before
 
     @property
     def width(self) -> int:
@@ -131,7 +131,7 @@ class ParameterTable:
 
 
 def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
-    """Return the break-aways that stand above the sliding force, as plain values for the page, and how many there are.
+    """Return the break-away forces above the sliding force, as plain values for the page, and their number.
 
     Parameters
     ----------
@@ -211,15 +211,13 @@ def _values(fit: pd.DataFrame, key: str) -> dict[tuple[str, str, str], dict]:
 
 
 def _readable(fit: pd.DataFrame, key: str, names: ConditionNames) -> tuple[pd.DataFrame, str]:
-    """Return the rows of as many conditions or series as one reads, and in words which they are."""
+    """Return the rows of at most `MOST_ROWS` conditions or series, and a note on the selection."""
     every = sorted(fit[key].unique(), key=lambda name: _place(name, names))
     if len(every) <= MOST_ROWS:
         return fit, ""
     stored = "aging_fit" if key == "series" else "dynamic_fit" if "dynamic" in set(fit["quantity"]) else "steady_fit"
-    note = (
-        f"{MOST_ROWS} of {count(len(every), key, key if key == 'series' else None)}, spread evenly over all of them; "
-    )
-    return fit[fit[key].isin(spread(every, MOST_ROWS))], f"{note}the others stand in {stored}.parquet."
+    note = f"{MOST_ROWS} of {count(len(every), key, key if key == 'series' else None)}, selected evenly; "
+    return fit[fit[key].isin(spread(every, MOST_ROWS))], f"{note}{stored}.parquet has all."
 
 
 def _table(
@@ -240,7 +238,7 @@ def _table(
             cells = tuple(replace(cell, before=old) for cell, old in zip(cells, olds, strict=True))
         keys = (names(name), symbol_html(quantity)) if several else (names(name),)
         found.append((keys, cells, _note(by, config)))
-    heads = (_head(key), "of") if several else (_head(key),)
+    heads = (key, "quantity") if several else (key,)
     groups = tuple((symbol_html(p), u) for p, u in parameters)
     title = _title(key, quantities, after=earlier is not None)
     return ParameterTable(title, heads, groups, tuple(found), compared=earlier is not None)
@@ -260,8 +258,8 @@ def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Conf
         keys = (names(name), symbol_html(of)) if several else (names(name),)
         found.append((keys, cells, _note(lack, config, named=False)))
     groups = tuple((Markup("{}").format(quantity_words(p)), u) for p, u in shown)
-    title = "How well the fits do" if key == "condition" else "How well the aging law does"
-    heads = (_head(key), "of") if several else (_head(key),)
+    title = "Goodness of fit, per condition" if key == "condition" else "Goodness of fit of the aging law, per series"
+    heads = (key, "quantity") if several else (key,)
     return ParameterTable(title, heads, groups, tuple(found), single=True)
 
 
@@ -280,13 +278,13 @@ def _place(name: str, names: ConditionNames) -> tuple[bool, list]:
 
 
 def _records(rows: pd.DataFrame, *keys: str) -> list[dict]:
-    """Return rows as dictionaries, None where nothing stands: a table of one dtype takes pandas one pass."""
+    """Return rows as dictionaries, with None for missing values."""
     plain = rows[[*keys, "parameter", "unit", "value", "lo95", "hi95", "u_sys", "identified", "reason"]].astype(object)
     return plain.where(plain.notna(), None).to_dict("records")
 
 
 def _statistic(row: Mapping) -> str:
-    """Return a count as a count, a measure with its digits."""
+    """Return a count without decimals, another statistic to three digits."""
     whole = known(row["value"]) and float(row["value"]).is_integer() and abs(row["value"]) >= 1
     return given(row["value"], 9) if whole else number(row["value"])
 
@@ -308,7 +306,7 @@ def _before(row: Mapping | None) -> str:
 
 
 def _note(rows: Mapping[tuple[str, str], Mapping], config: Config, *, named: bool = True) -> Markup:
-    """Return what there is to say about a row, each thing once, with the parameters that it is about."""
+    """Return the reasons and remarks of a row, each once, with its parameters."""
     about: dict[tuple[bool, str], list[str]] = {}
     for (parameter, _), row in rows.items():
         why = row["reason"] or ("" if row["identified"] else "these data do not determine it")
@@ -322,17 +320,13 @@ def _note(rows: Mapping[tuple[str, str], Mapping], config: Config, *, named: boo
     return Markup("<br>").join(said)
 
 
-def _head(key: str) -> str:
-    return {"condition": "condition", "series": "series"}.get(key, key)
-
-
 def _title(key: str, quantities: Sequence[str], *, after: bool) -> str:
     if quantities == ["dynamic"]:
-        return "Bristles, fitted to the starts of each condition"
+        return "Pre-sliding stiffness and damping, per condition"
     if key == "condition":
-        return "Steady friction, fitted to each condition on its own"
+        return "Steady friction, per condition"
     return (
-        ("Aging law of each series, from the joint fit" if after else "Aging law, fitted to each series")
+        ("Aging law per series, from the joint fit" if after else "Aging law per series")
         if set(quantities) <= {"mu_s", "mu_c", "F_s", "F_c"}
         else ", ".join(quantities)
     )

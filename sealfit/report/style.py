@@ -1,4 +1,4 @@
-"""One look for every plot, how panels become SVG and PNG, and how much of a large campaign is drawn."""
+"""Style of the plots, their conversion to SVG and PNG, and the selection of panels in large campaigns."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocato
 from sealfit.report.notation import count, plain, power_of_ten, short, symbol_math
 
 # ---------------------------------------------------------------- excerpts
-# What of a large campaign is shown: as many panels, rows and keys as a person looks at, chosen, and said so.
+# Selection of the panels, rows and legend keys that are shown for a large campaign.
 
 MOST_PANELS = 12  # of a figure
 MOST_KEYS = 16  # of a legend
@@ -37,7 +37,7 @@ Thing = TypeVar("Thing")
 
 
 def spread(things: Sequence[Thing], most: int) -> list[Thing]:
-    """Return at most so many of some things, evenly from the first to the last.
+    """Return at most `most` of `things`, selected evenly from the first to the last.
 
     Examples
     --------
@@ -50,27 +50,27 @@ def spread(things: Sequence[Thing], most: int) -> list[Thing]:
 def telling(
     things: Sequence[Thing], misfit: Sequence[float], heat: Sequence[float], what: str
 ) -> tuple[list[Thing], str]:
-    """Return the things that panels are drawn of, in their order, and in words which of how many they are.
+    """Return the things to draw, in their order, and a note on the selection.
 
     Parameters
     ----------
     things : sequence
         Series, say, in the order of the panels.
     misfit, heat : sequence of float
-        Of each, how far measurements lie from the model and how hot it was; NaN where that is not known.
+        Misfit to the model and aging temperature of each; NaN where unknown.
     what : str
-        What several of them are called.
+        Plural of the thing, for the note.
 
     Returns
     -------
     list, str
-        All of them and "" where there are few; else those with the largest misfit, the hottest, and others spread
-        evenly, a third each.
+        All of them and "" where there are few; else those with the largest misfit, the hottest, and an even
+        selection of the others, a third each.
 
     Examples
     --------
     >>> telling(range(40), [0.0] * 39 + [1.0], [20.0] * 40, "series")[1]
-    '12 of 40 series are drawn: the 4 with the largest misfit and 8 spread over the others.'
+    '12 of 40 series are drawn: the 4 with the largest misfit and 8 of the others, selected evenly.'
     """
     if len(things) <= MOST_PANELS:
         return list(things), ""
@@ -82,7 +82,7 @@ def telling(
             picked += order[:third]
             said.append(f"the {third} {words}")
     rest = spread([k for k in range(len(things)) if k not in picked], MOST_PANELS - len(picked))
-    said.append(f"{len(rest)} spread over the others" if picked else "spread evenly")
+    said.append(f"{len(rest)} of the others, selected evenly" if picked else "selected evenly")
     words = " and ".join([", ".join(said[:-1]), said[-1]]) if len(said) > 1 else said[0]
     text = f"{MOST_PANELS} of {count(len(things), what, what)} are drawn: {words}."
     return [things[k] for k in sorted([*picked, *rest])], text
@@ -106,7 +106,7 @@ def rms(values: Iterable[float]) -> float:
 
 
 # ---------------------------------------------------------------- axes
-# What several plots share: axes that read well, one scale for all panels, the order of names.
+# Shared by the plots: ticks, one scale for all panels, and the order of names.
 
 MOST_TICKS = 8  # names of categories that fit below a panel
 MOST_VALUES = 6  # values of four digits that fit there
@@ -123,7 +123,7 @@ def is_logarithmic(x: np.ndarray, span: float) -> bool:
 
 
 def value_ticks(ax: Axes, x: np.ndarray) -> None:
-    """Put the ticks at the values themselves where they are few and far enough apart, else at round numbers."""
+    """Put the ticks at the values if these are few and far enough apart, else at round numbers."""
     x = np.unique(x)
     if 1 < len(x) <= MOST_VALUES and np.diff(x).min() > TICK_APART * np.ptp(x):
         ax.set_xticks(x, [f"{value:.4g}".replace("-", "−") for value in x])
@@ -195,10 +195,10 @@ def evenly(count: int, wanted: int) -> list[int]:
 
 
 # ---------------------------------------------------------------- style
-# One look for every plot: colours, sizes, and how panels become a figure.
+# Style of the plots: colours, sizes, and the layout of panels in a figure.
 
-# Okabe & Ito, Color Universal Design (2008): told apart by all common kinds of colour vision. Yellow is left out: too
-# light for lines on white.
+# Okabe & Ito, Color Universal Design (2008): distinguishable with all common kinds of colour vision.
+# Yellow is left out: it is too light for lines on white.
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222",
 )  # fmt: skip
@@ -251,7 +251,7 @@ Mark = Literal["line", "dotted", "dashed", "band", "point", "open", "left", "bar
 
 @dataclass(frozen=True)
 class Key:
-    """One entry of a legend: a label as it stands, or a parameter's symbol."""
+    """One entry of a legend: a label, or a parameter's symbol."""
 
     label: str
     colour: str
@@ -261,7 +261,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes: what is drawn on it, and the same in words for who cannot see it."""
+    """One pair of axes, with a text alternative."""
 
     title: str
     alt: str
@@ -273,7 +273,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Plot:
-    """Panels that belong together, with one legend; a note says what of a large campaign is left out."""
+    """Panels with one legend, and a note on the selection in a large campaign."""
 
     name: str
     title: str
@@ -284,7 +284,7 @@ class Plot:
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Draw in the report's look, whatever a matplotlibrc says; the caller's settings are as before afterwards."""
+    """Draw in the report's style, independent of a matplotlibrc; the caller's settings are restored."""
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams.update(RC)
@@ -292,7 +292,7 @@ def look() -> Iterator[None]:
 
 
 def shades(n: int) -> list[str]:
-    """Return `n` colours from dark to light, in an order that is seen without colour (viridis, its pale end cut)."""
+    """Return `n` colours from dark to light (viridis without its pale end)."""
     scale = mpl.colormaps["viridis"]
     return [to_hex(scale(0.82 * k / max(n - 1, 1))) for k in range(n)]
 
@@ -355,7 +355,7 @@ def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> Axes:
 
 
 def _put_power_behind_title(axis: Axis) -> None:
-    """Write the power of ten that an axis's labels lack behind its title: beside the axes it is in the way."""
+    """Move the power of ten of an axis to its title."""
     formatter = axis.get_major_formatter()
     formatter.set_locs(axis.get_majorticklocs())
     if power := re.sub(r"([\d.]+)e([-−]?\d+)", _as_written, formatter.get_offset()):
@@ -397,7 +397,7 @@ def _handle(key: Key) -> Line2D | Patch:
 
 
 # ---------------------------------------------------------------- drawn
-# Plots as SVG and PNG for their files, and each panel as an SVG of its own for the page.
+# Plots as SVG and PNG files, and each panel as a separate SVG for the page.
 
 CSS = 96
 """Pixels of a page in an inch."""
@@ -422,7 +422,7 @@ class Drawn:
 
 
 def draw(plot: Plot) -> Drawn:
-    """Return a plot, drawn; the same plot gives the same bytes."""
+    """Return a plot, drawn; equal plots give equal bytes."""
     whole = compose(plot)
     panels = tuple(
         Image(_svg(panel_figure(panel)), round(CSS * WIDTH), round(CSS * panel.height)) for panel in plot.panels
@@ -431,7 +431,7 @@ def draw(plot: Plot) -> Drawn:
 
 
 def data_uri(text: str) -> str:
-    """Return SVG as an address that holds it, so that the page asks for nothing."""
+    """Return SVG as a data URI."""
     return "data:image/svg+xml;base64," + b64encode(text.encode()).decode()
 
 

@@ -1,4 +1,4 @@
-"""What a command ends with: the main figures as plain values, and clauses on the verdict that the report shares."""
+"""Summaries of the steps as plain values, and clauses on the verdict that the report shares."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------- summary
-# What a command ends with: the main figures as plain values, for --json; `summary_lines` has the same in words.
+# The main figures of each step as plain values, for --json; `summary_lines` puts them in words.
 
 NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift", "effect_shift")  # `quantity` of rows about the fit itself
 
@@ -73,7 +73,7 @@ def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
 
 
 def _incomplete(quality: pd.DataFrame) -> list[dict]:
-    """Return the columns that some files have no value of, and what that does."""
+    """Return the columns that have no value in some files, and the consequence."""
     rows = quality[quality["check"] == "incomplete_column"]
     return [
         {"column": column, "files_without": int(float(value)), "reason": reason}
@@ -97,7 +97,7 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
                 "max": float(known.max()) if len(known) else None,
                 "identified": len(known),
                 "of": len(group),
-                "reason": str(why.iloc[0]) if len(why) else "",  # the commonest why not
+                "reason": str(why.iloc[0]) if len(why) else "",  # the most frequent reason
             }
         )
     return {of: int(fit[of].nunique()), "parameters": ranges}
@@ -118,7 +118,7 @@ def of_dynamic(fit: pd.DataFrame) -> dict:
 
 
 def of_closure(closure: Mapping, units: Units) -> dict:
-    """Return the verdict, the errors before and after, the effects and what is left."""
+    """Return the verdict, the errors before and after, the effects and the remaining residual."""
     kept = (
         "verdict", "fit_quality", "sensitivity", "refused", "units", "noise_floor_N", "before", "after",
         "heldout_unit", "left", "next_runs",
@@ -141,26 +141,24 @@ def of_after(store: Store) -> dict:
 def verdict_sentence(closure: Mapping, units: Units) -> str:
     """Return the verdict in one sentence."""
     count = sum(not effect["candidate"] for effect in closure["effects"])
-    added = {0: "no effect was added", 1: "one effect was missing and is added"}.get(
-        count, f"{count} effects were missing and are added"
-    )
+    added = {0: "no effect was added", 1: "one effect was added"}.get(count, f"{count} effects were added")
     quality = quality_clause(closure)
     if closure["verdict"] == "nothing_missing":
         power = power_clause(closure, units)
-        return "; ".join(filter(None, ["nothing was found that the declared model misses", quality, power]))
+        return "; ".join(filter(None, ["no effect beyond the declared model is significant", quality, power]))
     if closure["verdict"] == "cannot_tell":
-        return f"{quality}, and these files cannot tell why: {untold_clause(closure, units)}"
+        return f"{quality}; these files do not decide whether an effect is missing: {untold_clause(closure, units)}"
     if closure["verdict"] == "closed":
         untold = untold_clause(closure, units)
-        beside = f"; these files cannot tell of {untold}" if untold else ""
-        return f"{added}; no significant structure is left; {quality}{beside}"
-    return f"{added}, and something is left that no model holds{_where(closure['left'], units)}; {quality}"
+        beside = f"; not decided by these files: {untold}" if untold else ""
+        return f"{added}; no significant residual remains; {quality}{beside}"
+    return f"{added}; a significant residual remains{_where(closure['left'], units)}; {quality}"
 
 
 def _where(left: Mapping, units: Units) -> str:
-    where = f", at the level of the {left['level']}" if left["level"] else ""
-    along = f", along {units.label(left['channel'])}" if left["channel"] else ""
-    return where + along + (f" (p = {left['p_value']:.2g})" if left["p_value"] is not None else "")
+    where = f" {level_words(left['level'])}" if left["level"] else ""
+    along = f" along {units.label(left['channel'])}" if left["channel"] else ""
+    return along + where + (f" (p = {left['p_value']:.2g})" if left["p_value"] is not None else "")
 
 
 def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
@@ -195,55 +193,60 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
 
 
 # ---------------------------------------------------------------- verdict
-# Clauses that the summary and the report share: fit quality beside the verdict, and what could have been seen.
+# Clauses that the summary and the report share: fit quality and sensitivity.
 
-WITHIN = {
-    "trace": "along a stroke", "stroke": "from stroke to stroke", "repeat": "from repeat to repeat",
-    "run": "from run to run", "condition": "from specimen to specimen",
+LEVEL_WORDS = {
+    "trace": "along strokes", "sample": "along strokes", "stroke": "between strokes", "repeat": "between repeats",
+    "file": "between repeats", "run": "between runs", "condition": "between specimens", "specimen": "between specimens",
 }  # fmt: skip
-"""Words for the level at which a variable varies."""
+"""Words for the levels of closure.json and of table `levels`."""
 
 NAMED = 3
 """Variables whose smallest effect a sentence gives."""
+
+
+def level_words(level: str) -> str:
+    """Return a level in words, e.g. "between runs"."""
+    return LEVEL_WORDS.get(level, level)
 
 
 def quality_clause(closure: Mapping) -> str:
     """Return how the error compares with the scatter of repeats, in a clause."""
     quality = closure.get("fit_quality") or {"state": "unknown"}
     if quality["state"] == "unknown":
-        return "whether the error is only scatter is not known without repeats"
+        return "without repeats it is not known whether the error exceeds the scatter"
     if quality["state"] == "within_scatter":
         return "the error is within the scatter of repeats"
     times, p_value = quality["ratio"], quality["p_value"]
-    return f"the error is {times:.2g} times the scatter of repeats (lack of fit p = {p_value:.1g})"
+    return f"the error is {times:.2g} times the scatter of repeats (lack of fit: p = {p_value:.1g})"
 
 
 def power_clause(closure: Mapping, units: Units) -> str:
-    """Return the smallest effects that the campaign would have found, in a clause; empty where nothing is known."""
+    """Return the smallest detectable effects of the least sensitive variables, in a clause; empty if none is known."""
     known = [s for s in closure.get("sensitivity") or () if s["smallest_N"] is not None]
     if not known:
         return ""
     largest = sorted(known, key=lambda s: -s["smallest_N"])[:NAMED]
-    texts = [f"{units.label(s['variable'])} {WITHIN[s['level']]} {s['smallest_pct']:.2g} %" for s in largest]
-    return f"the least sensitive variables would have shown an effect of {', '.join(texts)} of the force"
+    texts = [f"{s['smallest_pct']:.2g} % for {units.label(s['variable'])} {level_words(s['level'])}" for s in largest]
+    return f"the largest detection limits, in percent of the force, are {', '.join(texts)}"
 
 
 def untold_clause(closure: Mapping, units: Units) -> str:
-    """Return which variables the campaign could not tell of, and what would do, in a clause; empty for none."""
+    """Return what the campaign does not decide, and the data it needs, in a clause; empty for none."""
     texts = [
-        f"{effect['label']} (shown by too few specimens, or differently: test more)"
+        f"{effect['label']} (too few specimens, or specimens that disagree: test more)"
         for effect in closure["effects"]
         if effect["candidate"]
     ]
     texts += [
-        f"{item['label']} (p = {item['p_value']:.1g}, too weak to claim it: test more)"
+        f"{item['label']} (p = {item['p_value']:.1g}, weak evidence: test more)"
         for item in closure.get("refused") or ()
         if item["weak"]
     ][:NAMED]
     for entry in [s for s in closure.get("sensitivity") or () if s["cannot_tell"]][:NAMED]:
         name, smallest, files = entry["variable"], entry["smallest_pct"], entry["files_needed"]
-        size = "no effect" if smallest is None else f"no effect below {smallest:.2g} % of the force"
-        more = f"; about {files} files like these would show one of 1 %" if files and smallest is not None else ""
+        size = "no effect is detectable" if smallest is None else f"detection limit {smallest:.2g} % of the force"
+        more = f"; 1 % needs about {files} files" if files and smallest is not None else ""
         more = f"; at least {files} files are needed" if files and smallest is None else more
-        texts.append(f"{units.label(name)} ({size} could be seen{more})")
+        texts.append(f"{units.label(name)} ({size}{more})")
     return ", ".join(texts)

@@ -1,4 +1,4 @@
-"""What a command ends with, in a few lines: the figures of `summary` as people read them."""
+"""The summary that a command prints: the figures of `summary` in words."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Mapping
 
 
 def lines(summary: Mapping) -> list[str]:
-    """Return the summary of one step or of all of them, a line for each thing worth knowing.
+    """Return the summary of one or more steps, as lines.
 
-    Where the loop added effects, the fits with these taken out come first, and those before beside them.
+    Where the loop added effects, the fits without their contribution come first, then those before the loop.
     """
     writers = {
         "ingest": ingest_lines,
@@ -96,7 +96,7 @@ def closure_lines(part: Mapping) -> list[str]:
     for effect in part["effects"]:
         status = "candidate, not applied: " if effect["candidate"] else "+ "
         known = [p for p in effect["parameters"] if p["value"] is not None or p["name"] != "phi"]
-        values = ", ".join(_value(p) for p in known) if effect["named"] else "no form does as well"
+        values = ", ".join(_value(p) for p in known) if effect["named"] else "no closed form fits as well"
         found.append(line("", f"{status}{effect['label']}: {values}"))
         if not effect["candidate"]:
             found.append(line("", f"  reference state of the coefficients: {effect['reference']}"))
@@ -106,17 +106,17 @@ def closure_lines(part: Mapping) -> list[str]:
     if part["noise_floor_N"] is not None:
         found.append(line("noise floor", f"{_number(part['noise_floor_N'])} {unit}"))
     if part["left"]["channel"] is not None:
-        found.append(line("left", _left(part["left"], part["verdict"], unit)))
+        found.append(line("residual", _left(part["left"], part["verdict"], unit)))
     for run in part["next_runs"][:3]:
         found.append(line("next runs", run["why"]))
     return found
 
 
 def _left(left: Mapping, verdict: str, unit: str) -> str:
-    """Return what is left: how much above the floor, along which channels, and whether chance could have made it."""
-    above = f"rmse {_number(left['rmse_N'])} {unit} above the floor, " if left["rmse_N"] else ""
-    sure = "" if verdict == "unexplained" else ": no claim, a place to look"
-    return f"{above}along {left['channel']} (p {left['p_value']:.2g}){sure}"
+    """Return the remaining residual: its size above the floor, the variable, and the p-value."""
+    above = f"rms {_number(left['rmse_N'])} {unit} above the noise floor, " if left["rmse_N"] else ""
+    significant = "" if verdict == "unexplained" else ", not significant"
+    return f"{above}along {left['channel']} (p = {left['p_value']:.2g}{significant})"
 
 
 def _value(parameter: Mapping) -> str:
@@ -130,7 +130,7 @@ def _acts(effect: Mapping) -> str:
 
 
 def effects_lines(listed: Mapping) -> list[str]:
-    """Return the catalogue, an effect after the other."""
+    """Return the catalogue of effects as lines."""
     found = []
     for effect in listed["effects"]:
         mark = "  [in the model of this OUT]" if effect["id"] in (listed.get("added") or ()) else ""
@@ -141,7 +141,7 @@ def effects_lines(listed: Mapping) -> list[str]:
         for p in effect["parameters"]:
             found.append(f"    {p['name']}{' [' + p['unit'] + ']' if p['unit'] else ''}: {p['meaning']}")
     if listed.get("added", ()) is None:
-        found.append("The loop of this OUT is not closed, or stale: which effects it added is not known.")
+        found.append("The loop of this OUT has not been run or is out of date, so its effects are not listed.")
     if listed.get("note"):
         found.append(f"note: {listed['note']}")
     return found
@@ -149,11 +149,11 @@ def effects_lines(listed: Mapping) -> list[str]:
 
 def predict_lines(part: Mapping) -> list[str]:
     """Return the lines of a prediction."""
-    text = f"{part['answered']} of {_count(part['rows'], 'row')} answered, {part['extrapolated']} extrapolated"
+    text = f"{part['answered']} of {_count(part['rows'], 'row')} predicted, {part['extrapolated']} extrapolated"
     refused = part["rows"] - part["answered"]
     if refused:
-        text += f"; {_count(refused, 'row')} could not be, and the column note says why"
-    return [line("points", text), line("answers", part["output"])]
+        text += f"; {_count(refused, 'row')} not predicted (reason in column note)"
+    return [line("points", text), line("output", part["output"])]
 
 
 def line(title: str, text: str) -> str:
@@ -170,38 +170,38 @@ def _number(value: float | None) -> str:
 
 
 # ---------------------------------------------------------------- summary life
-# What `lifetime` ends with, in lines.
+# The summary of `lifetime`.
 
 
 def lifetime_lines(part: Mapping) -> list[str]:
-    """Return the lines of a lifetime, the rivals' answers below it."""
+    """Return the lines of a lifetime, followed by those of the alternative laws."""
     found = [line("model", text) for text in _model(part)]
     found.append(line("law", f"{part['quantity']} = {part['form']}, {_change(part)}"))
     found.append(line("life" if "days" in part else "use", _life(part)))
     if part.get("ci95_resampled"):
         found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
     if part.get("ci95_over_laws") and part["rivals"] and part["days"]:
-        found.append(line("", f"95 % interval over all laws by their weight: {_days_between(part['ci95_over_laws'])}"))
+        found.append(line("", f"95 % interval over all laws, weighted: {_days_between(part['ci95_over_laws'])}"))
     if part.get("before"):
         found.append(line("before", f"{_life(part['before'])}, without the effects"))
     for rival in part["rivals"]:
-        found.append(line("rival", f"{rival['form']}, {_change(rival)}: {_life(rival)}"))
+        found.append(line("alternative", f"{rival['form']}, {_change(rival)}: {_life(rival)}"))
     return found
 
 
 def _model(part: Mapping) -> list[str]:
-    """Return which model answers, and the state in which each of its effects is zero."""
+    """Return the model used, and the reference state of each of its effects."""
     if part["model"] == "before":
         return ["before: declared model, without the effects of the loop"]
     if not part["effects"]:
-        return ["after: no effect was added, so it is the declared model"]
+        return ["after: no effect was added, so this is the declared model"]
     return [f"after, {effect['reference']}: {effect['label']}" for effect in part["effects"]]
 
 
 def _change(part: Mapping) -> str:
     names = [name for name in ("E", "kappa") if name in part["parameters"]]
     if not names:
-        return "one temperature and compression"
+        return "a single temperature and compression"
     driven = f"temperature and compression change the {part['way']}"
     energy = f", E = {part['parameters']['E']:.3g} kJ/mol" if "E" in names else ""
     return driven + energy
@@ -213,26 +213,26 @@ def _life(part: Mapping) -> str:
         if part["always"] == "longer":
             return f"it lasts longer than {years} at every temperature {span}"
         if part["always"] == "shorter":
-            return f"at no temperature {span} does it last {years}"
+            return f"it lasts less than {years} at every temperature {span}"
         low, high = part["tested_C"]
         beyond = f" (extrapolated: tested from {low:g} to {high:g} degC)" if part["extrapolated"] else ""
         return f"it lasts {years} at {part['temperature_C']:.1f} degC{_degrees(part['temperature_ci95'])}{beyond}"
     if part["days"] is None:
-        return f"{part['threshold']:.4g} is not reached, not in 1e9 d"
+        return f"{part['threshold']:.4g} is not reached within 1e9 d"
     if part["days"] == 0:
-        return f"unaged rubber is beyond {part['threshold']:.4g} already"
+        return f"unaged rubber is already beyond {part['threshold']:.4g}"
     text = f"{part['days']:.3g} d to {part['threshold']:.4g}, 95 % {_days_between(part['ci95'])}"
     if part["beyond_tests"] is not None and part["beyond_tests"] > 1:
         text += f" (extrapolated: {part['beyond_tests']:.2g} times the longest test)"
     if part["outside"]:
-        text += f" (extrapolated: {' and '.join(part['outside'])} outside what was tested)"
+        text += f" (extrapolated: {' and '.join(part['outside'])} outside the tested range)"
     return text
 
 
 def _degrees(ends: list) -> str:
     low, high = ends
     if low is None and high is None:
-        return ", these tests set no limits to it"
+        return ", without a finite 95 % interval"
     if low is None or high is None:
         return f", 95 % below {high:.1f} degC" if low is None else f", 95 % above {low:.1f} degC"
     return f", 95 % {low:.1f} to {high:.1f} degC"
@@ -241,5 +241,5 @@ def _degrees(ends: list) -> str:
 def _days_between(ends: list) -> str:
     low, high = ends
     if low is None:
-        return "not in 1e9 d"
+        return "more than 1e9 d"
     return f"{low:.3g} d or more" if high is None else f"{low:.3g} to {high:.3g} d"

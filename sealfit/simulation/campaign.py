@@ -40,15 +40,16 @@ from sealfit.simulation.noise import (
 from sealfit.simulation.spec import Spec, plan_files
 
 # ---------------------------------------------------------------- truth
-# What the program that wrote a campaign knows about it: `<campaign>.truth.json`, and the force it stands for.
+# The truth of a campaign, `<campaign>.truth.json`, and the force that follows from it.
 
 SCHEMA = 1
 MADE_BY = "sealfit simulate"
-DIGITS = 9  # of a mean force in N: a nanonewton, far below what any noise leaves visible
+# Decimals of a mean force in N. They are far below any noise.
+DIGITS = 9
 
 
 def truth_path(campaign: Path) -> Path:
-    """Return where the truth of a campaign stands: beside its folder."""
+    """Return the path of the truth of a campaign, beside its folder."""
     campaign = Path(campaign)
     return campaign.with_name(campaign.name + ".truth.json")
 
@@ -165,15 +166,19 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
 # ---------------------------------------------------------------- campaign
 # Writes a simulated campaign: the folder as a rig would leave it, and the truth beside it.
 
-DISPLACEMENT_DECIMALS = 5  # 10 nm, as fine as any linear encoder on such a rig
-NOT_IN_RUNS = ["condition", "direction", "run_order", "elapsed_h"]  # keys and derived channels, which ingest makes
-CRAWL = 1e-3  # of the speed: slow enough for break-away; at zero itself a law in log speed has no value
-RMS_ROWS = 64  # rows per file on which an effect's RMS is taken; the rest would not change its second digit
+# Decimals of the displacement in mm: 10 nm, the resolution of a linear encoder.
+DISPLACEMENT_DECIMALS = 5
+# Keys and derived channels that ingest computes.
+NOT_IN_RUNS = ["condition", "direction", "run_order", "elapsed_h"]
+# Smallest speed at which effects are evaluated, as a share of the set speed. A law in log speed is not defined at 0.
+CRAWL = 1e-3
+# Number of rows per file for the RMS of an effect. It gives two digits.
+RMS_ROWS = 64
 
 
 @dataclass(frozen=True)
 class SetUp:
-    """How the rig was set up for one file: its number, real speed, gain and offset of the force."""
+    """The set-up of the rig for one file: its number, real speed, and gain and offset of the force."""
 
     number: int
     speed_mm_s: float
@@ -184,12 +189,12 @@ class SetUp:
 def simulate(spec: Spec, out: Path) -> None:
     """Write the campaign folder `out` and, beside it, `<out>.truth.json`.
 
-    The same SPEC gives the same bytes. The folder appears at once and whole, or not at all.
+    The same SPEC gives the same bytes. The folder is written completely or not at all.
 
     Raises
     ------
     ConfigError
-        If an effect is not the catalogue's or gives no number somewhere on this design.
+        If an effect is not in the catalogue or is not finite somewhere on this design.
     OutError
         If `out` holds files that `simulate` did not write, or cannot be written.
     """
@@ -212,7 +217,7 @@ def simulate(spec: Spec, out: Path) -> None:
             ) from error
     finally:
         if (part / "old").exists() and not out.exists():
-            os.replace(part / "old", out)  # whatever stopped it, Ctrl-C too: the last campaign comes back
+            os.replace(part / "old", out)  # restore the last campaign after any interruption
         shutil.rmtree(part, ignore_errors=True)
 
 

@@ -1,4 +1,4 @@
-"""Columns that no model holds: what else a laboratory writes down."""
+"""Irrelevant channels: other columns that a laboratory records."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GROUPS = {"file": "file", "run": "run_id", "specimen": "specimen_id", "condition
 
 
 class NumericChannel(Strict):
-    """An irrelevant number, drawn anew for each group of a level."""
+    """A random number for each group of a level."""
 
     kind: Literal["numeric"]
     name: str
@@ -29,7 +29,7 @@ class NumericChannel(Strict):
 
 
 class SlowChannel(Strict):
-    """A number logged once per file that drifts slowly, as a lab temperature does: a forgetful walk, a day's swing."""
+    """A number per file that varies slowly, as a laboratory temperature: Ornstein-Uhlenbeck process and daily sine."""
 
     kind: Literal["slow"]
     name: str
@@ -41,7 +41,7 @@ class SlowChannel(Strict):
 
 
 class TraceChannel(Strict):
-    """A number logged within the trace, with a memory of `correlation_s`."""
+    """A number logged within the trace, with a correlation time `correlation_s`."""
 
     kind: Literal["trace"]
     name: str
@@ -52,7 +52,7 @@ class TraceChannel(Strict):
 
 
 class CategoryChannel(Strict):
-    """A category per group of a level: drawn at random, dealt in turn, or each group's own (a serial number)."""
+    """A category per group of a level: random, in rotation, or unique to the group (a serial number)."""
 
     kind: Literal["category"]
     name: str
@@ -76,7 +76,7 @@ class ConstantChannel(Strict):
 
 
 class FormulaChannel(Strict):
-    """A number per file, computed from other columns of runs.csv: one that goes with the days, for example."""
+    """A number per file, computed from other columns of runs.csv."""
 
     kind: Literal["formula"]
     name: str

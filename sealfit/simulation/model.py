@@ -18,7 +18,7 @@ from sealfit.ingest.expression import evaluate, parse
 # ---------------------------------------------------------------- physics
 # The declared model of a SPEC: Eq. 14 with Eq. 15, one law for all series or one each.
 
-# The model's numbers before any effect; the endings _s and _c stand for mu_s and mu_c.
+# Parameters of the model without effects. The suffixes _s and _c refer to mu_s and mu_c.
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
 
 
@@ -31,7 +31,7 @@ class Law(Strict):
 
 
 class Growth(Strict):
-    """How `a` grows with temperature and compression where no series is declared by itself."""
+    """The dependence of `a` on temperature and compression, for series that are not listed."""
 
     reference_temperature_C: float = Field(60.0, description="temperature at which `a` is as declared")
     doubling_C: float = Field(40.0, gt=0, description="degrees that double `a`; ten is van 't Hoff's rule for a rate")
@@ -45,7 +45,7 @@ class Growth(Strict):
 
 
 class SeriesLaw(Strict):
-    """One series declared by itself; what is left out is as in `physics`. mu_0 belongs to the unaged rubber."""
+    """Parameters of one series; others are those of `physics`. mu_0 belongs to the unaged rubber."""
 
     temperature_C: float | None = None
     compression_ratio_pct: float | None = None
@@ -71,7 +71,7 @@ class Physics(Strict):
 
 
 def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the declared model's numbers at given conditions, before any effect: `QUANTITIES`, each of shape (n,).
+    """Return the parameters of the declared model without effects at given conditions: `QUANTITIES`, shape (n,) each.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) 
 
 
 # ---------------------------------------------------------------- effects
-# The undeclared effects of a SPEC, bound to the catalogue and put to work on the declared model.
+# The effects of a SPEC, bound to the catalogue.
 
 EXPRESSION = "expression"
 
@@ -148,7 +148,7 @@ class EffectEntry(Strict):
 
 @dataclass(frozen=True, slots=True)
 class BoundEffect:
-    """An effect of a SPEC with everything decided: what it reads, what it acts on, and its shape."""
+    """An effect of a SPEC, resolved: its channels, its target and its shape."""
 
     id: str
     channels: tuple[str, ...]
@@ -272,7 +272,7 @@ def _levels(entry: EffectEntry) -> BoundEffect:
     def shape(given: Mapping[str, np.ndarray]) -> np.ndarray:
         found = _as_label(np.asarray(given[channel]))
         place = np.minimum(np.searchsorted(labels, found), labels.size - 1)
-        return np.where(labels[place] == found, values[place], 0.0)  # a category without a value has none
+        return np.where(labels[place] == found, values[place], 0.0)  # 0 for a category without a value
 
     target, operation = entry.acts_on or "force", entry.operation or "add"
     return BoundEffect(LEVELS, (channel,), target, operation, "value of the level", dict(entry.parameters), shape)

@@ -1,4 +1,4 @@
-"""How the platform moves, and the force that it meets without noise."""
+"""The motion of the platform, and the noise-free force."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ from sealfit.simulation.model import QUANTITIES, BoundEffect, Physics, declared_
 from sealfit.simulation.spec import STEADY_LENGTHS, Design, Spec
 
 # ---------------------------------------------------------------- motion
-# How the platform moves: rest, ramp, constant speed, ramp, and back again where a file has strokes both ways.
+# The motion of the platform: rest, ramp, constant speed, ramp, and the reverse in files with both directions.
 
-RAMP_STEPS = 256  # in which the bristles follow a ramp: the speed is constant in each
-TICK_S = 1e-5  # time is logged to this; sampling intervals are whole ticks
+# Number of steps of constant speed in the simulation of a ramp.
+RAMP_STEPS = 256
+# Resolution of the logged time in s; sampling intervals are multiples of it.
+TICK_S = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One file's motion, sampled: arrays of shape (n,), and the rows of steady sliding."""
+    """The sampled motion of one file, and the mask of steady sliding; arrays of shape (n,)."""
 
-    time_s: np.ndarray  # the file's own clock
-    stroke_time_s: np.ndarray  # what sealfit calls time_s: from the stroke's start in a file of several strokes
+    time_s: np.ndarray  # from the start of the file
+    stroke_time_s: np.ndarray  # `time_s` of sealfit's tables: from the start of the stroke if there are several
     displacement_mm: np.ndarray
     distance_mm: np.ndarray
     speed_mm_s: np.ndarray  # signed; zero at rest
@@ -57,14 +59,14 @@ def move(design: Design, speed_mm_s: float, direction: int, start_mm: float) -> 
 
 
 def move_at(design: Design, speed_mm_s: float, direction: int, start_mm: float, time: np.ndarray) -> Motion:
-    """Return the motion of one file at given times, shape (n,), on the file's clock; the rest as `move`."""
+    """Return the motion of one file at given times since its start, shape (n,); other arguments as `move`."""
     length = design.stroke_mm
     ramp, rest, cruise, period = _phases(design, speed_mm_s)
     number = np.minimum((time / period).astype(int), design.strokes_per_file - 1)
-    since = time - number * period - rest  # since the stroke began to move
+    since = time - number * period - rest  # since the start of motion of the stroke
     along, speed = _trapezoid(since, ramp, cruise, speed_mm_s, length)
     cruising = (since > ramp) & (since < ramp + cruise)
-    reestimated = 0.5 * speed_mm_s * ramp + STEADY_LENGTHS * design.stiffness_mm
+    steady_from = 0.5 * speed_mm_s * ramp + STEADY_LENGTHS * design.stiffness_mm
     sign = direction * np.where(number % 2, -1, 1)
     both = design.strokes_per_file > 1
     return Motion(
@@ -76,12 +78,12 @@ def move_at(design: Design, speed_mm_s: float, direction: int, start_mm: float, 
         direction=sign,
         stroke=number + 1,
         cruising=cruising,
-        steady=cruising & (along > reestimated),
+        steady=cruising & (along > steady_from),
     )
 
 
 def _phases(design: Design, speed_mm_s: float) -> tuple[float, float, float, float]:
-    """Return the seconds of a ramp, of the rest before a stroke, of cruising, and of all of it together."""
+    """Return the durations in s of a ramp, of the rest before a stroke, of constant speed, and of their sum."""
     ramp = min(design.ramp_s, 0.1 * design.stroke_mm / speed_mm_s)
     rest = min(design.dwell_s, 0.1 * design.stroke_mm / speed_mm_s)
     cruise = design.stroke_mm / speed_mm_s - ramp
@@ -89,7 +91,7 @@ def _phases(design: Design, speed_mm_s: float) -> tuple[float, float, float, flo
 
 
 def finer(motion: Motion, design: Design, speed_mm_s: float) -> np.ndarray:
-    """Return the file's times and those between them in which the speed changes, RAMP_STEPS of each ramp, sorted."""
+    """Return the sorted times of the file, with RAMP_STEPS times in each ramp added."""
     time = motion.time_s
     ramp, *_ = _phases(design, speed_mm_s)
     changing = np.flatnonzero(~(motion.cruising[1:] & motion.cruising[:-1]))
@@ -102,28 +104,26 @@ def finer(motion: Motion, design: Design, speed_mm_s: float) -> np.ndarray:
 def _trapezoid(
     since: np.ndarray, ramp: float, cruise: float, speed: float, length: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance and speed of one stroke, `since` seconds after it began to move."""
-    left = 2.0 * ramp + cruise - since
-    up, down = since < ramp, left < ramp
+    """Return distance and speed of one stroke, `since` seconds after the start of its motion."""
+    remaining = 2.0 * ramp + cruise - since
+    up, down = since < ramp, remaining < ramp
     rate = speed / ramp if ramp > 0.0 else 0.0
     distance = np.where(
-        up, 0.5 * rate * since**2, np.where(down, length - 0.5 * rate * left**2, speed * (since - 0.5 * ramp))
+        up, 0.5 * rate * since**2, np.where(down, length - 0.5 * rate * remaining**2, speed * (since - 0.5 * ramp))
     )
-    moving = (since > 0.0) & (left > 0.0)
+    moving = (since > 0.0) & (remaining > 0.0)
     distance = np.where(moving, distance, np.where(since > 0.0, length, 0.0))
-    now = np.where(up, rate * since, np.where(down, rate * left, speed))
+    now = np.where(up, rate * since, np.where(down, rate * remaining, speed))
     return distance, np.where(moving, now, 0.0)
 
 
 def with_presliding(limit_N: np.ndarray, motion: Motion, rise_mm: np.ndarray, damping_s: float = 0.0) -> np.ndarray:
-    r"""Return the bristles' force, sigma_0 z + sigma_1 dz/dt, shape (n,).
+    r"""Return the bristle force sigma_0 z + sigma_1 dz/dt in N, shape (n,).
 
     .. math:: dF/dx = (F_{limit} - F) / x_0
 
-    which is Eq. 2 over the distance x for F = sigma_0 z, with x_0 = g, the rise's length: the force rises from rest
-    over x_0, passes a break-away where the ramp is longer than that, follows a stop as far as x_0 lets it, and holds
-    at rest. While the speed is constant only what is left of the start decays, so the truth of steady sliding has no
-    lag.
+    This is Eq. 2 over the distance x for F = sigma_0 z, with x_0 = g, the length of the rise. At constant speed only
+    the initial difference decays, so that the force of steady sliding has no lag.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def with_presliding(limit_N: np.ndarray, motion: Motion, rise_mm: np.ndarray, da
     damping_s : float
         sigma_1 / sigma_0 in s.
     """
-    left = np.exp(-np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0])) / rise_mm).tolist()
+    decay = np.exp(-np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0])) / rise_mm).tolist()
     result = limit_N.astype(float)
     phase = 2 * motion.stroke + motion.cruising
     edges = np.flatnonzero(np.diff(phase, prepend=-1, append=-1))
@@ -144,11 +144,11 @@ def with_presliding(limit_N: np.ndarray, motion: Motion, rise_mm: np.ndarray, da
     for first, last in pairwise(edges.tolist()):
         if motion.cruising[first]:
             slid = np.abs(motion.displacement_mm[first:last] - motion.displacement_mm[first])
-            result[first:last] += (force - limit_N[first]) * left[first] * np.exp(-slid / rise_mm[first])
+            result[first:last] += (force - limit_N[first]) * decay[first] * np.exp(-slid / rise_mm[first])
             force = float(result[last - 1])
             continue
         for row, target in enumerate(limit_N[first:last].tolist(), start=first):
-            force = target + (force - target) * left[row]
+            force = target + (force - target) * decay[row]
             result[row] = force
     return result + damping_s * np.abs(motion.speed_mm_s) / rise_mm * (limit_N - result)
 
@@ -170,8 +170,8 @@ CONDITIONS = ("temperature_C", "compression_ratio_pct", "aging_days")
 class SteadyLaw:
     """The force of steady sliding as a function of the channels.
 
-    Order of application: changes of mu_0, a, b, v_s and sigma_2; then of mu_s and mu_c; the factor on mu and what is
-    added to mu; the viscous term; the factor on the whole friction force; last the added forces, signed as in the file.
+    Effects are applied in this order: on mu_0, a, b, v_s and sigma_2; on mu_s and mu_c; factors on mu, then terms added
+    to mu; factors on the friction force, viscous term included; added forces, signed as in the file.
     """
 
     physics: Physics
@@ -182,18 +182,18 @@ class SteadyLaw:
         return replace(self, effects=tuple(e for k, e in enumerate(self.effects) if k != number))
 
     def parts(self, channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the bristles' limit, the viscous part and the added forces, in N, broadcast over the channels.
+        """Return the steady bristle force, the viscous part and the added forces, in N, broadcast over the channels.
 
         Parameters
         ----------
         channels : mapping of str to ndarray
-            `speed_mm_s` (signed), the condition columns and `load_N` where the design has them, and whatever the
-            effects read; each of shape (n,) or (1,).
+            `speed_mm_s` (signed), the condition columns and `load_N` of the design, and all channels that the effects
+            read; shape (n,) or (1,) each.
 
         Raises
         ------
         ParameterError
-            If an effect carries v_s or b to zero or below.
+            If an effect makes v_s or b zero or negative.
         """
         given = {name: np.atleast_1d(channels[name]) for name in CONDITIONS if name in channels}
         now = declared_parameters(self.physics, given)
@@ -243,13 +243,13 @@ def steady_law(spec: Spec) -> SteadyLaw:
     Raises
     ------
     ConfigError
-        If an effect is not the catalogue's.
+        If an effect is not in the catalogue.
     """
     return SteadyLaw(spec.physics, resolve_effects(spec.effects))
 
 
 def law_of_condition(physics: Physics, condition: Mapping[str, float]) -> dict[str, float]:
-    """Return the declared model's numbers at one condition, mu_s and mu_c included, before any effect."""
+    """Return the parameters of the declared model at one condition without effects, mu_s and mu_c included."""
     given = {name: np.array([condition[name]], dtype=float) for name in CONDITIONS if name in condition}
     values = {name: float(value[0]) for name, value in declared_parameters(physics, given).items()}
     days = float(condition.get("aging_days", 0.0))

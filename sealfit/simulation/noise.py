@@ -1,4 +1,4 @@
-"""Scatter, noise and defects of a SPEC: each kind with its size, in any combination."""
+"""Scatter, noise and defects of a SPEC."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from scipy.signal import lfilter
 from sealfit.config import Strict
 
 # ---------------------------------------------------------------- draws
-# Random numbers depend on the seed and on what they are for, and on nothing else: adding a noise kind or a channel to
-# a SPEC leaves every other draw as it was, so campaigns can be compared draw by draw.
+# Random numbers depend only on the seed and their purpose. Adding a kind of noise or a channel to a SPEC changes no
+# other draw, so that campaigns can be compared draw by draw.
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +32,9 @@ class Draws:
 
 
 def remembering(kicks: np.ndarray, memory: float) -> np.ndarray:
-    """Return unit noise whose neighbours correlate by `memory`, from independent unit `kicks`, shape (n,).
+    """Return unit noise with correlation `memory` between neighbours, from independent unit `kicks`, shape (n,).
 
-    The exact discretisation of an Ornstein-Uhlenbeck process at equal steps, stationary from the first value on.
+    It is the exact discretisation of a stationary Ornstein-Uhlenbeck process at equal steps.
     """
     scaled = np.sqrt(1.0 - memory**2) * kicks
     scaled[0] = kicks[0]
@@ -42,7 +42,7 @@ def remembering(kicks: np.ndarray, memory: float) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- noise
-# Scatter and noise of a SPEC: each kind with its size, in any combination.
+# Scatter and noise of a SPEC.
 
 
 class White(Strict):
@@ -53,7 +53,7 @@ class White(Strict):
 
 
 class Autocorrelated(Strict):
-    """Noise with a memory (Ornstein-Uhlenbeck; AR(1) where the length is in samples)."""
+    """Autocorrelated noise (Ornstein-Uhlenbeck; AR(1) for a length in samples)."""
 
     kind: Literal["autocorrelated"]
     sd_N: float = Field(ge=0)
@@ -62,7 +62,7 @@ class Autocorrelated(Strict):
 
 
 class Quantised(Strict):
-    """The force's resolution: it is rounded to multiples of this."""
+    """The resolution of the force, which is rounded to multiples of it."""
 
     kind: Literal["quantised"]
     resolution_N: float = Field(gt=0)
@@ -76,7 +76,7 @@ class RepeatGain(Strict):
 
 
 class RunSetup(Strict):
-    """A random factor on the friction, and a random offset of the force, of every run: repeats share them."""
+    """A random factor on the friction and a random offset of the force of every run, common to its repeats."""
 
     kind: Literal["run_setup"]
     sd_rel: float = Field(0.0, ge=0)
@@ -91,7 +91,7 @@ class SpecimenScatter(Strict):
 
 
 class Proportional(Strict):
-    """Independent noise whose SD is a share of the force."""
+    """Independent noise with a standard deviation proportional to the force."""
 
     kind: Literal["proportional"]
     sd_rel: float = Field(ge=0)
@@ -112,7 +112,7 @@ class SpeedScatter(Strict):
 
 
 class OutlierRepeats(Strict):
-    """Files, a share of all drawn at random, whose friction is off by a factor 1 + size_rel."""
+    """A random share of all files, with friction multiplied by 1 + size_rel."""
 
     kind: Literal["outlier_repeats"]
     share: float = Field(ge=0, le=1)
@@ -120,7 +120,7 @@ class OutlierRepeats(Strict):
 
 
 class BadData(Strict):
-    """Files, so many of each kind, that are spoilt as rigs and people spoil them; no file twice."""
+    """Defects of files: a number of files of each kind, no file twice."""
 
     kind: Literal["bad_data"]
     missing_cells: int = Field(0, ge=0, description="2 % of the force cells are empty")
@@ -148,7 +148,7 @@ Noise = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Scatter:
-    """What is drawn once per file, shape (files,) each."""
+    """Random numbers per file, shape (files,) each."""
 
     gain: np.ndarray  # factor on the friction
     offset_N: np.ndarray  # added to the force
@@ -233,7 +233,7 @@ def displacement_noise_mm(noise: Sequence[Noise], n: int, file: int, draws: Draw
 
 
 def quantised(noise: Sequence[Noise], force_N: np.ndarray) -> np.ndarray:
-    """Return the force as a sensor of finite resolution gives it."""
+    """Return the force rounded to the sensor's resolution."""
     for kind in noise:
         if isinstance(kind, Quantised):
             force_N = kind.resolution_N * np.round(force_N / kind.resolution_N)
@@ -241,18 +241,18 @@ def quantised(noise: Sequence[Noise], force_N: np.ndarray) -> np.ndarray:
 
 
 def _purpose(noise: Sequence[Noise], number: int) -> tuple[str, int]:
-    """Return a stream's name: the kind, and which of its kind it is."""
+    """Return the name of a stream: the kind of noise, and its number among those of the kind."""
     return noise[number].kind, sum(other.kind == noise[number].kind for other in noise[:number])
 
 
 # ---------------------------------------------------------------- defects
-# Bad data on purpose: what ingest must find, in files that the truth lists.
+# Defects that ingest must find, in files that the truth lists.
 
 Columns = dict[str, np.ndarray]  # a trace's columns, each of shape (n,); NaN is written as an empty cell
 
 
 def draw_defects(noise: Sequence[Noise], files: int, draws: Draws) -> dict[int, str]:
-    """Return which file is spoilt how; no file twice, so fewer where the files run out."""
+    """Return the defect of each file that has one; fewer than asked if there are not enough files."""
     wanted = [
         defect
         for kind in noise

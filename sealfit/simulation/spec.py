@@ -24,11 +24,12 @@ from sealfit.simulation.noise import Noise
 # ---------------------------------------------------------------- design
 # The design of a SPEC and the table of files that it plans, in the order in which they are measured.
 
-STEADY_LENGTHS = 9.0  # stiffness lengths after which 1 - exp(-9) = 0.9999 of the force has come up
+# Number of rise lengths after which sliding counts as steady: the force has reached 1 - exp(-9) = 0.9999 of its limit.
+STEADY_LENGTHS = 9.0
 
 
 class Design(Strict):
-    """Which runs are made, on what rig, in what order."""
+    """The runs of a campaign, the rig, and the order of tests."""
 
     temperatures_C: tuple[float, ...] = Field((60.0,), description="empty: no such column")
     compressions_pct: tuple[Annotated[float, Field(gt=0)], ...] = Field((80.0,), description="empty: no such column")

@@ -1,4 +1,4 @@
-"""One writer per OUT: its lock, the folder it is held in, and signals held back while both change."""
+"""Lock and ownership of the output folder, and delayed interrupts."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from sealfit.store.manifest import STATE
 from sealfit.store.staged_writes import STAGING, disk
 
 # ---------------------------------------------------------------- interrupts
-# Ctrl-C is held back while files are moved, since half of that would leave OUT stale.
+# Ctrl-C is delayed while files are moved, because an incomplete move leaves OUT stale.
 
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Let a Ctrl-C wait until the block has ended."""
+    """Delay Ctrl-C until the block has ended."""
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield  # signals reach the main thread only, and this one is not heard
+        yield  # signals reach the main thread only
         return
     waiting: list[object] = []
     signal.signal(signal.SIGINT, lambda *caught: waiting.append(caught))
@@ -38,7 +38,7 @@ def undisturbed() -> Iterator[None]:
 
 
 # ---------------------------------------------------------------- lock
-# One writer per OUT: a lock that names its host and process, and that a dead process does not keep.
+# One writer per OUT: the lock holds host and process, and is released when the process dies.
 
 try:
     import fcntl
@@ -66,7 +66,7 @@ def only_writer(folder: Path) -> Iterator[None]:
         _sign(handle, path)
         yield
     finally:
-        with contextlib.suppress(OSError):  # a folder that was taken away meanwhile has no lock to give back
+        with contextlib.suppress(OSError):  # the folder may have been removed meanwhile
             path.unlink()
         os.close(handle)
 
@@ -91,7 +91,7 @@ def _take(path: Path) -> int:
         busy = _owner(handle)
         gone = not _same_file(handle, path)
         os.close(handle)
-        if not gone:  # else its owner removed it between our two steps: try again
+        if not gone:  # otherwise its owner has just removed it: try again
             raise _busy(path, busy)
 
 
@@ -103,7 +103,7 @@ def _locked(handle: int) -> bool:
     except BlockingIOError:
         return False
     except OSError:
-        return True  # a file system without locks: the name in the file is all there is to go by
+        return True  # a file system without locks: only the name in the file is known
     return True
 
 
@@ -153,7 +153,7 @@ def _sign(handle: int, path: Path) -> None:
 
 @contextlib.contextmanager
 def held(out: Path) -> Iterator[None]:
-    """Hold `out` as its only writer, free of what a killed run left there; made, and gone again if it stays empty.
+    """Hold `out` as its only writer. It is created if missing, cleared of staged files, and removed if it stays empty.
 
     Raises
     ------
@@ -168,12 +168,12 @@ def held(out: Path) -> Iterator[None]:
             yield
     finally:
         if made:
-            with contextlib.suppress(OSError):  # stays if it holds anything
+            with contextlib.suppress(OSError):  # stays if it is not empty
                 out.rmdir()
 
 
 def _make(out: Path) -> bool:
-    """Make `out` if it is not there, and return whether it was made; refuse a folder that sealfit did not make."""
+    """Create `out` if it is missing, and return whether it was created; refuse a folder not made by sealfit."""
     if out.exists() and not out.is_dir():
         raise OutError("is a file.", file=out, fix="Give --out a folder.")
     if out.is_dir():

@@ -1,4 +1,4 @@
-"""What OUT knows of itself: what each step was made from and with, and the key under which it was made."""
+"""The state of OUT: the inputs, config and version of each step, and its key."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from sealfit.config import Config, Files, Loop, Sensor, parse_config, read_confi
 from sealfit.errors import OutError
 
 # ---------------------------------------------------------------- fingerprint
-# What a result was made from: a fingerprint per input, and one key per step.
+# A fingerprint per input, and one key per step.
 #
-# A step is current if the key it was made under equals the key computed now. The key holds everything the step could
-# see: the program's version, the part of the config that the step is given, its inputs, and the step before it.
+# A step is current if its stored key equals the key computed now. The key depends on the program's version, the part of
+# the config that the step uses, its inputs, and the step before it.
 
 STEPS = ("ingest", "fit-steady", "fit-aging", "fit-dynamic", "close-loop", "report")
-"""Every step, each reading what those before it wrote."""
+"""The steps in order; each reads the tables of those before it."""
 
 FITS = ("fit-steady", "fit-aging", "fit-dynamic")
-"""Those of which close-loop reads nothing: it fits its own model to the bins."""
+"""Steps whose tables close-loop does not read: it fits its own model to the bins."""
 
 UNSEEN = {
     "ingest": {"sensor": Sensor(), "loop": Loop()},
@@ -36,7 +36,7 @@ UNSEEN = {
     "fit-aging": {"loop": Loop()},
     "fit-dynamic": {"loop": Loop()},
 }
-"""Parts of the config that a step is not given, so that a change of them does not make it stale."""
+"""Parts of the config that a step does not use, with their defaults; a change of them does not make it stale."""
 
 
 class Fingerprint(NamedTuple):
@@ -47,11 +47,11 @@ class Fingerprint(NamedTuple):
     sha256: str | None = None
 
 
-Fingerprints = dict[str, Fingerprint]  # of files by their names
+Fingerprints = dict[str, Fingerprint]  # by file name
 
 
 def fingerprint(path: Path | str) -> Fingerprint:
-    """Return the fingerprint of `path`, which is read."""
+    """Return the fingerprint of the file at `path`."""
     try:
         stat = os.stat(path)
         with open(path, "rb") as file:
@@ -62,7 +62,7 @@ def fingerprint(path: Path | str) -> Fingerprint:
 
 
 def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
-    """Return the fingerprint of a file from its bytes, and its status when they were read."""
+    """Return the fingerprint of a file from its bytes and its status."""
     return Fingerprint(status.st_size, status.st_mtime_ns, hashlib.sha256(raw).hexdigest())
 
 
@@ -93,7 +93,7 @@ def glob_names(folder: Path, files: Files) -> list[str]:
 
 
 def seen_config(step: str, config: Config) -> Config:
-    """Return the config as `step` may see it: parts that are none of its business stand at their defaults."""
+    """Return the config as `step` uses it: other parts have their defaults."""
     return config.model_copy(update=UNSEEN.get(step, {}))
 
 
@@ -106,7 +106,7 @@ def step_keys(inputs: Fingerprints, config: Config, effects: Mapping[str, str | 
     keys: dict[str, str] = {}
     names = sorted(inputs)
     hashes = (inputs[name].sha256 or "" for name in names)
-    known = "\0".join([*names, *hashes])  # \0 stands in no path
+    known = "\0".join([*names, *hashes])  # no path contains \0
     before = hashlib.sha256(os.fsencode(known)).hexdigest()
     for step in STEPS:
         seen = [__version__, step, seen_config(step, config).model_dump(mode="json"), before]
@@ -117,7 +117,7 @@ def step_keys(inputs: Fingerprints, config: Config, effects: Mapping[str, str | 
 
 
 # ---------------------------------------------------------------- provenance
-# What results were made from and with, as provenance.json and the report say it.
+# The content of provenance.json and of the report's provenance section.
 
 PACKAGES = ("numpy", "pandas", "scipy", "pyarrow", "matplotlib", "pydantic", "jinja2", "typer", "rich")
 
@@ -157,7 +157,7 @@ def _version(package: str) -> str | None:
 
 
 # ---------------------------------------------------------------- state
-# What OUT knows of itself: its campaign, its config, its inputs, and the key under which each step was made.
+# The content of state.json: campaign, config, inputs, and the key of each step.
 
 STATE = "state.json"
 FORMAT = 6
@@ -166,7 +166,7 @@ DEFAULT = "default"
 
 @dataclass(frozen=True, slots=True)
 class ConfigCopy:
-    """A config as text, and where it came from: `path` is None for the default inside the package."""
+    """A config as text, with its path; `path` is None for the default in the package."""
 
     path: Path | None
     text: str
@@ -184,11 +184,11 @@ class ConfigCopy:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name of the config in messages."""
         return self.path.name if self.path else DEFAULT
 
     def now(self) -> ConfigCopy:
-        """Return the config as it stands now: read again if its file is still there, else this copy."""
+        """Return the current config: its file if it still exists, else this copy."""
         if self.path is None or self.path.is_file():
             return ConfigCopy.at(self.path)
         return self
@@ -214,13 +214,13 @@ class ConfigCopy:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """One step as it was last completed."""
+    """The last completion of a step."""
 
     key: str
     version: str
     finished_at: str  # ISO 8601, UTC
     seconds: float
-    files: dict[str, int]  # what it wrote, relative to OUT, and the size of each in bytes
+    files: dict[str, int]  # its files, relative to OUT, with their sizes in bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +261,7 @@ class State:
                 raise ValueError
             at = kept["config"]["path"]
             belongs = Path(kept["campaign"]), ConfigCopy(Path(at) if at else None, kept["config"]["text"])
-            if kept["format"] < FORMAT:  # of an earlier version: all is to be done again
+            if kept["format"] < FORMAT:  # of an earlier version: every step is out of date
                 return cls(*belongs)
             return cls(
                 *belongs,
@@ -280,7 +280,7 @@ class State:
 
 
 def _inside(done: Done) -> Done:
-    """Return `done`; ValueError if a file of it lies outside OUT: what a step wrote is read, and removed, again."""
+    """Return `done`; ValueError if it names a file outside OUT, because these files are read and removed."""
     for file in done.files:
         if PurePath(file).is_absolute() or ".." in PurePath(file).parts:
             raise ValueError(f"{file} lies outside")
@@ -292,7 +292,7 @@ def to_json(document: object, *, indent: int | None = 1) -> str:
     style = {"indent": indent, "ensure_ascii": False, "allow_nan": False}
     try:
         return json.dumps(document, **style) + "\n"
-    except (TypeError, ValueError):  # what JSON does not know, or a number that is not finite
+    except (TypeError, ValueError):  # a type that JSON lacks, or a number that is not finite
         return json.dumps(_plain(document), **style) + "\n"
 
 

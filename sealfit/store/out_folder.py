@@ -1,4 +1,4 @@
-"""The OUT folder: every table written whole or not at all, and every step either current or known to be stale."""
+"""The OUT folder: its tables, and whether each step is current or stale."""
 
 from __future__ import annotations
 
@@ -48,23 +48,21 @@ class Store:
 
     def __init__(self, out: Path, state: State, *, known: bool, kept: State | None = None, effects: Path | None = None):
         self.out, self.state = out, state
-        self._kept = kept  # the state as it stands in `out`
+        self._kept = kept  # the state as stored in `out`
         self.effects = effects
         config = state.config.parse()
         self._names_effects = config.loop.effects_folder is not None
         own = {"effects_folder": None if effects is None else str(effects)}
         self.config: Config = config.model_copy(update={"loop": config.loop.model_copy(update=own)})
         self.warnings: list[str] = []
-        self._keys: dict[str, str] | None = None  # of every step for the campaign as it is now
-        self.anew = False  # whether what is stored already is to be made again
-        self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new, or not as the state has them
+        self._keys: dict[str, str] | None = None  # of every step for the present campaign
+        self.anew = False  # whether stored results are to be recomputed
+        self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new or changed since the stored state
         if state.campaign.is_dir():
             self._changed = changes(state.campaign, state.inputs, self.config)
         elif known:
-            self.warnings.append(
-                f"the campaign folder {state.campaign} is not there: whether it has changed cannot be told."
-            )
-        self.marks = state.inputs | self._changed  # the campaign's files as they are now
+            self.warnings.append(f"the campaign folder {state.campaign} is missing, so changes cannot be detected.")
+        self.marks = state.inputs | self._changed  # the present files of the campaign
 
     # ------------------------------------------------------------ opening
     @classmethod
@@ -107,7 +105,7 @@ class Store:
             process, or cannot be written.
         """
         if campaign is None or source is None:
-            cls.open(out, effects)  # raises if there is nothing to go on from
+            cls.open(out, effects)  # raises if there are no results
         with held(out):
             if campaign is None or source is None:
                 store = cls.open(out, effects)
@@ -141,7 +139,7 @@ class Store:
         return store
 
     def _keep_what_moved(self) -> None:
-        """Keep the campaign's new place, new times of unchanged files and a config that says the same, if any."""
+        """Store a new path of the campaign, new times of unchanged files, and an equivalent config."""
         kept = self._kept
         if kept is None:
             return
@@ -162,12 +160,12 @@ class Store:
 
     @property
     def kept_effects(self) -> dict[str, str | None]:
-        """Hashes of the user's own effects with which the results were made, by file name."""
+        """Hashes of the user's own effects used for the results, by file name."""
         return self._kept.effects if self._kept is not None else {}
 
     # ------------------------------------------------------------ current or stale
     def why_stale(self, step: str) -> str:
-        """Return in words why `step` has to be done, or "" if it is current."""
+        """Return the reason why `step` is out of date, or "" if it is current."""
         if self._keys is None:
             self._keys = step_keys(self.marks, self.config, self.state.effects)
         keys = self._keys
@@ -246,11 +244,11 @@ class Store:
         return json.loads((self.out / f"{name}.json").read_text("utf-8"))
 
     def seen_config(self, step: str) -> Config:
-        """Return the config as `step` may see it."""
+        """Return the config as `step` uses it."""
         return seen_config(step, self.config)
 
     def provenance(self) -> dict:
-        """Return what the results were made from and with."""
+        """Return the provenance of the results."""
         return provenance(self.state)
 
     # ------------------------------------------------------------ writing
@@ -286,7 +284,7 @@ class Store:
             round(seconds, 3),
             files,
         )
-        # Until every file is in its place the step counts as not done: a kill in between cannot pass a mixture of old
+        # The step counts as not done until every file is moved, so that a killed run leaves no mixture of old
         # and new tables as current. All is on the disk before the first move, so a full disk changes nothing in OUT.
         earlier = {step: self.state.steps[step] for step in STEPS[: STEPS.index(name)] if step in self.state.steps}
         known = inputs if earlier else {}  # none are known of steps not done
@@ -296,7 +294,7 @@ class Store:
         staged.text("ended.json", to_json(ended.as_dict(), indent=None))
         staged.text(PROVENANCE, to_json(provenance(ended), indent=None))
         old = self.state.steps[name].files if name in self.state.steps else {}
-        with undisturbed(), disk(self.out):  # moving files takes milliseconds, and half of it would be stale
+        with undisturbed(), disk(self.out):  # an incomplete move would leave OUT stale
             staged.move("begun.json", STATE)
             sync(self.out)
             for file in files:

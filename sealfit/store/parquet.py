@@ -1,4 +1,4 @@
-"""Tables to Parquet and back: the schema of `tables.py` applied, true units and meanings in the metadata."""
+"""Tables to Parquet and back, with the schemas of `tables.py`; units and meanings are in the metadata."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def spelled_out(schema: pa.Schema) -> pa.Schema:
 
 
 def write_arrow(table: pa.Table, path: Path) -> None:
-    """Write a table as it is; whoever calls waits until it is on the disk. Raises OSError if the disk refuses."""
+    """Write a table without checks; the caller syncs it to the disk. Raises OSError if the disk refuses."""
     schema = spelled_out(table.schema)
     measured = [field.name for field in schema if pa.types.is_floating(field.type)]  # have no dictionary
     settings = {
@@ -121,13 +121,13 @@ def write_arrow(table: pa.Table, path: Path) -> None:
 
 
 def write_ipc(table: pa.Table, path: Path) -> None:
-    """Write a table in Arrow's own format, which is read in no time; errors as `write_arrow`."""
+    """Write a table in Arrow's IPC format; errors as `write_arrow`."""
     with path.open("wb") as file, pa.ipc.new_file(file, table.schema) as writer:
         writer.write_table(table)
 
 
 def read_ipc(path: Path) -> pa.Table:
-    """Return a table that `write_ipc` wrote; its columns stay on the disk until they are looked at."""
+    """Return a table that `write_ipc` wrote; its columns are memory-mapped."""
     with pa.memory_map(str(path)) as file:
         return pa.ipc.open_file(file).read_all()
 
@@ -183,7 +183,7 @@ def _whole(array: pa.Array | pa.ChunkedArray) -> pa.Array:
 
 
 def _mixed(values: pd.Series | np.ndarray) -> bool:
-    """Whether a channel holds categories, or numbers and words together: then all of it is words."""
+    """Whether a channel holds categories, or a mixture of numbers and text, which is stored as text."""
     if isinstance(values.dtype, pd.CategoricalDtype):
         return True
     return values.dtype == object and any(isinstance(value, str) for value in values)

@@ -1,4 +1,4 @@
-"""The folders and files that a command line names, the folder of own effects among them."""
+"""The folders and files named on the command line, including the folder of the user's effects."""
 
 from __future__ import annotations
 
@@ -10,9 +10,20 @@ from sealfit.errors import CampaignError, ConfigError, Fault, RequestError, did_
 from sealfit.store.manifest import STATE, ConfigCopy, fingerprint
 
 # ---------------------------------------------------------------- places
-# The folders and files that a command line names: found, or refused with the likeliest one that is there.
+# The folders and files named on the command line; a missing one is refused with the closest existing name.
 
 RUNS = "runs.csv"
+RUNS_TABLES = (RUNS, "runs.xlsx", "runs.parquet")
+
+
+def possible_tables(config: Config) -> tuple[str, ...]:
+    """Return where the table of runs may stand in a campaign folder: where the config says, or under a usual name."""
+    return RUNS_TABLES if config.files.runs_table is None else (config.files.runs_table,)
+
+
+def runs_tables(folder: Path, config: Config) -> list[str]:
+    """Return those of `possible_tables` that a campaign folder holds."""
+    return [name for name in possible_tables(config) if (folder / name).exists() or (folder / name).is_symlink()]
 
 
 def campaign_folder(path: Path, config: Config) -> Path:
@@ -21,14 +32,18 @@ def campaign_folder(path: Path, config: Config) -> Path:
     Raises
     ------
     CampaignError
-        If there is no such folder, or no runs.csv in it where the config needs one; the fix names the likeliest.
+        If there is no such folder, or no table of runs in it where the config needs one; the fix names the likeliest.
     """
     if path.is_file():
-        fix = f"Give its folder: {quoted(path.parent)}" if path.name == RUNS else f"Give the folder that holds {RUNS}."
+        fix = (
+            f"Give its folder: {quoted(path.parent)}"
+            if path.name in RUNS_TABLES
+            else f"Give the folder that holds {RUNS}."
+        )
         raise CampaignError([Fault("campaign_folder", f"{path} is a file, not a campaign folder.", fix=fix)])
     if not path.is_dir():
         raise CampaignError([Fault("campaign_folder", f"there is no folder {path}.", fix=did_you_mean(path))])
-    if config.files.glob is None and not (path / RUNS).is_file():
+    if config.files.glob is None and config.files.runs_table is None and not runs_tables(path, config):
         below = sorted(child.parent for child in path.glob(f"*/{RUNS}"))
         fix = f"It lists the trace files; or set files.glob in a config (--config). Files here: {_some_files(path)}"
         if below:
@@ -68,11 +83,11 @@ def _some_files(folder: Path) -> str:
 
 
 # ---------------------------------------------------------------- own effects
-# The folder of the user's own effects, as the command line names it: the one place from which Python is run.
+# The folder of the user's own effects, the only place from which Python is run.
 #
-# A campaign and a folder of results may come from somebody else. Nothing that lies in them, and no path that they keep,
-# leads to Python being run: the person who runs the command names the folder, by --effects-folder or in the config that
-# --config names. A folder of results keeps the hashes of the files, which tell whether they are the same.
+# A campaign and a folder of results may come from somebody else, so Python is never run from them or from a path
+# stored in them. The user names the folder, by --effects-folder or in the config given with --config. OUT keeps the
+# hashes of the files to detect changes.
 
 OPTION = "--effects-folder"
 KEY = "key 'loop.effects_folder'"
@@ -118,7 +133,7 @@ def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Pat
 
 
 def _place_of(path: Path, data: tuple[Path, ...]) -> Path | None:
-    """Return the one of the folders `data` in which a path lies, symbolic links followed; None if in none."""
+    """Return the folder of `data` that contains a path, after symbolic links; None if there is none."""
     return next((place for place in data if path.resolve().is_relative_to(place.resolve())), None)
 
 
@@ -130,7 +145,7 @@ def effect_hashes(folder: Path) -> dict[str, str | None]:
 def effects_seen(
     given: Path | None, kept: Mapping[str, str | None], kept_config: ConfigCopy, config: ConfigCopy
 ) -> dict[str, str | None]:
-    """Return the hashes of the user's own effects as they are now, as far as it can be told; nothing is run.
+    """Return the present hashes of the user's own effects, as far as known; nothing is run.
 
     Parameters
     ----------
@@ -144,13 +159,13 @@ def effects_seen(
     if given is not None:
         return effect_hashes(given)
     named = config.effects_folder()
-    if named is None:  # they were given by the option, or the config has dropped them
+    if named is None:  # given by the option, or removed from the config
         return dict(kept) if kept_config.effects_folder() is None else {}
     return effect_hashes(named) if config.path.is_file() and named.is_dir() else dict(kept)
 
 
 def what_differs(kept: Mapping[str, str | None], now: Mapping[str, str | None]) -> str:
-    """Return in words which files of the user's own effects differ; empty if none does."""
+    """Return a message on the changed files of the user's own effects; empty if there are none."""
     names = sorted(name for name in kept.keys() | now.keys() if kept.get(name) != now.get(name))
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return f"your own effects are not those it was made with ({', '.join(names[:3])}{more})" if names else ""

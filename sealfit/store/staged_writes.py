@@ -1,4 +1,4 @@
-"""Files written beside their final place, then moved there: nobody ever sees half a file in OUT."""
+"""Staged writes: files are written in a temporary folder and then moved, so that OUT has no partial files."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ PARQUET = ".parquet"
 
 
 class Staged:
-    """Files of one step, written beside their final place and moved there together when the step is complete."""
+    """Files of one step, written in a temporary folder and moved together when the step is complete."""
 
     def __init__(self, out: Path, units: Units, step: str):
         self._out, self._units = out, units
         self._folder = out / f"{STAGING}{os.getpid()}-{step}"
         self.files: dict[str, int] = {}
-        self.inputs: Fingerprints | None = None  # set by ingest: what it read
+        self.inputs: Fingerprints | None = None  # set by ingest: the files read
 
     def table(self, name: str, frame: pd.DataFrame) -> None:
         """Write table `name` of `tables.SCHEMAS`; ValueError if the frame does not have its columns and types."""
@@ -54,13 +54,13 @@ class Staged:
         self.text(f"plots/{name}.svg", figure.svg)
 
     def folder(self) -> Path:
-        """Return the folder in which other processes may write files of this step, told with `adopt`."""
+        """Return the folder in which other processes may write files of this step; see `adopt`."""
         with disk(self._out):
             self._folder.mkdir(exist_ok=True)
         return self._folder
 
     def adopt(self, files: Mapping[str, int]) -> None:
-        """Take files, with their sizes, for this step's: some that others wrote into `folder`, and some in OUT."""
+        """Add files with their sizes to this step: those written into `folder` by other processes, and those in OUT."""
         self.files |= files
 
     def _write(self, name: str, write: Callable[[Path], object]) -> None:
@@ -72,7 +72,7 @@ class Staged:
             self.files[name] = path.stat().st_size
 
     def move(self, name: str, to: str | None = None) -> None:
-        """Move a staged file to its final place in one step of the file system; one that is in OUT already stays."""
+        """Move a staged file to its final place atomically; a file that is already in OUT stays."""
         if name in self.files and not os.path.exists(f"{self._folder}/{name}"):
             return
         target, source = self._out / (to or name), self._folder / name
@@ -82,20 +82,20 @@ class Staged:
         os.replace(source, target)
 
     def clear(self) -> None:
-        """Remove what is staged."""
+        """Remove the staged files."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def disk(out: Path) -> Iterator[None]:
-    """Say in one line what the file system refused."""
+    """Turn an error of the file system into an OutError."""
     try:
         yield
     except OSError as error:
         reason = error.strerror or str(error)
         fix = "Fix the rights of the folder, or choose another --out."
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            fix = "Free some space and run the command again; the results that were there are untouched."
+            fix = "Free some space and run the command again; the earlier results are unchanged."
         raise OutError(f"cannot be written ({reason}).", file=out, fix=fix) from error
 
 
@@ -109,7 +109,7 @@ def file_size(path: str) -> int | None:
 
 
 def sync(path: Path) -> None:
-    """Wait until `path`, a file or a folder, is on the disk itself."""
+    """Sync `path`, a file or a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -65,7 +65,7 @@ def test_the_forces_are_those_of_rubber_that_does_not_warm(warmed):
 def test_the_shifts_hold_the_covariance_that_the_effects_give_the_forces(warmed):
     _, after, tables = warmed
     shifts = tables["steady_after"][shifts_of(tables["steady_after"])].to_numpy()
-    place = after.model.place(0)
+    place = after.model.term_slice(0)
     derivative = pd.DataFrame(evaluate(after.model, after.rows)[1].toarray()[:, place])
     means = derivative.groupby([after.rows.table["file"], after.rows.table["stroke"]], sort=False).mean()
     means = means.loc[pd.MultiIndex.from_frame(tables["steady_after"][["file", "stroke"]])].to_numpy()
@@ -118,7 +118,7 @@ def test_the_effects_uncertainty_is_common_to_all_conditions(warmed):
     alone = shared_levels(known, fit_conditions(known, Config()))
     levels = shared_levels(free, conditions)
     added = levels.covariance - alone.covariance
-    place = after.model.place(0)
+    place = after.model.term_slice(0)
     share = 0.035 / 0.05  # of the warming, in the mean of a stroke at mu_s: some 3.5 of 5 percent
     error = share * np.sqrt(after.covariance[place, place][0, 0]) * levels.table["value"].to_numpy()
     unlike = levels.table["condition"].to_numpy()[:, None] != levels.table["condition"].to_numpy()[None, :]

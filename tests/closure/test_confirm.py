@@ -12,7 +12,7 @@ from sealfit.closure.confirm import (
     confirmed,
     gain_between_settings,
     heldout_gain,
-    unseen_N,
+    rounding_error_N,
     varies_within,
 )
 from sealfit.closure.heldout import blocks
@@ -98,7 +98,7 @@ def decide(monkeypatch):
         held = dict(zip(map(id, proposals), gains, strict=True))
         monkeypatch.setattr("sealfit.closure.confirm.heldout_gain", lambda before, p, *args: held[id(p)])
         monkeypatch.setattr("sealfit.closure.confirm.gain_between_settings", lambda *args: settings)
-        monkeypatch.setattr("sealfit.closure.confirm._added_force", lambda p: np.full(3, added))
+        monkeypatch.setattr("sealfit.closure.confirm.added_force", lambda p: np.full(3, added))
         monkeypatch.setattr("sealfit.closure.confirm.rivals", lambda chosen, found: [p for p in found if p != chosen])
         refused, said = [], []
         context = Context(Config(), EFFECTS, **{"compare": False, "say": said.append} | more)
@@ -159,11 +159,14 @@ STEPS = pd.DataFrame({"force_N": np.repeat([10.0, 10.1, 10.2], 40), "stroke_id":
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        ({"gains": [Gain(0.5, 0.5, 1.0, 2.0)]}, "does not predict the data that were held out better"),
+        ({"gains": [Gain(0.5, 0.5, 1.0, 2.0)]}, "does not lower the error on held-out data"),
         ({"gains": [Gain(0.01, 0.99, 9.0)], "p_value": 1e-4}, "lowers the held-out error by less than 5%"),
-        ({"added": 0.0019}, "smaller than the recorded force can show"),  # 2e-4 of 10 N
-        ({"added": 0.028, "samples": STEPS}, "smaller than the recorded force can show"),  # 0.1 N over sqrt(12)
-        ({"settings": [GOOD, Gain(-0.1, 1.0, 1.0)]}, "does not predict whole settings that were held out"),
+        ({"added": 0.0019}, "smaller than the resolution of the recorded force"),  # 2e-4 of 10 N
+        (
+            {"added": 0.028, "samples": STEPS},
+            "smaller than the resolution of the recorded force",
+        ),  # 0.1 N over sqrt(12)
+        ({"settings": [GOOD, Gain(-0.1, 1.0, 1.0)]}, "does not predict held-out settings"),
     ],
 )
 def test_why_a_proposal_is_refused_is_said(decide, given, reason):
@@ -210,12 +213,12 @@ def test_a_free_shape_that_bends_the_curve_wants_more_evidence(decide, effect, c
 
 # ---------------------------------------------------------------- what a recorder resolves
 def test_a_recorder_hides_what_is_less_than_the_rounding_of_its_steps():
-    assert unseen_N(STEPS) == pytest.approx(0.1 / np.sqrt(12))
+    assert rounding_error_N(STEPS) == pytest.approx(0.1 / np.sqrt(12))
     rng = np.random.default_rng(0)
     noisy = STEPS.assign(force_N=(STEPS["force_N"] + rng.normal(0, 0.1, len(STEPS))).round(1))
-    assert unseen_N(pd.concat([noisy] * 9)) == 0.0  # noise of a step spreads the rounding, and means resolve less
-    assert unseen_N(STEPS.assign(force_N=rng.normal(10, 0.1, len(STEPS)))) == 0.0  # no steps
-    assert unseen_N(STEPS.assign(force_N=10.0)) == 0.0
+    assert rounding_error_N(pd.concat([noisy] * 9)) == 0.0  # noise of a step spreads the rounding
+    assert rounding_error_N(STEPS.assign(force_N=rng.normal(10, 0.1, len(STEPS)))) == 0.0  # no steps
+    assert rounding_error_N(STEPS.assign(force_N=10.0)) == 0.0
 
 
 def test_means_are_taken_in_groups_and_directions():

@@ -21,9 +21,11 @@ FEW_SPEEDS = (1.0, 4.0, 16.0, 64.0)
 def strongest(bins):
     """The smallest p-value of a claim in one search of single channels and pairs."""
     rows = make_rows(bins, has_aging=True)
-    judge, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
-    singles = search(judge, channels, rng)
-    return min((c.p_value for c in (*singles, *search_pairs(judge, channels, singles, rng)) if c.sure), default=1.0)
+    tests, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
+    singles = search(tests, channels, rng)
+    return min(
+        (c.p_value for c in (*singles, *search_pairs(tests, channels, singles, rng)) if c.claimable), default=1.0
+    )
 
 
 def tilted(level, size_N, seed):
@@ -141,8 +143,8 @@ def test_what_specimens_differ_in_is_judged_between_specimens():
         "displacement_mm": "specimen", "speed_mm_s": "specimen", "oil_ppm": "run",
     }  # fmt: skip
     assert scatter_level([channels["oil_ppm"], channels["temperature_C"]], rows) == "specimen"
-    few = rows.subset(rows.codes("specimen") < 2)
-    assert scatter_level([channels["displacement_mm"]], few) == "run"
+    two = rows.subset(rows.codes("specimen") < 2)
+    assert scatter_level([channels["displacement_mm"]], two) == "run"
     jittered = channels["oil_ppm"].values * (1 + 1e-5 * np.random.default_rng(0).normal(size=rows.force.size))
     assert unit_of(jittered, rows) == "run"
     assert np.unique(level_values(jittered, rows)).size == rows.groups.starts["run"].size
@@ -157,7 +159,7 @@ def test_two_specimens_with_the_same_slope_are_too_few_to_claim_it():
     found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     along = [c for c in found if c.channels == ("displacement_mm",) and c.p_value < 0.005]
     assert along
-    assert not any(c.sure for c in along)
+    assert not any(c.claimable for c in along)
 
 
 def test_what_two_specimens_show_is_a_candidate_and_the_verdict_cannot_tell():

@@ -6,7 +6,7 @@ from bins_helpers import make_bins
 
 from sealfit.closure.confirm import AcceptedEffect, silent
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.loop import _all_refused, _found_again
+from sealfit.closure.loop import _all_refused, _found_in_folds
 from sealfit.closure.selection import Selection
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit, fit_declared
@@ -21,7 +21,7 @@ def term_of(name, target="mu"):
 
 
 @pytest.fixture(scope="module")
-def grown():
+def selection():
     """A selection with two effects of weak evidence."""
     rows = make_rows(make_bins(5, repeats=1, bins=3, run_channels=OIL), has_aging=True)
     before = fit_declared(rows)
@@ -38,29 +38,29 @@ def grown():
     return Selection(before, after, added, (), (), None, None)
 
 
-def test_effects_of_weak_evidence_are_not_found_again_where_no_fold_has_their_shape(grown):
-    nothing = grown.before.model
+def test_effects_of_weak_evidence_are_not_found_again_where_no_fold_has_their_shape(selection):
+    nothing = selection.before.model
     other = nothing.with_term(term_of("time_s"), {"A": 1e-3})
-    assert not _found_again(grown, [nothing] * 5)
-    assert not _found_again(grown, [other] * 5)
+    assert not _found_in_folds(selection, [nothing] * 5)
+    assert not _found_in_folds(selection, [other] * 5)
 
 
-def test_one_fold_that_finds_one_of_them_on_any_quantity_is_enough(grown):
-    nothing = grown.before.model
+def test_one_fold_that_finds_one_of_them_on_any_quantity_is_enough(selection):
+    nothing = selection.before.model
     again = nothing.with_term(term_of("humidity_pct", "mu_c"), {"A": -1e-3})
-    assert _found_again(grown, [nothing, again])
+    assert _found_in_folds(selection, [nothing, again])
 
 
-def test_evidence_that_is_not_weak_needs_no_fold_to_find_it_again(grown):
-    first = grown.added[0]
-    sure = replace(first, proposal=replace(first.proposal, p_value=1e-9))
-    assert _found_again(replace(grown, added=(sure, *grown.added[1:])), [grown.before.model])
+def test_evidence_that_is_not_weak_needs_no_fold_to_find_it_again(selection):
+    first = selection.added[0]
+    strong = replace(first, proposal=replace(first.proposal, p_value=1e-9))
+    assert _found_in_folds(replace(selection, added=(strong, *selection.added[1:])), [selection.before.model])
 
 
-def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(grown):
-    own = _all_refused(grown, silent)
+def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(selection):
+    own = _all_refused(selection, silent)
     assert own.added == ()
-    assert own.after is grown.before
+    assert own.after is selection.before
     assert [r.term.channels[0] for r in own.refused] == list(OIL)
     assert all(r.weak and "no fold" in r.reason for r in own.refused)
     assert own.worse == ()

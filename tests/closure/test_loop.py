@@ -172,7 +172,7 @@ def test_too_few_specimens_to_show_their_scatter_are_said_to_be(null):
     assert "specimen" not in {s["level"] for s in made.document["scatter"]}
     assert any("how specimens scatter" in run["why"] for run in made.document["next_runs"])
     answer = predict(made.model, bins.head(2))
-    assert answer["note"].str.contains("how specimens scatter is not known").all()
+    assert answer["note"].str.contains("scatter of specimens is not known").all()
     assert answer["force_after_N"].notna().all()
     assert not any("how specimens scatter" in run["why"] for run in null[1].document["next_runs"])
 

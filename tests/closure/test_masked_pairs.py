@@ -1,4 +1,4 @@
-"""Effects that hide each other in few units."""
+"""Effects that mask each other in few units."""
 
 import numpy as np
 import pytest
@@ -19,10 +19,10 @@ ONE = {"temperatures": (), "days": (), "directions": (1, -1), "setup": 0.003, "b
 
 def hidden(bins, alpha=0.005):
     rows = make_rows(bins, has_aging=True)
-    judge, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
-    singles = search(judge, channels, rng)
-    pairs = search_pairs(judge, channels, singles, rng)
-    return search_masked_pairs(judge, {c.name: c for c in channels}, [*singles, *pairs], alpha)
+    tests, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
+    singles = search(tests, channels, rng)
+    pairs = search_pairs(tests, channels, singles, rng)
+    return search_masked_pairs(tests, {c.name: c for c in channels}, [*singles, *pairs], alpha)
 
 
 def one_way(table, force):

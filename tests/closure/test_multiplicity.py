@@ -11,10 +11,10 @@ from sealfit.closure.score_test import (
     Candidate,
     ScoreTestResult,
     adjust,
-    adjust_few,
+    adjust_all,
     adjust_slopes,
+    adjust_small_sample,
     critical_many,
-    judged,
     log_p_of,
     score_statistic,
 )
@@ -76,7 +76,7 @@ def test_the_critical_value_is_where_the_adjusted_p_value_is_the_level():
     npt.assert_allclose(adjust(at, np.random.default_rng(0)), 0.05, atol=0.002)
 
 
-def few(log_p, column):
+def along(log_p, column):
     """A test on four numbers, along one of them."""
     return SmallSampleTest(TARGET, np.eye(4)[:, [column]], 0.0, 1.0, log_p, 1.0, 3)
 
@@ -93,20 +93,20 @@ class FourNumbers:
 
 def test_tests_on_few_specimens_are_adjusted_by_draws_and_never_by_more_than_their_number():
     own = np.log(0.02)
-    results = [ScoreTestResult(1.0, 1, 4, NOWHERE, few=test) for test in (few(own, 0), few(NOWHERE, 1))]
+    results = [ScoreTestResult(1.0, 1, 4, NOWHERE, small_sample=test) for test in (along(own, 0), along(NOWHERE, 1))]
     plain = ScoreTestResult(1.0, 1, 4, NOWHERE)
-    found = adjust_few(FourNumbers, [*results, plain], np.random.default_rng(0), 20_000)
+    found = adjust_small_sample(FourNumbers, [*results, plain], np.random.default_rng(0), 20_000)
     # Squares of four numbers share one sum, so that two of them are seldom large together: 1 - 0.98^2 or a bit more.
     assert found[0] == pytest.approx(0.04, abs=0.004)
     assert found[1] > 0.5
     assert found[2] == 1.0
-    surer = [ScoreTestResult(1.0, 1, 4, NOWHERE, few=few(-30.0, k)) for k in (0, 1)]
-    npt.assert_allclose(adjust_few(FourNumbers, surer, np.random.default_rng(0)), 2 * np.exp(-30.0))
+    surer = [ScoreTestResult(1.0, 1, 4, NOWHERE, small_sample=along(-30.0, k)) for k in (0, 1)]
+    npt.assert_allclose(adjust_small_sample(FourNumbers, surer, np.random.default_rng(0)), 2 * np.exp(-30.0))
 
 
 def test_a_level_without_tests_adjusts_nothing():
-    results = [ScoreTestResult(1.0, 1, 4, NOWHERE, few=few(-9.0, 0)._replace(level="run"))]
-    assert adjust_few(FourNumbers, results, np.random.default_rng(0)).tolist() == [1.0]
+    results = [ScoreTestResult(1.0, 1, 4, NOWHERE, small_sample=along(-9.0, 0)._replace(level="run"))]
+    assert adjust_small_sample(FourNumbers, results, np.random.default_rng(0)).tolist() == [1.0]
 
 
 def test_draws_of_four_numbers_have_uniform_p_values():
@@ -149,7 +149,7 @@ def candidate(name, result):
 
 def test_a_search_says_the_strongest_evidence_first_with_p_values_for_two_searches():
     given = [candidate("idle", scored(np.array([[1.0], [-1.0]] * 4))), candidate("oil", alike(8))]
-    found = judged(SimpleNamespace(few={"specimen": FourNumbers}), given, np.random.default_rng(0))
+    found = adjust_all(SimpleNamespace(cluster_tests={"specimen": FourNumbers}), given, np.random.default_rng(0))
     assert [c.channels for c in found] == [("oil",), ("idle",)]
     assert found[0].p_value == pytest.approx(2 / 64, abs=0.012)  # 4 of 256 flips say as much of either; two searches
     assert found[1].p_value == 1.0
@@ -157,19 +157,25 @@ def test_a_search_says_the_strongest_evidence_first_with_p_values_for_two_search
 
 def test_two_ways_to_test_have_half_of_the_error_each():
     """The jackknife over 40 units, times the candidates; and F with contrasts, in few units."""
-    sure = alike(40)._replace(log_p_jackknife=-20.0)
-    found = judged(SimpleNamespace(few={"specimen": FourNumbers}), [candidate("a", sure)], np.random.default_rng(0))
+    strong = alike(40)._replace(log_p_jackknife=-20.0)
+    found = adjust_all(
+        SimpleNamespace(cluster_tests={"specimen": FourNumbers}), [candidate("a", strong)], np.random.default_rng(0)
+    )
     assert found[0].p_value == pytest.approx(2 * 2 * np.exp(-20.0))
-    both = ScoreTestResult(1.0, 1, 8, NOWHERE, few=few(-30.0, 0), slopes=(slopes_of(0.1),))
-    found = judged(SimpleNamespace(few={"specimen": FourNumbers}), [candidate("a", both)], np.random.default_rng(0))
+    both = ScoreTestResult(1.0, 1, 8, NOWHERE, small_sample=along(-30.0, 0), slopes=(slopes_of(0.1),))
+    found = adjust_all(
+        SimpleNamespace(cluster_tests={"specimen": FourNumbers}), [candidate("a", both)], np.random.default_rng(0)
+    )
     assert found[0].p_value == pytest.approx(2 * 2 * np.exp(-30.0))
 
 
 def test_a_claim_needs_enough_specimens_and_that_they_agree():
     shown = ScoreTestResult(1.0, 1, 8, NOWHERE)
-    assert candidate("a", shown).sure
-    assert not candidate("a", shown._replace(agree=False)).sure
-    assert not candidate("a", shown._replace(few=few(-9.0, 0)._replace(error_df=3))).sure  # of specimens: four
-    assert candidate("a", shown._replace(few=few(-9.0, 0)._replace(error_df=3, level="run"))).sure
-    differ = slopes_of(3.0, 1.0)._replace(agree=np.array([False, True]))  # the stronger of the two does
-    assert not candidate("a", shown._replace(slopes=(differ,))).sure
+    assert candidate("a", shown).claimable
+    assert not candidate("a", shown._replace(consistent=False)).claimable
+    assert not candidate(
+        "a", shown._replace(small_sample=along(-9.0, 0)._replace(error_df=3))
+    ).claimable  # of specimens: four
+    assert candidate("a", shown._replace(small_sample=along(-9.0, 0)._replace(error_df=3, level="run"))).claimable
+    differ = slopes_of(3.0, 1.0)._replace(consistent=np.array([False, True]))  # the stronger of the two does
+    assert not candidate("a", shown._replace(slopes=(differ,))).claimable

@@ -5,7 +5,7 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.next_runs import find_aliases, where_apart
+from sealfit.closure.next_runs import find_aliases, largest_difference
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Parameter
@@ -23,7 +23,7 @@ def bound(fitted, effect, channel, **values):
 
 def between(chosen, rival):
     channels = (*chosen.term.channels, *rival.term.channels)
-    return where_apart(chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, Config())
+    return largest_difference(chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, Config())
 
 
 def test_channels_that_always_went_together_are_taken_apart():
@@ -55,7 +55,7 @@ def test_an_offset_is_friction_where_all_runs_go_one_way():
     alias = next(a for a in find_aliases(fitted, EFFECTS, ("temperature_C",)) if a.term.effect.id == "zero_offset")
     force = 49.03 * 0.6
     assert alias.size_N == pytest.approx(0.01 * force, rel=0.3)
-    where, apart = where_apart(alias.holding, alias.lacking, fitted.rows, ("direction",), Config())
+    where, apart = largest_difference(alias.holding, alias.lacking, fitted.rows, ("direction",), Config())
     assert where["speed_mm_s"] < 0  # the other way, where the offset helps the friction it stood for
     assert apart == pytest.approx(2 * alias.size_N, rel=0.05)
 

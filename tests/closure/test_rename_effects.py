@@ -5,12 +5,12 @@ from bins_helpers import make_bins, make_traces
 from sealfit.closure import rename_effects
 from sealfit.closure.channels import find_channels
 from sealfit.closure.confirm import AcceptedEffect, Context
-from sealfit.closure.criteria import PAIR
+from sealfit.closure.criteria import PAIR_PENALTY
 from sealfit.closure.forms import terms_of
 from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.search import search
-from sealfit.closure.selection import grow, numbered, steady_samples
+from sealfit.closure.selection import numbered, select_effects, steady_samples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit, fit_declared
@@ -30,12 +30,12 @@ def test_a_shape_of_no_catalogue_is_one_effect_and_not_two_bumps():
 
     bins = make_bins(5, setup=0.003, effect=sigmoid, run_channels=OIL, bins=6)
     rows = make_rows(numbered(bins), has_aging=True)
-    grown = grow(rows, steady_samples(make_traces(bins), rows), Context(Config(), EFFECTS))
-    (effect,) = grown.added
+    selection = select_effects(rows, steady_samples(make_traces(bins), rows), Context(Config(), EFFECTS))
+    (effect,) = selection.added
     assert effect.proposal.term.channels == ("oil_ppm",)
-    assert grown.left is None
+    assert selection.left is None
     true = 0.06 * np.tanh((rows.values("oil_ppm") - 50) / 3) * rows.force
-    found = grown.after.force - grown.before.force
+    found = selection.after.force - selection.before.force
     assert np.corrcoef(found, true)[0, 1] > 0.95
 
 
@@ -75,7 +75,7 @@ def test_two_channels_together_pay_for_being_one_of_many():
         for term, searched in terms_of(candidate, channels, fitted, EFFECTS):
             for proposal in linearised(term, searched, candidate):
                 bic_penalty[term.effect.id] = proposal.bic_penalty
-    assert bic_penalty["product"] - bic_penalty["linear"] == pytest.approx(PAIR)
+    assert bic_penalty["product"] - bic_penalty["linear"] == pytest.approx(PAIR_PENALTY)
 
 
 def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
@@ -108,7 +108,7 @@ def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
     monkeypatch.setattr(rename_effects, "propose", without_its_own_curve)
     channels = {c.name: c for c in find_channels(rows)}
     again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
-    after, kept = again.all_but_last(fitted, added)
+    after, kept = again.earlier_renamed(fitted, added)
     assert refitted
     assert kept is added
     assert after is fitted
@@ -130,7 +130,7 @@ def in_place_of_two(bins, first, second, **options):
     one, two = (accepted(t, v, f) for (t, v), f in zip((first, second), (base, after), strict=True))
     channels = {c.name: c for c in find_channels(rows)}
     again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
-    earlier, new = again.one_for_two(base, [one], two, **options)
+    earlier, new = again.merged_with_earlier(base, [one], two, **options)
     return [a.proposal.term for a in (*earlier, new)]
 
 
@@ -175,7 +175,7 @@ def test_a_product_told_as_a_sum_of_two_is_one_effect():
     two = [(Term(EFFECTS["linear"], (n,), "mu", "multiply", {"x_ref": 5.0}), {"A": 0.01}) for n in channels]
     (term,) = in_place_of_two(bins, *two)
     assert set(term.channels) == set(channels)
-    assert len(in_place_of_two(bins, *two, awaited=True)) == 2  # a third is to come, beside which alone one shows
+    assert len(in_place_of_two(bins, *two, pending=True)) == 2  # a third is to come, beside which alone one shows
 
 
 def test_an_effect_that_gains_nothing_beside_the_others_goes():
@@ -195,8 +195,8 @@ def test_an_effect_that_gains_nothing_beside_the_others_goes():
     ]
     channels = {c.name: c for c in find_channels(rows)}
     again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
-    after, kept = again.all_but_last(fitted, added)
+    after, kept = again.earlier_renamed(fitted, added)
     assert [a.proposal.term.channels for a in kept] == [("oil_ppm",)]
     assert [t.channels for t in after.model.terms] == [("oil_ppm",)]
-    held, _ = again.all_but_last(after, kept)
+    held, _ = again.earlier_renamed(after, kept)
     assert held is after

@@ -47,7 +47,7 @@ def fitted():
 
 
 @pytest.fixture(scope="module")
-def grown(fitted):
+def selection(fitted):
     """The end of a loop that found nothing, with effects and candidates of one's choice put in."""
     channels = {c.name: c for c in find_channels(fitted.rows)}
     return Selection(fitted, fitted, (), (), (), None, None, channels)
@@ -71,10 +71,10 @@ def candidate(*channels, p_value=1e-3, log_p=-9.0, chi2=20.0, unit="run"):
 def test_an_error_held_out_weighs_rows_and_leaves_out_what_is_not_covered():
     rows = SimpleNamespace(force=np.array([1.0, 2.0, 3.0, 4.0]), weight=np.array([0.1, 0.2, 0.3, 0.4]))
     held = np.array([2.0, np.nan, 5.0, 7.0])  # errors of 1, 2 and 3; the second row was never held out
-    ends = BeforeAfter(SimpleNamespace(rows=rows), None, held, held, np.array([True, True, True, False]))
-    assert ends.heldout_rmse_N(held) == pytest.approx(np.sqrt((0.1 * 1 + 0.3 * 4) / 0.4))
-    assert ends.heldout_rmse_N(held, extrapolated=True) == pytest.approx(3.0)
-    assert ends.heldout_rmse_N(np.full(4, np.nan)) is None
+    models = BeforeAfter(SimpleNamespace(rows=rows), None, held, held, np.array([True, True, True, False]))
+    assert models.heldout_rmse_N(held) == pytest.approx(np.sqrt((0.1 * 1 + 0.3 * 4) / 0.4))
+    assert models.heldout_rmse_N(held, extrapolated=True) == pytest.approx(3.0)
+    assert models.heldout_rmse_N(np.full(4, np.nan)) is None
 
 
 @pytest.mark.parametrize(
@@ -91,38 +91,40 @@ def test_the_error_is_compared_with_what_repeats_scatter_by(p_value, floor, stat
 
 
 # ---------------------------------------------------------------- the verdict
-def document(grown, after=None):
-    after = grown.after if after is None else after
+def document(selection, after=None):
+    after = selection.after if after is None else after
     held = np.full(after.force.size, np.nan)
-    ends = BeforeAfter(grown.before, after, held, held, np.ones(held.size, dtype=bool))
-    return closure_document(replace(grown, after=after), ends, "run", Config(), EFFECTS)
+    models = BeforeAfter(selection.before, after, held, held, np.ones(held.size, dtype=bool))
+    return closure_document(replace(selection, after=after), models, "run", Config(), EFFECTS)
 
 
-def test_the_verdict_says_what_was_found_and_what_is_left(grown, fitted):
+def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted):
     item, after = accepted(fitted)
-    weak, sure = (RefusedEffect(WARMING, p, "it is too small") for p in (1e-4, 1e-7))
+    weak, strong = (RefusedEffect(WARMING, p, "it is too small") for p in (1e-4, 1e-7))
     left = candidate("oil_ppm")
     verdicts = {
-        "closed": document(replace(grown, added=(item,)), after),
-        "unexplained": document(replace(grown, left=left)),
-        "cannot_tell": document(replace(grown, unsure=item)),
-        "nothing_missing": document(replace(grown, refused=(sure,))),
+        "closed": document(replace(selection, added=(item,)), after),
+        "unexplained": document(replace(selection, left=left)),
+        "cannot_tell": document(replace(selection, inconclusive=item)),
+        "nothing_missing": document(replace(selection, refused=(strong,))),
     }
     assert {name: found["verdict"] for name, found in verdicts.items()} == {name: name for name in verdicts}
-    assert document(replace(grown, added=(item,), left=left), after)["verdict"] == "unexplained"
-    assert document(replace(grown, left=left, unsure=item))["verdict"] == "cannot_tell"  # too few specimens show it
-    assert document(replace(grown, worse=(sure,), refused=(sure,)))["verdict"] == "unexplained"
-    refused = document(replace(grown, refused=(weak, sure)))
+    assert document(replace(selection, added=(item,), left=left), after)["verdict"] == "unexplained"
+    assert (
+        document(replace(selection, left=left, inconclusive=item))["verdict"] == "cannot_tell"
+    )  # too few specimens show it
+    assert document(replace(selection, worse=(strong,), refused=(strong,)))["verdict"] == "unexplained"
+    refused = document(replace(selection, refused=(weak, strong)))
     assert refused["verdict"] == "cannot_tell"
     assert [(entry["id"], entry["weak"], entry["reason"]) for entry in refused["refused"]] == [
         ("warming_distance", True, "it is too small"), ("warming_distance", False, "it is too small"),
     ]  # fmt: skip
 
 
-def test_an_effect_is_written_with_its_intervals_and_rivals(grown, fitted):
+def test_an_effect_is_written_with_its_intervals_and_rivals(selection, fitted):
     rivals = tuple(accepted(fitted, replace(WARMING, acts_on=name))[0].proposal for name in ("force", "mu_c"))
     item, after = accepted(fitted, rivals=rivals, rmse=(0.41, np.nan))
-    (entry,) = document(replace(grown, added=(item,)), after)["effects"]
+    (entry,) = document(replace(selection, added=(item,)), after)["effects"]
     assert entry["label"] == "warming by sliding (distance), factor on mu"
     assert (entry["level"], entry["channels"], entry["named"], entry["candidate"]) == (
         "trace", ["distance_mm"], True, False,
@@ -136,9 +138,9 @@ def test_an_effect_is_written_with_its_intervals_and_rivals(grown, fitted):
         {"id": "warming_distance", "channels": ["distance_mm"], "acts_on": "force", "heldout_rmse_N": 0.41},
         {"id": "warming_distance", "channels": ["distance_mm"], "acts_on": "mu_c", "heldout_rmse_N": None},
     ]
-    (doubted,) = document(replace(grown, unsure=item))["effects"]
-    assert doubted["candidate"]
-    assert {**doubted, "candidate": False} == entry
+    (inconclusive_effect,) = document(replace(selection, inconclusive=item))["effects"]
+    assert inconclusive_effect["candidate"]
+    assert {**inconclusive_effect, "candidate": False} == entry
     table = effect_table([entry], [item])
     assert table[["round", "id", "channels", "parameter"]].to_numpy().tolist() == [
         [1, "warming_distance", "distance_mm", "A"], [1, "warming_distance", "distance_mm", "s_0"],
@@ -155,15 +157,15 @@ def test_a_table_of_no_effects_has_its_columns():
 
 
 # ---------------------------------------------------------------- what is left
-def test_the_error_left_is_what_exceeds_the_floor(grown):
-    assert left_entry(grown, 0.5, 0.3)["rmse_N"] == pytest.approx(0.4)
-    assert left_entry(grown, 0.2, 0.3)["rmse_N"] == 0.0
-    assert left_entry(grown, 0.5, None)["rmse_N"] is None
+def test_the_error_left_is_what_exceeds_the_floor(selection):
+    assert left_entry(selection, 0.5, 0.3)["rmse_N"] == pytest.approx(0.4)
+    assert left_entry(selection, 0.2, 0.3)["rmse_N"] == 0.0
+    assert left_entry(selection, 0.5, None)["rmse_N"] is None
 
 
-def test_what_is_still_significant_is_named_at_its_level(grown):
+def test_what_is_still_significant_is_named_at_its_level(selection):
     def left(found, **more):
-        entry = left_entry(replace(grown, left=found, **more), 0.5, 0.3)
+        entry = left_entry(replace(selection, left=found, **more), 0.5, 0.3)
         return entry["level"], entry["channel"], entry["p_value"]
 
     assert left(PEAK) == ("trace", "time_s", 1e-4)
@@ -175,9 +177,9 @@ def test_what_is_still_significant_is_named_at_its_level(grown):
     assert left(None, last=(candidate("oil_ppm", p_value=0.3), candidate("time_s", p_value=0.9))) == (None, None, 0.3)
 
 
-def test_an_effect_that_lowered_no_error_is_left(grown):
+def test_an_effect_that_lowered_no_error_is_left(selection):
     worse = RefusedEffect(WARMING, 1e-7, "it lowers no error")
-    entry = left_entry(replace(grown, worse=(worse,)), 0.5, 0.3)
+    entry = left_entry(replace(selection, worse=(worse,)), 0.5, 0.3)
     assert (entry["level"], entry["channel"], entry["p_value"]) == ("trace", "distance_mm", 1e-7)
 
 

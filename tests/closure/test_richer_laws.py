@@ -27,7 +27,7 @@ def test_an_induction_time_is_found_though_the_declared_law_bends_towards_it():
     candidate, proposal = found["aging_induction"]
     assert candidate.p_value < 0.005
     assert candidate.p_value < found["aging_floor"][0].p_value
-    assert candidate.sure
+    assert candidate.claimable
     assert proposal.values["t_i"] == pytest.approx(3.0, rel=0.1)
     assert proposal.values["A"] == pytest.approx(0.15, rel=0.15)
 
@@ -45,7 +45,7 @@ def test_too_few_specimens_are_never_sure():
     few = make_rows(make_bins(1, days=(1.0, 4.0, 8.0, 16.0), repeats=1, bins=3, effect=lag), has_aging=True)
     found = richer_laws(fit_declared(few), {c.name: c for c in find_channels(few)}, EFFECTS)
     assert found
-    assert not any(c.sure for c, _ in found)  # nine specimens, five numbers of the law, two more: two are left
+    assert not any(c.claimable for c, _ in found)  # nine specimens, five numbers of the law, two more: two are left
 
 
 def test_no_law_is_asked_for_without_days():

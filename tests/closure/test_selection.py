@@ -34,7 +34,7 @@ def effect(letter, *, periodic=False):
 def left(monkeypatch, added):
     monkeypatch.setattr(selection, "fit", fit)
     monkeypatch.setattr(selection, "_wald_statistic", wald_statistic)
-    fitted, kept = selection._drop_needless(fit(Model("abc")), added)
+    fitted, kept = selection._remove_redundant(fit(Model("abc")), added)
     assert fitted.model.terms == "".join(a.name for a in kept)
     return fitted.model.terms
 

@@ -8,7 +8,7 @@ from sealfit.closure.loop import close_loop
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
-from sealfit.closure.sensitivity import cannot_tell, sensitivity
+from sealfit.closure.sensitivity import sensitivity, undetectable_variables
 from sealfit.config import Config
 from sealfit.fit.joint.estimate import fit_declared
 from sealfit.fit.joint.rows import make_rows
@@ -25,8 +25,8 @@ def searched(bins):
     return Selection(fitted, fitted, (), found, found, None, None, channels)
 
 
-def entries(grown):
-    return {(e["variable"], e["level"]): e for e in sensitivity(grown, 0.005)}
+def entries(selection):
+    return {(e["variable"], e["level"]): e for e in sensitivity(selection, 0.005)}
 
 
 def p_with(bins, size_pct):
@@ -59,17 +59,17 @@ def test_a_variable_has_an_entry_for_each_level_at_which_it_varies():
 
 def test_four_files_cannot_tell_and_say_how_many_would_do():
     bins = make_bins(1, temperatures=(), speeds=(1.0, 4.0, 16.0, 64.0), repeats=1, bins=6)
-    grown = searched(bins)
-    found = sensitivity(grown, 0.005)
-    untold = cannot_tell(grown, found, [])
-    assert "displacement_mm" in untold
-    assert all(e["files_needed"] == 5 for e in found if e["variable"] in untold)
+    selection = searched(bins)
+    found = sensitivity(selection, 0.005)
+    undetectable = undetectable_variables(selection, found, [])
+    assert "displacement_mm" in undetectable
+    assert all(e["files_needed"] == 5 for e in found if e["variable"] in undetectable)
 
 
 def test_what_differs_between_two_specimens_cannot_be_told():
     bins = make_bins(1, temperatures=(60.0,), days=(4.0,), repeats=2, bins=6)
-    grown = searched(bins)
-    assert "aging_days" in cannot_tell(grown, sensitivity(grown, 0.005), [])
+    selection = searched(bins)
+    assert "aging_days" in undetectable_variables(selection, sensitivity(selection, 0.005), [])
 
 
 def test_two_specimens_of_one_condition_that_differ_cannot_be_told():
@@ -79,10 +79,10 @@ def test_two_specimens_of_one_condition_that_differ_cannot_be_told():
     both = pd.concat([bins, second], ignore_index=True)
     document = close_loop(both, make_traces(both), Config()).document
     assert document["verdict"] == "cannot_tell"
-    (untold,) = [e for e in document["sensitivity"] if e["variable"] == "specimen_id"]
-    assert (untold["cannot_tell"], untold["files_needed"]) == (True, 120)
+    (undetectable,) = [e for e in document["sensitivity"] if e["variable"] == "specimen_id"]
+    assert (undetectable["cannot_tell"], undetectable["files_needed"]) == (True, 120)
 
 
 def test_a_campaign_of_nine_specimens_can_tell():
-    grown = searched(make_bins(3, repeats=2, bins=6, run_channels=OIL))
-    assert cannot_tell(grown, sensitivity(grown, 0.005), []) == []
+    selection = searched(make_bins(3, repeats=2, bins=6, run_channels=OIL))
+    assert undetectable_variables(selection, sensitivity(selection, 0.005), []) == []

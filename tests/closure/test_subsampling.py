@@ -8,7 +8,7 @@ from bins_helpers import TRUE, make_bins, make_traces, warm
 
 from sealfit.closure.confirm import Context
 from sealfit.closure.loop import close_loop
-from sealfit.closure.selection import grow, numbered, steady_samples
+from sealfit.closure.selection import numbered, select_effects, steady_samples
 from sealfit.closure.subsampling import FURTHER, MOST_ROWS, PER_STROKE, ROWS, merged_bins, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -128,19 +128,19 @@ def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatc
     bins = numbered(make_bins(seed, effect=stiffer, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, noise_N=0.1))
     part = next(subsamples(make_rows(bins, has_aging=True), 1))
     samples = steady_samples(make_traces(bins), part.rows)
-    grown = grow(part.coarse, samples, Context(Config(), EFFECTS))
-    (found,) = grown.added
+    selection = select_effects(part.coarse, samples, Context(Config(), EFFECTS))
+    (found,) = selection.added
 
     def on(quantity):
         term = replace(found.proposal.term, acts_on=quantity)
-        model = grown.before.model.with_term(term, found.proposal.fitted.model.values[-1])
-        return replace(found.proposal, term=term, fitted=fit(model, part.coarse, grown.after.scatter, turns=0))
+        model = selection.before.model.with_term(term, found.proposal.fitted.model.values[-1])
+        return replace(found.proposal, term=term, fitted=fit(model, part.coarse, selection.after.scatter, turns=0))
 
     for first, second in ((other, acts_on), (acts_on, other)):
         chosen, rival = on(first), on(second)
         item = replace(found, proposal=chosen, rivals=(rival,), rivals_rmse_N=(0.1,))
-        doubted = replace(grown, after=chosen.fitted, added=(item,))
-        told, whole = reselect_on_all(doubted, part.every, samples, Config(), lambda text: None)
+        off_target = replace(selection, after=chosen.fitted, added=(item,))
+        told, whole = reselect_on_all(off_target, part.every, samples, Config(), lambda text: None)
         (effect,) = told.added
         terms = (effect.proposal.term, *told.after.model.terms, *whole.model.terms)
         assert [term.acts_on for term in terms] == [acts_on] * 3

@@ -168,7 +168,7 @@ def only_a_table_of_runs(folder):
         (words, "none of 1 files holds a table of numbers", "export them as text"),
         (binary, "is not text", "export them as text"),
         (packed, "a zip archive or .xlsx workbook", "export them as text"),
-        (tdms, "3 TDMS (LabVIEW) (.tdms), 1 Excel workbooks (.xlsx)", "Export the traces as text"),
+        (tdms, "3 TDMS (LabVIEW) (.tdms), 1 Excel workbooks (.xlsx)", "Name their columns in a config"),
         (empty_files, "is empty", "export them as text"),
         (values_over_days, "but no time and no force", "Give the folder that holds traces"),
         (only_a_table_of_runs, "none of 1 files holds a table of numbers", "export them as text"),

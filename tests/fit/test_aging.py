@@ -174,7 +174,7 @@ def test_lack_of_fit_names_both_of_its_causes(campaign):
     fit = fit_series(fit_conditions(table, Config()), Config())
     row = statistic(fit, "mu_s:lack_of_fit_p")
     assert row.value < 1e-6
-    assert "specimens differ, or the law is another" in row.reason
+    assert "specimens differ, or the law is wrong" in row.reason
     assert 1 < statistic(fit, "mu_s:specimen_sd_pct").value < 8
 
 

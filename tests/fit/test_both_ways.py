@@ -3,7 +3,7 @@
 import pytest
 
 from sealfit.config import Config
-from sealfit.fit.joint.rows import both_ways_together
+from sealfit.fit.joint.rows import merge_directions
 from sealfit.fit.steady.fit import fit_conditions
 from sealfit.fit.steady.uncertainty import run_means
 
@@ -11,7 +11,7 @@ from sealfit.fit.steady.uncertainty import run_means
 def test_one_row_a_file_and_the_offset_between_the_ways_cancels(campaign):
     table = campaign(noise=0.0, days=(0,), together=True)
     shifted = table.assign(force_N=table["force_N"] + 0.7)  # a zero offset: the same sign both ways
-    together = both_ways_together(shifted)
+    together = merge_directions(shifted)
     assert len(together) == len(table) / 2
     assert set(together["direction"]) == {0}
     assert together["half_N"].to_numpy() == pytest.approx(0.7)
@@ -21,7 +21,7 @@ def test_one_row_a_file_and_the_offset_between_the_ways_cancels(campaign):
 
 def test_files_of_one_way_each_stay_as_they_are(campaign):
     table = campaign(days=(0,))
-    together = both_ways_together(table)
+    together = merge_directions(table)
     assert together.drop(columns="half_N").equals(table)
 
 
@@ -29,7 +29,7 @@ def test_a_slow_way_out_and_a_fast_way_back_are_two_runs(campaign):
     table = campaign(noise=0.0, days=(0,), together=True)
     back = table["direction"] < 0
     table.loc[back, ["speed_mm_s", "speed_set_mm_s"]] *= 3.0
-    assert set(both_ways_together(table)["direction"]) == {1, -1}
+    assert set(merge_directions(table)["direction"]) == {1, -1}
 
 
 def test_what_both_ways_share_is_counted_once(campaign):

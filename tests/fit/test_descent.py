@@ -17,8 +17,8 @@ from sealfit.fit.joint.search import (
     bounds_of,
     least_squares,
     least_squares_within,
-    linear_solved,
     search_nonlinear,
+    solve_linear,
     start_model,
 )
 from sealfit.fit.joint.whitening import Component, Scatter
@@ -57,10 +57,10 @@ def test_a_stribeck_speed_moves_only_for_what_its_prior_costs(gained, moves, mon
     model, rows, curved = astray(one_specimen=False, aging=False)
     stands = model.vector()
 
-    def solved(at, *_, most=np.inf):
+    def solved(at, *_, ceiling=np.inf):
         return 100.0 - gained * float(np.abs(at.vector() - stands).max() > 1.0), at
 
-    monkeypatch.setattr(search, "_linear_solved", solved)
+    monkeypatch.setattr(search, "_linear_optimum", solved)
     found = search_nonlinear(model, rows, SCATTER).vector()
     assert np.array_equal(found[curved], stands[curved]) != moves
 
@@ -72,7 +72,7 @@ def test_a_search_never_ends_worse_than_it_began(gain, noise):
     model, rows, _ = astray(one_specimen=False, aging=False)
     rows = rows.sparse(ROWS_FOR_START)
     scatter = Scatter(noise, 0.0, (Component("file", "gain", gain),))
-    begun = linear_solved(model, rows, scatter, rows.force)
+    begun = solve_linear(model, rows, scatter, rows.force)
     found = search_nonlinear(model, rows, scatter)
     low, high = bounds_of(found, rows)
     assert np.all((found.vector() >= low) & (found.vector() <= high))
@@ -95,23 +95,23 @@ def test_bounds_are_asked_only_where_the_best_so_far_could_be_beaten(monkeypatch
     monkeypatch.setattr("sealfit.fit.joint.search.lsq_linear", counted)
     found = search_nonlinear(model, rows, SCATTER)
     few, solved[:] = len(solved), []
-    every = joint_search._linear_solved
+    every = joint_search._linear_optimum
 
-    def without_limit(*given, most=np.inf):
+    def without_limit(*given, ceiling=np.inf):
         return every(*given)
 
-    monkeypatch.setattr(joint_search, "_linear_solved", without_limit)
+    monkeypatch.setattr(joint_search, "_linear_optimum", without_limit)
     npt.assert_array_equal(search_nonlinear(model, rows, SCATTER).vector(), found.vector())
     assert few < len(solved) / 2
 
 
 def test_series_are_searched_on_their_own_rows_as_on_all(monkeypatch):
     model, rows, curved = astray(one_specimen=False, aging=True)
-    moving, still = joint_search._parted(model, rows, [int(curved[0])])
+    moving, still = joint_search._split_by_action(model, rows, [int(curved[0])])
     assert 0 < moving.force.size < rows.force.size == moving.force.size + still.force.size
     assert set(moving.table["specimen_id"]).isdisjoint(still.table["specimen_id"])
     found = search_nonlinear(model, rows, SCATTER)
-    monkeypatch.setattr(joint_search, "_parted", lambda model, rows, group: (rows, None))
+    monkeypatch.setattr(joint_search, "_split_by_action", lambda model, rows, group: (rows, None))
     npt.assert_allclose(search_nonlinear(model, rows, SCATTER).vector(), found.vector(), rtol=1e-9)
 
 

@@ -155,9 +155,9 @@ def test_numbers_of_effects_that_act_nonlinearly_are_known():
     rows = make_rows(bins_helpers.make_bins(1, bins=4, repeats=1), has_aging=True)
     term = Term(EFFECTS["warming_time"], ("time_s",), "mu", "multiply")
     model = start_model(rows).with_term(term, {"A": 0.05, "tau": 3.0})
-    own = model.bent[model.theta.size :]
+    own = model.nonlinear[model.theta.size :]
     assert own.tolist() == [False, True]
-    bent = {p.quantity for p, b in zip(model.declared.parameters, model.bent, strict=False) if b}
+    bent = {p.quantity for p, b in zip(model.declared.parameters, model.nonlinear, strict=False) if b}
     assert bent == {"v_s", "b_s", "b_c"}
 
 

@@ -62,14 +62,14 @@ def test_exact_values_give_the_law_back(loss, own):
 @pytest.mark.parametrize(("loss", "own", "a"), [("log", (0.1,), 0.05), ("stretched", (4.0, 0.6), 0.3)])
 def test_evidence_chooses_the_shape_that_is_true(loss, own, a):
     laws = fit_laws(campaign(loss, own, a=a, scatter=0.003))
-    assert (laws[0].loss.name, laws[0].way) == (loss, "rate")
+    assert (laws[0].loss.name, laws[0].acts_on) == (loss, "rate")
     assert all(law.bic > laws[0].bic for law in laws[1:])
     assert left_out(laws[0])["series"] < 0.02
 
 
 def test_a_factor_on_the_loss_is_told_from_one_on_the_rate():
     laws = fit_laws(campaign(way="loss", energy=20.0, scatter=0.003))
-    assert (laws[0].loss.name, laws[0].way) == ("log", "loss")
+    assert (laws[0].loss.name, laws[0].acts_on) == ("log", "loss")
 
 
 def test_intervals_hold_the_truth():
@@ -192,10 +192,10 @@ def test_a_decomposed_covariance_is_the_covariance(scatter):
     assert aged.spread.log_determinant(scatter) == pytest.approx(np.linalg.slogdet(covariance)[1])
 
 
-@pytest.mark.parametrize("way", ["rate", "loss"])
+@pytest.mark.parametrize("acts_on", ["rate", "loss"])
 @pytest.mark.parametrize("loss", LOSSES)
-def test_the_slope_of_a_law_is_that_of_its_values(loss, way):
-    law = replace(fit_joint_law(campaign(scatter=0.01), "log"), loss=LOSSES[loss], way=way)
+def test_the_slope_of_a_law_is_that_of_its_values(loss, acts_on):
+    law = replace(fit_joint_law(campaign(scatter=0.01), "log"), loss=LOSSES[loss], acts_on=acts_on)
     own = len(law.loss.parameters)
     law = replace(law, names=("mu_0", "a", *law.loss.parameters, "E", "kappa"))
     x = np.array([[0.9, 0.05, *[0.3, -0.4][:own], 70.0, 0.02], [0.8, 0.1, *[-1.2, 0.2][:own], 20.0, -0.01]])
@@ -313,7 +313,7 @@ def test_a_temperature_is_refused_where_the_tests_had_one():
 def test_strength_by_temperature(table, loss, energy):
     rows = pd.read_csv(Path(MEASURED) / "aging-strength" / "csv" / f"{table}.csv")
     laws = fit_laws(Aged(rows["TimeH"].to_numpy() / 24, rows["Response"].to_numpy(float), rows["TempC"].to_numpy()))
-    assert (laws[0].loss.name, laws[0].way) == (loss, "rate")
+    assert (laws[0].loss.name, laws[0].acts_on) == (loss, "rate")
     found = {name: (low, high) for name, _, low, high, _ in laws[0].parameters()}
     assert energy[0] < found["E"][0] < found["E"][1] < energy[1]
     assert laws[0] not in rivals_of(laws)

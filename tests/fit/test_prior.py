@@ -12,7 +12,7 @@ from sealfit.closure.forms import free_term
 from sealfit.effects.free import natural, roughness
 from sealfit.fit.joint.estimate import effective_df, fit, fit_declared
 from sealfit.fit.joint.model import shape_of
-from sealfit.fit.joint.prior import likely_smoothness, penalised
+from sealfit.fit.joint.prior import penalised, reml_smoothness
 from sealfit.fit.joint.rows import make_rows
 
 KNOTS = tuple(np.linspace(0.0, 1.0, 20))
@@ -31,7 +31,7 @@ def test_a_straight_line_is_worth_one_number():
     for seed in range(20):
         normal, gradient = normal_equations(lambda x: 2.0 * np.asarray(x), 0.3, seed)
         rough = roughness(KNOTS)
-        amplitude, size = penalised(normal, gradient, likely_smoothness(normal, gradient, rough) * rough)
+        amplitude, size = penalised(normal, gradient, reml_smoothness(normal, gradient, rough) * rough)
         sizes.append(size)
         npt.assert_allclose(amplitude, 2.0 * np.array(KNOTS[1:]), atol=0.6)
     assert np.median(sizes) < 1.5
@@ -46,7 +46,7 @@ def test_the_smoothness_of_greatest_likelihood_is_near_the_one_of_least_error(wa
     ratios = []
     for seed in range(20):
         normal, gradient = normal_equations(truth, 0.3, seed)
-        chosen = likely_smoothness(normal, gradient, rough)
+        chosen = reml_smoothness(normal, gradient, rough)
         tried = [*(chosen * 10.0 ** np.linspace(-4, 4, 33)), chosen]
         error = [np.sqrt(np.mean((penalised(normal, gradient, t * rough)[0] - wanted) ** 2)) for t in tried]
         ratios.append(error[-1] / min(error))

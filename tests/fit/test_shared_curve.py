@@ -47,7 +47,7 @@ def run_table(table):
 def test_intervals_do_not_depend_on_which_conditions_are_done_together(campaign, monkeypatch):
     table, config = campaign(noise=0.01, series=SERIES, laws=arrhenius(), days=DAYS, ways=(1,)), Config()
     one = fit_conditions(table, config)
-    monkeypatch.setattr(fit, "TOGETHER", 10)
+    monkeypatch.setattr(fit, "BLOCK", 10)
     pdt.assert_frame_equal(fit_conditions(table, config), one)
 
 

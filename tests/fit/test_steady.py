@@ -7,7 +7,7 @@ from scipy.optimize import curve_fit
 from sealfit.config import Config, Quantity, Sensor
 from sealfit.errors import FitError
 from sealfit.fit.steady.fit import fit_conditions
-from sealfit.fit.steady.uncertainty import likelier, run_means, speed_levels, unit_variance
+from sealfit.fit.steady.uncertainty import more_likely, run_means, speed_levels, unit_variance
 from sealfit.tables import STEADY_FIT
 
 TRUTH = {"mu_s": 0.7, "mu_c": 0.45, "v_s": 6.0, "sigma_2": 0.03}
@@ -361,6 +361,6 @@ def test_likelier_weights_by_hand():
     force = np.array([1.0, 1, 10, 10])
     error = np.array([0.1, -0.1, 1, -1])  # in proportion to the force
     weights = [np.ones(4), 1 / force**2]
-    assert likelier([np.sum(w * error**2) for w in weights], weights, 4) == 1
+    assert more_likely([np.sum(w * error**2) for w in weights], weights, 4) == 1
     even = np.array([0.1, -0.1, 0.1, -0.1])
-    assert likelier([np.sum(w * even**2) for w in weights], weights, 4) == 0
+    assert more_likely([np.sum(w * even**2) for w in weights], weights, 4) == 0

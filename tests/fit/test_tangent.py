@@ -50,7 +50,7 @@ def test_products_are_those_of_the_whole_matrix():
     npt.assert_allclose(tangent.norms(), np.linalg.norm(dense, axis=0), rtol=1e-12)
     mask = np.arange(9) % 3 > 0
     npt.assert_array_equal(tangent.columns(mask).toarray(), dense[:, mask])
-    npt.assert_array_equal(tangent.beside(some).toarray(), np.column_stack([dense, some]))
+    npt.assert_array_equal(tangent.append(some).toarray(), np.column_stack([dense, some]))
     npt.assert_allclose(
         tangent.sums(groups(), "run", some[:, 0]).toarray(), groups().sums(dense * some[:, :1], "run"), atol=1e-12
     )
@@ -60,11 +60,11 @@ def test_products_are_those_of_the_whole_matrix():
 def test_an_orthonormal_basis_spans_what_the_whole_matrix_spans(dependent):
     rng = np.random.default_rng(2)
     tangent, dense = blocked(rng)
-    tangent, dense = tangent.beside(rng.normal(size=len(dense))), None
+    tangent, dense = tangent.append(rng.normal(size=len(dense))), None
     if dependent:  # a column within a block, and one that blocks share
         place = tangent.layout.places
         tangent.values[tangent.layout.block == place[:, 4].argmax()] = 0.0
-        tangent = tangent.beside(tangent.toarray()[:, [0]] + tangent.toarray()[:, [9]])
+        tangent = tangent.append(tangent.toarray()[:, [0]] + tangent.toarray()[:, [9]])
     dense = tangent.toarray()
     basis = tangent.orthonormal(1e-9)
     expected = orthonormal(dense / np.maximum(np.linalg.norm(dense, axis=0), 1e-300))
@@ -103,7 +103,7 @@ def test_a_column_per_specimen_is_taken_out_with_the_tangent():
     code, load = groups().codes["specimen"], rng.uniform(1.0, 2.0, len(dense))
     load[code == 3] = 0.0
     own = OwnColumns(code, load)
-    basis = tangent.orthonormal(1e-9, freed=own.freed)
+    basis = tangent.orthonormal(1e-9, project_out=own.project_out)
     columns = rng.normal(size=(len(dense), 2))
     each = load[:, None] * (code[:, None] == np.unique(code[load > 0]))
     expected = orthonormal(
@@ -111,5 +111,5 @@ def test_a_column_per_specimen_is_taken_out_with_the_tangent():
     )
     assert own.count + basis.shape[1] == expected.shape[1]
     left = columns - expected @ (expected.T @ columns)
-    npt.assert_allclose(basis.freed(own.freed(columns)), left, atol=1e-10)
-    npt.assert_allclose(basis.freed(own.freed(columns[:, 0])), left[:, 0], atol=1e-10)
+    npt.assert_allclose(basis.project_out(own.project_out(columns)), left, atol=1e-10)
+    npt.assert_allclose(basis.project_out(own.project_out(columns[:, 0])), left[:, 0], atol=1e-10)

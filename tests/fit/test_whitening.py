@@ -18,7 +18,7 @@ CODES = {
 
 def covariance(scatter, force):
     """The model's covariance as a dense matrix: rows about their stroke's weighted mean, and the components."""
-    sd = np.sqrt(scatter.alike * (scatter.s0**2 + (scatter.g * force) ** 2))
+    sd = np.sqrt(scatter.design_effect * (scatter.s0**2 + (scatter.g * force) ** 2))
     load = {"offset": np.ones_like(force), "gain": force}
     found = np.zeros((force.size, force.size))
     for stroke in range(10):

@@ -91,7 +91,7 @@ def test_the_tutorial_finds_what_the_simulator_hid(results):
 def test_the_tutorial_shows_it(tutorial):
     code = {cell.source: cell.outputs for cell in tutorial[0].cells if cell.cell_type == "code"}
     (shown,) = (output.data for output in code["results"])
-    assert "<b>closed</b>: one effect was missing and is added" in shown["text/html"]
+    assert "<b>closed</b>: one effect was added" in shown["text/html"]
     (run,) = (outputs for source, outputs in code.items() if "sealfit.run" in source)
     assert {output.name for output in run} == {"stdout"}
     lines = "".join(output.text for output in run).splitlines()
@@ -264,11 +264,11 @@ def test_a_figure_without_data_says_so(results, monkeypatch):
 # ---------------------------------------------------------------- what is shown
 def test_results_show_verdict_errors_and_effects(results):
     shown = results._repr_html_()
-    assert "<b>closed</b>: one effect was missing and is added; no significant structure is left" in shown
+    assert "<b>closed</b>: one effect was added; no significant residual remains" in shown
     assert shown.count("<table") == 3
     assert "rms error on runs that the fit did not see" in shown
     assert "warming by sliding (distance)" in shown
-    assert repr(results).startswith("verdict     closed: one effect was missing and is added")
+    assert repr(results).startswith("verdict     closed: one effect was added")
 
 
 def test_names_in_what_is_shown_are_escaped(results, monkeypatch):

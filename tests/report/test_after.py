@@ -6,7 +6,7 @@ import pytest
 from report.made_campaigns import Made, aging_campaign
 from report.test_page import Page
 
-from sealfit.report.page import FITS, build_report, with_answer
+from sealfit.report.page import FITS, build_report, with_after_fits
 from sealfit.report.parameter_tables import law_rows, parameter_tables
 
 HIGHER = 1.04
@@ -33,7 +33,7 @@ def test_values_before_stand_beside_those_after(made):
     row = fit.query("aging_days == 1 and compression_ratio_pct == 80 and parameter == 'mu_s'").iloc[0]
     assert (cells[0].value, cells[0].before) == (f"{HIGHER * row['value']:.3f}", f"{row['value']:.3f}")
     law = parameter_tables(made.tables["aging_fit_after"], "series", made.config, made.tables["aging_fit"])[0]
-    assert law.title == "Aging law of each series, from the joint fit"
+    assert law.title == "Aging law per series, from the joint fit"
     (plain, _) = parameter_tables(fit, "condition", made.config)
     assert (plain.compared, plain.width) == (False, 3)
 
@@ -47,14 +47,14 @@ def test_the_likeliest_law_before_follows_that_after(made):
 
 def test_the_page_is_of_the_after_model_and_says_its_reference(made, unsaved):
     page = Page(build_report(*made.arguments).html)
-    assert "at the reference state of its effects: cold contact (time 0)" in page.text
+    assert "at the reference state: cold contact (time 0)" in page.text
     assert re.search(r"value 95 % u sys before", page.text)
     assert "before, without the effects" in page.text
 
 
 def test_without_effects_nothing_is_doubled(unsaved):
     made = aging_campaign(verdict="nothing_missing")
-    tables = with_answer(made.tables)
+    tables = with_after_fits(made.tables)
     assert not any(name.endswith("_before") and name != "residuals_before" for name in tables)
     page = Page(build_report(*made.arguments).html)
     assert "without the effects" not in page.text

@@ -128,23 +128,23 @@ def test_figures_are_named_for_the_store(reports):
 
 def test_the_verdict_stands_at_the_top(pages):
     text = pages["closed"].text
-    assert text.index("The declared model missed warming by sliding") < text.index("rms error on runs")
-    assert "misses nothing that these data can show" in pages["nothing_missing"].text
-    assert "misses something that no effect explains" in pages["unexplained"].text
+    assert text.index("The declared model lacks warming by sliding") < text.index("rms error, held-out runs")
+    assert "No effect beyond the declared model is significant" in pages["nothing_missing"].text
+    assert "A significant residual remains that no effect explains" in pages["unexplained"].text
 
 
 def test_before_and_after_stand_beside_the_floor(pages):
     text = pages["closed"].text
-    for words in ("before after change", "rms error on runs the fit did not see (N)", "noise floor", "lack of fit, p"):
+    for words in ("before after change", "rms error, held-out runs (N)", "noise floor", "lack of fit, p"):
         assert words in text
     assert "before after change" not in pages["nothing_missing"].text
 
 
-def test_effects_say_all_that_is_known(pages):
+def test_a_card_has_target_parameters_and_alternatives(pages):
     text = pages["closed"].text
-    assert "It scales the friction coefficient μ and goes with time (s), within a trace." in text
+    assert "It scales the friction coefficient μ and depends on time (s), which varies along strokes." in text
     assert "share of friction lost when warm" in text
-    assert "These data cannot tell it from: warming by sliding (distance), acting on μ" in text
+    assert "Not distinguishable from it with these data: warming by sliding (distance), acting on μ" in text
     assert "candidate, not applied" in text
     assert "Replicate specimens would show" in text
 
@@ -154,13 +154,13 @@ def test_torque_is_never_called_force_nor_its_slot(reports, pages):
     for slot in ("force_N", "displacement_mm", "speed_mm_s", "load_N", "friction force", "mm/s"):
         assert slot not in text
     assert "mN m" in text
-    assert "This rig does not age rubber" in text
-    assert "no load given: torque is fitted in place of coefficients" in text
+    assert "There is no aging law" in text
+    assert "no load given: torque is fitted instead of coefficients" in text
 
 
 def test_a_loop_that_was_not_run_is_said_not_guessed(pages):
     text = pages["not_run"].text
-    assert "The loop has not been closed on these data" in text
+    assert "The loop has not been run" in text
     assert "No aging law was fitted" in text
     assert "verdict" not in text
 
@@ -198,7 +198,7 @@ def test_any_table_may_be_missing(missing, small, unsaved):
 
 def test_with_no_tables_at_all_it_still_says_so():
     page = Page(build_report({}, None, {}, Config()).html)
-    for words in ("no steady measurement", "No parameters were fitted", "no averaged traces", "No quality findings"):
+    for words in ("no steady window to draw", "No parameters were fitted", "no averaged traces", "no quality table"):
         assert words in page.text
 
 
@@ -212,7 +212,7 @@ def test_null_everywhere_is_a_page_too(small, unsaved):
         for p in effect["parameters"]:
             p.update(value=None, ci95=[None, None])
     text = Page(build_report(*made.arguments).html).text
-    assert "the noise floor and the lack of fit cannot be known" in text
+    assert "the noise floor and the lack of fit are unknown" in text
     assert not re.search(r"\b(nan|None)\b", text)
 
 
@@ -257,7 +257,7 @@ def test_empty_tables_may_lack_columns(small, unsaved):
     assert "effect_shapes" not in build_report(*made.arguments).figures
 
 
-def test_the_page_says_what_would_have_been_seen_and_what_was_refused():
+def test_the_page_states_the_sensitivity_and_the_effects_not_accepted():
     from sealfit.report.loop_tables import refused_rows, sensitivity_rows
 
     seen = {"variable": "displacement_mm", "level": "trace", "smallest_N": 0.123, "smallest_pct": 0.31}
@@ -265,7 +265,7 @@ def test_the_page_says_what_would_have_been_seen_and_what_was_refused():
     unseen = {"variable": "speed_mm_s", "level": "run", "smallest_N": None, "smallest_pct": None, "files_needed": None}
     rows = sensitivity_rows({"sensitivity": [seen, unseen]}, Config())
     assert [row["smallest"].replace("\u00a0", " ") for row in rows] == ["0.12 N", "none"]
-    assert [row["level"] for row in rows] == ["along a stroke", "from run to run"]
+    assert [row["level"] for row in rows] == ["along strokes", "between runs"]
     assert rows[0]["files"] == "1,200"
     refused = {"id": "ripple", "channels": ["displacement_mm"], "p_value": 1e-6, "reason": "it is too small"}
     (row,) = refused_rows({"refused": [refused]}, Config())

@@ -33,7 +33,7 @@ def test_what_is_not_identified_says_why_and_gives_no_number():
 def test_coefficients_of_one_law_share_a_table():
     made = aging_campaign()
     (table,) = parameter_tables(made.tables["aging_fit"], "series", made.config)
-    assert table.heads == ("series", "of")
+    assert table.heads == ("series", "quantity")
     assert [str(keys[1]) for keys, _, _ in table.rows] == ["<i>μ</i><sub>s</sub>", "<i>μ</i><sub>c</sub>"] * 2
 
 

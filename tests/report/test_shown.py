@@ -38,14 +38,14 @@ def test_many_show_the_worst_the_hottest_and_the_rest_spread():
     assert len(picked) == 12
     assert picked == sorted(picked)
     assert words == (
-        "12 of 100 series are drawn: the 4 with the largest misfit, the 4 hottest and 4 spread over the others."
+        "12 of 100 series are drawn: the 4 with the largest misfit, the 4 hottest and 4 of the others, selected evenly."
     )
 
 
 def test_without_misfit_or_heat_the_shown_are_spread_evenly():
     picked, words = telling(range(23), [np.nan] * 23, [60.0] * 23, "series")
     assert picked == list(range(0, 23, 2))
-    assert words == "12 of 23 series are drawn: spread evenly."
+    assert words == "12 of 23 series are drawn: selected evenly."
     assert spread(range(23), 12) == picked
 
 
@@ -90,7 +90,7 @@ def drawn_of(rows):
 def test_many_days_of_a_series_are_thinned():
     plot = drawn_of(steady_rows(range(1, 21)))
     assert len(plot.panels) == 12
-    assert "Of 280 conditions 120 are in them." in plot.note
+    assert "They hold 120 of 280 conditions." in plot.note
     assert len(plot.legend) < 20
 
 
@@ -134,4 +134,4 @@ def test_inputs_are_cut_and_counted():
     found = page.provenance_facts({"inputs": every})
     assert (len(found["inputs"]), found["inputs_in_all"], found["bytes"]) == (2000, 2500, 25000)
     html = build_report({}, None, {"inputs": every}, Config()).html
-    assert "The first 2000 of 2500; all of them stand in inputs.parquet." in html
+    assert "The first 2000 of 2500; inputs.parquet has all." in html

@@ -56,24 +56,24 @@ def said(closure, table=None, config=None):
     return text.replace("\u00a0", " ").replace("<i>", "").replace("</i>", "").replace("p &lt; ", "p < ")
 
 
-def test_closed_says_what_was_missed_and_what_it_brings():
+def test_closed_says_which_effect_was_missing_and_the_errors():
     assert said(document()) == (
-        "The declared model missed warming by sliding (μ falls by 6.1 % [5.5, 6.7], time constant of warming τ = 4.0 s "
-        "[3.6, 4.5]); with it the error on runs the fit did not see falls from 1.42 N to 0.31 N; noise floor 0.29 N; "
-        "the error is 1.1 times the scatter of repeats (lack of fit p = 0.0002)."
+        "The declared model lacks warming by sliding (μ falls by up to 6.1 % [5.5, 6.7] at time 76 s, time constant of "
+        "warming τ = 4.0 s [3.6, 4.5]). With it, the rms error on held-out runs falls from 1.42 N to 0.31 N (noise "
+        "floor: 0.29 N). The error is 1.1 times the scatter of repeats (lack of fit: p = 0.0002)."
     )
 
 
 def test_several_effects_are_counted_and_candidates_are_not():
     text = said(document(effects=(WARMING, RIPPLE, {**RIPPLE, "candidate": True})))
-    assert text.startswith("The declared model missed two things: warming by sliding (")
-    assert "and ripple along displacement (λ = 5.020 mm [5.010, 5.030]); with them the error" in text
+    assert text.startswith("The declared model lacks two effects: warming by sliding (")
+    assert "and ripple along displacement (λ = 5.020 mm [5.010, 5.030]). With them, the rms error" in text
 
 
 def test_many_effects_are_named_once_each():
     text = said(document(effects=(WARMING, RIPPLE, RIPPLE, RIPPLE)))
     assert text.startswith(
-        "The declared model missed four things: warming by sliding and ripple along displacement (3 of them); with them"
+        "The declared model lacks four effects: warming by sliding and ripple along displacement (3 of them). With "
     )
 
 
@@ -89,7 +89,7 @@ def shape(values, **more):
 @pytest.mark.parametrize(
     ("values", "more", "words"),
     [
-        ([0.0, 1.0, 3.0], {}, "the friction force rises by 3.0 N [2.5, 3.5]"),
+        ([0.0, 1.0, 3.0], {}, "the friction force rises by up to 3.0 N [2.5, 3.5] at time 2.58 s"),
         ([-3.0, -1.0, -0.1], {}, "the friction force falls by up to 3.0 N [2.5, 3.5]"),
         ([0.0, -3.0, 0.0], {}, "the friction force falls by up to 3.0 N [2.5, 3.5]"),
         ([-1.0, 2.0, -1.0], {}, "the friction force varies by 3.0 N along time"),
@@ -105,9 +105,8 @@ def test_the_size_of_an_effect_is_read_off_its_shape(values, more, words):
 def test_nothing_missing_gives_one_error():
     text = said(document("nothing_missing", effects=()), empty("shapes"))
     assert text == (
-        "The declared model misses nothing that these data can show: no channel orders what it leaves over. "
-        "The error on runs the fit did not see is 1.42 N; noise floor 0.29 N; "
-        "the error is 1.1 times the scatter of repeats (lack of fit p = 0.0002)."
+        "No effect beyond the declared model is significant. The rms error on held-out runs is 1.42 N (noise floor: "
+        "0.29 N). The error is 1.1 times the scatter of repeats (lack of fit: p = 0.0002)."
     )
 
 
@@ -115,9 +114,9 @@ SEEN = {"variable": "displacement_mm", "level": "trace", "smallest_N": 0.5, "sma
 SEEN["cannot_tell"] = True
 
 
-def test_nothing_missing_says_what_would_have_been_seen():
+def test_nothing_missing_states_the_sensitivity():
     text = said({**document("nothing_missing", effects=()), "sensitivity": [SEEN]}, empty("shapes"))
-    assert text.endswith("would have shown an effect of displacement (mm) along a stroke 1.2 % of the force.")
+    assert text.endswith("in percent of the force, are 1.2 % for displacement (mm) along strokes.")
 
 
 def test_cannot_tell_says_of_what_and_what_would_do():
@@ -125,22 +124,21 @@ def test_cannot_tell_says_of_what_and_what_would_do():
     closure = {**document("cannot_tell", effects=()), "sensitivity": [SEEN, unseen]}
     text = said(closure, empty("shapes"))
     assert text.startswith(
-        "These files cannot tell what the declared model misses: displacement (mm) (no effect below 1.2 % of the force "
-        "could be seen; about 40 files like these would show one of 1 %), oil temp (no effect could be seen; "
-        "at least 12 files are needed). The error on runs"
+        "These files do not decide whether an effect is missing: displacement (mm) (detection limit 1.2 % of the force"
+        "; 1 % needs about 40 files), oil temp (no effect is detectable; at least 12 files are needed). The rms error"
     )
 
 
 def test_unexplained_says_where_it_sits():
     left = {"channel": "displacement_mm oil temp", "level": "trace", "p_value": 0.0005}
     assert said(document("unexplained", effects=(), **left)).startswith(
-        "The declared model misses something that no effect explains: the residual follows displacement (mm) and "
-        "oil temp within a trace (p < 0.001); the error"
+        "A significant residual remains that no effect explains: the residual varies with displacement (mm) and "
+        "oil temp along strokes (p < 0.001). The rms error"
     )
     text = said(document("unexplained", **left))
-    assert text.startswith("The declared model missed warming by sliding (")
-    assert "and something more that no effect explains: the residual follows displacement (mm)" in text
-    assert "so far the error on runs the fit did not see falls from 1.42 N to 0.31 N" in text
+    assert text.startswith("The declared model lacks warming by sliding (")
+    assert "A significant residual remains that no effect explains: the residual varies with displacement (mm)" in text
+    assert "With it, the rms error on held-out runs falls from 1.42 N to 0.31 N" in text
 
 
 def test_an_error_that_grows_is_not_called_falling():
@@ -152,26 +150,24 @@ def test_an_error_that_grows_is_not_called_falling():
 def test_without_repeats_the_floor_is_unknown():
     unknown = {"state": "unknown", "ratio": None, "p_value": None}
     text = said({**document(floor=None), "fit_quality": unknown})
-    assert text.endswith("the noise floor is not known without repeats.")
+    assert text.endswith("(noise floor unknown: there are no repeats).")
 
 
 def test_without_held_out_errors_the_fitted_ones_are_named_so():
     closure = document()
     for stage in ("before", "after"):
         closure[stage] = {**closure[stage], "heldout_rmse_N": None}
-    assert "the error on the data that were fitted (none could be held out) falls from 1.30 N to 0.31 N" in said(
-        closure
-    )
+    assert "the in-sample rms error (nothing could be held out) falls from 1.30 N to 0.31 N" in said(closure)
 
 
 def test_not_run_claims_nothing():
-    assert "has not been closed" in said(None)
+    assert "has not been run" in said(None)
 
 
 def test_the_units_are_the_declared_ones():
     made = torque_campaign()
     text = said(made.closure, made.tables["shapes"], made.config)
-    assert "1.5 mN m; noise floor 1.2 mN m" in text
+    assert "1.5 mN m (noise floor: 1.2 mN m)" in text
 
 
 def test_labels_from_data_are_escaped():
@@ -192,14 +188,17 @@ def test_how_an_effect_acts(change, words):
 
 
 def test_what_is_left_is_called_scatter_only_if_it_is():
-    assert "it is scatter" in left_over(document(), Config())
+    assert "consistent with scatter" in left_over(document(), Config())
     left = {"channel": "displacement_mm", "level": "trace", "p_value": 0.0005}
     text = left_over(document("unexplained", **left), Config())
-    assert "not only noise: the residual follows displacement (mm) within a trace (p &lt; 0.001)" in text
+    assert (
+        "A significant residual remains: the residual varies with displacement (mm) along strokes (p &lt; 0.001)"
+        in text
+    )
     assert "scatter" not in text
 
 
 def test_made_campaign_reads_as_the_example():
     made = aging_campaign()
     text = said(made.closure, made.tables["shapes"])
-    assert text.startswith("The declared model missed warming by sliding (time; μ falls by 6.1 % [5.5, 6.7]")
+    assert text.startswith("The declared model lacks warming by sliding (time; μ falls by up to 6.1 % [5.5, 6.7]")

@@ -1,4 +1,4 @@
-"""Joint laws of aging for the tables of OUT: every law with its evidence, against separate laws of the series."""
+"""Joint laws of aging as tables: every law with its evidence, compared with separate laws of the series."""
 
 from __future__ import annotations
 
@@ -17,21 +17,25 @@ from sealfit.physics.aging_laws import LOSSES
 from sealfit.tables import AGING_LAWS, MASTER_CURVE
 
 TEMPERATURE, COMPRESSION = "temperature_C", "compression_ratio_pct"
-SEPARATE = "separate"  # Eq. 15 with a and b of its own for every series
-LIKELY = 3  # laws held against data they were not fitted to
+# Name of the law with separate a and b of Eq. 15 for every series.
+SEPARATE = "separate"
+# Number of the best laws whose held-out error is computed.
+HELD_OUT_LAWS = 3
+# Points of a curve from a third of the first aged day on.
 CURVE_POINTS = 61
-START_POINTS = 20  # more, between day 0 and a third of the first day
+# Further points between day 0 and a third of the first aged day.
+START_POINTS = 20
 
 
 def aged_values(levels: Levels, rubber: str, quantity: str) -> Aged:
-    """Return the values of one quantity of a rubber over its conditions, those that the forces determine.
+    """Return the values of one quantity of a rubber at the conditions where the forces determine it.
 
     Parameters
     ----------
     levels : Levels
-        As `shared_levels` gives them.
+        Result of `shared_levels`.
     rubber, quantity : str
-        Which; "mu_s", "mu_c", "F_s" or "F_c".
+        Name of the rubber; "mu_s", "mu_c", "F_s" or "F_c".
     """
     of = (levels.table["rubber"] == rubber) & (levels.table["quantity"] == quantity)
     rows, here = levels.table[of], of.to_numpy()
@@ -89,17 +93,17 @@ def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
     best = laws[0]
     rivals = rivals_of(laws)
     for number, law in enumerate(laws):
-        held = left_out(law) if number < LIKELY else {}
+        errors = left_out(law) if number < HELD_OUT_LAWS else {}
         head = {
             "law": law.loss.name,
-            "way": law.way if best.aged.drivers() else "",
+            "way": law.acts_on if best.aged.drivers() else "",
             "form": law.loss.form,
             "rank": number + 1,
             "rival": law in rivals,
             "criterion": law.bic - best.bic,
             "scatter_rel": law.scatter,
-            "heldout_series": held.get("series", np.nan),
-            "heldout_last_day": held.get("last_day", np.nan),
+            "heldout_series": errors.get("series", np.nan),
+            "heldout_last_day": errors.get("last_day", np.nan),
         }
         units = {"mu_0": unit, "a": unit, "E": "kJ/mol", "kappa": "1/%"}
         units |= dict(zip(law.loss.parameters, law.loss.units, strict=True))
@@ -117,9 +121,9 @@ def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
 
 
 def _separate(law: JointLaw) -> tuple[float, float] | None:
-    """Return Schwarz's criterion of separate laws under the joint law's scatter, and their error at last days.
+    """Return the BIC of separate laws under the joint law's scatter, and their held-out error at last days.
 
-    None where the series have too few values for laws of their own.
+    None if the series have too few values for separate laws.
     """
     aged, series = law.aged, law.aged.series()
     days = [np.unique(aged.days[own]).size for own in aged.whole_series()]
@@ -138,17 +142,18 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
 def _master_curve(law: JointLaw) -> pd.DataFrame:
     """Return the values on the master curve, and the law at the reference temperature and compression with its band.
 
-    Where these change the rate of aging the values stand over k t; where they change the loss, a loss is divided by k.
+    If temperature and compression change the rate of aging, times are multiplied by k; if they change the loss, losses
+    are divided by k.
     """
     aged = law.aged
     tested = (aged.temperature_C, aged.compression_pct)
     scaled, start = law.tested_days(), law.x[0]
-    value = aged.value if law.way == "rate" else start + (aged.value - start) / law.rate(aged)
+    value = aged.value if law.acts_on == "rate" else start + (aged.value - start) / law.rate(aged)
     points = {"kind": "value", "scaled_days": scaled, "value": value, "aging_days": aged.days}
     for name, column in zip((TEMPERATURE, COMPRESSION), tested, strict=True):
         points[name] = np.nan if column is None else np.where(aged.days > 0, column, np.nan)
     first = scaled[scaled > 0].min() / 3
-    near = first * np.linspace(0, 1, START_POINTS, endpoint=False) ** 2  # where laws fall fastest
+    near = first * np.linspace(0, 1, START_POINTS, endpoint=False) ** 2  # laws fall fastest there
     days = np.r_[near, np.geomspace(first, scaled.max() * 1.5, CURVE_POINTS)]
     middle = (None if c is None else np.full(days.size, reference_of(c[aged.days > 0])) for c in tested)
     at = Aged(days, np.zeros(days.size), *middle)
@@ -160,16 +165,16 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
 
 
 def law_of(steady: pd.DataFrame, steady_fit: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
-    """Return the laws of one quantity, likeliest first; or a named one alone.
+    """Return the laws of one quantity in order of BIC, or only a named one.
 
     Parameters
     ----------
     steady, steady_fit : DataFrame
-        The tables of these names.
+        Tables of these names.
     quantity : str
         "mu_s", "mu_c", "F_s" or "F_c".
     name : str, optional
-        Of the law.
+        Name of the law.
 
     Raises
     ------

@@ -17,11 +17,14 @@ from sealfit.fit.joint.prior import covariance_of
 from sealfit.physics.aging_laws import LOSSES, Loss
 
 # ---------------------------------------------------------------- aged
-# Values of one quantity over aging time, temperature and compression: what a joint law is fitted to.
+# Values of one quantity over aging time, temperature and compression: the data of a joint law.
 
-GAS_CONSTANT = aging_laws.GAS_CONSTANT / 1000  # kJ/(mol K)
-TINY = 1e-300  # of a variance: values without any scatter
-ROUNDING = 1e-14  # of the largest variance: less is not known of a covariance
+# Gas constant in kJ/(mol K).
+GAS_CONSTANT = aging_laws.GAS_CONSTANT / 1000
+# Smallest variance of a value. It keeps the weights of values without scatter finite.
+TINY = 1e-300
+# Variances below this share of the largest are rounding.
+ROUNDING = 1e-14
 
 
 def _inverse(celsius):
@@ -32,23 +35,25 @@ def _plain(percent):
     return np.asarray(percent, float)
 
 
+# Variables that change the rate of aging: coefficient in ln k (kJ/mol, 1/%), attribute, and the function of the
+# attribute that the coefficient multiplies.
 DRIVERS = (("E", "temperature_C", _inverse), ("kappa", "compression_pct", _plain))
-"""What changes the pace of aging: its coefficient in ln k (kJ/mol, 1/%), where it stands, what it is multiplied by."""
 
 
 @dataclass(frozen=True)
 class Aged:
-    """Values of one quantity: a specimen, or the mean of those of one condition, each.
+    """Values of one quantity, each of a specimen or the mean of those of a condition.
 
     Attributes
     ----------
     days, value : ndarray, shape (n,)
         Aging time in days, and the value measured.
     temperature_C, compression_pct : ndarray, shape (n,), or None
-        Of aging; whatever stands there for unaged specimens is not read. None where no such thing was varied.
+        Temperature in degrees Celsius and height in percent during aging; not used for unaged specimens. None if
+        unknown.
     variance : ndarray, shape (n,) or (n, n), or None
-        Variance or covariance of the values as measured; the scatter between specimens is estimated and added. None
-        where it is all there is.
+        Measurement variance or covariance of the values; the scatter between specimens is estimated and added. None if
+        it is 0.
     """
 
     days: np.ndarray
@@ -58,7 +63,7 @@ class Aged:
     variance: np.ndarray | None = None
 
     def part(self, keep: np.ndarray) -> Aged:
-        """Return some of the values; `keep` is a mask, shape (n,)."""
+        """Return the values in a mask, shape (n,)."""
         taken = {
             name: None if getattr(self, name) is None else getattr(self, name)[keep]
             for name in ("temperature_C", "compression_pct")
@@ -76,7 +81,7 @@ class Aged:
         scatter : float
             Relative standard deviation between specimens, beyond the measured variance.
         about : ndarray, shape (n,), optional
-            What it is relative to; default the values.
+            Values to which it is relative; default the measured ones.
         """
         measured = np.zeros(self.value.size) if self.variance is None else self.variance
         own = (scatter * (self.value if about is None else about)) ** 2 + TINY
@@ -84,11 +89,11 @@ class Aged:
 
     @cached_property
     def spread(self) -> Spread:
-        """The same for any scatter."""
+        """The covariance as a function of the scatter."""
         return Spread(self.covariance(0.0), np.abs(self.value))
 
     def drivers(self) -> tuple[str, ...]:
-        """Return the names of the coefficients in ln k of what was varied."""
+        """Return the names of the coefficients in ln k of the variables that were varied."""
         aged, found = self.days > 0, []
         for name, column, _ in DRIVERS:
             at = getattr(self, column)
@@ -98,12 +103,12 @@ class Aged:
 
     @cached_property
     def middle(self) -> dict[str, float]:
-        """The middle of the tested temperatures and compressions, by the name of the coefficient."""
+        """Reference temperature and compression, the middle of the tested ones, by the name of the coefficient."""
         there = ((name, getattr(self, column)) for name, column, _ in DRIVERS)
         return {name: reference_of(at[self.days > 0]) for name, at in there if at is not None}
 
     def away(self, name: str, middle: float) -> np.ndarray:
-        """Return what a coefficient multiplies in ln k, counted from a temperature or compression, shape (n,)."""
+        """Return the factor of a coefficient in ln k, relative to a temperature or compression, shape (n,)."""
         column, of = next((column, of) for own, column, of in DRIVERS if own == name)
         return np.where(self.days > 0, of(middle) - of(getattr(self, column)), 0.0)
 
@@ -134,11 +139,11 @@ class Spread:
     measured : ndarray, shape (n, n)
         M.
     size : ndarray, shape (n,)
-        What the scatter is relative to.
+        Values to which the scatter is relative.
 
     Notes
     -----
-    Relative to the sizes C is M' + s^2, and the axes of M' are those of C for every s.
+    Divided by the sizes, C is M' + s^2, and its eigenvectors are those of M' for every s.
     """
 
     def __init__(self, measured: np.ndarray, size: np.ndarray) -> None:
@@ -172,15 +177,21 @@ def reference_of(tested: np.ndarray) -> float:
 #
 # with T in kelvin and C the height while aging in percent. Temperature and compression change the rate of aging (w = 0:
 # time-temperature superposition, all series fall on one master curve over k t) or the loss itself (w = 1). mu_0 is that
-# of the unaged rubber, shared by all. phi is one of `sealfit.physics.aging_laws`; which shape and which way is chosen
-# by Schwarz's criterion, and the rivals are kept beside it.
+# of the unaged rubber, shared by all. phi is one of `sealfit.physics.aging_laws`. BIC chooses the shape and w; the
+# rivals are kept beside the chosen law.
 #
 # Ferry 1980, Viscoelastic Properties of Polymers, chapter 11 (superposition); ISO 11346 (life of rubber by Arrhenius).
 
-WAYS = ("rate", "loss")  # what temperature and compression change
-TURNS, SETTLED = 4, 0.02  # of the fit and the scatter, at most; relative change of the scatter that ends them
-RIVAL = 6.0  # of the criterion: a rival law is less likely than the chosen one by less than exp(3)
-KNOWN = np.log(100.0)  # a positive number whose 95 % interval spans more than this is not determined
+# Quantities that temperature and compression may change.
+TARGETS = ("rate", "loss")
+# Largest number of alternating fits of the law and the scatter.
+TURNS = 4
+# Relative change of the scatter at which these fits have converged.
+CONVERGED = 0.02
+# Largest difference in BIC of a rival law. It is less likely than the chosen law by a factor of up to exp(3).
+RIVAL = 6.0
+# A positive parameter is not determined if its 95 % interval spans more than this natural logarithm.
+KNOWN = np.log(100.0)
 
 
 @dataclass(frozen=True)
@@ -190,24 +201,24 @@ class JointLaw:
     Attributes
     ----------
     aged : Aged
-        What it was fitted to.
-    loss, way : Loss, str
-        Shape, and what temperature and compression change.
+        Data.
+    loss, acts_on : Loss, str
+        Shape, and what temperature and compression change: "rate" or "loss".
     names : tuple of str
-        mu_0, a, the shape's own, E, kappa, those that there are.
+        Parameters: mu_0, a, those of the shape, and E and kappa if varied.
     x : ndarray, shape (p,)
-        Estimates in this order; the shape's own as logarithms.
+        Estimates; those of the shape are logarithms.
     covariance : ndarray, shape (p, p)
-        Of x.
+        Covariance of x.
     scatter : float
-        Relative standard deviation between specimens beyond the measured variance.
-    criterion : float
-        Schwarz's: -2 log L + p log n.
+        Relative standard deviation between specimens in addition to the measurement variance.
+    bic : float
+        -2 log L + p log n.
     """
 
     aged: Aged
     loss: Loss
-    way: str
+    acts_on: str
     names: tuple[str, ...]
     x: np.ndarray
     covariance: np.ndarray
@@ -225,36 +236,33 @@ class JointLaw:
         return float(stdtrit(max(self.df, 1), 0.975))
 
     def at(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
-        """Return the law at other conditions, shape (n,), or (..., n) for x of shape (..., p).
-
-        The references of temperature and compression are those of the fit.
-        """
+        """Return the law at other conditions, shape (n,), or (..., n) for x of shape (..., p)."""
         x = self.x if x is None else x
         k, own = self.rate(aged, x), self.own(x)
-        lost = self.loss.value(aged.days * k, *own) if self.way == "rate" else k * self.loss.value(aged.days, *own)
+        lost = self.loss.value(aged.days * k, *own) if self.acts_on == "rate" else k * self.loss.value(aged.days, *own)
         return x[..., :1] - x[..., 1:2] * lost
 
     def own(self, x: np.ndarray | None = None) -> list[np.ndarray]:
-        """Return the shape's own numbers, shape (..., 1) each."""
+        """Return the parameters of the shape, shape (..., 1) each."""
         x = self.x if x is None else x
         return [np.exp(x[..., 2 + k, None]) for k in range(len(self.loss.parameters))]
 
     def rate(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
-        """Return k at some conditions, shape (..., n)."""
+        """Return k at the conditions, shape (..., n)."""
         x, logarithm = self.x if x is None else x, np.zeros(aged.days.size)
         for name, away in self.away(aged).items():
             logarithm = logarithm + x[..., self.names.index(name), None] * away
         return np.exp(np.clip(logarithm, -50, 50))
 
     def away(self, aged: Aged) -> dict[str, np.ndarray]:
-        """Return what E and kappa, those that there are, multiply in ln k at some conditions, shape (n,) each."""
+        """Return the factors of E and kappa, if varied, in ln k at the conditions, shape (n,) each."""
         return {name: aged.away(name, self.aged.middle[name]) for name in self.names[2 + len(self.loss.parameters) :]}
 
     def slope(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
-        """Return the derivative of the law along its parameters, shape (p, n), or (..., p, n) for many x."""
+        """Return the derivatives of the law with respect to x, shape (p, n), or (..., p, n) for x of shape (..., p)."""
         x = self.x if x is None else x
         k, own, a = self.rate(aged, x), self.own(x), x[..., 1:2]
-        if self.way == "rate":
+        if self.acts_on == "rate":
             lost = self.loss.value(aged.days * k, *own)
             along_k, *along_own = self.loss.slopes(aged.days * k, *own)
         else:
@@ -264,8 +272,8 @@ class JointLaw:
         return np.stack([np.ones_like(lost), -lost, *(-a * slope for slope in along)], axis=-2)
 
     def tested_days(self) -> np.ndarray:
-        """Return the days of the tests, in the master curve's time where there is one, shape (n,)."""
-        return self.aged.days * (self.rate(self.aged) if self.way == "rate" else 1.0)
+        """Return the aging times in days, scaled to the master curve if the rate changes, shape (n,)."""
+        return self.aged.days * (self.rate(self.aged) if self.acts_on == "rate" else 1.0)
 
     def parameters(self) -> Iterator[tuple[str, float, float, float, bool]]:
         """Yield name, value, ends of the 95 % interval, and whether the values determine it."""
@@ -279,16 +287,16 @@ class JointLaw:
                 yield name, float(self.x[k]), float(self.x[k] - half), float(self.x[k] + half), bool(known)
 
 
-def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
-    """Fit one law to all series of a quantity, the scatter between specimens estimated with it.
+def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> JointLaw:
+    """Fit one law to all series of a quantity, and the scatter between specimens.
 
     Parameters
     ----------
     aged : Aged
-        Values of at least as many conditions as the law has numbers.
+        Values of at least as many conditions as the law has parameters.
     loss : str
         Name in `LOSSES`.
-    way : str
+    acts_on : str
         "rate" or "loss".
 
     Raises
@@ -303,17 +311,17 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
         raise FitError("no aged rubber was tested.", fix="Test at least two aged conditions.")
     if conditions < len(names):
         raise FitError(
-            f"{conditions} conditions do not determine the {len(names)} numbers of the law '{loss}'.",
-            fix="Test more days, or choose a law with fewer numbers.",
+            f"{conditions} conditions do not determine the {len(names)} parameters of the law '{loss}'.",
+            fix="Test more days, or choose a law with fewer parameters.",
         )
-    empty = JointLaw(aged, shape, way, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf)
+    empty = JointLaw(aged, shape, acts_on, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf)
     x, scatter, before = None, 0.05, np.inf
     for _ in range(TURNS):
         x = solved(empty, aged.spread.whitening(scatter), x)
-        left = aged.value - empty.at(aged, x)
-        chi2 = partial(aged.spread.chi2, left)
-        before, scatter = scatter, paule_mandel(chi2, aged.value.size - len(names), left / aged.value)
-        if abs(scatter - before) <= SETTLED * before:
+        residual = aged.value - empty.at(aged, x)
+        chi2 = partial(aged.spread.chi2, residual)
+        before, scatter = scatter, paule_mandel(chi2, aged.value.size - len(names), residual / aged.value)
+        if abs(scatter - before) <= CONVERGED * before:
             break
     bic = aged.spread.chi2(aged.value - empty.at(aged, x), scatter) + aged.spread.log_determinant(scatter)
     bic += len(names) * float(np.log(aged.value.size))
@@ -323,7 +331,7 @@ def fit_joint_law(aged: Aged, loss: str = "log", way: str = "rate") -> JointLaw:
 
 
 def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw]:
-    """Return every law that these values determine, both ways, likeliest first.
+    """Return every law that the values determine, acting on rate and on loss, in order of BIC.
 
     Raises
     ------
@@ -333,28 +341,28 @@ def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw
     found, first = [], None
     for loss in losses:
         both = aged.drivers() and loss != "power"  # a power of k t is a power of k times one of t
-        for way in WAYS if both else WAYS[:1]:
+        for acts_on in TARGETS if both else TARGETS[:1]:
             try:
-                found.append(fit_joint_law(aged, loss, way))
+                found.append(fit_joint_law(aged, loss, acts_on))
             except FitError as error:
-                first = first or error  # of the law with the fewest numbers
+                first = first or error  # of the law with the fewest parameters
     if not found:
         raise first
     return sorted(found, key=lambda law: law.bic)
 
 
 def rivals_of(laws: Sequence[JointLaw]) -> list[JointLaw]:
-    """Return the laws that these values cannot tell from the first."""
+    """Return the laws that are not distinguishable from the first: their BIC differs by less than `RIVAL`."""
     return [law for law in laws[1:] if law.bic - laws[0].bic < RIVAL]
 
 
 def left_out(law: JointLaw) -> dict[str, float]:
-    """Return the RMS error of a law at whole series, and at last days, that it was not fitted to; NaN without any."""
+    """Return the RMS held-out error of a law at whole series and at last days; NaN if none can be left out."""
     aged, drivers = law.aged, law.aged.drivers()
     whole = aged.whole_series()
-    held = {"series": whole if len(whole) > 2 else [], "last_day": aged.last_days()}
-    plain = replace(aged, variance=None)  # a matrix that is not asked for here, and large
-    kept = {name: [out for out in masks if plain.part(~out).drivers() == drivers] for name, masks in held.items()}
+    folds = {"series": whole if len(whole) > 2 else [], "last_day": aged.last_days()}
+    plain = replace(aged, variance=None)  # `part` need not copy the covariance
+    kept = {name: [out for out in masks if plain.part(~out).drivers() == drivers] for name, masks in folds.items()}
     masks = np.array([out for own in kept.values() for out in own])
     if not len(masks):
         return dict.fromkeys(kept, np.nan)

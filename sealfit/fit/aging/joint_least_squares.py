@@ -1,4 +1,4 @@
-"""The least squares of a joint law of aging: from anywhere, without some of the values, or of many draws of them."""
+"""Least squares of a joint law of aging: of all values, of subsets, or of many draws of the values."""
 
 from __future__ import annotations
 
@@ -12,41 +12,44 @@ from sealfit.fit.least_squares import levenberg_marquardt
 if TYPE_CHECKING:
     from sealfit.fit.aging.joint_law import JointLaw
 
-ENERGIES = (0.0, 50.0, 100.0)  # kJ/mol, to begin with
+# Starting values of E in kJ/mol.
+ENERGIES = (0.0, 50.0, 100.0)
+# Starting values and bounds of the parameters of the shapes: days, and exponents.
 SHAPES = {"b": (0.01, 0.3, 10.0), "tau": (0.5, 5.0, 50.0), "beta": (0.5, 1.0), "n": (0.2, 0.5, 1.0), "t_i": (0.3, 3.0)}
 LIMITS = {"b": (1e-9, 1e4), "tau": (1e-6, 1e6), "beta": (0.05, 5.0), "n": (0.01, 5.0), "t_i": (1e-3, 1e3)}
-LINEAR = 2  # mu_0 and a: the law is linear in them
-POLISHED = 4  # points of the grid
-DEPENDENT = 1e-20  # share of a loss beyond mu_0, squared, below which it is one with it
+# Number of linear parameters: mu_0 and a.
+LINEAR = 2
+# Number of starting points that are polished.
+POLISHED = 4
+# The loss is constant, and a not determined, if mu_0 explains all but this share of its square.
+DEPENDENT = 1e-20
 
 
 def solved(law: JointLaw, white: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-    """Return the parameters of least squares, shape (p,): from a start, or from the best few of a grid.
+    """Return the least-squares parameters, shape (p,), from a start or from the best points of a grid.
 
     Parameters
     ----------
     law : JointLaw
-        Gives shape, way, values and the references.
+        Gives the shape, its target, the values and the references.
     white : ndarray, shape (n, n)
         W with W C W' = 1 for the covariance C of the values.
     start : ndarray, shape (p,), optional
-        Where to begin.
+        Starting point.
     """
     problem = _Projected(law, white, law.aged.value[None])
-    bent = problem.grid() if start is None else start[None, LINEAR:]
-    x, rss = problem.polished(bent, np.zeros(len(bent), int))
+    nonlinear = problem.grid() if start is None else start[None, LINEAR:]
+    x, rss = problem.polished(nonlinear, np.zeros(len(nonlinear), int))
     return x[np.argmin(rss)]
 
 
 def solved_many(law: JointLaw, white: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the parameters for many draws of the values near the law's own, shape (draws, p), all draws at once.
+    """Return the parameters for many draws of the values, shape (draws, p), computed together.
 
     Parameters
     ----------
-    law : JointLaw
-        Where the search begins.
-    white : ndarray, shape (n, n)
-        W with W C W' = 1 for the covariance C of the values of a draw.
+    law, white
+        As `solved`; the parameters of the law are the starting point.
     values : ndarray, shape (draws, n)
         The draws.
     """
@@ -54,32 +57,28 @@ def solved_many(law: JointLaw, white: np.ndarray, values: np.ndarray) -> np.ndar
 
 
 def solved_without(law: JointLaw, white: np.ndarray, masks: np.ndarray) -> np.ndarray:
-    """Return the parameters without the values of each mask, shape (masks, p), all masks at once.
+    """Return the parameters without the values of each mask, shape (masks, p), computed together.
 
     Parameters
     ----------
-    law : JointLaw
-        Where the search begins.
-    white : ndarray, shape (n, n)
-        W with W C W' = 1 for the covariance C of the values.
+    law, white
+        As `solved`; the parameters of the law are the starting point.
     masks : ndarray of bool, shape (masks, n)
-        What is left out.
+        Values to leave out.
     """
     values = np.broadcast_to(law.aged.value, masks.shape)
     return _Projected(law, white, values, masks).polished(np.tile(law.x[LINEAR:], (len(masks), 1)))[0]
 
 
 class _Projected:
-    """The least squares of a law on sets of values, mu_0 and a solved for: what is left to search bends less.
+    """Variable projection of a law on sets of values: mu_0 and a are solved for.
 
     Parameters
     ----------
-    law : JointLaw
-    white : ndarray, shape (n, n)
-        W with W C W' = 1 for the covariance C of the values of a set.
     values : ndarray, shape (sets, n)
+        Sets of values; `law` and `white` as in `solved`.
     masks : ndarray of bool, shape (sets, n), optional
-        What is left out of each set.
+        Values to leave out of each set.
 
     Notes
     -----
@@ -94,7 +93,7 @@ class _Projected:
             self.level = (level @ white / (level @ level))[None]
             self.white = white - np.outer(level, self.level)
         else:
-            # a value with a number of its own says nothing: with mu_0, what these numbers' columns reach goes
+            # Leaving a value out equals giving it a parameter; these columns are projected out together with mu_0.
             self.white, self.level = white, np.zeros(values.shape)
             self.aside = np.zeros((len(masks), masks.sum(axis=1).max() + 1, values.shape[1]))
             for k, out in enumerate(masks):
@@ -105,22 +104,23 @@ class _Projected:
         self.reach = float((white**2).sum())
 
     def _whitened(self, many: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return whitened rows, shape (r, m, n), of the sets `of` (r,), with nothing of mu_0 in them."""
+        """Return rows, shape (r, m, n), of the sets `of`, shape (r,), whitened, with mu_0 projected out."""
         many = (many.reshape(-1, len(self.white)) @ self.white.T).reshape(many.shape)
         return many if self.aside is None else many - (many @ np.swapaxes(self.aside[of], 1, 2)) @ self.aside[of]
 
-    def solve(self, bent: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def solve(self, nonlinear: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return mu_0 and a, shape (r, 2), the whitened residual, (r, n), and its derivative, (r, p - 2, n).
 
         Parameters
         ----------
-        bent : ndarray, shape (r, p - 2)
+        nonlinear : ndarray, shape (r, p - 2)
             All other parameters.
         of : ndarray of int, shape (r,)
-            Which set of values.
+            Number of the set of values.
         """
         law, measured = self.law, self.measured[of]
-        unit = np.concatenate([np.tile([0.0, -1.0], (len(bent), 1)), bent], axis=1)  # mu_0 = 0, a = -1: the loss itself
+        # The law with mu_0 = 0 and a = -1 is the loss.
+        unit = np.concatenate([np.tile([0.0, -1.0], (len(nonlinear), 1)), nonlinear], axis=1)
         plain = law.slope(law.aged, unit)[:, 1:]
         columns = self._whitened(plain, of)
         square = (columns[:, :1] ** 2).sum(axis=2, keepdims=True)
@@ -134,21 +134,21 @@ class _Projected:
         return np.concatenate([mu_0, a[:, 0]], axis=1), (along * column - measured)[:, 0], -a * slope
 
     def grid(self) -> np.ndarray:
-        """Return the best few points of a grid, shape (POLISHED, p - 2)."""
+        """Return the best points of a grid, shape (POLISHED, p - 2)."""
         own = self.law.loss.parameters
         grids = [[np.log(v) for v in SHAPES[name]] for name in own]
         grids += [ENERGIES if name == "E" else (0.0,) for name in self.law.names[LINEAR + len(own) :]]
-        bent = np.array(list(product(*grids)))
-        rest = self.solve(bent, np.zeros(len(bent), int))[1]
-        return bent[np.argsort((rest**2).sum(axis=1), kind="stable")[:POLISHED]]
+        points = np.array(list(product(*grids)))
+        rest = self.solve(points, np.zeros(len(points), int))[1]
+        return points[np.argsort((rest**2).sum(axis=1), kind="stable")[:POLISHED]]
 
-    def polished(self, bent: np.ndarray, of: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return all parameters and the sums of squares, shape (r, p) and (r,), where starts lead to."""
-        of = np.arange(len(bent)) if of is None else of
+    def polished(self, nonlinear: np.ndarray, of: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return all parameters, shape (r, p), and the sums of squares, shape (r,), at the optima from starts."""
+        of = np.arange(len(nonlinear)) if of is None else of
         own = self.law.loss.parameters
         low, high = (
-            np.array([np.log(LIMITS[name][end]) if name in own else endless for name in self.law.names[LINEAR:]])
-            for end, endless in enumerate((-np.inf, np.inf))
+            np.array([np.log(LIMITS[name][end]) if name in own else infinity for name in self.law.names[LINEAR:]])
+            for end, infinity in enumerate((-np.inf, np.inf))
         )
-        bent, rss = levenberg_marquardt(lambda bent, rows: self.solve(bent, of[rows])[1:], bent, low, high)
-        return np.concatenate([self.solve(bent, of)[0], bent], axis=1), rss
+        found, rss = levenberg_marquardt(lambda x, rows: self.solve(x, of[rows])[1:], nonlinear, low, high)
+        return np.concatenate([self.solve(found, of)[0], found], axis=1), rss

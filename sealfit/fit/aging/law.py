@@ -1,7 +1,7 @@
 """Eq. 15 fitted to the coefficients of many conditions: one law per curve, the unaged value shared by all curves.
 
 A curve is one quantity (mu_s or mu_c) of one series. Curves of a quantity share mu_0, so their values are fitted
-together by generalised least squares; linear in mu_0 and a, and in ln b searched globally curve by curve.
+together by generalised least squares. mu_0 and a are linear; ln b is searched globally, curve by curve.
 """
 
 from __future__ import annotations
@@ -23,20 +23,24 @@ from sealfit.fit.least_squares import (
     levenberg_marquardt,
 )
 
-SOONEST, LATEST = 1e-9, 1e3  # b is sought from 1e-9 of the first aged day to 1000 times the last
-PER_DECADE = 8  # points of the search along b; ln(1 + t/b) changes over a decade of b
-MOST_SCATTER = 1e6  # relative: where a law is zero, no scatter of it explains what is left
-PROFILED = 17  # points along ln b at which the intervals of a and c are taken
+# b is searched from this share of the first aged day to this multiple of the last.
+SOONEST, LATEST = 1e-9, 1e3
+# Grid points of b per decade. ln(1 + t/b) changes slowly over a decade of b.
+PER_DECADE = 8
+# Largest relative scatter. If a law is zero, no relative scatter explains its residuals.
+MOST_SCATTER = 1e6
+# Number of points along ln b at which the intervals of a and c are computed.
+PROFILED = 17
 
 
 def search_limits(days) -> tuple[np.ndarray, np.ndarray]:
-    """Return the limits of ln b for the days tested, shape (..., n), at least one of each n above zero."""
+    """Return the limits of ln b, shape (...), for tested days, shape (..., n), at least one of each n above zero."""
     first = np.min(days, axis=-1, where=days > 0, initial=np.inf)
     return np.log(first * SOONEST), np.log(np.max(days, axis=-1) * LATEST)
 
 
 def solve_law(days, value, weight) -> BatchFit:
-    """Global weighted least-squares fit of the aging law to many curves that share nothing.
+    """Return the global weighted least-squares fit of the aging law to many separate curves.
 
     Parameters
     ----------
@@ -67,13 +71,13 @@ def solve_law(days, value, weight) -> BatchFit:
 
 @dataclass(frozen=True)
 class Values:
-    """Measured values of one rubber: those of one condition are neighbours, `covariance` is of all of them."""
+    """Measured values of one rubber; values of one condition are adjacent."""
 
     days: np.ndarray  # (n,)
     value: np.ndarray  # (n,)
-    origin: np.ndarray  # (n,) int: which mu_0
-    curve: np.ndarray  # (n,) int: which curve, -1 for unaged rubber
-    covariance: np.ndarray  # (n, n), no correlation between conditions
+    origin: np.ndarray  # (n,) int: number of the value's mu_0
+    curve: np.ndarray  # (n,) int: number of its curve, -1 for unaged rubber
+    covariance: np.ndarray  # (n, n), 0 between conditions
 
     @property
     def origins(self) -> int:
@@ -87,7 +91,7 @@ class Values:
 
     @cached_property
     def whitening(self) -> np.ndarray:
-        """W with W C W' = 1, shape (n, n): block by block, as only neighbours are correlated."""
+        """W with W C W' = 1, shape (n, n); block diagonal, as only adjacent values are correlated."""
         n = self.value.size
         linked = np.abs(self.covariance) > 0
         reach = np.array([np.flatnonzero(row)[-1] for row in linked])
@@ -128,7 +132,7 @@ class LawFit:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Of the parameters, shape (p, p): see `covariance_of`; none of a ln b at a limit."""
+        """Covariance of the parameters, shape (p, p), by `covariance_of`; 0 for a ln b at a limit."""
         free = np.ones(self.x.size, bool)
         free[-self.values.curves :] = (self.x[-self.values.curves :] > self.limits[0]) & (
             self.x[-self.values.curves :] < self.limits[1]
@@ -165,20 +169,20 @@ def law_model(values: Values, x) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
-    """Global generalised least-squares fit of all curves together.
+    """Return the global generalised least-squares fit of all curves together.
 
-    Every curve is first solved alone (with the unaged values of its quantity), then all are polished together, then
-    each curve's b is searched over its whole range with the rest held, until none moves.
+    Every curve is first fitted alone (with the unaged values of its quantity). Then all are fitted together from this
+    start. Then each b is searched over its whole range with the other parameters fixed, until none improves the fit.
 
     Parameters
     ----------
     values : Values
         At least one value per parameter.
     start : ndarray, shape (p,), optional
-        Parameters of a fit to nearly the same values: polished only.
+        Parameters of a fit to nearly the same values, for a local fit only.
     """
     m, k = values.origins, values.curves
-    whiten = csr_array(values.whitening)  # of few entries
+    whiten = csr_array(values.whitening)
     limits = np.array([search_limits(values.days[values.curve == c]) for c in range(k)]).reshape(k, 2).T
     low, high = (np.concatenate([np.full(m + k, end), own]) for end, own in zip((-np.inf, np.inf), limits, strict=True))
 
@@ -226,7 +230,7 @@ def _each_alone(values: Values) -> np.ndarray:
 
 
 def _rescan(found: LawFit) -> np.ndarray | None:
-    """Search each curve's b over its whole range with everything else held; None where no curve gains."""
+    """Return parameters with each b searched over its whole range, the others fixed; None if none improves the fit."""
     values, limits, whiten = found.values, found.limits, found.values.whitening
     m, k = values.origins, values.curves
     x, gained = found.x.copy(), False
@@ -248,9 +252,9 @@ def _rescan(found: LawFit) -> np.ndarray | None:
 
 
 def between_scatter(values: Values) -> tuple[float, LawFit]:
-    """Relative scatter of single values beyond their covariance, and the fit without it; one quantity.
+    """Return the relative scatter of the values of one quantity in excess of their covariance, and the fit without it.
 
-    Every value has (scatter times the law)^2 added to its variance; the estimate is Paule and Mandel's.
+    The variance of every value is increased by (scatter times the law)^2; the estimate is Paule and Mandel's.
     """
     plain = fit_law(values)
     if plain.df <= 0 or plain.chi2 <= plain.df:
@@ -265,22 +269,22 @@ def between_scatter(values: Values) -> tuple[float, LawFit]:
 
 
 def paule_mandel(chi2: Callable[[float], float], df: float, residual: np.ndarray) -> float:
-    """Return the relative scatter at which chi-square equals its degrees of freedom; 0 where it is no larger already.
+    """Return the relative scatter at which chi-square equals its degrees of freedom; 0 if chi-square is not larger.
 
     Parameters
     ----------
     chi2 : callable
-        Chi-square with a relative scatter added to the variance of every value; it falls with the scatter.
+        Chi-square as a function of the scatter, with which it falls.
     df : float
         Its degrees of freedom.
     residual : ndarray
-        Relative residuals, whose RMS is where the search begins.
+        Relative residuals; the search starts at their RMS.
 
     Notes
     -----
     Paule and Mandel 1982, J. Res. NBS 87(5), 377-385, doi:10.6028/jres.087.022.
     """
-    if df < 1 or not chi2(0.0) > df:  # also where a start gives no number
+    if df < 1 or not chi2(0.0) > df:  # also if chi-square is NaN
         return 0.0
     high = float(np.sqrt(np.mean(residual**2))) + 1e-9
     while chi2(high) > df and high < MOST_SCATTER:

@@ -11,16 +11,15 @@ from scipy.optimize import brentq
 from sealfit.fit.aging.law import PROFILED, LawFit, Values, law_model
 from sealfit.fit.least_squares import covariance_of, levenberg_marquardt
 
-# Ends of intervals are found to 0.1 % of b, which is far below what an interval means.
+# Tolerance of the ends of intervals in ln b: 0.1 % of b.
 CLOSE = 1e-3
-
 # The first step along ln b from the optimum outwards; each further step is twice as long.
 FIRST_STEP = 0.25
 
 
 @dataclass(frozen=True)
 class CurveInterval:
-    """95 % limits of one curve; an open end is 0 or inf for b, -inf or inf for a and c."""
+    """95 % intervals of one curve; an open end is 0 or inf for b, -inf or inf for a and c."""
 
     a: tuple[float, float]
     b: tuple[float, float]
@@ -33,8 +32,8 @@ End = tuple[float, bool]  # of an interval of ln b, and whether it is open
 def curve_intervals(fit: LawFit, rise_of_origin: np.ndarray) -> list[CurveInterval]:
     """Return the profile-likelihood intervals of every curve.
 
-    For b: where the best chi-square with ln b held exceeds the optimum's by no more than the rise. For a and
-    c = -a ln b, both linear in a once b is held: the union of their intervals along those b.
+    The interval of b is where the least chi-square at fixed ln b exceeds the minimum by at most the rise. Those of a
+    and c = -a ln b, which are linear in a at fixed b, are the unions of their intervals over these b.
 
     Parameters
     ----------
@@ -47,8 +46,8 @@ def curve_intervals(fit: LawFit, rise_of_origin: np.ndarray) -> list[CurveInterv
     linked = _linked(values)
     rows = [np.flatnonzero(np.isin(values.curve, curves)) for curves in linked]
     intervals: dict[int, CurveInterval] = {}
-    for curves, own, said in zip(linked, rows, _of_the_others(fit, linked, rows), strict=True):
-        series = _Series(fit, curves, own, *said)
+    for curves, own, others in zip(linked, rows, _other_series(fit, linked, rows), strict=True):
+        series = _Series(fit, curves, own, *others)
         for place, curve in enumerate(curves):
             rise = float(rise_of_origin[values.origin[values.curve == curve][0]])
             intervals[curve] = _curve_interval(series, place, rise)
@@ -56,21 +55,21 @@ def curve_intervals(fit: LawFit, rise_of_origin: np.ndarray) -> list[CurveInterv
 
 
 def _curve_interval(series: _Series, place: int, rise: float) -> CurveInterval:
-    """Return the interval of one curve of a series; `rise` is by how much chi-square may exceed its minimum."""
+    """Return the interval of one curve of a series; `rise` is that of chi-square above its minimum."""
     limit, log_b = series.chi2 + rise, float(series.x[series.b_at(place)])
     low, high = (_end(series, place, sign, limit) for sign in (-1, 1))
     points = np.unique([*np.linspace(low[0], high[0], PROFILED), log_b])
-    chi2, a, variance = np.array([series.held(place, u) for u in points]).T
+    chi2, a, variance = np.array([series.profile(place, u) for u in points]).T
     room = limit - chi2
     half = np.sqrt(np.where(room > 0, room * variance, 0.0))
     return _interval(points, a, half, low, high)
 
 
 class _Series:
-    """The curves of one series, with its own values and, as a Gaussian, what the others say of mu_0.
+    """The curves of one series, with its values and a Gaussian likelihood of mu_0 from the other series.
 
-    mu_0 hardly moves, so that the others' laws stay in the linear range. The numbers of a series are its mu_0, then a,
-    then ln b of its curves.
+    mu_0 hardly changes along a profile, so that the laws of the other series may be linearised. The parameters of a
+    series are its mu_0, then a, then ln b of its curves.
 
     Parameters
     ----------
@@ -81,12 +80,12 @@ class _Series:
     rows : ndarray of int, shape (n,)
         Its values.
     root, miss : ndarray, shape (k, m) and (k,)
-        The others' chi-square is |root (mu_0 - fitted) + miss|^2.
+        The chi-square of the other series is |root (mu_0 - fitted) + miss|^2.
 
     Attributes
     ----------
     x : ndarray, shape (p,)
-        Its numbers at the joint optimum.
+        Its parameters at the joint optimum.
     chi2 : float
         Chi-square there.
     """
@@ -101,11 +100,11 @@ class _Series:
         self.chi2 = float((self._evaluate(self.x[None])[0] ** 2).sum())
 
     def b_at(self, place: int) -> int:
-        """Return where ln b of a curve stands among the numbers."""
+        """Return the index of ln b of a curve among the parameters."""
         return self.m + self.width + place
 
-    def held(self, place: int, log_b: float) -> tuple[float, float, float]:
-        """Return chi-square, a and the variance of a, with ln b of one curve held."""
+    def profile(self, place: int, log_b: float) -> tuple[float, float, float]:
+        """Return the least chi-square, a and the variance of a at a fixed ln b of one curve."""
         x, low, high = self.x.copy(), self.low.copy(), self.high.copy()
         x[self.b_at(place)] = low[self.b_at(place)] = high[self.b_at(place)] = log_b
         found, chi2 = levenberg_marquardt(lambda x, _: self._evaluate(x), x[None], low, high)
@@ -115,7 +114,7 @@ class _Series:
         return float(chi2[0]), float(found[0, at]), float(covariance[at, at])
 
     def _evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the whitened residual, then what the others say of mu_0, shape (1, n + k), and its derivative."""
+        """Return the whitened residuals, those of mu_0 from other series last, shape (1, n + k), and the derivative."""
         model, slope = law_model(self.values, x[0])
         white = self.values.whitening
         others = np.zeros((self.miss.size, x.size))
@@ -125,7 +124,7 @@ class _Series:
 
 
 def _interval(log_b: np.ndarray, a: np.ndarray, half: np.ndarray, low: End, high: End) -> CurveInterval:
-    """Return the interval of a curve: a with its half-width where ln b is held at points from one end to the other."""
+    """Return the interval of a curve from a and its half-width at fixed values of ln b between the ends."""
     around = {
         name: [float((factor * a - np.abs(factor) * half).min()), float((factor * a + np.abs(factor) * half).max())]
         for name, factor in (("a", 1.0), ("c", -log_b))
@@ -133,21 +132,21 @@ def _interval(log_b: np.ndarray, a: np.ndarray, half: np.ndarray, low: End, high
     signs = [end for end, reached in ((1, around["a"][1] > 0), (0, around["a"][0] < 0)) if reached]
     for outer in signs:
         endless = np.inf if outer else -np.inf
-        if high[1]:  # a grows with b without end
+        if high[1]:  # a grows without bound with b
             around["a"][outer], around["c"][1 - outer] = endless, -endless
-        if low[1]:  # and c grows as b goes to zero
+        if low[1]:  # c grows without bound as b goes to 0
             around["c"][outer] = endless
     b = (0.0 if low[1] else float(np.exp(low[0])), np.inf if high[1] else float(np.exp(high[0])))
     return CurveInterval(tuple(around["a"]), b, tuple(around["c"]))
 
 
 def _end(series: _Series, place: int, sign: int, limit: float) -> End:
-    """Return where the profile along ln b reaches the limit, from the optimum outwards, and whether it never does."""
+    """Return the ln b at which the profile reaches the limit, from the optimum outwards, and whether it is open."""
     at = series.b_at(place)
     near, edge = float(series.x[at]), float((series.low, series.high)[sign > 0][at])
 
     def above(log_b: float) -> float:
-        return series.held(place, log_b)[0] - limit
+        return series.profile(place, log_b)[0] - limit
 
     step = FIRST_STEP
     while sign * (edge - near) > 0:
@@ -159,7 +158,7 @@ def _end(series: _Series, place: int, sign: int, limit: float) -> End:
 
 
 def _linked(values: Values) -> list[list[int]]:
-    """Groups of curves whose values are correlated: the quantities of one series."""
+    """Return groups of curves with correlated values: the quantities of one series."""
     group = list(range(values.curves))
     rows, columns = np.nonzero(values.covariance)
     for one, other in set(zip(values.curve[rows].tolist(), values.curve[columns].tolist(), strict=True)):
@@ -169,17 +168,17 @@ def _linked(values: Values) -> list[list[int]]:
     return [[c for c in range(values.curves) if group[c] == g] for g in sorted(set(group))]
 
 
-def _of_the_others(
+def _other_series(
     fit: LawFit, series: list[list[int]], rows: list[np.ndarray]
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield for each series what the others say of its mu_0: R, shape (k, m), and r, shape (k,).
+    """Yield for each series the likelihood of its mu_0 from the other series: R, shape (k, m), and r, shape (k,).
 
-    Their chi-square is |R (mu_0 - fitted) + r|^2. Their a and b are solved for, in the linear range. The covariance
-    links no two series, so each says its own.
+    Their chi-square is |R (mu_0 - fitted) + r|^2, linearised, with their a and b eliminated. Series are not correlated,
+    so that their contributions add.
     """
     values, m, k = fit.values, fit.values.origins, fit.values.curves
     tangent = values.whitening @ fit.jacobian
-    said = np.column_stack([tangent[:, :m], values.whitening @ (fit.model - values.value)])
+    columns = np.column_stack([tangent[:, :m], values.whitening @ (fit.model - values.value)])  # of mu_0, residual
     unaged = np.setdiff1d(np.arange(values.value.size), np.concatenate(rows))
     squares = []
     for curves, own in zip(series, rows, strict=True):
@@ -187,13 +186,13 @@ def _of_the_others(
         scale = np.linalg.norm(aside, axis=0)
         left, singular, _ = np.linalg.svd(aside / np.where(scale > 0, scale, 1.0), full_matrices=False)
         left = left[:, singular > 1e-10]
-        rest = said[own] - left @ (left.T @ said[own])
+        rest = columns[own] - left @ (left.T @ columns[own])
         squares.append(rest.T @ rest)
-    total = said[unaged].T @ said[unaged]
+    total = columns[unaged].T @ columns[unaged]
     for s, own in enumerate(rows):
         square = total + sum(squares[:s] + squares[s + 1 :], np.zeros_like(total))
         used = np.append(np.isin(np.arange(m), values.origin[own]), True)
-        if not used.all():  # what the series has not is solved for too
+        if not used.all():  # mu_0 of quantities that the series lacks are eliminated too
             cross = square[np.ix_(~used, used)]
             square = square[np.ix_(used, used)] - cross.T @ np.linalg.pinv(square[np.ix_(~used, ~used)]) @ cross
         share, axes = np.linalg.eigh(square)

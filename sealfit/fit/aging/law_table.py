@@ -1,4 +1,4 @@
-"""What table `aging_fit` says of one curve: its law, how good it is, and what the days tested cannot determine."""
+"""Rows of table `aging_fit` for one curve: its law, the lack of fit, and the parameters that are not determined."""
 
 from __future__ import annotations
 
@@ -12,16 +12,20 @@ from sealfit.fit.aging.law import LawFit
 from sealfit.fit.aging.law_profiles import CurveInterval
 from sealfit.fit.steady.fit import table_row
 
-DAYS_FOR_LAW = 3  # mu_0, a and b are three numbers
-WIDE_B = 100.0  # a 95 % interval of b over more than this ratio does not determine it
+# Number of days that a law needs: mu_0, a and b are three parameters.
+DAYS_FOR_LAW = 3
+# b is not determined if the ends of its 95 % interval differ by more than this ratio.
+WIDE_B = 100.0
+# Level of the test for lack of fit.
 SIGNIFICANT = 0.05
+
 LAW = ("mu_0", "a", "b", "c")
-NO_SCATTER = "as many parameters as days: the interval leaves out how specimens scatter, which nothing shows."
+NO_SCATTER = "as many parameters as days: the interval excludes the scatter between specimens, which is not known."
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One quantity of one series: its place in the joint fit (-1 without a law) and what was tested."""
+    """One quantity of one series: its number in the joint fit (-1 without a law) and the tested days."""
 
     series: str
     quantity: str
@@ -33,12 +37,12 @@ class Curve:
 
 @dataclass(frozen=True)
 class OneQuantity:
-    """The law fitted to one quantity of all series by itself, and how specimens scatter about it."""
+    """The separate fit of one quantity of all series, and the scatter between specimens."""
 
     alone: LawFit
-    part: np.ndarray  # numbers of its values among those of the joint fit
-    tau: float  # relative standard deviation between specimens beyond the steady fits
-    series: int  # that have a law
+    part: np.ndarray  # indices of its values among those of the joint fit
+    tau: float  # relative standard deviation between specimens in excess of the steady fits' errors
+    series: int  # number of series with a law
 
     @property
     def df(self) -> int:
@@ -58,9 +62,9 @@ class Estimate:
     Attributes
     ----------
     x, shift : ndarray, shape (3,)
-        Estimates, and their change when the sensor reads one standard uncertainty too high.
+        Estimates, and their change if the sensor reads one standard uncertainty too high.
     covariance : ndarray, shape (3, 3)
-        Of x.
+        Covariance of x.
     """
 
     x: np.ndarray
@@ -69,7 +73,7 @@ class Estimate:
 
     @classmethod
     def of(cls, joint: LawFit, curve: Curve, q: int, shift: np.ndarray) -> Estimate:
-        """Return those of a curve of a joint fit; `shift`, shape (p,), is of all its parameters."""
+        """Return the estimates of a curve of a joint fit; `shift`, shape (p,), is that of all parameters."""
         m, k = joint.values.origins, joint.values.curves
         at = [q, m + curve.place, m + k + curve.place]
         return cls(joint.x[at], joint.covariance[np.ix_(at, at)], shift[at])
@@ -88,7 +92,7 @@ def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, t: float, df: f
     se = np.sqrt(np.diag(found.covariance))
     b, se_c = np.exp(u), found.error_of_c()
     beside = "" if df > 0 else NO_SCATTER
-    move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # less is rounding
+    move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # the rest is rounding
     judged = _judge(curve, a, b, ends)
     limits = {"mu_0": (mu_0 - t * se[0], mu_0 + t * se[0]), "a": ends.a, "b": ends.b, "c": ends.c}
     numbers = {
@@ -144,7 +148,7 @@ def _judge(curve: Curve, a: float, b: float, ends: CurveInterval) -> dict[str, t
 
 
 def without_law(curve: Curve) -> Iterator[dict]:
-    """Return empty rows that say how many days are missing."""
+    """Return the rows of a curve with too few days: no values, and a reason."""
     days = ", ".join(f"{day:g}" for day in ([0.0, *curve.days] if curve.unaged else curve.days)) or "none"
     reason = f"the law needs {DAYS_FOR_LAW} distinct days where {curve.quantity} is determined; there are: {days}."
     for name in LAW:
@@ -158,14 +162,14 @@ def without_law(curve: Curve) -> Iterator[dict]:
 
 
 def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Iterator[dict]:
-    """Return how well the law fits the days of this curve."""
+    """Return the rows with the statistics of the fit of this curve."""
     part, alone, share, tau = quantity.part, quantity.alone, quantity.series, quantity.tau
     values = joint.values
     own = values.curve == curve.place
     q = values.origin[own][0]
     unaged = (values.curve < 0) & (values.origin == q)
-    left = (alone.values.whitening @ (alone.values.value - alone.model)) ** 2
-    chi2 = float(left[own[part]].sum() + left[unaged[part]].sum() / share)
+    squares = (alone.values.whitening @ (alone.values.value - alone.model)) ** 2
+    chi2 = float(squares[own[part]].sum() + squares[unaged[part]].sum() / share)
     own_df = float(own.sum() - 2 + (unaged.sum() - 1) / share)
     shown = own | unaged
     error = joint.model[shown] / values.value[shown] - 1
@@ -175,8 +179,8 @@ def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Itera
         reason = "as many parameters as days: the law cannot disagree with them."
     elif p < SIGNIFICANT:
         reason = (
-            f"the values scatter about the law by {100 * tau:.2g} % more than their steady fits say: specimens differ, "
-            "or the law is another. It is in the intervals; replicate specimens would tell the two apart."
+            f"the values scatter about the law by {100 * tau:.2g} % more than their errors: specimens differ, or the "
+            "law is wrong. The intervals include this; replicate specimens would distinguish the two."
         )
     name = curve.quantity
     for statistic, value, its_unit, why in (
@@ -201,7 +205,7 @@ def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Itera
 
 
 def covariance_rows(curve: Curve, covariance: np.ndarray) -> Iterator[dict]:
-    """Return the covariance of mu_0, a and ln b, shape (3, 3)."""
+    """Return the rows with the covariance of mu_0, a and ln b, shape (3, 3)."""
     names, units = ("mu_0", "a", "ln b"), (curve.unit, curve.unit, "")
     for i in range(3):
         for j in range(i + 1):

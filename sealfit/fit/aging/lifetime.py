@@ -1,4 +1,4 @@
-"""Days until aging has carried a quantity to a threshold, and the temperature at which it lasts so many years."""
+"""The lifetime, the aging time at which a quantity reaches a threshold, and the temperature for a given lifetime."""
 
 from __future__ import annotations
 
@@ -15,46 +15,48 @@ from sealfit.fit.aging.joint_least_squares import solved_many
 from sealfit.fit.least_squares import central_jacobian
 
 # ---------------------------------------------------------------- lifetime
-# Days until aging has carried a quantity to a threshold, and the temperature at which it lasts so many years.
-#
-# From a joint law, :math:`a\, k^w \varphi(k^{1-w} t) = \mu_0 - \mu^*` solved for t. The interval is that of ln t by the
-# delta method, with the law's whole covariance; `resampled` draws the values anew instead and checks it. In the spirit
-# of ISO 11346 (rubber, estimation of life-time and maximum temperature of use), whose threshold is a share of the
-# start.
+# The lifetime t of a joint law solves :math:`a\, k^w \varphi(k^{1-w} t) = \mu_0 - \mu^*`. Its interval is that of ln t
+# by the delta method with the full covariance of the law; `resampled` checks it by a parametric bootstrap. ISO 11346
+# (rubber, estimation of life-time and maximum temperature of use) has a threshold relative to the start.
 
 DAYS_PER_YEAR = 365.25
-SPAN_C = (-80.0, 300.0)  # of temperatures of use
-STRIDE_C, HALVINGS = 2.0, 12  # in which the ends of the interval of a temperature are sought, and then halved
-SPAN_PCT = (1.0, 200.0)  # of the original height in use; above 100 it is stretched
-AT_ONCE, FOREVER = 1e-9, 1e9  # days: beyond, the law is asked for more than it can say
+# Range of temperatures of use in degrees Celsius.
+SPAN_C = (-80.0, 300.0)
+# Step in degrees Celsius of the search for the ends of a temperature interval, and number of bisections after it.
+STRIDE_C, HALVINGS = 2.0, 12
+# Range of the height in use, in percent of the original height; above 100 the rubber is stretched.
+SPAN_PCT = (1.0, 200.0)
+# Range of lifetimes in days. A law has no meaning beyond it.
+AT_ONCE, FOREVER = 1e-9, 1e9
 
 
 @dataclass(frozen=True)
 class Goal:
-    """What ends a life: the value itself, or a loss as a share of the start (0.2: a fifth is lost)."""
+    """The end of life: a value, or a loss relative to the start (0.2: a fifth is lost)."""
 
     value: float | None = None
     loss: float | None = None
 
     def reached(self, start: float) -> float:
-        """Return the value at which life ends, for rubber that starts at `start`."""
+        """Return the value at the end of life for rubber with the unaged value `start`."""
         return self.value if self.loss is None else start * (1 - self.loss)
 
 
 @dataclass(frozen=True)
 class Lifetime:
-    """Days to a threshold, ends of the 95 % interval (inf where open), and how far that lies beyond the tests.
+    """Days to a threshold, the 95 % interval, and the degree of extrapolation.
 
     Attributes
     ----------
     days, low, high : float
-        Estimate and interval; `days` is inf where the law never comes there, 0 where rubber starts beyond it.
+        Estimate and ends of the interval, inf if open; `days` is inf if the law does not reach the threshold, 0 if
+        unaged rubber is beyond it.
     threshold : float
-        The value at which life ends.
+        Value at the end of life.
     beyond : float
-        days over the longest test, in the master curve's time where there is one: above 1 it is extrapolated.
+        days over the longest test, in the time of the master curve if there is one. Above 1 is extrapolated.
     outside : tuple of str
-        What lies outside the tested range: "temperature", "compression".
+        Variables outside of the tested range: "temperature", "compression".
     """
 
     days: float
@@ -66,7 +68,7 @@ class Lifetime:
 
     @property
     def extrapolated(self) -> bool:
-        """Whether the answer goes beyond the tests."""
+        """Whether the lifetime is extrapolated."""
         return self.beyond > 1.0 or bool(self.outside)
 
 
@@ -75,28 +77,26 @@ def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, comp
 
     Parameters
     ----------
-    law : JointLaw
-        Fitted.
-    goal : Goal
-        What ends a life.
+    law, goal : JointLaw, Goal
+        Fitted law, and end of life.
     temperature_C, compression_pct : float, optional
-        Of use; needed where the tests varied them.
+        Temperature in degrees Celsius and height in percent in use; needed if the tests varied them.
 
     Raises
     ------
     RequestError
-        If one is missing that the law needs, given though the tests did not vary it, or out of any range of use.
+        If one is missing that the law needs, given though the tests did not vary it, or out of the range of use.
     """
     place = _place(law, temperature_C, compression_pct)
     days = _days(law, law.x, goal, place)
     low, high = days, days
     if 0 < days < FOREVER:
-        with np.errstate(divide="ignore", invalid="ignore"):  # near where it is never reached, or at once
+        with np.errstate(divide="ignore", invalid="ignore"):  # the lifetime may be 0 or inf nearby
             slope = central_jacobian(lambda x: np.log(np.array([_days(law, x, goal, place)])), law.x)[0]
         half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if np.isfinite(slope).all() else np.inf
         low, high = (float(days * np.exp(np.clip(s * half, -700, 700))) for s in (-1, 1))
         low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
-    asked = days * (float(law.rate(place)[0]) if law.way == "rate" else 1.0)
+    asked = days * (float(law.rate(place)[0]) if law.acts_on == "rate" else 1.0)
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
     return Lifetime(days, low, high, threshold, beyond, _outside(law, temperature_C, compression_pct))
 
@@ -104,16 +104,16 @@ def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, comp
 def over_laws(
     laws: Sequence[JointLaw], goal: Goal, temperature_C: float | None = None, compression_pct: float | None = None
 ) -> tuple[float, float]:
-    """Return the ends of the 95 % interval of the lifetime when the law is not known: inf, or 0, where open.
+    """Return the ends of the model-averaged 95 % interval of the lifetime, 0 or inf if open.
 
-    Each law's log lifetime has its Student distribution, weighed by exp(-1/2) of Schwarz's criterion: with few tests
-    the likeliest law is often not the true one, and its own interval too short. Buckland, Burnham & Augustin 1997,
-    Biometrics 53(2), 603-618, doi:10.2307/2533961.
+    The log lifetime of each law has a Student distribution, and the weights are exp(-BIC/2). With few tests the law of
+    least BIC is often not the true one, and its own interval too short. Buckland, Burnham & Augustin 1997, Biometrics
+    53(2), 603-618, doi:10.2307/2533961.
 
     Parameters
     ----------
     laws : sequence of JointLaw
-        Of the same values.
+        Laws fitted to the same values.
     goal, temperature_C, compression_pct
         As `lifetime`.
     """
@@ -146,12 +146,12 @@ def over_laws(
 
 
 def ends_of(values: np.ndarray) -> tuple[float, float]:
-    """Return the least and the greatest."""
+    """Return the smallest and the largest value."""
     return float(values.min()), float(values.max())
 
 
 def _asked(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> Iterator[tuple]:
-    """Yield per driver of aging its name, in words, what is asked, what was tested, what may be asked, and its unit."""
+    """Yield per driver of aging: name, name of the option, its value, tested values, allowed range, and unit."""
     asked = (temperature_C, compression_pct)
     spans = (("temperature", SPAN_C, "degC"), ("compression", SPAN_PCT, "percent"))
     for (name, column, _), value, (what, span, unit) in zip(DRIVERS, asked, spans, strict=True):
@@ -159,7 +159,7 @@ def _asked(law: JointLaw, temperature_C: float | None, compression_pct: float | 
 
 
 def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> Aged:
-    """Return where the rubber is used, checked."""
+    """Return the condition of use after checks; see `lifetime` for the errors raised."""
     for name, what, value, tested, (least, most), unit in _asked(law, temperature_C, compression_pct):
         if name in law.names and value is None:
             raise RequestError(f"the rubber was aged at more than one {what}.", fix=f"Say which with --{what}.")
@@ -176,14 +176,14 @@ def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | 
 
 
 def _days(law: JointLaw, x: np.ndarray, goal: Goal, place: Aged) -> float:
-    """Return the days to the goal for parameters x; inf where it is never reached."""
+    """Return the lifetime in days for parameters x; inf if the goal is not reached."""
     k, own = float(law.rate(place, x)[0]), [float(value[0]) for value in law.own(x)]
-    a = x[1] * (k if law.way == "loss" else 1.0)
+    a = x[1] * (k if law.acts_on == "loss" else 1.0)
     phi = (x[0] - goal.reached(x[0])) / a if a != 0 else np.inf
     if phi <= 0:
         return 0.0 if a > 0 else np.inf
     with np.errstate(over="ignore"):
-        days = float(law.loss.time(phi, *own)) / (k if law.way == "rate" else 1.0)
+        days = float(law.loss.time(phi, *own)) / (k if law.acts_on == "rate" else 1.0)
     return days if days < FOREVER else np.inf
 
 
@@ -205,14 +205,14 @@ def resampled(
     draws: int = 500,
     seed: int = 1,
 ) -> tuple[float, float]:
-    """Return the ends of the 95 % interval of the lifetime from values drawn anew around the law, refitted each time.
+    """Return the ends of the 95 % interval of the lifetime by a parametric bootstrap.
 
-    The logarithm's quantiles are spread by Student's over the normal quantile, as the scatter is itself an estimate.
+    Quantiles of the logarithm are multiplied by Student's over the normal quantile, as the scatter is an estimate.
 
     Parameters
     ----------
     draws, seed : int
-        How many, and of which stream.
+        Number of draws, and seed of the random numbers.
     """
     rng, place = np.random.default_rng(seed), _place(law, temperature_C, compression_pct)
     mean = law.at(law.aged)
@@ -229,19 +229,19 @@ def resampled(
 def temperature_for(
     law: JointLaw, goal: Goal, years: float, compression_pct: float | None = None
 ) -> tuple[float, float, float]:
-    """Return the temperature of use at which life is so many years, and its 95 % interval.
+    """Return the temperature of use at which the lifetime is a number of years, and its 95 % interval.
 
     Returns
     -------
     celsius, low, high : float
-        In degrees Celsius; celsius is inf where life is longer at every temperature sought, -inf where it is shorter.
-        The interval are the temperatures at which so many years lie in the interval of the life (Fieller's way); an end
-        that was not found is infinite.
+        In degrees Celsius; celsius is inf if the lifetime is longer at all temperatures searched, -inf if shorter. The
+        interval contains the temperatures whose lifetime interval contains the years (Fieller's method); an end that
+        was not found is infinite.
 
     Raises
     ------
     RequestError
-        If the rubber was aged at one temperature only, or the years are no time.
+        If the rubber was aged at one temperature only, or the years are not positive.
     """
     if not 0 < years < np.inf:
         raise RequestError(f"--years {years:g} is no time to last.", fix="Give a number above 0.")
@@ -253,7 +253,7 @@ def temperature_for(
         days = _days(law, law.x, goal, _place(law, celsius, compression_pct))
         return float(np.log(np.clip(days, 1e-12, 1e12) / wanted))
 
-    def held(celsius: float) -> bool:
+    def contains(celsius: float) -> bool:
         life = lifetime(law, goal, celsius, compression_pct)
         return life.low <= wanted <= life.high
 
@@ -262,25 +262,25 @@ def temperature_for(
         always = np.inf if ends[0] > 0 else -np.inf
         return always, -np.inf, np.inf
     celsius = float(brentq(longer, *SPAN_C, xtol=1e-6))
-    return celsius, _last(held, celsius, SPAN_C[0]), _last(held, celsius, SPAN_C[1])
+    return celsius, _last(contains, celsius, SPAN_C[0]), _last(contains, celsius, SPAN_C[1])
 
 
-def _last(held: Callable[[float], bool], inside: float, limit: float) -> float:
-    """Return where, from a place inside towards a limit, something ceases to hold; infinite where it never does."""
+def _last(contains: Callable[[float], bool], inside: float, limit: float) -> float:
+    """Return the end of the interval that contains `inside`, in the direction of a limit; infinite if open."""
     direction = np.sign(limit - inside)
     outside = inside
     while (limit - outside) * direction > 0:
         inside, outside = outside, outside + direction * min(STRIDE_C, abs(limit - outside))
-        if not held(outside):
+        if not contains(outside):
             for _ in range(HALVINGS):
                 middle = (inside + outside) / 2
-                inside, outside = (middle, outside) if held(middle) else (inside, middle)
+                inside, outside = (middle, outside) if contains(middle) else (inside, middle)
             return float(inside)
     return float(direction * np.inf)
 
 
 # ---------------------------------------------------------------- lifetime answer
-# What is asked of a lifetime, and the answer as plain values.
+# A request for a lifetime, and its answer as plain values.
 
 
 def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
@@ -312,20 +312,16 @@ def answer(
     compression_pct: float | None = None,
     resample: bool = False,
 ) -> dict:
-    """Return a law's answer as plain values: days with interval, how far beyond the tests, the temperature for years.
+    """Return the answer of a law as plain values: the lifetime with its interval, or the temperature for a lifetime.
 
     Parameters
     ----------
-    law : JointLaw
-        Fitted.
-    goal : Goal
-        What ends a life.
+    law, goal, temperature_C, compression_pct
+        As `lifetime`.
     years : float, optional
-        Asks for the temperature at which life is so long, in place of the days.
-    temperature_C, compression_pct : float, optional
-        Of use.
+        Lifetime for which the temperature is computed.
     resample : bool
-        Whether the interval is checked by drawing the values anew.
+        Whether the interval is checked by `resampled`.
 
     Raises
     ------
@@ -339,7 +335,7 @@ def answer(
             "no unaged rubber was tested: there is no start of which a share could be lost.",
             fix="Give --threshold VALUE, or test unaged rubber.",
         )
-    found = {"law": law.loss.name, "way": law.way, "form": law.loss.form, "criterion": law.bic}
+    found = {"law": law.loss.name, "way": law.acts_on, "form": law.loss.form, "criterion": law.bic}
     found |= {"parameters": {name: value for name, value, *_ in law.parameters()}}
     if years is not None:
         celsius, *ends = temperature_for(law, goal, years, compression_pct)
@@ -356,7 +352,7 @@ def answer(
 
 
 def finite_ends(interval: Sequence[float]) -> list[float | None]:
-    """Return the ends of an interval, None where it is open."""
+    """Return the ends of an interval, None for an open end."""
     return [_finite(end) for end in interval]
 
 

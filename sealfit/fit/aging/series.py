@@ -1,4 +1,4 @@
-"""The law by which aging changes mu_s and mu_c (Eq. 15), per series, from the conditions' steady fits."""
+"""The aging law (Eq. 15) of mu_s and mu_c per series, fitted to the steady fits of the conditions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ from sealfit.physics import aging_law
 from sealfit.tables import AGING_CURVES, AGING_FIT
 
 PAIRS = (("mu_s", "mu_c"), ("F_s", "F_c"))
-SMALLEST = 1e-6  # relative standard deviation below which a steady fit is not believed
+# Smallest relative standard deviation of a steady value.
+SMALLEST = 1e-6
+# Number of points of a curve.
 CURVE_POINTS = 61
 
 
@@ -35,14 +37,13 @@ def fit_series(steady_fit: pd.DataFrame, config: Config) -> pd.DataFrame:
 
     .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b), \quad c = -a \ln b
 
-    One generalised least-squares fit per rubber of all its series and both quantities, with the covariance that mu_s
-    and mu_c of a condition have from their steady fit, and the scatter between specimens (one per condition) estimated
-    from what the law leaves.
+    All series and both quantities of a rubber are fitted together by generalised least squares. The covariance is that
+    of mu_s and mu_c in the steady fits plus the scatter between specimens, estimated from the residuals.
 
     Parameters
     ----------
     steady_fit : DataFrame
-        Table `steady_fit` with the column `aging_days`; only what it calls identified is used.
+        Table `steady_fit` with the column `aging_days`; only identified values are used.
     config : Config
         Names the condition columns.
 
@@ -55,9 +56,9 @@ def fit_series(steady_fit: pd.DataFrame, config: Config) -> pd.DataFrame:
 
     Notes
     -----
-    `lo95` and `hi95` of a, b and c are profile-likelihood limits, those of mu_0 of the curvature, with Student's t on
-    values less parameters of the quantity: specimens are the unit of evidence. `u_sys` moves all steady values
-    together, as the sensor would, and takes what the fit makes of it.
+    Intervals of a, b and c are profile-likelihood intervals, that of mu_0 is from the curvature, with Student's t. The
+    degrees of freedom are values minus parameters of the quantity, as specimens are the unit of evidence. `u_sys` is
+    the change of the fit if the sensor's error changes all steady values together.
     """
     open_columns = [name for name in config.series_columns if name in steady_fit.columns]
     columns = [*AGING_FIT.names(), *open_columns]
@@ -114,9 +115,9 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
 
 
 def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
-    """Return the values without Coulomb coefficients of too few speeds, where other conditions have a Stribeck curve.
+    """Return the values without mu_c of conditions with too few speeds, if other conditions have a Stribeck curve.
 
-    Over two or three slow speeds, "mu_c" is what friction is like at them: mu_s included, it is another quantity.
+    The "mu_c" of two or three slow speeds includes mu_s: it is a different quantity.
     """
     with_curve = set(found.loc[found["parameter"] == pair[0], "condition"])
     if not with_curve:
@@ -141,13 +142,13 @@ def _curves(found: pd.DataFrame, series: list[str], quantities: list[str], unit:
 
 
 def values_of(steady_fit: pd.DataFrame, quantity: str) -> dict[tuple[str, str], float]:
-    """Return what table `steady_fit` has under a `quantity`, by condition and parameter."""
+    """Return the values of table `steady_fit` with a `quantity`, by condition and parameter."""
     rows = steady_fit[steady_fit["quantity"] == quantity]
     return dict(zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"].tolist(), strict=True))
 
 
 def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -> np.ndarray:
-    """Return the covariance of steady values, shape (n, n): full within a condition, none between conditions.
+    """Return the covariance of steady values, shape (n, n); it is 0 between conditions.
 
     Parameters
     ----------
@@ -168,7 +169,7 @@ def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -
 
 
 def _with_specimens(values: Values, taus: list[float], model: np.ndarray) -> Values:
-    """Add the scatter between specimens: relative, per quantity, correlated within a condition as the residuals are."""
+    """Return values with specimen scatter added to their covariance, correlated within a condition as the residuals."""
     relative = (values.value - model) / model
     tau = np.array(taus)[values.origin]
     near = values.covariance != 0
@@ -176,12 +177,12 @@ def _with_specimens(values: Values, taus: list[float], model: np.ndarray) -> Val
     correlation = 0.0
     if link.any() and min(taus) > 0:
         cross = (np.outer(relative, relative) - values.covariance / np.outer(model, model))[link].mean()
-        correlation = float(np.clip(cross / np.prod(taus), -0.9, 0.9))  # 0.9: one specimen, but never one number
+        correlation = float(np.clip(cross / np.prod(taus), -0.9, 0.9))  # below 1, so that it is invertible
     added = np.outer(tau * model, tau * model) * (np.eye(len(tau)) + correlation * link)
     return Values(values.days, values.value, values.origin, values.curve, values.covariance + added)
 
 
-# ---------------------------------------------------------------- what the table says
+# ---------------------------------------------------------------- table
 def _rubber_rows(
     values: Values, curves: list[Curve], fitted: list[str], used: pd.DataFrame, own: pd.DataFrame
 ) -> Iterator[dict]:
@@ -209,7 +210,7 @@ def _rubber_rows(
 
 
 def _shift(joint: LawFit, used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:
-    """Change of every parameter when the sensor reads one standard uncertainty too high in all conditions."""
+    """Return the change of the parameters, shape (p,), if the sensor reads one standard uncertainty too high."""
     known = values_of(own, "sensor_shift")
     moved = np.array([known.get(key, 0.0) for key in zip(used["condition"], used["quantity"], strict=True)], float)
     white = joint.values.whitening
@@ -226,12 +227,12 @@ def aging_curves(aging_fit: pd.DataFrame, days: np.ndarray | None = None) -> pd.
     aging_fit : DataFrame
         Table `aging_fit`.
     days : ndarray, shape (n,), optional
-        Aging times; default from 0 to the last day tested, denser where the law bends.
+        Aging times in days; default from 0 to the last tested day, denser near 0.
 
     Returns
     -------
     DataFrame
-        Table `aging_curves`; the band is that of the law (population mean), from the covariance of mu_0, a and ln b.
+        Table `aging_curves`; the band is that of the population mean, from the covariance of mu_0, a and ln b.
     """
     parts: dict[str, list[np.ndarray]] = {name: [] for name in AGING_CURVES.names()}
     for series, own in aging_fit.groupby("series", sort=False) if len(aging_fit) else ():
@@ -250,7 +251,7 @@ def aging_curves(aging_fit: pd.DataFrame, days: np.ndarray | None = None) -> pd.
 
 
 def _curve(known: dict[tuple[str, str], float], quantity: str, days: np.ndarray | None) -> dict[str, np.ndarray]:
-    """Return the curve of one quantity, none without a law; `known` are a series' values by quantity and parameter."""
+    """Return the curve of one quantity, empty without a law; `known` are values by quantity and parameter."""
     mu_0, a, b = (known[quantity, name] for name in ("mu_0", "a", "b"))
     if np.isnan([mu_0, a, b]).any():
         return {}

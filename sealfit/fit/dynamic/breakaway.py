@@ -12,7 +12,11 @@ from sealfit.config import Config
 from sealfit.fit.dynamic.bristle_model import Cells
 from sealfit.fit.dynamic.stiffness import together
 
-SAMPLES, SHARE = 8, 1 / 40  # of the window over which a peak is averaged: samples of a start, share of the distance
+# Width of the window over which a peak is averaged, the larger of a number of samples and a share of the distance.
+SAMPLES, SHARE = 8, 1 / 40
+# Family-wise error rate of the test for a peak in a campaign.
+FAMILY = 0.01
+
 FORCE, RATIO, SLIDING = "F_ba", "F_ba/F", "F"
 TOP, NOISE, PLACES, WHERE, REACH = "top", "noise", "places", "where", "reach"
 AT = ["condition", "speed_set_mm_s", "direction"]
@@ -20,29 +24,28 @@ LARGEST = "F_max/F"
 INTO = "{where:.3g} {unit} into strokes of {reach:.3g} {unit}"
 NO_PEAK = "the force comes up to its sliding value without passing above it"
 FEW = "no repeats: no scatter is known"
-FAMILY = 0.01  # chance of a peak anywhere in a campaign where there is none
 
 
 def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the break-away force F_ba and its share of the sliding force, per file, or per stroke of a single file.
+    """Return the break-away force F_ba and its ratio to the sliding force, per file, or per stroke of a single file.
 
-    The sliding force is that of the line through where steady sliding has just begun, taken back to the peak: what
-    warming takes off along a stroke is no break-away. Where the peak lies is read from the mean of the other units, and
-    a start's own force is then taken there: the largest of noisy samples is always too high. For a test of whether
-    there is a peak at all, `top` is its force above sliding where the mean of all is largest, `noise` the standard
-    error of that in those of a sample, and `places` how many places there are; `F` is the sliding force.
+    The sliding force is extrapolated to the peak along the line through the beginning of steady sliding, so that
+    warming along the stroke does not count as break-away. The position of the peak is taken from the mean of the other
+    units, and the force of a start is read there, as the maximum of noisy samples is biased. For the test for a peak,
+    `top` is the force above sliding where the mean of all units is largest, `noise` its standard error in units of that
+    of a sample, and `places` the number of positions; `F` is the sliding force.
 
     Parameters
     ----------
     cells : Cells
-        Of strokes at one condition, in groups of one commanded speed and direction.
+        Cells of the strokes at one condition, in groups of one commanded speed and direction.
     file : ndarray of int, shape (strokes,)
         Number of each stroke's file.
 
     Returns
     -------
     dict of ndarray, shape (units,) each
-        By name; `group` is the number of the unit's group. Units where one of the others is not known are left out.
+        By name; `group` is the number of the unit's group. Units with an unknown value are left out.
     """
     of, count = cells.groups.of, cells.count
     each = np.arange(len(of))
@@ -82,19 +85,18 @@ def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
 def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: Config) -> pd.DataFrame:
     """Return rows of table `dynamic_fit` for all break-aways of a campaign.
 
-    The scatter of repeats is pooled within a condition: that of the force as a share of it, that of the ratio as the
-    force above the sliding force over its noise, since what does not cancel in it is the noise of the samples. The
-    force is also widened by the scatter of set-ups, which all repeats of a run share. A peak is one where the largest
-    mean stands above the sliding force by a t-test at 1 % for all places of all starts of the campaign (Bonferroni);
-    elsewhere `reason` says that there is none, and there is no interval.
+    The scatter of repeats is pooled within a condition: for the force relative to it, for the ratio as the force above
+    sliding over its noise, as other errors cancel in the ratio. The variance of the force includes set-up scatter,
+    which is common to the repeats of a run. There is a peak if the largest mean exceeds the sliding force in a t-test
+    at 1 % for all positions of all starts of the campaign (Bonferroni). Else `reason` says so, without an interval.
 
     Parameters
     ----------
     found : DataFrame
-        What `peaks` gave, and the condition, commanded speed and direction of each unit.
+        Result of `peaks`, with the condition, commanded speed and direction of each unit.
     widened : (float, float)
-        How many times the variance that repeats give them run means have, and on how many degrees of freedom that
-        rests: from the steady fit.
+        Ratio of the variance of run means to that expected from repeats, and its degrees of freedom, from the steady
+        fit.
     config : Config
         Gives the units and the sensor's accuracy.
     """
@@ -132,19 +134,18 @@ def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: C
         both.append(pd.DataFrame({**row, "identified": peak, "reason": reason}))
     keys = mean.index.to_frame(index=False)
     rows = pd.concat([one.join(keys) for one in both])
-    return rows.sort_index(kind="stable", ignore_index=True)  # the two of a group one after the other
+    return rows.sort_index(kind="stable", ignore_index=True)  # the two rows of a group are adjacent
 
 
 def largest_rows(found: pd.DataFrame, config: Config) -> pd.DataFrame:
-    """Return rows of table `dynamic_fit` for the largest force anywhere in strokes, over their sliding force.
+    """Return rows of table `dynamic_fit` for the largest force in strokes over their sliding force.
 
-    It may come at the end as well as at the start, so it describes strokes and is no break-away; where it lies stands
-    in `reason`.
+    It may be at the end of a stroke as well as at its start, so it is no break-away; `reason` has its position.
 
     Parameters
     ----------
     found : DataFrame
-        What `peaks` gave for whole strokes, and the condition, commanded speed and direction of each unit.
+        Result of `peaks` for whole strokes, with the condition, commanded speed and direction of each unit.
     config : Config
         Gives the units.
     """
@@ -168,11 +169,11 @@ class _Lines:
         self.force, self.slope, self.distance, self.extent, self.rows = values.reshape(-1, len(names)).T
 
     def at(self, distance_mm: np.ndarray) -> np.ndarray:
-        """Return the force that sliding would have had at distances, shape (strokes, n)."""
+        """Return the extrapolated sliding force at distances, shape (strokes, n)."""
         return self.force[:, None] + self.slope[:, None] * (distance_mm - self.distance[:, None])
 
     def error(self, distance_mm: np.ndarray) -> np.ndarray:
-        """Return the standard error of that at one distance each, in standard deviations of a sample."""
+        """Return the standard error of `at` at one distance per stroke, in standard deviations of a sample."""
         away = (distance_mm - self.distance) / np.maximum(self.extent, 1e-300)
         return np.sqrt(1 / self.rows + away**2)
 
@@ -192,7 +193,7 @@ def _pooled(values: pd.DataFrame, groups: Sequence[pd.Series]) -> tuple[dict[str
 
 
 def _units(group: np.ndarray, file: np.ndarray) -> np.ndarray:
-    """Return the number of each stroke's unit of evidence: its file; the stroke itself where its group has one file."""
+    """Return the number of each stroke's unit of evidence: its file, or the stroke itself if its group has one file."""
     each = np.arange(len(file))
     first = np.searchsorted(group, group)  # groups lie one after the other
     alone = np.bincount(group, file != file[first], minlength=1)[group] == 0
@@ -201,28 +202,25 @@ def _units(group: np.ndarray, file: np.ndarray) -> np.ndarray:
 
 
 def _mean_of(values: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return the mean of the known values of every unit, shape (units,); NaN where none is."""
+    """Return the mean of the known values of every unit, shape (units,); NaN if there is none."""
     known = np.isfinite(values)
     n = np.bincount(unit, known)
     return np.where(n > 0, np.bincount(unit, np.where(known, values, 0.0)) / np.maximum(n, 1), np.nan)
 
 
 def _places(above: np.ndarray, hits: np.ndarray, unit: np.ndarray, cells: Cells) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cell where the mean of a group's other units is largest for each stroke, shape (strokes,), and that
-    where the mean of all is, shape (groups,).
+    """Return the cells of the peaks: for each stroke from its group's other units, for each group from all units.
 
     Parameters
     ----------
     above, hits : ndarray, shape (strokes, cells)
-        Sum of the force above sliding over a window about each cell, and of how many cells.
+        Sum of the force above sliding over a window about each cell, and number of cells in the sum.
     unit : ndarray of int, shape (strokes,)
-        Of evidence.
-    cells : Cells
-        Of the strokes.
+        Unit of evidence of each stroke.
     """
 
     def highest(total: np.ndarray, count: np.ndarray) -> np.ndarray:
-        sure = count > count.max(axis=1, keepdims=True) / 2  # a mean of few is mostly noise
+        sure = count > count.max(axis=1, keepdims=True) / 2  # means of fewer cells are too noisy
         return np.argmax(np.where(sure, total / np.maximum(count, 1), -np.inf), axis=1)
 
     of = cells.groups.of
@@ -238,7 +236,7 @@ def _places(above: np.ndarray, hits: np.ndarray, unit: np.ndarray, cells: Cells)
 
 
 def _window(values: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Return the sum over each cell and `half`, shape (strokes,), cells to either side, shape of `values`."""
+    """Return the sums over each cell and `half`, shape (strokes,), cells on each side, shape of `values`."""
     most, columns = int(half.max()), values.shape[1]
     padded = np.pad(values.astype(float), ((0, 0), (most, most)))
     total = values.astype(float)

@@ -1,4 +1,4 @@
-"""The beginnings of a condition's strokes, averaged over cells of distance and followed by the bristle model."""
+"""The starts of the strokes of a condition: averages over cells of distance, and the bristle model."""
 
 from __future__ import annotations
 
@@ -14,29 +14,30 @@ from sealfit.ingest.stored_parts import noise_from_bends
 from sealfit.physics import bristle_limit
 
 # ---------------------------------------------------------------- cells
-# Strokes in groups, averaged over cells of distance: all groups of a condition together.
+# Strokes in groups, averaged over cells of distance.
 
-MOST_CELLS = 200  # of the distance over which strokes are averaged
+# Largest number of cells of a group.
+MOST_CELLS = 200
 
 
 class Cells:
-    """Cells of distance, for groups of strokes that lie one after the other.
+    """Cells of distance for groups of strokes.
 
-    The cells of a group reach as far as half of its strokes do and are as many as such a stroke has samples,
-    MOST_CELLS at most. Arrays have as many columns as the group with most cells has.
+    The cells of a group extend to the median distance of its strokes. Their number is the median number of samples of a
+    stroke, at most MOST_CELLS. Arrays are padded to the largest number of cells.
 
     Attributes
     ----------
     parts : sequence of Part, length strokes
-        The strokes, those of a group one after the other.
+        The strokes; those of a group are adjacent.
     groups : Pieces
-        Which strokes are of which group.
+        The strokes of each group.
     count : ndarray of int, shape (groups,)
-        Cells of each group.
+        Number of cells of each group.
     samples, reach_mm : ndarray, shape (groups,)
-        Median number of samples of a stroke, and the distance that half of the strokes reach.
+        Median number of samples of a stroke, and median distance.
     middle_mm : ndarray, shape (groups, cells)
-        Middle of each cell.
+        Midpoint of each cell.
     """
 
     def __init__(self, parts: Sequence[Part], group: np.ndarray) -> None:
@@ -50,7 +51,7 @@ class Cells:
         self.count = np.clip(self.samples.astype(int), LEAST, MOST_CELLS)
         width = int(self.count.max(initial=0))
         self.middle_mm = (np.arange(width) + 0.5) * (self.reach_mm / self.count)[:, None]
-        # The cell of every sample in a flat array, one column more taking what lies beyond.
+        # The cell of every sample in a flat array; samples beyond the last cell are in an extra column.
         distance = np.concatenate([part.distance_mm for part in parts]) if len(parts) else np.zeros(0)
         count = np.repeat(self.groups.spread(self.count), self._size)
         cell = (distance / np.repeat(self.groups.spread(self.reach_mm), self._size) * count).astype(np.int64)
@@ -60,7 +61,7 @@ class Cells:
 
     @cached_property
     def own(self) -> np.ndarray:
-        """Which cells are those of a stroke's group, shape (strokes, cells)."""
+        """Mask of the cells of a stroke's group, shape (strokes, cells)."""
         return np.arange(self._shape[1] - 1) < self.groups.spread(self.count)[:, None]
 
     @cached_property
@@ -68,35 +69,33 @@ class Cells:
         return np.bincount(self._cell, minlength=self._shape[0] * self._shape[1]).reshape(self._shape)[:, :-1]
 
     def means(self, values: Sequence[np.ndarray]) -> np.ndarray:
-        """Return each stroke's mean in each cell, shape (strokes, cells); NaN where it has no sample.
+        """Return each stroke's mean in each cell, shape (strokes, cells); NaN without a sample.
 
         Parameters
         ----------
         values : sequence of ndarray, shape (n,) each
-            What is averaged, a number per sample of each stroke.
+            Values of the samples of each stroke.
         """
         total = np.bincount(self._cell, np.concatenate(values), minlength=self._shape[0] * self._shape[1])
         return np.where(self._hits > 0, total.reshape(self._shape)[:, :-1] / np.maximum(self._hits, 1), np.nan)
 
     @cached_property
     def force_N(self) -> np.ndarray:
-        """Each stroke's mean force, as `means` has it."""
+        """Mean force of each stroke in each cell, shape (strokes, cells)."""
         return self.means([part.force_N for part in self.parts])
 
     def totals(self, values: np.ndarray) -> np.ndarray:
-        """Return the sum of values of strokes, shape (strokes, ...), over every group, shape (groups, ...)."""
+        """Return the sums over groups, shape (groups, ...), of values of strokes, shape (strokes, ...)."""
         return np.add.reduceat(values, self.groups.start, axis=0)
 
 
 def mean_over(cells: Cells, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean of strokes in each cell of their group, its standard error and how many, (groups, cells) each.
+    """Return the mean over strokes in each cell of a group, its standard error and their number, (groups, cells) each.
 
     Parameters
     ----------
-    cells : Cells
-        Of the strokes.
     values : ndarray, shape (strokes, cells)
-        NaN where a stroke has none.
+        Values, NaN if missing.
     """
     there = np.isfinite(values)
     n = cells.totals(there.astype(np.int64))
@@ -107,28 +106,35 @@ def mean_over(cells: Cells, values: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 # ---------------------------------------------------------------- rises
-# The beginnings of a condition's strokes, which the bristles follow step by step, all strokes together.
+# The starts of the strokes of a condition, simulated with the bristle model.
 
-STIFFNESSES = 40  # of the grid: the rise's length from a third of a step to the whole stroke
-COARSE = 4  # of them lie between two that are tried first: where the best is, the others follow
-DAMPINGS = np.array([0.0, 0.01, 0.03, 0.1, 0.3, 1.0])  # of the grid: tau as a share of the time that the rise takes
-SHARE = (0.02, 0.98)  # of the rise: samples in between show its length
-FAR = 500.0  # rise lengths after which nothing is left; more of them overflow
-APART = 1e-10  # of what level and start would explain alone: what tells one from the other
+# Grid values of the stiffness. The length of the rise goes from a third of a step to the whole stroke.
+STIFFNESSES = 40
+# Every such grid value is tried first, then all values around the best.
+COARSE = 4
+# Grid values of the damping: tau as a share of the duration of the rise.
+DAMPINGS = np.array([0.0, 0.01, 0.03, 0.1, 0.3, 1.0])
+# Samples between these shares of the rise determine its length.
+SHARE = (0.02, 0.98)
+# Number of rise lengths after which the exponential is zero; larger exponents overflow.
+FAR = 500.0
+# Level and start are not distinguishable if the determinant of their normal equations is below this share of the
+# product of its diagonal.
+APART = 1e-10
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """A stroke from where it begins to move to where it slides steadily, in the direction of its motion.
+    """A stroke from the start of motion to steady sliding.
 
     Attributes
     ----------
     file, run : int
-        Numbers of its file and run; of the stroke itself, where there is one file or run alone.
+        Number of its file and run, or of the stroke itself if there is only one file or run.
     share : float
-        Its limit over that of the condition's curve.
+        Ratio of its steady bristle force to that of the condition's curve.
     distance_mm, speed_mm_s, force_N : ndarray, shape (n,)
-        Distance slid, smoothed; speed; force against the motion.
+        Smoothed distance slid; speed; force opposing the motion.
     """
 
     file: int
@@ -143,7 +149,7 @@ class Stroke:
 class Curve:
     """The Stribeck curve of a condition under its load, in N: F_s, F_c; v_s in mm/s (inf: flat), sigma_2 in N s/mm.
 
-    `covariance`, shape (4, 4), is of these four in this order, with `df` degrees of freedom.
+    `covariance`, shape (4, 4), is that of these four in this order, with `df` degrees of freedom.
     """
 
     static_N: float
@@ -155,11 +161,11 @@ class Curve:
 
     @property
     def known(self) -> bool:
-        """Whether it bends at all."""
+        """Whether the curve is determined; it is flat otherwise."""
         return bool(np.isfinite(self.v_s))
 
     def moved(self) -> Iterator[Curve]:
-        """Yield the curve moved by one standard deviation along each principal axis of its covariance."""
+        """Yield the curve changed by one standard deviation along each principal axis of its covariance."""
         size = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         unit = np.where(size > 0, size, 1.0)
         variance, axes = np.linalg.eigh(self.covariance / np.outer(unit, unit))
@@ -170,7 +176,7 @@ class Curve:
                 yield replace(self, static_N=static, coulomb_N=coulomb, v_s=max(v_s, 0.1 * self.v_s), sigma_2=sigma_2)
 
     def limit_N(self, speed_mm_s: np.ndarray) -> np.ndarray:
-        """Return G, the bristles' force in steady sliding, of the shape of the speed."""
+        """Return G, the bristle force in steady sliding in N, shape of the speed."""
         if not self.known:
             return np.full(np.shape(speed_mm_s), self.coulomb_N)
         return bristle_limit(speed_mm_s, 1.0, mu_s=self.static_N, mu_c=self.coulomb_N, v_s=self.v_s, sigma_0=1.0)
@@ -178,16 +184,16 @@ class Curve:
 
 @dataclass(frozen=True)
 class Tangent:
-    """What is left of the forces at (log sigma_0, tau), and how it changes, per stroke padded with zeros.
+    """Residual of the forces at (log sigma_0, tau), and its derivative; strokes are padded with zeros.
 
     Attributes
     ----------
     level, begin : ndarray, shape (strokes,)
-        Level over the curve's, and the bristles' force at the start over it, in N: solved for exactly.
+        Force relative to the curve, and bristle force at the start in N: the linear parameters.
     residual : ndarray, shape (strokes, rows)
         Measured minus model.
     jacobian : ndarray, shape (2, strokes, rows)
-        Its derivative, the two linear numbers following.
+        Derivative of the residual, the linear parameters at their optimum.
     """
 
     level: np.ndarray
@@ -213,8 +219,10 @@ class Tangent:
 
 @dataclass(frozen=True)
 class _Columns:
-    """The forces that are linear in tau: whole[0] + tau whole[1] from relaxed bristles, start[0] + tau start[1] what a
-    start of 1 N adds; shape (2, strokes, rows) each."""
+    """The columns of level and start, linear in tau, shape (2, strokes, rows) each.
+
+    whole[0] + tau whole[1] is the force from relaxed bristles, start[0] + tau start[1] that of a start of 1 N.
+    """
 
     whole: np.ndarray
     start: np.ndarray
@@ -224,7 +232,7 @@ class _Columns:
 
 
 class Rises:
-    """The strokes of a condition, padded to one length, so that all are followed together."""
+    """The strokes of a condition, padded to one length and simulated together."""
 
     def __init__(self, strokes: Sequence[Stroke], curve: Curve) -> None:
         sizes = np.array([s.force_N.size for s in strokes])
@@ -254,7 +262,7 @@ class Rises:
         return other
 
     def _columns(self, sigma_0: float, *, slopes: bool) -> list[_Columns]:
-        """Return the forces at a stiffness, and with `slopes` their derivative with respect to its logarithm."""
+        """Return the columns at a stiffness, and with `slopes` their derivatives with respect to its logarithm."""
         slid = sigma_0 * self.lengths
         kept = np.exp(-slid)
         bristles = _followed(slid, (1 - kept) * self.between)
@@ -275,7 +283,7 @@ class Rises:
     def tangent(self, at: np.ndarray) -> Tangent:
         """Return the residual at (log sigma_0, tau), and its derivative.
 
-        The derivative of the linear numbers is that of their normal equations (Golub and Pereyra 1973).
+        The derivative of the linear parameters is that of their normal equations (Golub and Pereyra 1973).
         """
         (columns, slopes), tau = self._columns(float(np.exp(at[0])), slopes=True), float(at[1])
         both = np.stack(columns.at(tau), axis=1)  # (strokes, 2, rows)
@@ -297,8 +305,7 @@ class Rises:
         return linear[:, 0, 0], self.force - (linear * both).sum(axis=1)
 
     def best_of_grid(self) -> tuple[np.ndarray, tuple[float, float]]:
-        """Return where on a grid the sum of squares is least: (log sigma_0, tau), and the least and largest of the
-        grid's log sigma_0."""
+        """Return the best point of a grid, (log sigma_0, tau), and the range of log sigma_0 of the grid."""
         level = float(np.median(self.limit[self.there]))
         steps = self.step[self.step > 0]
         lengths = np.geomspace(0.3 * np.median(steps), self.step.sum(axis=1).max(), STIFFNESSES)
@@ -319,7 +326,7 @@ class Rises:
         return np.array([np.log(level / lengths[best]), found[best][1]]), (float(low), float(high))
 
     def _squares(self, sigma_0: float, tau: np.ndarray) -> np.ndarray:
-        """Return the sum of squares at one stiffness and every damping, shape of `tau`, from the columns' products."""
+        """Return the sums of squares at one stiffness and all dampings, shape of `tau`."""
         columns = self._columns(sigma_0, slopes=False)[0]
         parts = np.stack([*columns.whole, *columns.start], axis=1)  # (strokes, 4, rows)
         products, moments = parts @ parts.transpose(0, 2, 1), parts @ self.force[..., None]
@@ -333,11 +340,11 @@ class Rises:
         return total - (solved * moment).sum(axis=(1, 2, 3))
 
     def noise_N(self) -> float:
-        """Return the noise of a sample, from how neighbours bend."""
+        """Return the standard deviation of a sample in N, from second differences."""
         return noise_from_bends(np.diff(self.force, 2, axis=1)[self.there[:, 2:]])
 
     def gain_of(self, rss: float) -> float:
-        """Return how much better a fit is than a force that is there after one row, in its own residual variances."""
+        """Return the fall of the sum of squares from a force that is constant after one row, in residual variances."""
         there = self.there[:, 1:]
         force = self.force[:, 1:]
         mean = force.sum(axis=1) / there.sum(axis=1)
@@ -346,7 +353,7 @@ class Rises:
         return (flat - rss) / max(rss / self.there.sum(), rounding)
 
     def forces(self, residual: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return every stroke's fitted force, from the residual of all samples, shape (strokes, rows)."""
+        """Return the fitted forces of the strokes from the residual, shape (strokes, rows)."""
         fitted = self.force - residual
         return tuple(own[:n] for own, n in zip(fitted, self.there.sum(axis=1).tolist(), strict=True))
 
@@ -355,23 +362,23 @@ class Rises:
         return np.bincount(self.run, np.log(np.maximum(levels, 1e-6))) / np.bincount(self.run)
 
     def inside(self, sigma_0: float, levels: np.ndarray, start_N: np.ndarray) -> int:
-        """Return how many samples lie inside the rise."""
+        """Return the number of samples inside the rise."""
         slid = np.cumsum(self.step, axis=1)
-        bent = 1 - start_N / np.maximum(levels * self.limit[:, 0], 1e-300)
-        left = np.exp(-slid * sigma_0 / self.limit) * bent[:, None]
-        return int(((left > 1 - SHARE[1]) & (left < 2 - SHARE[0]) & (slid > 0) & self.there).sum())
+        height = 1 - start_N / np.maximum(levels * self.limit[:, 0], 1e-300)
+        remaining = np.exp(-slid * sigma_0 / self.limit) * height[:, None]
+        return int(((remaining > 1 - SHARE[1]) & (remaining < 2 - SHARE[0]) & (slid > 0) & self.there).sum())
 
 
 def _followed(slid: np.ndarray, added: np.ndarray, begin: np.ndarray | float = 0.0) -> np.ndarray:
-    r"""Return x of :math:`x_k = e^{-s_k} x_{k-1} + a_k` along the last axis, from x before the first.
+    r"""Return x of the recursion :math:`x_k = e^{-s_k} x_{k-1} + a_k` along the last axis.
 
-    With D the sum of s up to a row, :math:`x_k = e^{-D_k} (x_{-1} + \sum_j a_j e^{D_j})`; where that would overflow,
-    one half of the rows after the other.
+    With D the cumulative sum of s, :math:`x_k = e^{-D_k} (x_{-1} + \sum_j a_j e^{D_j})`. If that would overflow, the
+    rows are split in two halves.
 
     Parameters
     ----------
     slid, added : ndarray, shape (strokes, rows)
-        s, not negative, and a.
+        s >= 0, and a.
     begin : float or ndarray, shape (strokes, 1)
         x before the first row.
     """
@@ -387,7 +394,7 @@ def _followed(slid: np.ndarray, added: np.ndarray, begin: np.ndarray | float = 0
 
 
 def _inverse(gram: np.ndarray) -> np.ndarray:
-    """Return the inverse of products of two columns, shape (..., 2, 2); of the first alone where both are alike."""
+    """Return the inverse of Gram matrices of two columns, shape (..., 2, 2); of the first alone if dependent."""
     ww, ss, ws = gram[..., 0, 0], gram[..., 1, 1], gram[..., 0, 1]
     own = ww * ss - ws**2
     apart = own > APART * ww * ss

@@ -1,4 +1,4 @@
-"""The dynamic part of the model per condition: sigma_0 and sigma_1 from how the force comes up, and break-away."""
+"""The dynamic part of the model per condition: sigma_0 and sigma_1 from pre-sliding, and the break-away force."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
 
 # ---------------------------------------------------------------- bristle rows
-# What a condition's table says of sigma_0 and sigma_1, and why where one of them is not determined.
+# Rows of table `dynamic_fit` for sigma_0 and sigma_1, with the reason if one of them is not determined.
 
 NO_START = "no stroke begins at rest or at a reversal within its rows: the rise of the force is not in these traces"
 ALONG = "the sliding force of some strokes lies along the motion: check the offset between the directions, and the sign"
-TOO_FAST = "the force comes up within a few samples: sample faster, or start more slowly"
-MISSED = "the force does not come up as the model's does: {share:.0%} of the sliding force is left"
-NO_CURVE = "the Stribeck curve is not known: what it does along the ramp looks like damping"
+TOO_FAST = "the force rises within a few samples: sample faster, or start more slowly"
+MISSED = "the rise of the force differs from the model's: the residual is {share:.0%} of the sliding force"
+NO_CURVE = "the Stribeck curve is not known: its effect along the ramp cannot be distinguished from damping"
 ONE_START = "one start alone: no scatter is known; measure repeats"
 WIDE = "the starts disagree: only that it lies between {low:.3g} and {high:.3g} {unit} is known"
 
 
 def bristle_rows(found: Stiffness | None, curve: Curve, config: Config, *, braked: bool = True) -> Iterator[dict]:
-    """Yield rows of table `dynamic_fit` for one condition: sigma_0, sigma_1 and what the fit rests on.
+    """Yield rows of table `dynamic_fit` for one condition: sigma_0, sigma_1 and statistics of the fit.
 
     Parameters
     ----------
     found : Stiffness or None
-        None where no stroke shows its beginning.
+        Estimates; None if no stroke has a recorded start.
     curve : Curve
-        That the strokes were fitted with.
+        Stribeck curve of the fit.
     config : Config
         Gives the units and the sensor's accuracy.
     braked : bool
-        Whether the sliding force of every stroke opposes the motion.
+        Whether the sliding force of every stroke opposes its motion.
     """
     units = dynamic_units(config)
     if found is None or not found.seen:
@@ -103,12 +103,13 @@ def dynamic_units(config: Config) -> Mapping[str, str]:
 
 
 # ---------------------------------------------------------------- dynamic
-# The dynamic part of the model per condition: sigma_0 and sigma_1 from how the force comes up, and the break-away.
+# The fit of all conditions.
 
-OF_TRACES = ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]  # columns that are read
+# Columns of table `traces` that are read.
+OF_TRACES = ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]
 
-
-Columns = dict[str, np.ndarray]  # of a table, all of one length
+# Columns of a table, all of one length.
+Columns = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -132,28 +133,28 @@ def fit_dynamic(
     Parameters
     ----------
     traces : DataFrame or sequence of StoredTraces
-        Table `traces`, or where it lies: then no more of it is read at once than some conditions have.
+        Table `traces`, or its stored partitions, which are read one at a time.
     steady : DataFrame
         Table `steady` or `steady_after`; rows with `used` false are left out.
     steady_fit : DataFrame
-        Its table `steady_fit`: the Stribeck curve of each condition; flat where that is not identified.
+        Its table `steady_fit` with the Stribeck curve of each condition; a curve that is not identified is flat.
     config : Config
         Names the condition columns, the units and the sensor's accuracy.
     workers : int
-        Processes.
+        Number of processes.
 
     Returns
     -------
     Dynamic
-        In its fit `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (rows per commanded speed and direction: the
-        force, and its share of the sliding force), "largest" (the same rows: the largest force anywhere in the strokes
-        over the sliding force) or "statistics". Its curves are the mean starts and the model's.
+        In its fit `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (per commanded speed and direction: the
+        force, and its ratio to the sliding force), "largest" (likewise: ratio of the largest force in the strokes to
+        the sliding force) or "statistics". Its curves are the mean starts, measured and fitted.
 
     Notes
     -----
-    Files are the units of evidence for the length of the rise, runs for the level of the force; strokes where there is
-    one file or run alone. Intervals of sigma_0 are symmetric in its logarithm. `u_sys` takes the sensor's accuracy as
-    one unknown error of the force's size, the same for all samples.
+    The unit of evidence is the file for the length of the rise and the run for the level of the force; it is the stroke
+    if there is only one file or run. Intervals of sigma_0 are symmetric in its logarithm. `u_sys` assumes one unknown
+    error of |force| for all samples.
     """
     steady = steady[steady["used"].astype(bool) & steady["condition"].notna()].reset_index(drop=True)
     asked = _asked(traces, steady, steady_fit)
@@ -184,7 +185,7 @@ class _Asked:
 
 @dataclass(frozen=True)
 class _Found:
-    """What one condition gives: rows of the fit, and columns of mean starts, break-aways and largest forces."""
+    """Results of one condition: rows of the fit, and columns of mean starts, break-aways and largest forces."""
 
     name: str
     rows: list[dict]
@@ -196,7 +197,7 @@ class _Found:
 def _asked(
     traces: pd.DataFrame | Sequence[StoredTraces], steady: pd.DataFrame, steady_fit: pd.DataFrame
 ) -> list[_Asked]:
-    """Return what is to be fitted, in pieces that are read together."""
+    """Return the conditions to fit, in partitions that are read together."""
     if isinstance(traces, pd.DataFrame):
         return [_Asked(traces, steady, steady_fit)]
     piece = {condition: k for k, part in enumerate(traces) for condition in part.conditions}
@@ -207,7 +208,7 @@ def _asked(
 
 
 def _stacked(found: Sequence[_Found], name: str) -> pd.DataFrame:
-    """Return the columns of that name of all conditions, one below the other, with the condition."""
+    """Return the columns in one attribute of all conditions as one table, with the condition."""
     parts = [(one.name, getattr(one, name)) for one in found if getattr(one, name)]
     if not parts:
         return pd.DataFrame()
@@ -262,7 +263,7 @@ def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
 
 
 def _less_effects(strokes: Sequence[Along], steady: pd.DataFrame) -> Sequence[Along]:
-    """Return strokes less the effects' force where they start, if table `steady` holds it."""
+    """Return strokes minus the effects' force at their start, if table `steady` has it."""
     if "effects_start_N" not in steady:
         return strokes
     size = (steady["effects_start_N"] * steady["direction"]).tolist()
@@ -280,13 +281,13 @@ class _Grouped:
         self.at = {"speed_set_mm_s": strokes.speed_set_mm_s[first], "direction": strokes.direction[first]}
 
     def peaks(self) -> Columns:
-        """Return the columns of `peaks`, and the speed and direction."""
+        """Return the columns of `peaks`, with speed and direction."""
         found = peaks(self.cells, self.file)
         group = found.pop("group")
         return {**{name: values[group] for name, values in self.at.items()}, **found}
 
     def curves(self, models: Sequence[np.ndarray] | None) -> Columns:
-        """Return the mean starts, and those of the fitted model where there is one, as table `dynamic_curves`."""
+        """Return the mean starts, measured and, if there is a fit, of the model, as table `dynamic_curves`."""
         force, error, n = mean_over(self.cells, self.cells.force_N)
         model = np.full(n.shape, np.nan) if models is None else mean_over(self.cells, self.cells.means(models))[0]
         group, cell = np.nonzero(n > 0)
@@ -305,17 +306,17 @@ def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
 
 
 def _against_motion(starts: Sequence[Start], strokes: _Strokes) -> bool:
-    """Whether the sliding force of every start opposes the motion, as a bristle's does.
+    """Return whether the sliding force of every start opposes the motion, as the model needs.
 
-    An offset between the directions, or a wrong sign, can turn it round; bristles then have no force to come up to.
+    An offset between the directions or a wrong sign can reverse it.
     """
     return all(strokes.size_N[start.row] > 0 for start in starts)
 
 
 def _evidence(starts: Sequence[Start], strokes: _Strokes, run: np.ndarray, curve: Curve) -> list[Stroke]:
-    """Return the starts of a condition with their units of evidence and their share of the curve.
+    """Return the starts of a condition with their units of evidence and their ratio to the curve.
 
-    That is their load's; where the curve is flat, as the speeds do not tell it, that of their own sliding force.
+    The ratio is that of the loads, or of the sliding forces if the curve is not determined.
     """
     rows = np.array([start.row for start in starts], int)
     size = (strokes.load_N if curve.known else strokes.size_N)[rows]
@@ -329,12 +330,12 @@ def _evidence(starts: Sequence[Start], strokes: _Strokes, run: np.ndarray, curve
 
 
 def _numbered(numbers: np.ndarray) -> np.ndarray:
-    """Return the number of each stroke's file or run; the strokes' own where there is one alone."""
+    """Return the number of each stroke's file or run; that of the stroke if there is only one."""
     return numbers if (numbers != numbers[:1]).any() else np.arange(len(numbers))
 
 
 def _fitted(steady_fit: pd.DataFrame) -> dict[str, dict[tuple[str, str], float]]:
-    """Return the numbers of table `steady_fit` by condition, quantity and parameter; identified parameters only."""
+    """Return the values of table `steady_fit` by condition, quantity and parameter; identified parameters only."""
     made: dict[str, dict[tuple[str, str], float]] = {}
     names = ("condition", "quantity", "parameter", "value", "identified")
     for condition, quantity, parameter, value, identified in zip(
@@ -346,7 +347,7 @@ def _fitted(steady_fit: pd.DataFrame) -> dict[str, dict[tuple[str, str], float]]
 
 
 def _curve(fitted: Mapping[tuple[str, str], float], strokes: _Strokes, rows: np.ndarray) -> Curve:
-    """Return a condition's Stribeck curve under its mean load; flat at its mean force where it is not identified."""
+    """Return a condition's Stribeck curve under its mean load; flat at its median force if not identified."""
     load = strokes.load_N[rows].mean()
     sigma_2 = max(float(fitted.get(("steady", "sigma_2"), 0.0)), 0.0)
     flat = float(np.median(strokes.size_N[rows] - sigma_2 * np.abs(strokes.speed_mm_s[rows])))
@@ -361,7 +362,7 @@ def _curve(fitted: Mapping[tuple[str, str], float], strokes: _Strokes, rows: np.
 
 
 def _covariance(fitted: Mapping[tuple[str, str], float], names: Sequence[str]) -> np.ndarray:
-    """Return the covariance of a steady fit's parameters, shape (p, p), zero where it is not known."""
+    """Return the covariance of a steady fit's parameters, shape (p, p), 0 if unknown."""
     covariance = np.zeros((len(names), len(names)))
     for i, one in enumerate(names):
         for j, other in enumerate(names):

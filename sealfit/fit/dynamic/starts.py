@@ -1,4 +1,4 @@
-"""The beginnings of strokes: from where the platform begins to move, along a ramp, to where it slides steadily."""
+"""The starts of strokes: from the first motion of the platform, along a ramp of speed, to steady sliding."""
 
 from __future__ import annotations
 
@@ -15,34 +15,30 @@ from sealfit.ingest.segments import median
 from sealfit.ingest.stored_parts import noise_from_bends, stroke_index, strokes_of
 
 # ---------------------------------------------------------------- ramps
-# The motion of platforms that start along a ramp of two numbers, fitted to many strokes together.
+# The motion of a platform that starts along a ramp of speed with two parameters, fitted to many strokes together.
 
-# Steps in time that a ramp may take, to begin with.
+# Starting values of the length of a ramp, in time steps.
 RAMPS = np.geomspace(0.5, 200.0, 12)
-
-# The rows of every stroke are padded to a multiple of this, so that its sums do not depend on which strokes are fitted
-# together.
+# The rows of every stroke are padded to a multiple of this, so that sums do not depend on the strokes fitted together.
 PADDED = 64
-
-# Rows of strokes that are fitted together, at most.
+# Largest number of rows fitted together.
 TOGETHER = 16_384
-
-# The logarithm of a ramp's length in s stays within this of 0.
+# Bound of |ln(length of a ramp in s)|.
 LONGEST = 50.0
 
 
 @dataclass(frozen=True)
 class Ramp:
-    """The motion along a fitted ramp, up to the last row that it was fitted to.
+    """The motion along a fitted ramp.
 
     Attributes
     ----------
     distance_mm, speed_mm_s : ndarray, shape (n,)
-        Distance and speed.
+        Distance and speed at the fitted rows.
     final_mm_s : float
-        Speed that it comes to.
+        Speed after the ramp.
     rms_mm : float
-        What the fit leaves of the displacement.
+        RMS residual of the displacement.
     """
 
     distance_mm: np.ndarray
@@ -53,7 +49,7 @@ class Ramp:
 
 @dataclass(frozen=True)
 class _Rows:
-    """The rows of strokes, padded: time, displacement about its mean, and where there is a row, (strokes, rows)."""
+    """The padded rows of strokes: time, displacement minus its mean, and mask of rows, shape (strokes, rows) each."""
 
     time: np.ndarray
     along: np.ndarray
@@ -67,7 +63,7 @@ class _Rows:
         return _Rows(self.time[strokes], self.along[strokes], self.there[strokes])
 
     def centred(self, values: np.ndarray) -> np.ndarray:
-        """Return values about their stroke's mean, 0 where there is no row."""
+        """Return values minus their stroke's mean, 0 in padding."""
         mean = np.einsum("kr,kr->k", values, self.there) / self.there.sum(axis=1)
         return (values - mean[:, None]) * self.there
 
@@ -75,25 +71,24 @@ class _Rows:
 def fit_ramps(
     times_s: Sequence[np.ndarray], alongs_mm: Sequence[np.ndarray], paces_mm_s: Sequence[float]
 ) -> list[Ramp]:
-    """Return the motion of platforms that start along a straight or a lagging ramp, whichever is closer.
+    """Return the motion of platforms along a linear ramp or a first-order lag, whichever fits better.
 
-    Noise of the displacement makes a local speed of little use where the speed changes most; a ramp of two numbers,
-    its beginning and its length, does not care. Place and final speed are linear and solved for exactly (variable
-    projection: Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995), the other two by Levenberg-Marquardt from the best
-    of a grid of lengths.
+    A local speed is too noisy where the speed changes most; the two parameters of a ramp, beginning and length, use all
+    samples. Position and final speed are linear and solved for exactly (variable projection: Kaufman 1975, BIT 15,
+    49-57, doi:10.1007/BF01932995). Beginning and length are fitted by Levenberg-Marquardt from the best of a grid.
 
     Parameters
     ----------
     times_s, alongs_mm : sequence of ndarray, shape (n,) each
-        Time and displacement of every stroke, counted along its motion.
+        Time and displacement of every stroke, positive along its motion.
     paces_mm_s : sequence of float
-        About how fast it is in the end.
+        Approximate final speed.
     """
     made: list[Ramp | None] = [None] * len(times_s)
-    alike: dict[int, list[int]] = {}
+    of_length: dict[int, list[int]] = {}
     for k, time in enumerate(times_s):
-        alike.setdefault(-(-len(time) // PADDED) * PADDED, []).append(k)
-    for rows, members in alike.items():
+        of_length.setdefault(-(-len(time) // PADDED) * PADDED, []).append(k)
+    for rows, members in of_length.items():
         size = max(TOGETHER // rows, 1)
         for group in (members[i : i + size] for i in range(0, len(members), size)):
             fitted = _fit_some(*([values[k] for k in group] for values in (times_s, alongs_mm, paces_mm_s)), rows)
@@ -105,13 +100,13 @@ def fit_ramps(
 def _fit_some(
     times_s: Sequence[np.ndarray], alongs_mm: Sequence[np.ndarray], paces_mm_s: Sequence[float], rows: int
 ) -> list[Ramp]:
-    """Return `fit_ramps` of strokes that are padded to that number of rows."""
+    """Return `fit_ramps` of strokes padded to a number of rows."""
     sizes = np.array([len(time) for time in times_s])
     there = np.arange(rows) < sizes[:, None]
     time, along = np.zeros(there.shape), np.zeros(there.shape)
     time[there], along[there] = np.concatenate(times_s), np.concatenate(alongs_mm)
     step = np.array([median(np.diff(time)) for time in times_s])
-    # When it would have started at full speed.
+    # Time at which a start at full speed would have given the same displacement.
     each, last = np.arange(len(sizes)), sizes - 1
     lagged = time[each, last] - (along[each, last] - along[:, 0]) / paces_mm_s
     padded = _Rows.of(time, along, there)
@@ -129,8 +124,11 @@ Shape = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def _fit_shape(rows: _Rows, shape: Shape, lagged: np.ndarray, lag: float, step: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the ramps of one shape that fit best: distance and speed where it comes to 1, (strokes, rows) each, the
-    speed that it does come to, and the sum of squares, (strokes,) each."""
+    """Return the best ramps of one shape.
+
+    Returns distance and speed for a final speed of 1, shape (strokes, rows) each, and the final speed and the sum of
+    squares, shape (strokes,) each.
+    """
     grid = [np.stack([lagged - lag * ramp * step, np.log(ramp * step)], axis=1) for ramp in RAMPS]
     squares = [_solved(rows, rows.centred(_moved(rows, shape, at)[0]))[2] for at in grid]
     at = np.choose(np.argmin(squares, axis=0)[:, None], grid)
@@ -140,7 +138,7 @@ def _fit_shape(rows: _Rows, shape: Shape, lagged: np.ndarray, lag: float, step: 
         distance, rate, by_ramp = _moved(own, shape, at)
         distance = own.centred(distance)
         speed, residual, _ = _solved(own, distance)
-        # residual = along - speed * distance(time - at[0], ramp): its slopes, free of what place and speed take up
+        # residual = along - speed * distance(time - at[0], ramp); position and speed are projected out of its slopes
         slopes = speed[:, None, None] * np.stack([own.centred(rate), -own.centred(by_ramp)], axis=1)
         square = np.einsum("kr,kr->k", distance, distance)
         shared = np.einsum("kir,kr->ki", slopes, distance) / np.maximum(square, 1e-300)[:, None]
@@ -158,7 +156,7 @@ def _moved(rows: _Rows, shape: Shape, at: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _solved(rows: _Rows, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the slope of the displacement on a centred distance, what it leaves, and the sum of squares of that."""
+    """Return the slope of the displacement on a centred distance, the residual, and its sum of squares."""
     square = np.einsum("kr,kr->k", distance, distance)
     slope = np.einsum("kr,kr->k", distance, rows.along) / np.maximum(square, 1e-300)
     residual = rows.along - slope[:, None] * distance
@@ -166,42 +164,48 @@ def _solved(rows: _Rows, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _straight(since: np.ndarray, ramp: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return distance, speed and d distance / d log ramp, for a speed that rises to 1 along a straight line."""
+    """Return distance, speed and d distance / d log ramp, for a speed that rises linearly to 1."""
     share = np.clip(since / ramp, 0.0, 1.0)
     lag = 0.5 * ramp * share**2
     return np.where(since < ramp, lag, since - 0.5 * ramp), share, -lag
 
 
 def _lagging(since: np.ndarray, ramp: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return distance, speed and d distance / d log ramp, for a speed of 1 approached as by a first-order lag."""
+    """Return distance, speed and d distance / d log ramp, for a speed that approaches 1 by a first-order lag."""
     since = np.maximum(since, 0.0)
-    left = np.exp(-since / ramp)
-    return since - ramp * (1 - left), 1 - left, since * left - ramp * (1 - left)
+    decay = np.exp(-since / ramp)
+    return since - ramp * (1 - decay), 1 - decay, since * decay - ramp * (1 - decay)
 
 
 # ---------------------------------------------------------------- starts
-# The beginnings of strokes: from where the platform begins to move to where it slides steadily.
+# The starts of strokes: from the first motion of the platform to steady sliding.
 
-STANDSTILL = 0.05  # slower than this share of the steady speed: not moving yet
-ROUGH = 0.1  # wanted noise of the local speed, as a share of the steady speed
-AS_NOISE = 1.2  # times the noise: what a ramp may leave that is that of the platform
-ROUNDING = 1e-13  # of the displacement: less noise is none, and a local speed says all
-JUST_BEGUN = 0.1  # of the steady window: what sliding is like at its beginning
-LEAST = 4  # rows below which a beginning shows nothing
+# A platform is at rest below this share of the steady speed.
+STANDSTILL = 0.05
+# Largest standard deviation of the local speed, as a share of the steady speed.
+ROUGH = 0.1
+# A ramp is accepted if its RMS residual is at most this multiple of the noise.
+AS_NOISE = 1.2
+# Noise below this share of the displacement is rounding; the local speed is then exact.
+ROUNDING = 1e-13
+# Share of the steady window in which the force at the beginning of sliding is fitted.
+JUST_BEGUN = 0.1
+# Smallest number of rows of a start.
+LEAST = 4
 
 
 @dataclass(frozen=True)
 class Sliding:
-    """The force where steady sliding has just begun, as a line: further on, warming or wear may change it otherwise.
+    """A straight line through the force at the beginning of steady sliding, before much warming or wear.
 
     Attributes
     ----------
     force_N, distance_mm, slope_N_mm : float
-        Mean force, the distance slid there, and how the force changes along it.
+        Mean force, mean distance slid, and slope of the force.
     rows : int
-        Samples that it rests on.
+        Number of samples.
     extent_mm : float
-        Root of the sum of their squared distances from `distance_mm`.
+        Square root of the sum of squared deviations from `distance_mm`.
     """
 
     force_N: float
@@ -223,16 +227,16 @@ class Sliding:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of one stroke, its motion and force positive along it.
+    """A part of one stroke; distance and force are positive in its direction.
 
     Attributes
     ----------
     row : int
         Its row in table `steady`.
     distance_mm, force_N : ndarray, shape (n,)
-        Distance slid, never falling, and the force.
+        Distance slid, not decreasing, and force.
     sliding : Sliding
-        What it comes to.
+        Force at the beginning of steady sliding.
     """
 
     row: int
@@ -243,7 +247,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Start(Part):
-    """The beginning of one stroke, the noise of its displacement smoothed away.
+    """The start of one stroke, with smoothed displacement.
 
     Attributes
     ----------
@@ -256,18 +260,18 @@ class Start(Part):
 
 @dataclass(frozen=True)
 class Along:
-    """A stroke that slides steadily somewhere, counted along its motion.
+    """A stroke with a steady window; displacement and force are positive in its direction.
 
     Attributes
     ----------
     row : int
         Its row in table `steady`.
     pace_mm_s : float
-        How fast it slides.
+        Steady speed.
     time_s, along_mm, force_N : ndarray, shape (n,)
         Time, displacement and force.
     steady : ndarray of bool, shape (n,)
-        Where it slides steadily.
+        Mask of the steady window.
     """
 
     row: int
@@ -284,24 +288,24 @@ class Along:
 
     @cached_property
     def noise_mm(self) -> float:
-        """Noise of the displacement."""
+        """Standard deviation of the displacement's noise."""
         return noise_from_bends(np.diff(self.along_mm, 2))
 
     @property
     def noisy(self) -> bool:
-        """Whether the displacement has noise at all."""
+        """Whether the displacement has noise above rounding."""
         return self.noise_mm > ROUNDING * float(np.abs(self.along_mm[[0, -1]]).max())
 
 
 def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
-    """Return every stroke that slides steadily somewhere.
+    """Return all strokes with a steady window.
 
     Parameters
     ----------
     traces : DataFrame
-        Table `traces`, the samples of a stroke one after the other.
+        Table `traces`; the samples of a stroke are adjacent.
     steady : DataFrame
-        Table `steady`: the strokes.
+        Table `steady`.
     """
     edges, own = strokes_of(traces, stroke_index(steady))
     time, along, force = (traces[name].to_numpy(float) for name in ("time_s", "displacement_mm", "force_N"))
@@ -318,10 +322,10 @@ def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
 
 
 def starts_of(strokes: Sequence[Along]) -> list[Start]:
-    """Return the beginning of every stroke that has one; a stroke whose rows begin in steady sliding has none."""
+    """Return the start of every stroke that has one; a record that begins in steady sliding has none."""
     strokes = [stroke for stroke in strokes if stroke.until >= LEAST]
     noisy = [stroke for stroke in strokes if stroke.noisy]
-    rows = [slice(0, 2 * stroke.until) for stroke in noisy]  # up to steady sliding, and as many after
+    rows = [slice(0, 2 * stroke.until) for stroke in noisy]  # up to steady sliding, and as many rows after
     ramps = fit_ramps(
         [stroke.time_s[own] for stroke, own in zip(noisy, rows, strict=True)],
         [stroke.along_mm[own] for stroke, own in zip(noisy, rows, strict=True)],
@@ -333,7 +337,7 @@ def starts_of(strokes: Sequence[Along]) -> list[Start]:
 
 
 def whole_strokes(strokes: Sequence[Along]) -> list[Part]:
-    """Return every stroke from its first row to its last, the sliding force being the mean of its steady window."""
+    """Return every stroke from its first row to its last; its sliding force is the mean of its steady window."""
     made = []
     for stroke in strokes:
         distance = np.maximum.accumulate(stroke.along_mm - stroke.along_mm[0])
@@ -346,7 +350,7 @@ def whole_strokes(strokes: Sequence[Along]) -> list[Part]:
 
 
 def _begun(stroke: Along, ramp: Ramp | None) -> Start | None:
-    """Return the beginning of a stroke from where it moves, along its ramp if it has one; None where too short."""
+    """Return the start of a stroke from its first motion, along its ramp if that fits; None if too short."""
     until, pace = stroke.until, stroke.pace_mm_s
     on_ramp = ramp is not None and ramp.rms_mm <= AS_NOISE * stroke.noise_mm and ramp.final_mm_s > 0.0
     smooth, speed = (ramp.distance_mm, ramp.speed_mm_s) if on_ramp else _smoothed(stroke)
@@ -362,14 +366,13 @@ def _begun(stroke: Along, ramp: Ramp | None) -> Start | None:
 
 
 def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance and speed up to steady sliding, by a parabola through as many rows to either side as the noise
-    asks for.
+    """Return distance and speed up to steady sliding by a Savitzky-Golay filter of second order.
 
-    Beyond the ends lie the first and the last displacement (Savitzky and Golay 1964, Anal. Chem. 36(8), 1627-1639,
-    doi:10.1021/ac60214a047).
+    Its width depends on the noise, and the ends are padded with the first and last displacement (Savitzky and Golay
+    1964, Anal. Chem. 36(8), 1627-1639, doi:10.1021/ac60214a047).
     """
     half = _half_width(stroke) if stroke.noisy else 1
-    rows = slice(0, stroke.until + half + 1)  # all that the rows before steady sliding see
+    rows = slice(0, stroke.until + half + 1)  # all rows that the filter needs
     along, time = stroke.along_mm[rows], stroke.time_s[rows]
     if half == 1:
         smooth, rate = along, np.gradient(along)
@@ -383,7 +386,7 @@ def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _half_width(stroke: Along) -> int:
-    """Return the rows to either side over which a parabola gives the local speed to `ROUGH` of the steady one."""
+    """Return the half-width of the filter, in rows, that gives the local speed to `ROUGH` of the steady speed."""
     step = stroke.pace_mm_s * median(np.diff(stroke.time_s))
     half = np.arange(1, max(2, len(stroke.time_s) // 16))
     enough = stroke.noise_mm * np.sqrt(3.0 / (half * (half + 1) * (2 * half + 1))) <= ROUGH * step

@@ -6,12 +6,12 @@ Over a stroke the bristles' force :math:`B = \sigma_0 z` follows Eqs. 2 and 6 ex
     \frac{dB}{dx} = \sigma_0 \Big(1 - \frac{B}{G}\Big), \quad F = B + \tau \dot B + \sigma_2 v, \quad
     G = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}], \quad \tau = \sigma_1 / \sigma_0,
 
-with the Stribeck curve G of the condition's steady fit. It is linear in where the bristles begin, so each stroke has
-two linear numbers of its own, its level and its start (relaxed, or bent the other way after a reversal), and they are
-solved for exactly; sigma_0 and tau are searched on a grid and polished (Golub and Pereyra 1973, SIAM J. Numer. Anal.
-10(2), 413-432, doi:10.1137/0710036). The rise shows the length G / sigma_0, and its evidence are whole files, as
-neighbouring samples are not independent; what makes a stiffness of it is the level of the strokes, whose evidence are
-runs, as a set-up shifts all files of a run.
+with the Stribeck curve G of the condition's steady fit. B is linear in its initial value. Each stroke has two linear
+parameters, its level and its initial bristle force (0, or negative after a reversal), which are solved for exactly.
+sigma_0 and tau are searched on a grid and refined (Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432,
+doi:10.1137/0710036). The rise determines the length G / sigma_0; its unit of evidence is the file, as neighbouring
+samples are correlated. The level of the strokes converts it to a stiffness; its unit of evidence is the run, as a
+set-up shifts all files of a run.
 """
 
 from __future__ import annotations
@@ -25,10 +25,14 @@ from scipy.special import stdtrit
 from sealfit.fit.dynamic.bristle_model import Curve, Rises, Stroke, Tangent
 from sealfit.fit.least_squares import levenberg_marquardt
 
-LEAST = 3  # such samples below which nothing can be said
-RISES = 30.0  # residual variances by which a rise must do better than none
-MISSED_NOISE, MISSED_LEVEL = 2.0, 0.03  # of the noise and of the sliding force: what a fit leaves that has missed
-OPEN = np.log(3.0)  # of log sigma_0: an interval that reaches further each way is no estimate
+# Number of samples inside the rise that an estimate needs.
+LEAST = 3
+# Fall of the sum of squares by the rise, in residual variances, that an estimate needs.
+RISES = 30.0
+# A fit disagrees with the data if its RMS residual exceeds these multiples of the noise and of the sliding force.
+MISSED_NOISE, MISSED_LEVEL = 2.0, 0.03
+# Half-width of the 95 % interval of log sigma_0 from which sigma_0 is not determined.
+OPEN = np.log(3.0)
 
 
 @dataclass(frozen=True)
@@ -40,19 +44,19 @@ class Stiffness:
     sigma_0, tau_s : float
         Estimates.
     covariance : ndarray, shape (2, 2)
-        Of log sigma_0 and tau; NaN from fewer than two units.
+        Covariance of log sigma_0 and tau; NaN from fewer than two units.
     df : ndarray, shape (2,)
         Satterthwaite's degrees of freedom of the two.
     within : int
-        Samples inside the rise.
+        Number of samples inside the rise.
     gain : float
-        By how many residual variances a force that is there at once fits worse.
+        Rise of the sum of squares, in residual variances, for a force that is constant from the start.
     files : int
-        Files.
+        Number of files.
     forces_N : tuple of ndarray, shape (n,) each
         Fitted force of every stroke.
     rmse_N, noise_N : float
-        RMS of what the fit leaves, and the noise of a sample as its neighbours tell it.
+        RMS residual, and standard deviation of a sample from second differences.
     """
 
     sigma_0: float
@@ -68,11 +72,11 @@ class Stiffness:
 
     @property
     def seen(self) -> bool:
-        """Whether the samples show the rise: some lie within it, and a force that is there at once does worse."""
+        """Whether the samples resolve the rise."""
         return self.within >= LEAST and self.gain > RISES
 
     def misses(self, level_N: float) -> bool:
-        """Whether the force comes up otherwise than the model's, by more than noise and than matters at this level."""
+        """Return whether the residual exceeds noise and is not small relative to a sliding force."""
         return self.rmse_N > MISSED_NOISE * self.noise_N and self.rmse_N > MISSED_LEVEL * level_N
 
     @property
@@ -86,7 +90,7 @@ class Stiffness:
 
     @property
     def stiffness_known(self) -> bool:
-        """Whether the interval of sigma_0 is one."""
+        """Whether sigma_0 is determined."""
         return self.seen and np.isfinite(self.covariance[0, 0]) and self.log_half_width() < OPEN
 
     @property
@@ -106,14 +110,14 @@ class Stiffness:
 
 
 def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
-    """Return sigma_0 and tau of the strokes of a condition; None where there is no stroke.
+    """Return sigma_0 and tau of the strokes of a condition; None without strokes.
 
     Parameters
     ----------
     strokes : sequence of Stroke
-        All strokes that begin at rest or at a reversal.
+        All strokes that start at rest or at a reversal.
     curve : Curve
-        Of the condition.
+        Stribeck curve of the condition.
     """
     if not strokes:
         return None
@@ -152,14 +156,14 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
 
 
 def _step(normal: np.ndarray, pull: np.ndarray, x: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Return one Gauss-Newton step from J'J and J'r, shape (p,); what it would carry over a bound is held there."""
+    """Return one Gauss-Newton step from J'J and J'r, shape (p,), with parameters fixed at bounds it would cross."""
     step, free = np.zeros(x.size), np.ones(x.size, bool)
     scale = np.sqrt(np.diag(normal))
     scale = np.where(scale > 0, scale, 1.0)
     for _ in range(x.size):
-        left = -(pull + normal @ np.where(free, 0.0, step)) / scale
+        target = -(pull + normal @ np.where(free, 0.0, step)) / scale
         scaled = (normal / np.outer(scale, scale))[np.ix_(free, free)]
-        step[free] = np.linalg.lstsq(scaled, left[free], rcond=1e-12)[0] / scale[free]
+        step[free] = np.linalg.lstsq(scaled, target[free], rcond=1e-12)[0] / scale[free]
         over = free & ((x + step < bounds[0]) | (x + step > bounds[1]))
         if not over.any():
             break
@@ -168,24 +172,21 @@ def _step(normal: np.ndarray, pull: np.ndarray, x: np.ndarray, bounds: np.ndarra
 
 
 def together(parts: Sequence[tuple[np.ndarray, np.ndarray | int]]) -> np.ndarray:
-    """Return the degrees of freedom of sums of variances (Welch and Satterthwaite), shape (p,)."""
+    """Return the degrees of freedom of sums of variances (Welch-Satterthwaite), shape (p,)."""
     total = sum(variance for variance, _ in parts)
     spread = sum(variance**2 / np.maximum(df, 1) for variance, df in parts)
     return total**2 / np.maximum(spread, 1e-300)
 
 
 def _between_files(found: Tangent, inverse: np.ndarray, file: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance of the estimates from how files pull at them, shape (p, p), and its degrees of freedom.
+    """Return the cluster-robust covariance of the estimates, shape (p, p), and its degrees of freedom, shape (p,).
 
-    Each file's pull is that on a fit without it (the jackknife's, CR3); the degrees of freedom follow from how evenly
-    files share the information.
+    It is the jackknife over files (CR3). The degrees of freedom depend on the leverages of the files.
 
     Parameters
     ----------
-    found : Tangent
-        At the optimum.
     inverse : ndarray, shape (p, p)
-        Of J'J.
+        Inverse of J'J.
     file : ndarray of int, shape (strokes,)
         Number of each stroke's file.
     """

@@ -1,4 +1,4 @@
-"""What the declared model can carry at these conditions and speeds, and which fitted number serves which condition."""
+"""The parameters of the declared model that the conditions and speeds determine, and the conditions that use them."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ import pandas as pd
 from sealfit.fit.joint.rows import SAME_SPEED, Rows
 
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
+# Number of tested speeds that a Stribeck curve needs. With sigma_2 >= 0 three speeds determine it at these speeds.
 SPEEDS_FOR_STRIBECK = 3
-"""Tested speeds from which a series has a Stribeck curve: three fix it there, with sigma_2 not below 0."""
-
+# Number of tested speeds that determine the curve between them as well: mu_s, mu_c, v_s and sigma_2 are four numbers.
 SPEEDS_BETWEEN = 4
-"""Tested speeds from which the curve is known between them too: mu_s, mu_c, v_s and sigma_2 are four numbers."""
-
-CURVED = ("full", "interpolated")  # forms with mu_s and v_s
-
+# Forms of the speed dependence with mu_s and v_s.
+CURVED = ("full", "interpolated")
+# Number of tested speeds that the viscous term needs.
 SPEEDS_FOR_VISCOUS = 2
-ROUNDING = 1e-24  # of a sum of squares, below which it is none
-DAYS_FOR_LAW = 3  # mu_0, a and b are three numbers
+# Number of aging days that Eq. 15 needs: mu_0, a and b are three numbers.
+DAYS_FOR_LAW = 3
+# A residual sum of squares below this share of the total is rounding.
+ROUNDING = 1e-24
 
 
 @dataclass(frozen=True, slots=True)
 class JointParameter:
-    """One fitted number of the declared model: which quantity, and of which rubber, series or condition."""
+    """One fitted number of the declared model: its quantity, and its rubber, series or condition."""
 
     quantity: str
     owner: str
@@ -35,7 +36,7 @@ class JointParameter:
 
 @dataclass(frozen=True)
 class Declared:
-    """Which fitted number each condition uses for each quantity; -1 where the quantity is absent."""
+    """The fitted number that each condition uses for each quantity; -1 if the model of the condition lacks it."""
 
     parameters: tuple[JointParameter, ...]
     index: Mapping[str, np.ndarray]  # quantity -> (conditions,) number of the parameter
@@ -45,23 +46,23 @@ class Declared:
     law: Mapping[str, bool]  # series -> whether Eq. 15 is fitted across its days
 
     @property
-    def numbers_of_mu(self) -> int:
-        """How many numbers the model fits to one coefficient across conditions: specimens beyond them show scatter."""
+    def mu_parameter_count(self) -> int:
+        """Number of parameters of one coefficient over all conditions; specimens in excess of it show scatter."""
         return sum(p.quantity in ("mu_0c", "a_c", "b_c") for p in self.parameters)
 
 
 def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
-    """Return the declared model that these conditions and speeds can carry.
+    """Return the declared model that these conditions and speeds determine.
 
-    A series needs four speeds in one direction for Eq. 14, or three between which friction is not a straight line
-    ("interpolated"), and two for the viscous term; Eq. 15 needs three days, the unaged day included. What cannot be
-    fitted is left out, not guessed. Speeds are counted within one direction, as an offset between directions would
-    otherwise pass for a Stribeck curve. Made once for the same rows. Rows that are a part of a campaign, with its
-    conditions, may carry its model: `as_in` is the campaign.
+    A series needs four speeds in one direction for Eq. 14, or three at which friction is not a straight line
+    ("interpolated"), and two for the viscous term. Eq. 15 needs three days, the unaged day included. Parameters that
+    are not determined are left out. Speeds are counted within one direction: an offset between directions could be
+    taken for a Stribeck curve. The result is cached. A part of a campaign with the same conditions takes the model of
+    the campaign, `as_in`.
     """
-    if ("declared",) not in rows.kept:
-        rows.kept["declared",] = _declare(rows) if as_in is None else declare(as_in)
-    return rows.kept["declared",]
+    if ("declared",) not in rows.cache:
+        rows.cache["declared",] = _declare(rows) if as_in is None else declare(as_in)
+    return rows.cache["declared",]
 
 
 def _declare(rows: Rows) -> Declared:
@@ -101,14 +102,14 @@ def _declare(rows: Rows) -> Declared:
 
 
 def series_of_curve(conditions, aging: bool) -> np.ndarray:
-    """Return the series whose v_s and sigma_2 each condition uses: a lone series takes its unaged rubber in.
+    """Return the series whose v_s and sigma_2 each condition uses; unaged rubber belongs to its series if there is one.
 
     Parameters
     ----------
     conditions : DataFrame
         A row per condition with `series`, `rubber` and, where rubber is aged, `aging_days`.
     aging : bool
-        Whether it is.
+        Whether rubber is aged.
     """
     series = conditions["series"].to_numpy(dtype=object).copy()
     if aging:
@@ -121,7 +122,7 @@ def series_of_curve(conditions, aging: bool) -> np.ndarray:
 
 
 def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
-    """Return what the speeds of each series can carry, from the series of each condition."""
+    """Return the form of the speed dependence that the speeds of each series determine."""
     number, names = pd.factorize(series_of)
     key = 2 * number[rows.condition] + (rows.speed > 0)
     order = np.argsort(key, kind="stable")
@@ -142,8 +143,8 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
 def _curved(rows: Rows, chosen: np.ndarray) -> bool:
     """Return whether friction at three speeds is not a straight line, by Akaike's criterion on means of files.
 
-    A curve through three speeds leaves little to judge other effects by, so a line is kept where it will do. Conditions
-    have a level each and share the slope and the bend; the two directions count as repeats.
+    A curve through three speeds leaves few degrees of freedom for other effects, so a line is preferred. Each condition
+    has its own level; slope and curvature are shared. The two directions count as repeats.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
     tested = tested_speeds(rows, chosen)
@@ -162,8 +163,9 @@ def _curved(rows: Rows, chosen: np.ndarray) -> bool:
     costs = []
     for columns in (line, np.column_stack([line, files["middle"]])):
         found, _, rank, _ = np.linalg.lstsq(columns, files["mu"], rcond=1e-9)
-        left = files["mu"] - columns @ found
-        costs.append(len(files) * np.log(max(left @ left, ROUNDING * (files["mu"] @ files["mu"]))) + 2 * rank)
+        residual = files["mu"] - columns @ found
+        rss = max(residual @ residual, ROUNDING * (files["mu"] @ files["mu"]))
+        costs.append(len(files) * np.log(rss) + 2 * rank)
     return bool(costs[1] < costs[0])
 
 

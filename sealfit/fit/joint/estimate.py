@@ -1,8 +1,7 @@
 r"""One estimator for "before" and "after": generalised least squares with scatter at every level.
 
-The weights come from the variance components (`variance_components.py`), which are estimated from the residual with the
-degrees of freedom of the model taken out; model and scatter are fitted in turn until neither moves. What is known
-beforehand of some numbers is in `prior.py`.
+The weights come from the variance components (`variance_components.py`), estimated by REML. Model and scatter are
+fitted alternately until they converge. Priors are in `prior.py`.
 """
 
 from __future__ import annotations
@@ -20,25 +19,29 @@ from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.variance_components import estimate_components, estimate_scatter
 from sealfit.fit.joint.whitening import Scatter, Whitening
 
-COMPARED = 1e-2  # of the whitened sum of squares, where fits are only compared: rivals are several units apart
-ROUGH = 1.0  # as above before anything is known of the scatter
-TURNS = 3  # of model and scatter; the third moves no estimate by a tenth of its standard error
+# Fall of the whitened sum of squares at which a descent ends when fits are only compared. Rivals differ by several
+# units.
+COMPARED = 1e-2
+# The same for the first fit, before the scatter is estimated.
+ROUGH = 1.0
+# Number of alternating fits of model and scatter. The third changes no estimate by a tenth of its standard error.
+TURNS = 3
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model fitted to rows: force and tangent at the optimum, scatter, and the whitened residual and tangent."""
+    """A model fitted to rows: its force, tangent and scatter at the optimum, and the whitened residual and tangent."""
 
     model: Model
     scatter: Scatter
     rows: Rows
     force: np.ndarray  # (n,)
-    friction: np.ndarray  # (n,) that noise and gains load on: the force less what is added to it
+    friction: np.ndarray  # (n,) force without added forces; noise and gains are proportional to it
     jacobian: Tangent  # (n, p)
     white_residual: np.ndarray  # (n,)
     white_jacobian: Tangent  # (n, p)
-    deviance: float  # whitened sum of squares + log det: twice the negative log likelihood, constants left out
-    whitening: Whitening  # of columns on the rows, at this scatter and friction
+    deviance: float  # whitened sum of squares + log det: -2 log likelihood without its constant
+    whitening: Whitening  # at this scatter and friction
 
     @property
     def residual(self) -> np.ndarray:
@@ -63,15 +66,15 @@ class Fitted:
         return {}
 
     def slope(self, acts_on: str, operation: str) -> np.ndarray:
-        """Return the force's derivative with respect to the shape of a term that is not there yet, shape (n,)."""
+        """Return the force's derivative with respect to the shape of a term not yet in the model, shape (n,)."""
         if (acts_on, operation) not in self._slopes:
             self._slopes[acts_on, operation] = term_slope(self.model, self.rows, acts_on, operation)
         return self._slopes[acts_on, operation]
 
     def unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return eigenvalues, shape (g, k), and axes, shape (g, k, k), of what the fit took out of each group.
+        """Return eigenvalues, shape (g, k), and eigenvectors, shape (g, k, k), of each group's block of the hat matrix.
 
-        The axes are those of the basis's places in the block of the group.
+        The eigenvectors are in the coordinates of the basis columns of the group's block.
         """
         if level not in self._shares:
             starts = self.rows.groups.starts[level]
@@ -79,15 +82,15 @@ class Fitted:
         return self._shares[level]
 
     def unit_residual(self, level: str) -> np.ndarray:
-        """Return the whitened residual widened by (I - H_gg)^(-1/2) in each group of a level, shape (n,).
+        """Return the whitened residual times (I - H_gg)^(-1/2) in each group of a level, shape (n,).
 
-        H_gg is the group's block of the projection on the tangent space: what the fit took out of the group
-        (the CR2 correction of Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181).
+        H_gg is the group's block of the hat matrix. This is the CR2 correction (Bell & McCaffrey 2002, Survey
+        Methodology 28(2), 169-181).
         """
         if level not in self._widened:
             code = self.rows.codes(level)
             size, axes = self.unit_shares(level)
-            size = np.clip(size, 0.0, 0.98)  # a group that the fit owns whole has nothing left to widen
+            size = np.clip(size, 0.0, 0.98)  # a leverage of 1 leaves no residual to correct
             grow = np.where(size > 1e-12, (1 / np.sqrt(1 - size) - 1) / np.maximum(size, 1e-12), 0.0)
             inner = self.basis.sums(self.rows.groups, level, self.white_residual).values
             rotated = np.einsum("gji,gj->gi", axes, inner) * grow
@@ -102,7 +105,7 @@ class Fitted:
 
 
 def fit_declared(rows: Rows) -> Fitted:
-    """Return the declared model fitted to `rows`: "before"; the better of two starts where series could go astray."""
+    """Return the declared model fitted to `rows` ("before"); with several v_s, the better fit from two starts."""
     fitted = fit(start_model(rows), rows)
     if sum(p.quantity == "v_s" for p in fitted.model.declared.parameters) > 1:
         other = fit(start_model(rows, together=True), rows)
@@ -123,20 +126,20 @@ def fit(
     Parameters
     ----------
     model : Model
-        Where to start; a global search has set v_s and b.
+        Starting point, with v_s and b from a global search.
     rows : Rows
-        What to fit to.
+        Data.
     scatter : Scatter, optional
-        Scatter to start from; with `turns=0` it is kept.
+        Starting value; fixed if `turns` is 0.
     turns : int
-        How often scatter is estimated anew and the model refitted.
+        How often the scatter is re-estimated and the model refitted.
     friction : ndarray, shape (n,), optional
-        Friction that gains and noise load on, where `turns` is 0: fits to be compared must share it.
+        Friction to which gains and noise are proportional, for `turns=0`. Fits to be compared must share it.
     """
     centre = centre_of(model)
     if scatter is None:
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
-        model = descend(model, rows, scatter, centre, near=ROUGH)
+        model = descend(model, rows, scatter, centre, tolerance=ROUGH)
     if turns and model.terms:
         model = search_nonlinear(model, rows, scatter)
     for turn in range(turns):
@@ -144,15 +147,15 @@ def fit(
         scatter = estimate_scatter(
             rows, rows.force - force, friction_of(model, rows), jacobian, scatter if turn else None
         )
-        model = descend(as_smooth_as_wanted(model, rows, scatter), rows, scatter, centre)
+        model = descend(with_reml_smoothness(model, rows, scatter), rows, scatter, centre)
     if not turns:
-        model = descend(model, rows, scatter, centre, friction, near=COMPARED)
+        model = descend(model, rows, scatter, centre, friction, tolerance=COMPARED)
         return fitted_at(model, rows, scatter, friction)
     return fitted_at(model, rows, scatter)
 
 
 def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Fitted:
-    """Return the `Fitted` of a model as it stands, nothing refitted."""
+    """Return the `Fitted` of a model without refitting."""
     force, jacobian = evaluate(model, rows)
     friction = friction_of(model, rows) if friction is None else friction
     whitening = Whitening(scatter, friction, rows.groups)
@@ -162,35 +165,35 @@ def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray |
 
 
 def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
-    """Return a fit with the variance components that its own residual shows, and the row noise if asked for.
+    """Return a fit with variance components re-estimated from its own residual, and the row noise too if wanted.
 
-    What a model leaves unexplained between units stands in their variance. Two models are told apart by their deviances
-    only if each has its own; under the larger variance of what is missing they all look alike.
+    An effect that a model lacks inflates its variance components. Deviances distinguish models only if each model has
+    its own components; under inflated ones all models fit about equally well.
 
     Parameters
     ----------
     fitted : Fitted
-        A fit made under other components; what noise and gains load on is kept, as fits to be compared share it.
+        A fit with other components. Its friction is kept, as fits to be compared share it.
     noise : bool
-        Whether the row noise is estimated anew too. Fits to be compared share it: it is that of the best.
+        Whether the row noise is re-estimated too. Fits to be compared share the row noise of the best fit.
     """
     rows, estimate = fitted.rows, estimate_scatter if noise else estimate_components
     scatter = estimate(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
-    model = as_smooth_as_wanted(fitted.model, rows, scatter, fitted.friction)
-    model = descend(model, rows, scatter, centre_of(model), fitted.friction, near=COMPARED)
+    model = with_reml_smoothness(fitted.model, rows, scatter, fitted.friction)
+    model = descend(model, rows, scatter, centre_of(model), fitted.friction, tolerance=COMPARED)
     return fitted_at(model, rows, scatter, fitted.friction)
 
 
 def effective_df(fitted: Fitted, number: int) -> float:
-    """Return how many numbers a term's free shape is worth, held as smooth as it is."""
+    """Return the effective degrees of freedom of a term's free shape at its smoothness."""
     model, white = fitted.model, fitted.white_jacobian
-    place = model.place(number)
+    place = model.term_slice(number)
     own, pull = free_of_others(model, white.gram(), white.against(fitted.white_residual), place)
     return penalised(own, pull, precision_of(model)[place, place])[1]
 
 
-def as_smooth_as_wanted(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Model:
-    """Return the model with its free shapes as smooth as the data want them under this scatter."""
+def with_reml_smoothness(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Model:
+    """Return the model with the smoothness of its free shapes estimated by REML under this scatter."""
     if all(term.smoothness is None for term in model.terms):
         return model
     at = fitted_at(model, rows, scatter, friction)

@@ -18,8 +18,9 @@ from sealfit.fit.joint.tangent import Layout, Tangent, blocks_of
 # ---------------------------------------------------------------- terms
 # Effects bound to channels: their shapes at the rows, averaged over each row's bin, and the derivatives of these.
 
-FEW_SAMPLES, MANY = (
-    tuple((float(place), float(weight) / 2) for place, weight in zip(*np.polynomial.legendre.leggauss(k), strict=True))
+# Gauss-Legendre nodes on [-1, 1] and weights that sum to 1: two for smooth shapes, four for narrow ones.
+TWO_NODES, FOUR_NODES = (
+    tuple((float(node), float(weight) / 2) for node, weight in zip(*np.polynomial.legendre.leggauss(k), strict=True))
     for k in (2, 4)
 )
 
@@ -28,9 +29,9 @@ FEW_SAMPLES, MANY = (
 class Term:
     """An effect bound to the channels it reads and the quantity it acts on, with fixed reference values.
 
-    In `fixed`, `shift` holds each pass's own origin, and `held` the 95 % interval of each parameter that comes from the
-    raw samples and that no fit to bins moves. `smoothness` is the weight on how much a free shape bends (`prior.py`),
-    None where nothing holds its amplitudes.
+    In `fixed`, `shift` is the origin of the channel in each pass. `held` are the parameters that were estimated from
+    the raw samples, with their 95 % intervals; fits to bins do not change them. `smoothness` is the weight of the
+    roughness penalty of a free shape (`prior.py`), None without a penalty.
     """
 
     effect: Effect
@@ -42,39 +43,39 @@ class Term:
 
     @cached_property
     def shape_key(self) -> tuple:
-        """What the shape depends on, besides the rows and its parameters."""
+        """All that the shape depends on besides the rows and its parameters."""
         return (self.effect.id, self.channels, _hashable(self.fixed))
 
     def inputs(self, rows: Rows) -> dict[str, np.ndarray]:
-        """Return what the effect's shape reads, from the rows' channels."""
+        """Return the inputs of the effect's shape: channels of the rows, shape (n,), and fixed values."""
         key = ("inputs", self.shape_key)
-        if key not in rows.kept:
-            rows.kept[key] = self._inputs(rows)
-        return rows.kept[key]
+        if key not in rows.cache:
+            rows.cache[key] = self._inputs(rows)
+        return rows.cache[key]
 
     def _inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         given = {}
         for name, channel in zip(self.effect.reads, self.channels, strict=True):
             values = rows.values(channel)
             if name in (CHANNEL, SECOND) and channel == "speed_mm_s":
-                values = np.abs(values)  # a form of the speed is one of its size
+                values = np.abs(values)  # forms of the speed use its magnitude
             given[name] = values
         shift = self.fixed.get("shift")
-        if shift is not None:  # each pass has its own origin, NaN where that is unknown
+        if shift is not None:  # NaN where the origin of a pass is unknown
             given[self.effect.reads[0]] = given[self.effect.reads[0]] + passes(rows.table).map(shift).to_numpy(float)
         return {**given, **self.fixed}
 
     def nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
-        """Return (weight, inputs) at the points of each row where the shape is averaged.
+        """Return (weight, inputs) at the quadrature nodes of each row.
 
-        A row is the mean over the samples of a bin. Of a wave that is known; another shape that bends within the bin is
-        averaged by Gauss-Legendre quadrature along it (over an even spread with the variance of n samples), more
-        closely where it may be as fine as the bin. The rest is taken in the middle.
+        A row is the mean over the samples of a bin. The mean of a sine has a closed form. Another nonlinear shape along
+        the stroke is averaged by Gauss-Legendre quadrature, over a uniform distribution with the variance of the n
+        samples; shapes that may be as narrow as a bin get more nodes. All other shapes are evaluated at the bin mean.
         """
         key = ("nodes", self.shape_key)
-        if key not in rows.kept:
-            rows.kept[key] = self._nodes(rows)
-        return rows.kept[key]
+        if key not in rows.cache:
+            rows.cache[key] = self._nodes(rows)
+        return rows.cache[key]
 
     def _nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
         inputs = self.inputs(rows)
@@ -86,25 +87,24 @@ class Term:
             return [(1.0, {**inputs, SAMPLES: rows.samples, **widths})]
         spread = np.sqrt(1 - 1 / np.maximum(rows.samples, 1.0) ** 2)
         return [
-            (weight, {**inputs, **{n: inputs[n] + 0.5 * place * spread * rows.bin_width(c) for n, c in along}})
-            for place, weight in (MANY if self.effect.narrow else FEW_SAMPLES)
+            (weight, {**inputs, **{n: inputs[n] + 0.5 * node * spread * rows.bin_width(c) for n, c in along}})
+            for node, weight in (FOUR_NODES if self.effect.narrow else TWO_NODES)
         ]
 
     def key(self) -> tuple:
-        """Return what makes two terms the same effect."""
+        """Return the identity of the effect: two terms with the same key are one effect."""
         return (self.effect.id, self.channels, self.acts_on, self.operation)
 
 
 def _hashable(value: object) -> object:
-    """Return fixed values, mappings and sequences among them, as what a dictionary can have as a key."""
+    """Return fixed values in a form that can be a key of a dictionary."""
     if isinstance(value, Mapping):
         return tuple(sorted((name, _hashable(own)) for name, own in value.items()))
     return tuple(value) if isinstance(value, (list, np.ndarray)) else value
 
 
 def passes(table: pd.DataFrame) -> pd.Series:
-    """Return the name of each row's pass: its record and the direction in it, as play in a drive shifts one against the
-    other."""
+    """Return the name of each row's pass: its record and direction."""
     record = table.get("record", table["file"])
     return record + np.where(table["speed_mm_s"] >= 0, "+", "-") if len(table) else record
 
@@ -116,31 +116,31 @@ def mean_derivatives(
     parts = [
         (weight, term_derivatives(term, values, inputs, only_linear=only_linear)) for weight, inputs in term.nodes(rows)
     ]
-    return [_known(term, sum(weight * part[k] for weight, part in parts)) for k in range(len(parts[0][1]))]
+    return [_zero_if_unknown(term, sum(weight * part[k] for weight, part in parts)) for k in range(len(parts[0][1]))]
 
 
-def _known(term: Term, shape: np.ndarray) -> np.ndarray:
-    """Return a shape with zero where a pass's own origin is not known, shape (n,)."""
+def _zero_if_unknown(term: Term, shape: np.ndarray) -> np.ndarray:
+    """Return a shape, shape (n,), with 0 where the origin of the pass is unknown."""
     return np.nan_to_num(shape) if "shift" in term.fixed else shape
 
 
 def term_derivatives(
     term: Term, values: Mapping[str, float], inputs: Mapping[str, np.ndarray], *, only_linear: bool = False
 ) -> list[np.ndarray]:
-    """Return the shape's derivative in each of the effect's parameters (or amplitudes alone), each of shape (n,)."""
+    """Return the shape's derivatives with respect to the parameters, or to the amplitudes only, shape (n,) each."""
     if not term.effect.nonlinear and not only_linear:
         return list(_linear_columns(term, inputs).T)
     result = []
     zero = {name: 0.0 for name in term.effect.linear}
-    held = () if only_linear else term.fixed.get("held", ())
+    constant = () if only_linear else term.fixed.get("held", ())
     for p in term.effect.parameters:
-        if p.name in held:
+        if p.name in constant:
             result.append(np.zeros_like(inputs[term.effect.reads[0]], dtype=float))
         elif p.linear:
             result.append(term.effect.shape(inputs, **{**values, **zero, p.name: 1.0}))
         elif not only_linear:
             step = 1e-5 * max(abs(values[p.name]), 1e-3)
-            ends = np.clip([values[p.name] - step, values[p.name] + step], *p.bounds)  # beyond, a form need not exist
+            ends = np.clip([values[p.name] - step, values[p.name] + step], *p.bounds)  # the shape may end there
             down, up = (term.effect.shape(inputs, **{**values, p.name: float(end)}) for end in ends)
             result.append((up - down) / (ends[1] - ends[0]))
     return result
@@ -154,54 +154,55 @@ def _linear_columns(term: Term, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def shape_of(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
-    """Return the term's shape at the rows, shape (n,); what does not change is made once."""
+    """Return the term's shape at the rows, shape (n,); the last one is cached."""
     if not term.effect.nonlinear:
         return _columns_of(term, rows) @ np.array([values[p.name] for p in term.effect.parameters])
-    return _kept(
-        "shape",
-        term,
-        values,
-        rows,
-        lambda: _known(term, sum(weight * term.effect.shape(inputs, **values) for weight, inputs in term.nodes(rows))),
-    )
+
+    def make() -> np.ndarray:
+        mean = sum(weight * term.effect.shape(inputs, **values) for weight, inputs in term.nodes(rows))
+        return _zero_if_unknown(term, mean)
+
+    return _cached("shape", term, values, rows, make)
 
 
 def derivatives_of(term: Term, values: Mapping[str, float], rows: Rows) -> list[np.ndarray] | np.ndarray:
-    """Return the derivatives of a term's shape in each of its parameters; what does not change is made once."""
+    """Return the derivatives of a term's shape with respect to its parameters, shape (n,) each; the last are cached."""
     if not term.effect.nonlinear:
         return _columns_of(term, rows).T
-    return _kept("derivatives", term, values, rows, lambda: mean_derivatives(term, values, rows))
+    return _cached("derivatives", term, values, rows, lambda: mean_derivatives(term, values, rows))
 
 
-def _kept(what: str, term: Term, values: Mapping[str, float], rows: Rows, make: Callable):
-    """Return what was made last for a term at the same values, or make it: a fit moves some terms and not others."""
+def _cached(what: str, term: Term, values: Mapping[str, float], rows: Rows, make: Callable):
+    """Return the cached result of a term if its values are the same, else compute it: a step may leave a term fixed."""
     key, at = (what, term.shape_key), tuple(values.values())
-    if key not in rows.kept or rows.kept[key][0] != at:
-        rows.kept[key] = (at, make())
-    return rows.kept[key][1]
+    if key not in rows.cache or rows.cache[key][0] != at:
+        rows.cache[key] = (at, make())
+    return rows.cache[key][1]
 
 
 def _columns_of(term: Term, rows: Rows) -> np.ndarray:
     key = ("columns", term.shape_key)
-    if key not in rows.kept:
-        rows.kept[key] = _linear_columns(term, term.inputs(rows))
-    return rows.kept[key]
+    if key not in rows.cache:
+        rows.cache[key] = _linear_columns(term, term.inputs(rows))
+    return rows.cache[key]
 
 
 # ---------------------------------------------------------------- joint
-# The one declared model, everywhere: Eq. 14 with Eq. 15 in one joint fit, and the effects added to it.
+# The declared model, Eq. 14 with Eq. 15 in one joint fit, and the effects added to it.
 #
 # .. math::
 #     F = \Big[N (\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2})(1 + h_\mu)\,\mathrm{sgn}\,v + \sigma_2 v\Big](1 + h_F) + f,
 #     \quad \mu = \mu_0 - a \ln(1 + t/b)
 #
-# for mu_s and mu_c alike; mu_0 is shared by a rubber's series, v_s and sigma_2 by a series' days. Effects change a
-# parameter first, then act as a factor on mu, then as a factor on the whole force, then as an added force.
+# for both mu_s and mu_c. mu_0 is shared by the series of a rubber, v_s and sigma_2 by the days of a series. Effects on
+# a parameter are applied first, then factors on mu, then factors on the force, then added forces.
 #
-# Every quantity of a row depends on one fitted number at most, so the tangent is a scatter of row derivatives. v_s and
-# b are fitted as logarithms. Wu et al. 2020, Polymers 12(1) 102, doi:10.3390/polym12010102, Eqs. 14 and 15.
+# Every quantity of a row depends on at most one fitted number, so that each row derivative has one place in the
+# tangent. Wu et al. 2020, Polymers 12(1) 102, doi:10.3390/polym12010102, Eqs. 14 and 15.
 
+# Quantities whose logarithm is fitted.
 LOGARITHMIC = ("b_s", "b_c", "v_s")
+# Quantities of the declared model that an effect on each target changes. Effects on mu_s and mu_c come after aging.
 QUANTITIES_OF = {
     "mu_0": ("mu_0s", "mu_0c"),
     "a": ("a_s", "a_c"),
@@ -209,13 +210,14 @@ QUANTITIES_OF = {
     "v_s": ("v_s",),
     "sigma_2": ("sigma_2",),
 }
-"""Quantities of the declared model that an effect on each of these changes; those on mu_s and mu_c come after aging."""
-FEW = 24  # declared numbers, of two or three series, which are as quickly held whole as by blocks
+
+# A tangent of up to this many declared numbers (two or three series) is stored dense; blocks save no time there.
+DENSE_NUMBERS = 24
 
 
 @dataclass(frozen=True)
 class Model:
-    """Declared model plus terms, with the fitted numbers: `theta` (declared) and `values` per term."""
+    """Declared model plus terms, with the fitted numbers: `theta`, shape (k,), of the model and `values` per term."""
 
     declared: Declared
     theta: np.ndarray
@@ -224,17 +226,17 @@ class Model:
 
     @property
     def size(self) -> int:
-        """Number of fitted numbers."""
+        """How many numbers are fitted."""
         return self.theta.size + sum(len(t.effect.parameters) for t in self.terms)
 
     @property
-    def bent(self) -> np.ndarray:
-        """Which numbers act nonlinearly, v_s and b among them, in the order of `vector`, shape (size,)."""
+    def nonlinear(self) -> np.ndarray:
+        """Mask of the nonlinear parameters, v_s and b included, in the order of `vector`, shape (size,)."""
         declared = [p.quantity in LOGARITHMIC for p in self.declared.parameters]
         return np.array(declared + [not p.linear for t in self.terms for p in t.effect.parameters], dtype=bool)
 
-    def place(self, number: int) -> slice:
-        """Return where a term's numbers stand in `vector`."""
+    def term_slice(self, number: int) -> slice:
+        """Return the slice of a term's parameters in `vector`."""
         first = self.theta.size + sum(len(t.effect.parameters) for t in self.terms[:number])
         return slice(first, first + len(self.terms[number].effect.parameters))
 
@@ -244,7 +246,7 @@ class Model:
         return np.r_[self.theta, tail]
 
     def at(self, vector: np.ndarray) -> Model:
-        """Return the model with other fitted numbers."""
+        """Return the model with other fitted numbers, shape (size,)."""
         theta, rest, values = vector[: self.theta.size], list(vector[self.theta.size :]), []
         for term in self.terms:
             count = len(term.effect.parameters)
@@ -286,12 +288,15 @@ def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.nda
 
 
 def _layout(model: Model, rows: Rows) -> Layout:
-    """Return the blocks of the model's tangent: the numbers of a specimen's conditions, then those of all terms."""
+    """Return the layout of the model's tangent.
+
+    A block has the declared numbers of a specimen's conditions, then the parameters of all terms.
+    """
     declared, size = model.declared, model.theta.size
     key, made = ("blocks",), ("layout", model.size)
-    if made in rows.kept and rows.kept[made][0] is declared:
-        return rows.kept[made][1]
-    if key not in rows.kept or rows.kept[key][0] is not declared:
+    if made in rows.cache and rows.cache[made][0] is declared:
+        return rows.cache[made][1]
+    if key not in rows.cache or rows.cache[key][0] is not declared:
         used = np.stack([declared.index[quantity] for quantity in QUANTITIES], axis=1)
         of_condition = [frozenset(numbers[numbers >= 0].tolist()) for numbers in used]
         specimen, conditions = rows.codes("specimen"), len(used)
@@ -300,41 +305,41 @@ def _layout(model: Model, rows: Rows) -> Layout:
             number, condition = divmod(pair, conditions)
             touched[number] = touched.get(number, frozenset()) | of_condition[condition]
         whole = [frozenset(range(size))]
-        index, block = blocks_of(whole * len(touched) if size <= FEW else list(touched.values()), size)
-        rows.kept[key] = (declared, index, block[specimen])
-    _, index, block = rows.kept[key]
+        index, block = blocks_of(whole * len(touched) if size <= DENSE_NUMBERS else list(touched.values()), size)
+        rows.cache[key] = (declared, index, block[specimen])
+    _, index, block = rows.cache[key]
     added = np.arange(size, model.size)
     index = np.column_stack([np.where(index == size, model.size, index), np.tile(added, (len(index), 1))])
-    rows.kept[made] = (declared, Layout(model.size, index, block))
-    return rows.kept[made][1]
+    rows.cache[made] = (declared, Layout(model.size, index, block))
+    return rows.cache[made][1]
 
 
 def friction_of(model: Model, rows: Rows) -> np.ndarray:
-    """Return the model's force less what is added to it, shape (n,): what rubber, load and gains scale."""
+    """Return the model's force without added forces, shape (n,): the part that rubber, load and gains scale."""
     return _State.of(model, rows).friction
 
 
 def term_slope(model: Model, rows: Rows, acts_on: str, operation: str) -> np.ndarray:
-    """Return the force's derivative with respect to the shape of a term that is not there yet, shape (n,)."""
+    """Return the force's derivative with respect to the shape of a term not yet in the model, shape (n,)."""
     state = _State.of(model, rows)
     return state.term_slope(state.slopes(), acts_on, operation)
 
 
 @dataclass(frozen=True)
 class _State:
-    """A model at every row: what its force is made of; each array has shape (n,)."""
+    """The parts of a model's force at the rows; each array has shape (n,)."""
 
     rows: Rows
     shapes: list[np.ndarray]  # of the effects
     base: dict[str, np.ndarray]  # quantities of the declared model
-    now: dict[str, np.ndarray]  # the same with the effects on them
-    through: dict[str, np.ndarray]  # factors by which effects multiply them
+    now: dict[str, np.ndarray]  # the same, changed by the effects on them
+    through: dict[str, np.ndarray]  # product of the factors of these effects
     ratio: np.ndarray  # speed over v_s
     decay: np.ndarray  # share of mu_s in mu
-    mu: np.ndarray  # Eq. 14, before the effects on mu as a whole
-    on_mu: np.ndarray  # their factors
-    on_force: np.ndarray  # factors on the whole force
-    friction: np.ndarray  # force less what is added to it
+    mu: np.ndarray  # of Eq. 14, without the effects on mu
+    on_mu: np.ndarray  # product of the factors on mu
+    on_force: np.ndarray  # product of the factors on the force
+    friction: np.ndarray  # force without added forces
     force: np.ndarray
 
     @classmethod
@@ -347,7 +352,7 @@ class _State:
         for target, quantities in QUANTITIES_OF.items():
             for quantity in quantities:
                 _change(quantity, [(o, shape) for t, o, shape in effects if t == target], now, through)
-        for quantity in LOGARITHMIC:  # a change may not carry v_s or b to zero or below
+        for quantity in LOGARITHMIC:  # v_s and b stay positive
             now[quantity] = np.maximum(now[quantity], 1e-3 * base[quantity])
         for end in "sc":
             mu = f"mu_{end}"
@@ -384,7 +389,7 @@ class _State:
     def term_slope(
         self, slopes: Mapping[str, np.ndarray], acts_on: str, operation: str, shape: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return dF/dh for a term's shape h; `shape` is the term's own, so that its factor is not counted twice."""
+        """Return dF/dh for a term's shape h, shape (n,); `shape` is h if the term's factor is already in the state."""
         own = 1.0 if shape is None or operation == "add" else 1 + shape
         own = np.where(np.abs(own) < 1e-9, 1e-9, own)
         if acts_on == "force":
@@ -400,7 +405,7 @@ class _State:
 
 
 def _declared_values(model: Model, rows: Rows) -> dict[str, np.ndarray]:
-    """Return every quantity of the declared model at the rows; what is not fitted is 0, or 1 for v_s and b."""
+    """Return every quantity of the declared model at the rows; one that is not fitted is 0, or 1 for v_s and b."""
     found = {}
     for quantity in QUANTITIES:
         number = model.declared.index[quantity]
@@ -410,7 +415,7 @@ def _declared_values(model: Model, rows: Rows) -> dict[str, np.ndarray]:
 
 
 def _change(quantity: str, effects: list[tuple[str, np.ndarray]], now: dict, through: dict) -> None:
-    """Apply effects, each an operation and its shape, to a quantity in `now`; keep their factors in `through`."""
+    """Apply effects, each an operation and its shape, to a quantity in `now`; record their factors in `through`."""
     for operation, shape in effects:
         if operation == "multiply":
             now[quantity] = now[quantity] * (1 + shape)
@@ -422,7 +427,7 @@ def _change(quantity: str, effects: list[tuple[str, np.ndarray]], now: dict, thr
 def _factor_and_sum(
     effects: list[tuple[str, str, np.ndarray]], target: str, like: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the product of the factors on a target and the sum of what is added to it, shape of `like` each."""
+    """Return the product of the factors on a target and the sum of the added terms, shape of `like` each."""
     factor, added = np.ones_like(like), np.zeros_like(like)
     for acts_on, operation, shape in effects:
         if acts_on == target and operation == "multiply":

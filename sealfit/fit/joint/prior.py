@@ -1,17 +1,17 @@
-r"""What is known beforehand of the fitted numbers: weak priors on v_s and b, and how smooth a free shape is.
+r"""Priors of the fitted numbers: weak ones on v_s and b, and the roughness penalty of free shapes.
 
-v_s and b carry a Gaussian prior on their logarithm (SD 3, a factor of 20) about the global search's value: it holds a
-number that the data do not determine, and is far weaker than any data that do.
+log v_s and log b have a Gaussian prior with standard deviation 3, a factor of 20, centred at the value of the global
+search. It determines a parameter that the data do not, and is negligible otherwise.
 
-A free shape with many knots bends as often as the data ask for and no more. Its amplitudes c carry the precision
-:math:`\lambda S`, with :math:`c^T S c` the integral of the squared second derivative: a smoothing spline, in which a
-straight line costs nothing. :math:`\lambda` has the greatest restricted likelihood,
+A free shape is a smoothing spline with many knots. Its amplitudes c have the prior precision :math:`\lambda S`, where
+:math:`c^T S c` is the integral of the squared second derivative; a straight line is not penalised. :math:`\lambda`
+maximises the restricted likelihood,
 
 .. math:: -2 \log L(\lambda) = - g^T (G + \lambda S)^{-1} g + \log |G + \lambda S| - \mathrm{rank}(S) \log \lambda,
 
-with G and g the normal matrix and gradient of the amplitudes, every other number solved for. The intervals are those of
-the posterior. Wood 2011, J. R. Stat. Soc. B 73(1), 3-36, doi:10.1111/j.1467-9868.2010.00749.x; Nychka 1988, J. Am.
-Stat. Assoc. 83(404), 1134-1143, doi:10.1080/01621459.1988.10478711.
+with G and g the normal matrix and gradient of the amplitudes after elimination of all other parameters. Intervals are
+those of the posterior. Wood 2011, J. R. Stat. Soc. B 73(1), 3-36, doi:10.1111/j.1467-9868.2010.00749.x; Nychka 1988,
+J. Am. Stat. Assoc. 83(404), 1134-1143, doi:10.1080/01621459.1988.10478711.
 """
 
 from __future__ import annotations
@@ -23,37 +23,41 @@ import numpy as np
 from sealfit.effects.free import roughness
 from sealfit.fit.joint.model import LOGARITHMIC, Model, Term
 
+# Standard deviation of the prior of log v_s and log b.
 PRIOR_SD = 3.0
-DECADES = np.linspace(-8.0, 6.0, 57)  # of the smoothness, about the one that weighs as much as the data
-RIDGE = 1e-10  # of the diagonal: a straight line may stand in the declared model already
+# Decimal logarithms of the smoothness tried, relative to the one whose penalty weighs as much as the data.
+DECADES = np.linspace(-8.0, 6.0, 57)
+# Ridge added to the normal matrix, as a share of its diagonal. The declared model may contain the straight line, which
+# then makes the matrix singular.
+RIDGE = 1e-10
 
 
 def roughness_of(term: Term) -> np.ndarray:
-    """Return S of a smooth shape, shape (amplitudes, amplitudes)."""
+    """Return the penalty matrix S of a smooth shape, shape (amplitudes, amplitudes)."""
     return roughness(tuple(term.fixed["knots"]), term.fixed.get("x_ref"))
 
 
 def precision_of(model: Model) -> np.ndarray:
     """Return the prior's precision of the fitted numbers, shape (model.size, model.size).
 
-    1/3^2 on log v_s and log b, the smoothness of free shapes on their amplitudes, none elsewhere.
+    It is 1/3^2 for log v_s and log b, the smoothness times S for amplitudes of free shapes, and 0 elsewhere.
     """
     own = [1.0 / PRIOR_SD**2 if p.quantity in LOGARITHMIC else 0.0 for p in model.declared.parameters]
     precision = np.zeros((model.size, model.size))
     precision[range(len(own)), range(len(own))] = own
     for number, term in enumerate(model.terms):
         if term.smoothness is not None:
-            place = model.place(number)
+            place = model.term_slice(number)
             precision[place, place] = term.smoothness * roughness_of(term)
     return precision
 
 
 def centre_of(model: Model) -> np.ndarray:
-    """Return where the priors lie, shape (model.size,): v_s and b where they stand, amplitudes of free shapes at 0."""
+    """Return the mean of the prior, shape (model.size,): the present values, and 0 for amplitudes of free shapes."""
     centre = model.vector()
     for number, term in enumerate(model.terms):
         if term.smoothness is not None:
-            centre[model.place(number)] = 0.0
+            centre[model.term_slice(number)] = 0.0
     return centre
 
 
@@ -61,21 +65,21 @@ def covariance_of(normal: np.ndarray, precision: np.ndarray) -> np.ndarray:
     """Return the covariance of parameters from the normal matrix and the prior's precision, shape (p, p) each."""
     normal = normal + precision
     size = np.sqrt(np.diag(normal))
-    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # 0: a number that nothing here moves
+    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # 0 for a parameter without effect
     return scale[:, None] * np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
 
 
-def likely_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray) -> float:
-    """Return the smoothness of greatest restricted likelihood.
+def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray) -> float:
+    """Return the smoothness lambda that maximises the restricted likelihood.
 
     Parameters
     ----------
     normal : ndarray, shape (p, p)
-        G, every other number solved for.
+        G, all other parameters eliminated.
     gradient : ndarray, shape (p,)
-        g, at amplitudes of zero.
+        g, at zero amplitudes.
     rough : ndarray, shape (p, p)
-        S; its null space is the straight line.
+        S; straight lines are its null space.
     """
     unit = np.trace(normal) / np.trace(rough)
     if not unit > 0:
@@ -89,7 +93,7 @@ def likely_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarra
 
 
 def penalised(normal: np.ndarray, gradient: np.ndarray, penalty: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return a free shape's amplitudes, shape (p,), and how many numbers it is worth: tr (G + P)^-1 G, 1 for a line.
+    """Return a free shape's amplitudes, shape (p,), and its effective degrees of freedom, tr (G + P)^-1 G.
 
     Parameters
     ----------
@@ -104,23 +108,21 @@ def penalised(normal: np.ndarray, gradient: np.ndarray, penalty: np.ndarray) -> 
 
 
 def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
-    """Return the model with each free shape as smooth as the restricted likelihood wants it, one after the other.
+    """Return the model with the smoothness of its free shapes estimated by REML, one after the other.
 
     Parameters
     ----------
-    model : Model
-        The model the tangent is taken at.
     normal : ndarray, shape (model.size, model.size)
-        Normal matrix of the whitened tangent, no prior in it.
+        Normal matrix of the whitened tangent, without prior.
     gradient : ndarray, shape (model.size,)
         Whitened tangent times whitened residual.
     """
     for number, term in enumerate(model.terms):
         if term.smoothness is None:
             continue
-        place = model.place(number)
+        place = model.term_slice(number)
         own, pull = free_of_others(model, normal, gradient, place)
-        value = likely_smoothness(own, pull, roughness_of(term))
+        value = reml_smoothness(own, pull, roughness_of(term))
         terms = tuple(replace(t, smoothness=value) if k == number else t for k, t in enumerate(model.terms))
         model = replace(model, terms=terms)
     return model
@@ -129,7 +131,7 @@ def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
 def free_of_others(
     model: Model, normal: np.ndarray, gradient: np.ndarray, place: slice
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return G and g of a term's amplitudes, counted from zero, every other number solved for."""
+    """Return G and g of a term's amplitudes, at amplitudes of zero, all other parameters eliminated."""
     others = np.r_[0 : place.start, place.stop : model.size]
     precision = precision_of(model)
     pull = (gradient - precision @ (model.vector() - centre_of(model)))[others]

@@ -1,4 +1,4 @@
-"""The rows that the joint model is fitted to: the `bins` table as sorted arrays, with the groups they nest in."""
+"""The rows to which the joint model is fitted: the `bins` table as sorted arrays, with nested groups."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Groups:
 
     @classmethod
     def of(cls, codes: dict[str, np.ndarray]) -> Groups:
-        """Return the groups of `codes` (level -> group per row, contiguous, finest level first)."""
+        """Return the groups of `codes`: per level the group of each row, contiguous, finest level first."""
         starts, numbers = {}, {}
         for level, code in codes.items():
             change = np.flatnonzero(np.r_[True, code[1:] != code[:-1]][: code.size])  # no rows: no groups
@@ -52,72 +52,73 @@ class Groups:
         return Groups.of({name: self.codes[name][first] for name in levels[levels.index(level) :]})
 
     def repeated(self, count: int) -> Groups:
-        """Return the groups of a table with each row `count` times, one copy after the other."""
+        """Return the groups of a table that repeats each row `count` times."""
         return Groups(
             {level: count * start for level, start in self.starts.items()},
             {level: np.repeat(code, count) for level, code in self.codes.items()},
         )
 
 
-# ---------------------------------------------------------------- both ways
-# Strokes both ways of one file: one set-up and one repeat, so one piece of evidence of how large the friction is.
+# ---------------------------------------------------------------- both directions
+# Strokes of one file in both directions share set-up and repeat: they are one unit of evidence of the friction.
 
-BOTH = 0  # `direction` of a row that stands for both
-SAME_SPEED = 1.25  # measured speeds within 25 % are one setting: rigs without speed control wander that much
+# `direction` of a row that is the mean of both directions.
+BOTH_DIRECTIONS = 0
+# Measured speeds within this ratio are one setting. The speed of rigs without speed control varies by so much.
+SAME_SPEED = 1.25
+
 KEYS = ["file", "run_id"]
 
 
-def both_ways_together(steady: pd.DataFrame) -> pd.DataFrame:
-    """Return table `steady` with one row per record for runs that go both ways at one speed, other rows as they are.
+def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
+    """Return table `steady` with one row per record for runs with both directions at one speed; other rows unchanged.
 
-    The size of the force is the mean of the two ways, so that an offset between them cancels; what gain and set-up do
-    to a file they do to both, and neither tells anything that the other does not.
+    The magnitude of the force is averaged over the two directions, so that an offset between them cancels. Gain and
+    set-up of a file are common to both directions, which are therefore not independent.
 
     Parameters
     ----------
     steady : DataFrame
-        Table `steady`, rows that are used.
+        Rows of table `steady` with `used` true.
 
     Returns
     -------
     DataFrame
-        The same columns and `half_N`, half of the difference between the ways (NaN in other rows). In a row for both,
-        `direction` is 0, `force_N` and `speed_mm_s` are sizes, and `run_id` has no sign.
+        The same columns and `half_N`, half of the difference between the directions (NaN in other rows). In a merged
+        row `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id` has no sign.
     """
     rows = steady.assign(half_N=np.nan)
     run, record = nesting_run(rows), records(rows)
     pace = rows["speed_mm_s"].abs()
     if "speed_set_mm_s" in rows.columns:
         pace = rows["speed_set_mm_s"].abs().fillna(pace)
-    extent = pd.DataFrame({"file": record, "run": run, "way": rows["direction"], "pace": pace})
+    extent = pd.DataFrame({"file": record, "run": run, "direction": rows["direction"], "pace": pace})
     grouped = extent.groupby(["file", "run"])
-    alike = grouped["way"].transform("nunique").eq(2)
-    alike &= grouped["pace"].transform("max") <= SAME_SPEED * grouped["pace"].transform("min")
-    alike = alike.groupby(run).transform("all")
-    if not alike.any():
+    merged = grouped["direction"].transform("nunique").eq(2)
+    merged &= grouped["pace"].transform("max") <= SAME_SPEED * grouped["pace"].transform("min")
+    merged = merged.groupby(run).transform("all")
+    if not merged.any():
         return rows
     size = {"force_N": rows["force_N"] * rows["direction"], "speed_mm_s": rows["speed_mm_s"].abs()}
-    own = rows.assign(run_id=run, file=record, **size)[alike]
+    own = rows.assign(run_id=run, file=record, **size)[merged]
     numbers = [c for c in own.columns if pd.api.types.is_float_dtype(own[c])]
-    ways = own.groupby([*KEYS, "direction"], sort=False)[numbers].mean()
-    force = ways["force_N"].unstack("direction")
-    together = own.drop(columns=numbers).groupby(KEYS, sort=False).first()
-    together[numbers] = ways.groupby(level=KEYS, sort=False).mean()
-    together = together.assign(direction=BOTH, half_N=(force[1] - force[-1]) / 2)
-    return pd.concat([rows[~alike], together.reset_index()[list(rows.columns)]], ignore_index=True)
+    directions = own.groupby([*KEYS, "direction"], sort=False)[numbers].mean()
+    force = directions["force_N"].unstack("direction")
+    means = own.drop(columns=numbers).groupby(KEYS, sort=False).first()
+    means[numbers] = directions.groupby(level=KEYS, sort=False).mean()
+    means = means.assign(direction=BOTH_DIRECTIONS, half_N=(force[1] - force[-1]) / 2)
+    return pd.concat([rows[~merged], means.reset_index()[list(rows.columns)]], ignore_index=True)
 
 
 # ---------------------------------------------------------------- rows
-# The rows that the joint model is fitted to: the `bins` table as sorted arrays, with the groups they nest in.
+# The `bins` table as sorted arrays.
 
+# Grouping levels, finest first. A row of `bins` is a mean of samples of a stroke.
 LEVELS = ("stroke", "file", "run", "specimen")
-"""Grouping levels, finest first; a row of `bins` stands for samples below the stroke."""
-
+# Channels that increase along a stroke, so that they vary within a bin.
 ALONG = ("displacement_mm", "distance_mm", "time_s")
-"""Channels that run along a stroke, so that a bin covers a piece of them."""
-
+# Derived channel if loads differ: load times |speed|, the power of friction over its coefficient.
 POWER = "power"
-"""Derived channel where loads differ: load times the size of the speed, the power of friction over its coefficient."""
 
 NOT_CHANNELS = {
     "file",
@@ -142,8 +143,8 @@ NOT_CHANNELS = {
 class Rows:
     """Sorted rows of `bins` as arrays.
 
-    `table` holds them with a fresh index; `order` takes a row here back to its place in the table it came from. Files
-    that hold strokes both ways belong to two runs; they nest in the run without its sign, so that groups are nested.
+    `table` holds them with a new index; `order` gives each row's place in the original table. A file with strokes in
+    both directions belongs to two runs; its group is the run without sign, so that groups are nested.
     """
 
     table: pd.DataFrame
@@ -151,54 +152,53 @@ class Rows:
     groups: Groups
     force: np.ndarray  # (n,) measured
     speed: np.ndarray  # (n,) signed, of the stroke
-    pace: np.ndarray  # (n,) signed, of the bin, where it is seen to differ: what the model's force depends on
-    load: np.ndarray  # (n,) 1 where no load is known
-    days: np.ndarray  # (n,) 0 where there is no aging
+    pace: np.ndarray  # (n,) signed, of the bin if measured to differ: the speed in the model's force
+    load: np.ndarray  # (n,) 1 if unknown
+    days: np.ndarray  # (n,) aging time in days, 0 without aging
     condition: np.ndarray  # (n,) number in `conditions`
     conditions: pd.DataFrame  # (c,) condition, series, rubber, aging_days
     has_load: bool
     has_aging: bool
-    weight: np.ndarray  # (n,) sums to 1; each file weighs the same
+    weight: np.ndarray  # (n,) sums to 1; all files have equal weight
     filled: dict[str, np.ndarray] = field(default_factory=dict)  # channels that some files lack: `fill_missing`
-    kept: dict = field(default_factory=dict, init=False, compare=False, repr=False)
-    """What follows from these rows and was computed once, by what it depends on besides them."""
+    cache: dict = field(default_factory=dict, init=False, compare=False, repr=False)
+    """Derived values that are computed once; the key names all that they depend on besides the rows."""
 
     @property
     def channels(self) -> list[str]:
-        """Names of the columns that may order a residual."""
+        """Names of the columns on which a residual may depend."""
         return [name for name in self.table.columns if name not in NOT_CHANNELS]
 
     def values(self, channel: str) -> np.ndarray:
-        """Return one channel as floats, or as strings if it is a category; with what stands for missing values."""
+        """Return one channel, shape (n,): floats, or strings if it is categorical; missing values filled in."""
         if channel in self.filled:
             return self.filled[channel]
-        if channel not in self.kept:
+        if channel not in self.cache:
             column = self.table[channel]
             if pd.api.types.is_numeric_dtype(column):
-                self.kept[channel] = column.to_numpy(dtype=float, na_value=np.nan)
+                self.cache[channel] = column.to_numpy(dtype=float, na_value=np.nan)
             else:
-                self.kept[channel] = column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
-        return self.kept[channel]
+                self.cache[channel] = column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
+        return self.cache[channel]
 
     def bin_width(self, channel: str) -> np.ndarray:
-        """Return how far a channel goes within each row's bin, shape (n,): its samples times the step between them.
+        """Return the width of each row's bin in a channel, shape (n,): number of samples times the step between them.
 
-        The step is that of the stroke there: from the middle of one bin to that of the next lie half the samples of
-        both.
+        The step is the difference of neighbouring bin means over half the sum of their numbers of samples.
         """
         key = ("width", channel)
-        if key not in self.kept:
+        if key not in self.cache:
             values, code, samples = self.values(channel), self.codes("stroke"), self.samples
             inside = np.diff(code) == 0
             step = np.where(inside, np.diff(values) / ((samples[1:] + samples[:-1]) / 2), 0.0)
             left, right = np.r_[0.0, step], np.r_[step, 0.0]
             own = np.where(left == 0, right, np.where(right == 0, left, (left + right) / 2))
-            self.kept[key] = samples * own
-        return self.kept[key]
+            self.cache[key] = samples * own
+        return self.cache[key]
 
     @property
     def samples(self) -> np.ndarray:
-        """How many samples each row is the mean of, shape (n,); as good as endless where that is not told."""
+        """Number of samples in each row's mean, shape (n,); 1e9 if unknown."""
         return self.table["n"].to_numpy(dtype=float) if "n" in self.table else np.full(self.force.size, 1e9)
 
     def codes(self, level: str) -> np.ndarray:
@@ -206,19 +206,19 @@ class Rows:
         return self.groups.codes[level]
 
     def sparse(self, most: int) -> Rows:
-        """Return at most about `most` rows of each stroke, evenly spread: enough for what acts on whole strokes."""
+        """Return about `most` or fewer rows of each stroke, evenly spread, for effects that act on whole strokes."""
         key = ("sparse", most)
-        if key not in self.kept:
+        if key not in self.cache:
             start, code = self.groups.starts["stroke"], self.codes("stroke")
             for channel in (name for name in ALONG if name in self.table):
-                self.bin_width(channel)  # of the bins as they are, not from one kept row to the next
+                self.bin_width(channel)  # from all bins, not from the ones that remain
             place = np.arange(code.size) - start[code]
             step = -(-np.bincount(code) // most)[code]  # rounded up
-            self.kept[key] = self.subset(place % step == step // 2)
-        return self.kept[key]
+            self.cache[key] = self.subset(place % step == step // 2)
+        return self.cache[key]
 
     def subset(self, mask: np.ndarray) -> Rows:
-        """Return the rows where `mask` is true; conditions keep their numbers, so that a model fits both."""
+        """Return the rows for which `mask`, shape (n,), is true; conditions keep their numbers, as models need them."""
         weight = self.weight[mask]
         part = replace(
             self,
@@ -234,9 +234,9 @@ class Rows:
             weight=weight / weight.sum(),
             filled={name: values[mask] for name, values in self.filled.items()},
         )
-        for name, values in self.kept.items():
-            if isinstance(name, str) or name[0] == "width":  # channels, and bins as they are
-                part.kept[name] = values[mask]
+        for name, values in self.cache.items():
+            if isinstance(name, str) or name[0] == "width":  # channels, and widths of all bins
+                part.cache[name] = values[mask]
         return part
 
 
@@ -250,7 +250,7 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
     has_aging : bool
         Whether the config's condition has `aging_days`.
     conditions : DataFrame, optional
-        Conditions of the campaign that these are a part of, as `Rows` holds them: a model of it then fits both.
+        `Rows.conditions` of the campaign of which these bins are a part, so that its model applies to them.
     """
     table = bins.reset_index(drop=True).assign(record=records(bins).to_numpy())
     base_run = nesting_run(table)
@@ -307,11 +307,11 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
 
 
 def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
-    """Return the campaign's own numeric channels that a few files lack, each with its missing values filled in.
+    """Return the campaign's own numeric channels that a few files lack, with missing values filled in.
 
-    A missing value is that of its stroke, file, run or specimen, the first of them that has any (the mean, where they
-    differ), else the mean of all files. So a channel stays constant wherever it was, and files without a value say
-    next to nothing of a slope along it. Channels that too many files lack are not in it.
+    A missing value becomes the mean of its stroke, file, run or specimen, the first of these that has values, else the
+    mean of all files. A channel that was constant in a group remains so, and files without a value have little leverage
+    on a slope along it. Channels that too many files lack are left out.
 
     Parameters
     ----------
@@ -338,28 +338,27 @@ def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
 
 
 def sliding_power(load: np.ndarray | pd.Series, speed: np.ndarray | pd.Series) -> np.ndarray | pd.Series:
-    """Return the derived channel `POWER` from the load and the signed speed, of their shape."""
+    """Return the derived channel `POWER` in N mm/s, shape of the load (N) and the signed speed (mm/s)."""
     return load * np.abs(speed)
 
 
 def thin(bins: pd.DataFrame, most: int) -> pd.DataFrame:
-    """Return `bins` with neighbouring bins of a stroke merged until at most about `most` rows are left."""
+    """Return `bins` with neighbouring bins of a stroke merged, so that about `most` or fewer rows remain."""
     merged = int(np.ceil(len(bins) / most))
     return bins if merged <= 1 else merge(bins, merged)
 
 
 def merge(bins: pd.DataFrame, together: int | np.ndarray) -> pd.DataFrame:
-    """Return `bins` with so many neighbouring bins of a stroke in one row.
+    """Return `bins` with neighbouring bins of a stroke merged into means over all their samples.
 
-    Means over all their samples: for shapes that are smooth over a few bins nothing is lost, and the cost no longer
-    grows with how finely the strokes were cut. A ripple needs the bins as they are.
+    This loses nothing for shapes that are smooth over a few bins. A ripple needs the original bins.
 
     Parameters
     ----------
     bins : DataFrame, shape (n, ...)
         Table `bins`.
     together : int or ndarray of int, shape (n,)
-        How many bins make a row; the same throughout a stroke.
+        Number of bins per row, constant within a stroke.
     """
     place = bins.groupby(["file", "stroke"], sort=False).cumcount() // together
     keys = [bins["file"], bins["stroke"], place.rename("place")]
@@ -375,8 +374,8 @@ def merge(bins: pd.DataFrame, together: int | np.ndarray) -> pd.DataFrame:
 def records(table: pd.DataFrame) -> pd.Series:
     """Return each row's record, named by its first file.
 
-    A file is a record, unless the files of one repeat of a run each hold other strokes (column `stroke` of runs.csv):
-    these are one record that was split.
+    A file is a record. Files of one repeat of a run that contain different strokes (column `stroke` of runs.csv) are
+    one record.
     """
     strokes = table.drop_duplicates(["file", "stroke"])
     repeat = [strokes["specimen_id"], _unsigned(strokes["run_id"]), strokes["repeat"]]
@@ -388,9 +387,9 @@ def records(table: pd.DataFrame) -> pd.Series:
 
 
 def nesting_run(table: pd.DataFrame) -> pd.Series:
-    """Return each row's run, without the sign that a record with strokes both ways adds to it."""
-    both_ways = table.groupby(records(table))["run_id"].transform("nunique") > 1
-    return table["run_id"].where(~both_ways, _unsigned(table["run_id"]))
+    """Return each row's run, without its sign if the record has strokes in both directions."""
+    both = table.groupby(records(table))["run_id"].transform("nunique") > 1
+    return table["run_id"].where(~both, _unsigned(table["run_id"]))
 
 
 def _unsigned(run: pd.Series) -> pd.Series:
@@ -406,18 +405,18 @@ def open_columns(table: pd.DataFrame) -> list[str]:
 def point_rows(
     table: pd.DataFrame, condition: np.ndarray, conditions: pd.DataFrame, *, has_load: bool, has_aging: bool
 ) -> Rows:
-    """Return points to predict at as `Rows`, each its own group.
+    """Return the points of a prediction as `Rows`, one group per point.
 
     Parameters
     ----------
     table : DataFrame, shape (n, ...)
-        `speed_mm_s` and every channel the model reads.
+        `speed_mm_s` and all channels that the model reads.
     condition : ndarray, shape (n,)
         Number of each point's condition in `conditions`.
     conditions : DataFrame
-        condition, series, rubber and aging_days.
+        `condition`, `series`, `rubber` and `aging_days`.
     has_load, has_aging : bool
-        As in the rows the model was fitted to.
+        As in the rows to which the model was fitted.
     """
     n = len(table)
     every = np.arange(n)

@@ -1,4 +1,4 @@
-"""Where the joint fit starts and how it descends: a global search of v_s and b, then Levenberg-Marquardt."""
+"""The optimisation of the joint fit: its start by a global search of v_s and b, then Levenberg-Marquardt."""
 
 from __future__ import annotations
 
@@ -14,13 +14,20 @@ from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter, Whitening
 
 # ---------------------------------------------------------------- descent
-# The way down: Levenberg-Marquardt on the whitened residual, and a grid over v_s and b for what lies behind a hill.
+# Levenberg-Marquardt on the whitened residual, and a grid over v_s and b against local minima.
 
+# Largest number of Levenberg-Marquardt steps.
 MAX_STEPS = 60
-GRID_POINTS = 12  # points of log v_s and log b tried when an effect has come in
-ROWS_FOR_START = 4  # of each stroke: v_s acts on a stroke as a whole
-CREEPING = 1e-2  # several such steps in a row go along a valley in which the data hold nothing
-SETTLED = 1e-4  # of the whitened sum of squares: the estimates then lie within a hundredth of a standard error
+# Number of grid values of log v_s and of log b that are tried when an effect has been added.
+GRID_POINTS = 12
+# Number of rows of each stroke that the grid search uses. v_s and b act on a stroke as a whole.
+ROWS_FOR_START = 4
+# Fall of the whitened sum of squares below which a step counts as slow. The descent ends after four slow steps in a
+# row: the data then determine nothing along its direction.
+SLOW = 1e-2
+# Fall of the whitened sum of squares below which the descent has converged. The estimates then lie within a hundredth
+# of a standard error of the optimum.
+CONVERGED = 1e-4
 
 
 def descend(
@@ -30,11 +37,21 @@ def descend(
     centre: np.ndarray,
     friction: np.ndarray | None = None,
     *,
-    near: float = SETTLED,
+    tolerance: float = CONVERGED,
 ) -> Model:
-    """Return the model at the least whitened sum of squares, by Levenberg-Marquardt with the scatter held fixed.
+    """Return the model at the least penalised whitened sum of squares, at fixed scatter, by Levenberg-Marquardt.
 
-    It ends where a step gains less than `near`.
+    Parameters
+    ----------
+    model : Model
+        Starting point; it is moved inside the bounds.
+    centre : ndarray, shape (model.size,)
+        Mean of the prior.
+    friction : ndarray, shape (n,), optional
+        Friction on which noise and gains load; default the model's at the start. It is fixed during the descent, so
+        that all steps minimise the same function.
+    tolerance : float
+        Fall of the sum of squares below which the descent ends.
     """
     precision = precision_of(model)
     low, high = bounds_of(model, rows)
@@ -42,8 +59,7 @@ def descend(
     model = model.at(vector)
     force, jacobian = evaluate(model, rows)
     if friction is None:
-        friction = friction_of(model, rows)  # held, so that the criterion does not move under the search
-
+        friction = friction_of(model, rows)
     whitening = Whitening(scatter, friction, rows.groups)
 
     def cost_of(residual: np.ndarray, at: np.ndarray) -> float:
@@ -51,7 +67,7 @@ def descend(
 
     residual = whitening((rows.force - force)[:, None])[:, 0]
     cost = cost_of(residual, vector)
-    damping, crept = 1e-4, 0
+    damping, slow_steps = 1e-4, 0
     for _ in range(MAX_STEPS):
         normal, gradient = whitening.normal(jacobian, residual)
         gradient = gradient - precision @ (vector - centre)
@@ -78,18 +94,18 @@ def descend(
         gain = cost - trial_cost
         vector, model, residual, cost = trial, trial_model, trial_residual, trial_cost
         damping /= 10
-        crept = crept + 1 if gain < CREEPING else 0
-        if crept > 3 or (gain < near and damping < 1e-3):  # a step under heavy damping gains little anywhere
+        slow_steps = slow_steps + 1 if gain < SLOW else 0
+        if slow_steps > 3 or (gain < tolerance and damping < 1e-3):  # under heavy damping every step gains little
             return model
         _, jacobian = evaluate(model, rows)
     return model
 
 
 def search_nonlinear(model: Model, rows: Rows, scatter: Scatter) -> Model:
-    """Return the model with each v_s, and all b together, at the best point of a grid, what is linear solved anew.
+    """Return the model with each v_s, and all b together, at the best of a grid; linear parameters are solved for.
 
-    What an effect explains may have stood in them before, and the way out of there can lead over a hill. Series share
-    mu_0, so that one v_s alone may not get out: all are tried together first, then each by itself.
+    Without the effect that was added, v_s and b may have converged to another local minimum. Series share mu_0, so that
+    one v_s alone may not leave it: first all v_s get the same value, then each is searched by itself.
     """
     rows = rows.sparse(ROWS_FOR_START)
     quantities = [p.quantity for p in model.declared.parameters]
@@ -103,70 +119,70 @@ def search_nonlinear(model: Model, rows: Rows, scatter: Scatter) -> Model:
 
 
 def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) -> Model:
-    """Return the model with the numbers of a group, equal to one another, at the best of a few values or as it is.
+    """Return the model at the least cost among itself and the grid values of a group of parameters, all set equal.
 
-    Rows on which the group does not act are summed once.
+    The cost is the penalised whitened sum of squares, with the linear parameters at their optimum. Rows on which the
+    group does not act have the same normal equations at every grid value; these are computed once.
     """
     low, high = bounds_of(model, rows)
     prior = _linear_prior(model)
-    held = np.diag(precision_of(model))[group]  # where the data hold nothing, v_s stays where it stands
-    moving, still = _parted(model, rows, group)
-    whitening = Whitening(scatter, moving.force, moving.groups)
-    rest = None if still is None else _equations(model, still, Whitening(scatter, still.force, still.groups))
+    precision = np.diag(precision_of(model))[group]  # of the prior, which is centred at the present values
+    acted_on, others = _split_by_action(model, rows, group)
+    whitening = Whitening(scatter, acted_on.force, acted_on.groups)
+    constant = None if others is None else _equations(model, others, Whitening(scatter, others.force, others.groups))
 
-    def solved_at(at: Model, most: float = np.inf) -> tuple[float, Model]:
-        own = _equations(at, moving, whitening)
-        return _linear_solved(at, own if rest is None else own.plus(rest), *prior, (low, high), most=most)
+    def optimum(trial: Model, ceiling: float = np.inf) -> tuple[float, Model]:
+        own = _equations(trial, acted_on, whitening)
+        equations = own if constant is None else own.plus(constant)
+        return _linear_optimum(trial, equations, prior, (low, high), ceiling=ceiling)
 
-    best, chosen = solved_at(model)
+    least_cost, best = optimum(model)
     for value in np.linspace(low[group[0]], high[group[0]], GRID_POINTS):
         vector = model.vector()
-        away = value - vector[group]
+        penalty = float(precision @ (value - vector[group]) ** 2)
         vector[group] = value
-        pull = float(held @ away**2)
-        cost, solved = solved_at(model.at(vector), best - pull)
-        cost += pull
-        if cost < best - 1e-9:
-            best, chosen = cost, solved
-    return model.at(np.clip(chosen.vector(), low, high))
+        cost, solved = optimum(model.at(vector), least_cost - penalty)
+        if cost + penalty < least_cost - 1e-9:
+            least_cost, best = cost + penalty, solved
+    return model.at(np.clip(best.vector(), low, high))
 
 
-def _parted(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, Rows | None]:
-    """Return the rows that numbers of the declared model act on, and the others; all and None where they do not part.
+def _split_by_action(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, Rows | None]:
+    """Return the rows on which declared parameters act, and the others; all rows and None if one part is empty.
 
-    Rows of one specimen are not independent and stay together.
+    Rows of one specimen are correlated and stay together.
     """
     acts = np.any([np.isin(numbers, group) for numbers in model.declared.index.values()], axis=0)[rows.condition]
     specimen = rows.codes("specimen")
     acts = (np.bincount(specimen, acts) > 0)[specimen]
     if acts.all() or not acts.any():
         return rows, None
-    key = ("parted", acts.tobytes())
-    if key not in rows.kept:
-        rows.kept[key] = (rows.subset(acts), rows.subset(~acts))
-    return rows.kept[key]
+    key = ("split", acts.tobytes())
+    if key not in rows.cache:
+        rows.cache[key] = (rows.subset(acts), rows.subset(~acts))
+    return rows.cache[key]
 
 
-def linear_solved(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
-    """Return the model with all that acts linearly solved for, v_s, b and the effects' own numbers where they stand.
+def solve_linear(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
+    """Return the model with its linear parameters at their optimum, all nonlinear parameters fixed.
 
-    A term that has just come in takes over what others had explained for it: until they have given that back, a
-    descent throws the rest anywhere.
+    A new term explains part of what other terms explained before. This solve redistributes it before the descent,
+    which would otherwise start far from the optimum and may diverge.
     """
-    low, high = bounds_of(model, rows)
+    bounds = bounds_of(model, rows)
     equations = _equations(model, rows, Whitening(scatter, friction, rows.groups))
-    solved = _linear_solved(model, equations, *_linear_prior(model), (low, high))[1]
-    return model.at(np.clip(solved.vector(), low, high))
+    solved = _linear_optimum(model, equations, _linear_prior(model), bounds)[1]
+    return model.at(np.clip(solved.vector(), *bounds))
 
 
 def _linear_prior(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Return the prior's precision of the numbers that act linearly, and where it lies."""
-    linear = ~model.bent
+    """Return precision, shape (k, k), and mean, shape (k,), of the prior of the linear parameters."""
+    linear = ~model.nonlinear
     return precision_of(model)[np.ix_(linear, linear)], centre_of(model)[linear]
 
 
 class _Equations(NamedTuple):
-    """Normal equations of the numbers that act linearly, and the whitened sum of squares before they are solved."""
+    """Normal equations of a step of the linear parameters, and the sum of squares without a step."""
 
     normal: np.ndarray  # (k, k)
     gradient: np.ndarray  # (k,)
@@ -176,57 +192,59 @@ class _Equations(NamedTuple):
         """Return the equations of these rows and of others that are independent of them."""
         return _Equations(self.normal + other.normal, self.gradient + other.gradient, self.square + other.square)
 
+    def penalised(self, precision: np.ndarray, away: np.ndarray) -> _Equations:
+        """Return the equations with a prior; `away`, shape (k,), is the parameters less the prior's mean."""
+        square = self.square + float(away @ precision @ away)
+        return _Equations(self.normal + precision, self.gradient - precision @ away, square)
+
+    def cost(self, step: np.ndarray) -> float:
+        """Return the sum of squares after a step, shape (k,)."""
+        return self.square - 2 * float(step @ self.gradient) + float(step @ self.normal @ step)
+
 
 def _equations(model: Model, rows: Rows, whitening: Whitening) -> _Equations:
     force, jacobian = evaluate(model, rows)
     residual = whitening((rows.force - force)[:, None])[:, 0]
-    linear = ~model.bent  # one step far from the optimum would throw the others anywhere
-    return _Equations(*whitening.normal(jacobian.columns(linear), residual), float(residual @ residual))
+    return _Equations(*whitening.normal(jacobian.columns(~model.nonlinear), residual), float(residual @ residual))
 
 
-def _linear_solved(
+def _linear_optimum(
     model: Model,
     equations: _Equations,
-    precision: np.ndarray,
-    centre: np.ndarray,
+    prior: tuple[np.ndarray, np.ndarray],
     bounds: tuple[np.ndarray, np.ndarray],
     *,
-    most: float = np.inf,
+    ceiling: float = np.inf,
 ) -> tuple[float, Model]:
-    """Return the whitened sum of squares left, and the model, its linear numbers solved for at once in their bounds.
+    """Return the penalised sum of squares and the model, its linear parameters at their optimum within the bounds.
 
-    Without the bounds, a v_s far off can seem the best, with a negative friction that the fit cannot have. Bounds only
-    add to what is left: where that is more than `most` without them, they are not asked.
+    Without bounds, a wrong v_s could fit best with negative friction. Bounds can only raise the sum of squares, so they
+    are ignored where it is not below `ceiling` without them.
     """
-    linear, vector = ~model.bent, model.vector()
-    away = vector[linear] - centre
-    normal, gradient = equations.normal + precision, equations.gradient - precision @ away
-    low, high = (bound[linear] - vector[linear] for bound in bounds)
-    there = equations.square + float(away @ precision @ away)
-
-    def left(step: np.ndarray) -> float:
-        return there - 2 * float(step @ gradient) + float(step @ normal @ step)
-
-    step = least_squares(normal, gradient)
-    if left(step) < most:
-        step = least_squares_within(normal, gradient, low, high, step)
+    linear, vector = ~model.nonlinear, model.vector()
+    precision, centre = prior
+    equations = equations.penalised(precision, vector[linear] - centre)
+    step = least_squares(equations.normal, equations.gradient)
+    if equations.cost(step) < ceiling:
+        low, high = (bound[linear] - vector[linear] for bound in bounds)
+        step = least_squares_within(equations.normal, equations.gradient, low, high, step)
     vector[linear] += step
-    return left(step), model.at(vector)
+    return equations.cost(step), model.at(vector)
 
 
 def least_squares(normal: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Return the smallest x that minimises x' normal x / 2 - gradient' x, shape (k,)."""
+    """Return the x of least norm that minimises x' normal x / 2 - gradient' x, shape (k,)."""
     return np.linalg.lstsq(normal, gradient, rcond=1e-10)[0]
 
 
 def least_squares_within(
     normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, free: np.ndarray
 ) -> np.ndarray:
-    """Return the x between bounds that does so, shape (k,), from `free`, the x that does so without them."""
+    """Return the minimiser of `least_squares` within bounds, shape (k,); `free` is the one without bounds."""
     if np.all((free >= low) & (free <= high)):
         return free
     square = np.diag(normal)
-    acts = square > 1e-30 * square.max()  # a column that does nothing keeps its scale
+    acts = square > 1e-30 * square.max()  # a column of zeros keeps its scale
     scale = 1 / np.sqrt(np.where(acts, square, 1.0))
     size, axes = np.linalg.eigh(normal * np.outer(scale, scale))
     kept = size > 1e-10 * size[-1]
@@ -236,7 +254,7 @@ def least_squares_within(
 
 
 def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and greatest value of each fitted number, each of shape (model.size,)."""
+    """Return the lower and upper bounds of all fitted numbers, shape (model.size,) each."""
     slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
     days = rows.days[rows.days > 0]
     first, last = (days.min(), days.max()) if days.size else (1.0, 1.0)
@@ -257,20 +275,21 @@ def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 
 
 # ---------------------------------------------------------------- start
-# Where the joint fit starts: a global search of v_s and b, everything linear exact.
+# The start of the joint fit: a global search of v_s and b, with the linear parameters solved for.
 
-GRID = 80  # values of v_s
-
+# Number of grid values of v_s.
+GRID = 80
+# Values of v_s whose sums of squares differ by less than this share of the sum of squared forces fit equally well. The
+# middle one is taken.
 EQUAL = 1e-10
-"""Of the sum of squares of the forces, within which values of v_s fit equally well; the middle one of them is taken."""
-
-RANK = 1e-10  # of the largest singular value, below which columns are as good as dependent
+# Singular values below this share of the largest one count as zero.
+RANK = 1e-10
 
 
 def start_model(rows: Rows, *, together: bool = False) -> Model:
     """Return the declared model with v_s and b from a global search and the rest from exact least squares.
 
-    With `together`, all series start from one v_s and one sigma_2, which a few noisy runs cannot lead astray.
+    With `together`, all series start from one v_s and one sigma_2, which a few noisy runs cannot make far wrong.
     """
     declared = declare(rows)
     theta = np.zeros(len(declared.parameters))
@@ -284,7 +303,7 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
     level = np.zeros((len(declared.conditions), 2))  # mu_s, mu_c of each condition
     chosen = np.zeros(len(declared.conditions), dtype=bool)
     curved = declared.index["v_s"] >= 0
-    solved: dict[bytes, tuple] = {}  # together, all series of a kind ask the same
+    solved: dict[bytes, tuple] = {}  # with `together`, series of one form share the solution
     for name in series:
         k = number.get(JointParameter("sigma_2", name), number.get(JointParameter("v_s", name)))
         full = JointParameter("v_s", name) in number
@@ -324,7 +343,7 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
 
 
 def _per_condition(speed, load, size, condition, full: bool):
-    """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of one series by a grid over v_s, the rest exact."""
+    """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of one series: a grid over v_s, the others solved for."""
     own, code = np.unique(condition, return_inverse=True)
     grid = np.geomspace(*stribeck_range(speed), GRID) if full else np.array([1.0])
     solved, costs = [], []
@@ -333,11 +352,11 @@ def _per_condition(speed, load, size, condition, full: bool):
         columns = (load * decay, load * (1 - decay))
         pairs, sigma_2 = pairs_and_shared(columns, code, speed, size)
         first, second = pairs.T
-        left = size - first[code] * columns[0] - second[code] * columns[1] - sigma_2 * speed
-        costs.append(float(left @ left))
+        residual = size - first[code] * columns[0] - second[code] * columns[1] - sigma_2 * speed
+        costs.append(float(residual @ residual))
         solved.append((pairs, sigma_2, v_s))
-    alike = np.flatnonzero(np.array(costs) <= min(costs) + EQUAL * float(size @ size))
-    pairs, sigma_2, v_s = solved[alike[alike.size // 2]]
+    equal = np.flatnonzero(np.array(costs) <= min(costs) + EQUAL * float(size @ size))
+    pairs, sigma_2, v_s = solved[equal[equal.size // 2]]
     mu_s, mu_c = pairs.T if full else (pairs[:, 1], pairs[:, 1])
     return {int(c): (s, k) for c, s, k in zip(own, mu_s, mu_c, strict=True)}, float(sigma_2), float(v_s)
 
@@ -345,18 +364,19 @@ def _per_condition(speed, load, size, condition, full: bool):
 def pairs_and_shared(
     columns: tuple[np.ndarray, np.ndarray], code: np.ndarray, shared: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the least squares of two numbers per group and one, not below 0, that all share; the smallest of many.
+    """Return the least squares solution of two numbers per group and one, not below 0, that all groups share.
 
-    Each group's two columns are made orthogonal and taken out, which leaves one equation for the shared number.
+    Each group's two columns are orthonormalised and projected out, which leaves one equation for the shared number.
+    Among several solutions it is the one of least norm.
 
     Parameters
     ----------
     columns : tuple of ndarray, shape (n,) each
-        What a group's own numbers multiply.
+        Columns of the two numbers of each group.
     code : ndarray, shape (n,)
-        Group of each value, from 0 on.
+        Number of each value's group, from 0.
     shared, values : ndarray, shape (n,)
-        What the shared number multiplies; the values.
+        Column of the shared number; the values to fit.
 
     Returns
     -------
@@ -372,15 +392,15 @@ def pairs_and_shared(
     least = RANK * max(float(spread.max()), float(np.linalg.norm(shared)), 1e-300)
     inverse = np.divide(1.0, spread, out=np.zeros_like(spread), where=spread > least)
 
-    def taken(column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a column's coefficients on the groups' own, shape (groups, 2), and what is left of it."""
+    def projected(column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a column's coefficients on the groups' columns, shape (groups, 2), and its residual, shape (n,)."""
         inside = np.column_stack([np.bincount(code, one * column), np.bincount(code, two * column)])
         pairs = np.einsum("gji,gj->gi", right, np.einsum("gji,gj->gi", left, inside) * inverse)
         first, second = pairs.T
         return pairs, column - first[code] * columns[0] - second[code] * columns[1]
 
-    of_shared, shared_left = taken(shared)
-    of_values, values_left = taken(values)
+    of_shared, shared_left = projected(shared)
+    of_values, values_left = projected(values)
     square = float(shared_left @ shared_left)
     if np.sqrt(square) > least:
         number = float(shared_left @ values_left) / square
@@ -391,16 +411,16 @@ def pairs_and_shared(
 
 
 def _unit(column: np.ndarray, code: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a column made of length 1 in each group, and its lengths; zeros stay."""
+    """Return a column scaled to length 1 in each group, and its lengths; a column of zeros stays zero."""
     length = np.sqrt(np.bincount(code, column**2))
     return column * np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)[code], length
 
 
 def stribeck_range(speeds: np.ndarray) -> tuple[float, float]:
-    """Return where v_s is looked for: from half the second slowest speed to the fastest.
+    """Return the range in which v_s is searched: from half the second slowest speed to the fastest, in mm/s.
 
-    Below that range only the slowest speed would see mu_s, which could then be any size; above it the exponential is a
-    parabola that sigma_2 and mu_c make as well (v_s needs two speeds below about 2 v_s).
+    Below that range only the slowest speed would depend on mu_s, which would not be bounded. Above it the exponential
+    is close to a parabola, which sigma_2 and mu_c can imitate (v_s needs two speeds below about 2 v_s).
     """
     positive = np.sort(speeds[speeds > 0])
     above = positive[positive > SAME_SPEED * positive[0]]

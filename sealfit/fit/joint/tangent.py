@@ -1,10 +1,10 @@
-r"""The tangent of the joint model, held by what each specimen's rows depend on.
+r"""The tangent of the joint model, the derivatives of all rows, stored by blocks of columns.
 
-A series has numbers of its own and shares a few with the others, so a row has as many derivatives as one series has
-numbers, however many series there are. Rows of a specimen share a *block*: the columns that any of them depends on.
-Whitening mixes rows of a specimen alone and stays within the block; normal matrices are sums over blocks; and columns
-of one block only are made orthonormal in it, before those that blocks share (a bordered block diagonal: Golub and
-Pereyra 1973, doi:10.1137/0710036, take linear numbers out in the same way). Cost and memory are linear in the rows.
+A row depends only on the parameters of its series and on a few that series share. Rows of a specimen share a *block*:
+the columns on which any of them depends. Whitening combines rows of one specimen only and keeps the blocks. Normal
+matrices are sums over blocks. A bordered block-diagonal factorisation orthonormalises the columns of each block first,
+then those that blocks share (as Golub and Pereyra 1973, doi:10.1137/0710036, eliminate linear parameters). Time and
+memory are linear in the number of rows.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from scipy.sparse import csr_array
 
 from sealfit.fit.joint.rows import Groups
 
-WORTHWHILE = 0.5  # share of all columns beyond which a block is no smaller than the whole
+# With a block of more than this share of all columns the tangent is stored dense.
+LARGEST_BLOCK = 0.5
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Which column stands where in each block, and the block of each row."""
+    """The columns of each block, and the block of each row."""
 
-    size: int  # columns, p
-    index: np.ndarray  # (blocks, k) column at each place; p where the place is empty
+    size: int  # number of columns, p
+    index: np.ndarray  # (blocks, k) column at each place of a block; p if the place is empty
     block: np.ndarray  # (n,)
 
     @cached_property
     def rows(self) -> list[slice | np.ndarray]:
-        """Rows of each block; a slice where they follow one another."""
+        """Rows of each block; a slice if they are contiguous."""
         if len(self.index) == 1:
             return [slice(None)]
         order = np.argsort(self.block, kind="stable")
@@ -43,17 +44,17 @@ class Layout:
 
     @cached_property
     def places(self) -> np.ndarray:
-        """Place of each column in each block, shape (blocks, p); -1 where a block does not have it."""
+        """Place of each column in each block, shape (blocks, p); -1 if the block lacks it."""
         found = np.full((len(self.index), self.size + 1), -1)
         np.put_along_axis(found, self.index, np.arange(self.index.shape[1])[None, :], axis=1)
         return found[:, :-1]
 
     def of(self, rows: np.ndarray) -> Layout:
-        """Return the layout of chosen rows."""
+        """Return the layout of some rows."""
         return Layout(self.size, self.index, self.block[rows])
 
     def gram(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return the product of two sets of columns on the rows, shape (n, k) each -> (p, p)."""
+        """Return A' B of two sets of columns in this layout, shape (n, k) each -> (p, p)."""
         if self.whole:
             return first.T @ second
         parts = np.stack([first[rows].T @ second[rows] for rows in self.rows])
@@ -63,18 +64,18 @@ class Layout:
 
     @cached_property
     def pairs(self) -> np.ndarray:
-        """Where each entry of the blocks' Gram matrices stands in the whole one and its margin, (blocks * k * k,)."""
+        """Flat index of each entry of the blocks' Gram matrices in the padded Gram matrix, shape (blocks * k * k,)."""
         return (self.index[:, :, None] * (self.size + 1) + self.index[:, None, :]).ravel()
 
     @cached_property
     def whole(self) -> bool:
-        """Whether there is one block, of every column in order."""
+        """Whether there is one block with all columns in order."""
         return len(self.index) == 1 and np.array_equal(self.index[0], np.arange(self.size))
 
 
 @dataclass(frozen=True)
 class Tangent:
-    """Derivatives of rows, shape (n, p), by blocks: `values`, shape (n, k), 0 where a place is empty."""
+    """Derivatives of rows, shape (n, p), by blocks: `values`, shape (n, k), 0 at empty places."""
 
     layout: Layout
     values: np.ndarray
@@ -96,12 +97,12 @@ class Tangent:
         np.put_along_axis(found, self.layout.index[self.layout.block], self.values, axis=1)
         return found[:, :-1]
 
-    def holding(self, values: np.ndarray) -> Tangent:
-        """Return other values, shape (n, k), of the same layout."""
+    def with_values(self, values: np.ndarray) -> Tangent:
+        """Return a tangent with other values, shape (n, k), in the same layout."""
         return Tangent(self.layout, values)
 
-    def beside(self, columns: np.ndarray) -> Tangent:
-        """Return the tangent with more columns, shape (n,) or (n, m), in every block."""
+    def append(self, columns: np.ndarray) -> Tangent:
+        """Return the tangent with columns, shape (n,) or (n, m), appended to every block."""
         values = np.column_stack([self.values, columns])
         first, size = self.layout.size, self.layout.size + values.shape[1] - self.values.shape[1]
         index = np.where(self.layout.index == first, size, self.layout.index)
@@ -113,7 +114,7 @@ class Tangent:
         return self.layout.gram(self.values, self.values)
 
     def against(self, columns: np.ndarray) -> np.ndarray:
-        """Return T' C of columns on the rows, shape (n,) or (n, m) -> (p,) or (p, m)."""
+        """Return T' C of columns, shape (n,) or (n, m) -> (p,) or (p, m)."""
         total = np.zeros((self.layout.size + 1, *columns.shape[1:]))
         for index, rows in zip(self.layout.index, self.layout.rows, strict=True):
             total[index] += self.values[rows].T @ columns[rows]
@@ -127,12 +128,12 @@ class Tangent:
             found[rows] = self.values[rows] @ padded[index]
         return found
 
-    def freed(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns on the rows, shape (n,) or (n, m), less what these, orthonormal, hold of them."""
+    def project_out(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns, shape (n,) or (n, m), minus their projection on the tangent, which must be orthonormal."""
         return columns - self @ self.against(columns)
 
     def squares(self, matrix: np.ndarray) -> np.ndarray:
-        """Return t' M t of each row t, for a matrix of shape (p, p) -> (n,)."""
+        """Return t' M t of each row t for a matrix M, shape (p, p) -> (n,)."""
         padded, found = np.pad(matrix, (0, 1)), np.empty(self.values.shape[0])
         for index, rows in zip(self.layout.index, self.layout.rows, strict=True):
             found[rows] = np.einsum("ij,ij->i", self.values[rows] @ padded[np.ix_(index, index)], self.values[rows])
@@ -146,20 +147,20 @@ class Tangent:
         return np.sqrt(squares[:-1])
 
     def scaled(self, factor: np.ndarray) -> Tangent:
-        """Return each column times a factor, shape (p,)."""
-        return self.holding(self.values * np.append(factor, 0.0)[self.layout.index][self.layout.block])
+        """Return the tangent with each column multiplied by a factor, shape (p,)."""
+        return self.with_values(self.values * np.append(factor, 0.0)[self.layout.index][self.layout.block])
 
     def sums(self, groups: Groups, level: str, factor: np.ndarray | None = None) -> Tangent:
-        """Return the sum over each group, within a specimen, of the rows times a factor, shape (n,)."""
+        """Return the sums over groups of the rows times a factor, shape (n,); groups lie within specimens."""
         values = self.values if factor is None else self.values * factor[:, None]
         return Tangent(self.layout.of(groups.starts[level]), groups.sums(values, level))
 
     def means(self, groups: Groups, level: str) -> Tangent:
-        """Return the mean over each group, within a specimen."""
+        """Return the means over groups; groups lie within specimens."""
         return Tangent(self.layout.of(groups.starts[level]), groups.means(self.values, level))
 
     def columns(self, mask: np.ndarray) -> Tangent:
-        """Return the columns where `mask`, shape (p,), is true."""
+        """Return the columns for which `mask`, shape (p,), is true."""
         size, number = int(mask.sum()), np.append(np.cumsum(mask) - 1, 0)
         index = np.where(np.append(mask, False)[self.layout.index], number[self.layout.index], size)
         used = (index < size).any(axis=0)
@@ -167,23 +168,23 @@ class Tangent:
         return Tangent(Layout(size, index[:, used], self.layout.block), values[:, used])
 
     def orthonormal(
-        self, tolerance: float, freed: Callable[[np.ndarray], np.ndarray] = lambda columns: columns
+        self, tolerance: float, project_out: Callable[[np.ndarray], np.ndarray] = lambda columns: columns
     ) -> Tangent:
-        """Return an orthonormal basis of the columns' span, of shape (n, rank), columns first made of length 1.
+        """Return an orthonormal basis of the span of the columns, scaled to length 1 first, of shape (n, rank).
 
         Parameters
         ----------
         tolerance : float
-            Share of the largest singular value below which one is taken for zero.
-        freed : callable, optional
-            Takes something out of columns, (n, m) -> (n, m), specimen by specimen, once they are of length 1.
+            Singular values below this share of the largest one count as zero.
+        project_out : callable, optional
+            Projection of the scaled columns, (n, m) -> (n, m), that combines rows of one specimen only.
         """
         unit = self.scaled(1 / np.maximum(self.norms(), 1e-300))
-        unit = unit.holding(freed(unit.values))
+        unit = unit.with_values(project_out(unit.values))
         layout = self.layout
         shared = (layout.places >= 0).sum(axis=0) > 1
         border = np.column_stack([unit._column(k) for k in np.flatnonzero(shared)]) if shared.any() else None
-        most = 1.0 if border is None else max(1.0, float(np.linalg.norm(border, 2)))  # one column has length 1
+        most = 1.0 if border is None else max(1.0, float(np.linalg.norm(border, 2)))  # columns have length 1
         parts = []
         for index, rows in zip(layout.index, layout.rows, strict=True):
             own = unit.values[rows][:, np.append(~shared, False)[index]]
@@ -202,9 +203,9 @@ class Tangent:
         own = Tangent(Layout(size, index, layout.block), values)
         if border is None:
             return own
-        border = own.freed(own.freed(border))  # twice: the first leaves what rounding has left
+        border = own.project_out(own.project_out(border))  # the second projection removes rounding errors
         left, spread, _ = np.linalg.svd(border, full_matrices=False)
-        return own.beside(left[:, spread > tolerance * most])
+        return own.append(left[:, spread > tolerance * most])
 
     def _column(self, number: int) -> np.ndarray:
         """Return one column, shape (n,)."""
@@ -213,14 +214,14 @@ class Tangent:
 
 
 class OwnColumns:
-    """A column for each specimen, on rows of its own: taking them out needs no matrix.
+    """One column per specimen, zero outside the specimen's rows; they are orthogonal, so no matrix is inverted.
 
     Parameters
     ----------
     code : ndarray, shape (n,)
         Specimen of each row.
     load : ndarray, shape (n,)
-        What its column holds there; one that holds nothing is none.
+        Value of its column there. Columns of zeros do not count.
     """
 
     def __init__(self, code: np.ndarray, load: np.ndarray) -> None:
@@ -229,25 +230,25 @@ class OwnColumns:
         self.unit = load / np.sqrt(np.where(square > 0, square, 1.0))[code]
         self.code, self.summing = code, csr_array((self.unit, (code, np.arange(code.size))))
 
-    def freed(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns, shape (n,) or (n, m), less what the specimens' own hold of them."""
+    def project_out(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns, shape (n,) or (n, m), minus their projection on the specimens' columns."""
         return columns - (self.unit * (self.summing @ columns)[self.code].T).T
 
 
 def blocks_of(sets: Sequence[frozenset[int]], size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return blocks that hold sets of columns, and the block of each set; one for all where that is no dearer.
+    """Return blocks that contain sets of columns, and the block of each set; one block if a set has most columns.
 
     Parameters
     ----------
     sets : sequence of frozenset
-        Columns that must stand together.
+        Columns that must be in one block.
     size : int
         Number of columns.
 
     Returns
     -------
     tuple of ndarray
-        Column at each place, shape (blocks, k), `size` where it is empty; and number of the block, shape (sets,).
+        Column at each place, shape (blocks, k), `size` if empty; and number of each set's block, shape (sets,).
     """
     kept: list[frozenset[int]] = []
     home: dict[frozenset[int], int] = {}
@@ -256,7 +257,7 @@ def blocks_of(sets: Sequence[frozenset[int]], size: int) -> tuple[np.ndarray, np
         if home[one] == len(kept):
             kept.append(one)
     most = max(map(len, kept), default=0)
-    if len(kept) < 2 or most > WORTHWHILE * size:
+    if len(kept) < 2 or most > LARGEST_BLOCK * size:
         return np.arange(size)[None, :], np.zeros(len(sets), dtype=int)
     index = np.full((len(kept), most), size)
     for k, block in enumerate(kept):

@@ -1,4 +1,4 @@
-"""What is random in a residual: noise, and the variance of strokes, files, runs and specimens by REML."""
+"""Row noise, and the variance components of strokes, files, runs and specimens by REML."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sealfit.fit.joint.whitening import Component, Scatter
 from sealfit.ingest.scatter import two_nonnegative
 
 # ---------------------------------------------------------------- reml
-# The size of scatter at several nested levels, by restricted maximum likelihood (REML), with its exact gradient.
+# Variance components at nested levels by restricted maximum likelihood (REML), with its exact gradient.
 #
 # With B = [1, F] the loadings of offset and gain, :math:`K_l` their variances at level l, and V_l the covariance up to
 # that level, Woodbury's identity gives for each group
@@ -25,30 +25,37 @@ from sealfit.ingest.scatter import two_nonnegative
 # .. math:: B^T V_l^{-1} B = Q - Q M Q, \quad M = K^{1/2} (1 + K^{1/2} Q K^{1/2})^{-1} K^{1/2},
 #           \quad Q = \sum_\mathrm{inside} B^T V_{l-1}^{-1} B
 #
-# so that nothing larger than 2 x 2 is inverted: from the finest level up for the likelihood, and down again for the
-# traces in its gradient.
+# Only 2 x 2 matrices are inverted: from the finest level to the coarsest for the likelihood, and back for its gradient.
 #
 # Searle, Casella & McCulloch 1992, *Variance Components*, doi:10.1002/9780470316856, chapter 6.
 
-REVIVED = 0.03  # share at which a component starts though it was nothing before: from zero it could not come back
-MOST_GAIN = 0.5  # no rig's gain scatters more: a model near zero with gains of any size would fit every force
-LEAST = 1e-5  # share of all scatter below which a component is nothing
-MOST_SHARE = 30.0  # of the residual, of which the model has taken much where it has nearly as many numbers
+# Smallest start of a component, as a share of the residual variance. The gradient is 0 at a component of 0, which
+# could not grow again.
+LEAST_START = 0.03
+# Largest relative standard deviation of a gain; no rig's is larger. Without a limit a force of nearly 0 with a large
+# gain would fit any data.
+MOST_GAIN = 0.5
+# A component below this share of the residual variance counts as zero.
+LEAST = 1e-5
+# Largest component, as a multiple of the residual variance. It exceeds 1 as a model with nearly as many parameters as
+# groups leaves small residuals.
+MOST_SHARE = 30.0
+
 KINDS = ("offset", "gain")
 
 
 @dataclass(frozen=True)
 class GroupMeans:
-    """Means over the finest groups, m of them.
+    """Means over the m finest groups.
 
     Attributes
     ----------
     residual, force : ndarray, shape (m,)
-        Of the residual at the fitted model, and of the model's force, signed.
+        Means of the residual and of the model's force, signed, in N.
     variance : ndarray, shape (m,)
-        Variance of each mean from the rows' own noise.
+        Variance of each mean due to row noise, in N^2.
     groups : Groups
-        Of the m means.
+        Nested groups of the m means.
     """
 
     residual: np.ndarray
@@ -67,21 +74,19 @@ def reml(
 
     Parameters
     ----------
-    means : GroupMeans
-        What scatters.
     jacobian : Tangent, shape (m, p)
-        Mean tangent of the model; the degrees of freedom it takes are accounted for.
+        Mean tangent of the model, for the restricted likelihood.
     kinds : sequence of (level, kind)
-        Components sought, finest level first.
+        Components to estimate, finest level first.
     start : sequence of float, optional
-        Variances to start from.
+        Starting values of the variances.
     """
     if not kinds:
         return ()
     scale_force = max(float(np.sqrt(np.mean(means.force**2))), 1e-12)
     total = max(float(np.var(means.residual)), float(np.mean(means.variance)), 1e-20)
     unit = np.array([total / (scale_force**2 if kind == "gain" else 1.0) for _, kind in kinds])
-    # A variance that is nothing beside the scatter would leave rounding to decide.
+    # A lower limit of the noise variance keeps the likelihood from being dominated by rounding.
     means = replace(means, variance=np.maximum(means.variance, LEAST * total))
     likelihood = RestrictedLikelihood(means, jacobian.orthonormal(1e-9), kinds)
 
@@ -91,15 +96,15 @@ def reml(
 
     most = [MOST_GAIN**2 / u if kind == "gain" else np.inf for u, (_, kind) in zip(unit, kinds, strict=True)]
     high = np.sqrt(np.clip(most, LEAST, MOST_SHARE))
-    first = np.full(len(kinds), 0.2) if start is None else np.maximum(np.asarray(start) / unit, REVIVED)
-    # Over standard deviations: a component that is nothing is a minimum at 0 there, over logarithms an endless slope.
+    first = np.full(len(kinds), 0.2) if start is None else np.maximum(np.asarray(start) / unit, LEAST_START)
+    # The parameters are standard deviations: a zero component has its minimum at 0, in logarithms at -inf.
     best = minimize(
         objective,
         np.minimum(np.sqrt(first), 0.6 * high),
         jac=True,
         method="L-BFGS-B",
         bounds=[(0.0, most) for most in high],
-        options={"maxiter": 200, "ftol": 1e-10},  # far below what rounding in the residual should move
+        options={"maxiter": 200, "ftol": 1e-10},  # so that rounding in the residual changes no estimate
     )
     share = best.x**2
     variances = np.where(share > LEAST, unit * share, 0.0)
@@ -121,7 +126,7 @@ class RestrictedLikelihood:
 
     def __init__(self, means: GroupMeans, basis: Tangent, kinds: Sequence[tuple[str, str]]) -> None:
         groups, self.variance = means.groups, means.variance
-        every = basis.beside(means.residual)
+        every = basis.append(means.residual)
         self.columns = every.values
         self.loads = np.column_stack([np.ones_like(means.force), means.force])
         self.places = [(level, KINDS.index(kind)) for level, kind in kinds]
@@ -161,18 +166,18 @@ class RestrictedLikelihood:
             mq = _product(m, q)
             left = (1.0 - mq[0], -mq[1], -mq[2], 1.0 - mq[3])
             inner.append((m, mt, left))
-            # q - q m q and t - q m t: what is left between the groups of this level
+            # q - q m q and t - q m t, for the groups of this level
             square = (q[0] * left[0] + q[1] * left[2], q[0] * left[1] + q[1] * left[3], q[1] * left[1] + q[2] * left[3])
             cross = tuple(x - y for x, y in zip(t, _applied(q, mt), strict=True))
             steps.append((square, cross))
         chol = _root_of(gram[:-1, :-1])
         half = solve_triangular(chol, gram[:-1, -1], lower=True)
         value += 2.0 * float(np.log(np.diag(chol)).sum()) + float(gram[-1, -1] - half @ half)
-        # Columns that are orthonormal under V, and what is left of the residual: the gradient is in their loads.
+        # Columns orthonormal under V^-1 and the GLS residual; the gradient is a function of their loadings.
         turn = np.zeros_like(gram)
         turn[:-1, :-1] = solve_triangular(chol, np.eye(half.size), lower=True).T
         turn[:-1, -1], turn[-1, -1] = -turn[:-1, :-1] @ half, 1.0
-        turned = turn @ turn.T  # whose product with a Gram matrix is the sum of squares of the turned columns
+        turned = turn @ turn.T  # its product with a Gram matrix is the sum of squares of the transformed columns
         slope = {}
         n = y = None
         for k in reversed(range(len(steps))):
@@ -201,7 +206,7 @@ class RestrictedLikelihood:
 
 
 def _root_of(gram: np.ndarray) -> np.ndarray:
-    """Return the lower Cholesky root of a Gram matrix; directions that only rounding holds are given a little size."""
+    """Return the lower Cholesky root of a Gram matrix, with the smallest ridge that makes it positive definite."""
     ridge = 1e-12
     while True:
         try:
@@ -214,11 +219,11 @@ def _root_of(gram: np.ndarray) -> np.ndarray:
 
 
 Symmetric = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""2 x 2 matrices by their entries 11, 12 and 22, each (groups,): far quicker than products of stacks so small."""
+"""2 x 2 matrices by their entries 11, 12 and 22, shape (groups,) each; faster than products of stacked matrices."""
 
 
 def _shrinkage(q: Symmetric, size: np.ndarray) -> tuple[Symmetric, np.ndarray]:
-    """Return (S^-1 + q)^-1 and log det (1 + S q), shape (groups,), for S the diagonal of `size`; S may hold zeros."""
+    """Return (S^-1 + q)^-1 and log det (1 + S q), shape (groups,), for S the diagonal of `size`, which may be 0."""
     a, b, c = 1.0 + size[0] * q[0], np.sqrt(size[0] * size[1]) * q[1], 1.0 + size[1] * q[2]
     det = a * c - b * b
     return (size[0] * c / det, -np.sqrt(size[0] * size[1]) * b / det, size[1] * a / det), np.log(det)
@@ -255,49 +260,48 @@ def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- scatter
-# What is random in a residual: the rows' own noise, and the variance of strokes, files, runs and specimens.
+# Row noise, design effect and variance components of a residual.
 
-LEAST_NOISE = 1e-6  # of the force: below what any sensor resolves; keeps noise-free data from weights without end
-LEAST_FILES = 6  # from which files can be compared in shape
+# Smallest row noise, as a share of the force. It is below the resolution of any sensor, and keeps the weights of
+# noise-free data finite.
+LEAST_NOISE = 1e-6
+# Number of files from which differences in their shape along strokes are estimated.
+LEAST_FILES = 6
 
 
 def estimate_scatter(
     rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: Tangent, start: Scatter | None = None
 ) -> Scatter:
-    """Return row noise and variance components of the residual at a model, its degrees of freedom taken out.
+    """Return row noise and variance components of the residual of a model, by REML.
 
     Parameters
     ----------
     rows : Rows
-        The rows.
+        Data.
     residual, friction : ndarray, shape (n,)
-        Measured minus model, and the model's friction, which noise and gains load on.
+        Measured minus model, and the model's friction, to which noise and gains are proportional, in N.
     jacobian : Tangent, shape (n, p)
-        The model's.
+        Tangent of the model.
     start : Scatter, optional
-        An earlier estimate, to start from.
+        Starting values.
     """
-    s0, g, inflation = row_noise(rows, residual, friction)
-    shape = shape_scatter(rows, residual, np.sqrt((s0**2 + (g * friction) ** 2) * inflation))
-    start = Scatter(s0, g, () if start is None else start.components, inflation, shape)
+    s0, g, design_effect = row_noise(rows, residual, friction)
+    shape = shape_scatter(rows, residual, np.sqrt((s0**2 + (g * friction) ** 2) * design_effect))
+    start = Scatter(s0, g, () if start is None else start.components, design_effect, shape)
     return estimate_components(rows, residual, friction, jacobian, start)
 
 
 def estimate_components(
     rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: Tangent, scatter: Scatter
 ) -> Scatter:
-    """Return a scatter with its components estimated anew and its row noise as it is.
+    """Return a scatter with re-estimated variance components and the same row noise.
 
     Parameters
     ----------
-    rows : Rows
-        The rows.
-    residual, friction : ndarray, shape (n,)
-        Measured minus model, and the model's friction.
-    jacobian : Tangent, shape (n, p)
-        The model's, whose degrees of freedom are taken out.
+    rows, residual, friction, jacobian
+        As `estimate_scatter`.
     scatter : Scatter
-        Row noise, and where the components start.
+        Row noise, and starting values of the components.
     """
     groups, level = rows.groups, "stroke"
     means = groups.means(np.column_stack([residual, friction]), level)
@@ -306,7 +310,7 @@ def estimate_components(
     kinds = usable_components(rows)
     known = {(c.level, c.kind): c.variance for c in scatter.components}
     components = reml(
-        GroupMeans(means[:, 0], noise * scatter.alike / count, means[:, 1], groups.at(level)),
+        GroupMeans(means[:, 0], noise * scatter.design_effect / count, means[:, 1], groups.at(level)),
         jacobian.means(groups, level),
         kinds,
         [known.get(kind, 0.0) for kind in kinds] if known else None,
@@ -315,7 +319,7 @@ def estimate_components(
 
 
 def usable_components(rows: Rows) -> list[tuple[str, str]]:
-    """Return the (level, kind) of random effects that these groups can tell apart, finest level first."""
+    """Return (level, kind) of the random effects that these groups distinguish, finest level first."""
     counts = {level: rows.groups.starts[level].size for level in LEVELS}
     used, finer = [], None
     for level in LEVELS:
@@ -331,13 +335,13 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
     both = rows.speed.min() < 0 < rows.speed.max() or np.ptp(np.abs(rows.force)) > 0.2 * np.abs(rows.force).max()
     kinds = {level: ("offset", "gain") if both else ("offset",) for level in used}
     if both and "specimen" in kinds:
-        kinds["specimen"] = ("gain",)  # a piece of rubber has a friction of its own, not a zero of the sensor
+        kinds["specimen"] = ("gain",)  # specimens differ in friction, not in the sensor's zero
     return [(level, kind) for level in used for kind in kinds[level]]
 
 
 def _specimens_free(rows: Rows) -> bool:
-    """Whether specimens scatter about something: replicate specimens of a condition, or a law across conditions."""
-    return rows.groups.starts["specimen"].size - declare(rows).numbers_of_mu >= 2
+    """Return whether specimen scatter is estimable: replicate specimens of a condition, or a law across conditions."""
+    return rows.groups.starts["specimen"].size - declare(rows).mu_parameter_count >= 2
 
 
 def _df(rows: Rows, component: Component) -> float:
@@ -349,9 +353,9 @@ def _df(rows: Rows, component: Component) -> float:
 
 
 def row_noise(rows: Rows, residual: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
-    """Return (s0, g, inflation): row noise sqrt(s0^2 + (gF)^2) inside strokes, and how correlation widens a mean.
+    """Return (s0, g, design effect): row noise sqrt(s0^2 + (gF)^2) within strokes, and the effect of its correlation.
 
-    What the strokes have in common at a bin is not noise and is taken out first.
+    The mean pattern of all strokes along the bins is not noise and is subtracted first.
     """
     groups = rows.groups
     code, start = groups.codes["stroke"], groups.starts["stroke"]
@@ -375,35 +379,33 @@ def row_noise(rows: Rows, residual: np.ndarray, force: np.ndarray) -> tuple[floa
     for _ in range(4):
         a, b = two_nonnegative(square, variance + floor, count[long] / guess**2)
         guess = np.maximum(a + b * square, floor)
-    return float(np.sqrt(max(a, floor))), float(np.sqrt(b)), _inflation(inside, code, start, count)
+    return float(np.sqrt(max(a, floor))), float(np.sqrt(b)), _design_effect(inside, code, start, count)
 
 
-def _inflation(inside: np.ndarray, code: np.ndarray, start: np.ndarray, count: np.ndarray) -> float:
-    """Return 1 + 2 sum of autocorrelations over bins, cut at the first one that is not positive."""
+def _design_effect(inside: np.ndarray, code: np.ndarray, start: np.ndarray, count: np.ndarray) -> float:
+    """Return the design effect: 1 + 2 sum of autocorrelations over bins, up to the first that is below 0.05."""
     scale = np.sqrt(np.maximum(np.add.reduceat(inside**2, start) / count, 1e-300))[code]
     unit = inside / scale
-    total, inflation = max(float((unit**2).mean()), 1e-300), 1.0
+    total, effect = max(float((unit**2).mean()), 1e-300), 1.0
     for lag in range(1, max(2, int(count.min()) // 3)):
         same = code[lag:] == code[:-lag]
         rho = float((unit[lag:] * unit[:-lag])[same].mean()) / total
         if rho < 0.05:
             break
-        inflation += 2 * rho
-    return inflation
+        effect += 2 * rho
+    return effect
 
 
 def shape_scatter(rows: Rows, residual: np.ndarray, sd: np.ndarray) -> float:
-    """Return by what factor files differ in shape along their strokes more than the noise of their rows lets them.
+    """Return the variance ratio, at least 1, of shapes along strokes between files to that expected from row noise.
 
-    Each pass's slope and bend along displacement are held against the mean of all passes of that direction: what they
-    have in common is no scatter. Without it hundreds of rows would outweigh the few files they come from.
+    Slope and curvature of each pass along displacement are compared with their mean over all passes of that direction.
+    Without this factor hundreds of rows would outweigh the few files they come from.
 
     Parameters
     ----------
-    rows : Rows
-        The rows.
     residual, sd : ndarray, shape (n,)
-        Measured minus model, and the rows' own noise.
+        Measured minus model, and standard deviation of row noise, in N.
     """
     groups = rows.groups
     code, start = groups.codes["stroke"], groups.starts["stroke"]
@@ -416,7 +418,7 @@ def shape_scatter(rows: Rows, residual: np.ndarray, sd: np.ndarray) -> float:
     number = 2 * groups.codes["file"] + (rows.speed > 0)
     size = np.abs(groups.means(rows.force, "stroke"))[code]
     factors = []
-    for load in (np.ones_like(size), size / max(size.mean(), 1e-300)):  # an added force, or one that follows friction
+    for load in (np.ones_like(size), size / max(size.mean(), 1e-300)):  # added, or proportional to friction
         found = []
         for shape in (place, place**2 - groups.means(place**2, "stroke")[code]):
             weight = np.bincount(number, (shape * load / sd) ** 2)

@@ -5,13 +5,13 @@ A residual is noise of its row plus random offsets and gains of its stroke, file
 .. math:: r_i = \epsilon_i + \sum_l (o_{l,g(i)} + k_{l,g(i)} F_i), \quad
           \mathrm{Var}\, o_l = \sigma_{o,l}^2, \ \mathrm{Var}\, k_l = \sigma_{k,l}^2
 
-with F the model's friction: its force less what effects add to it, as rubber and load scale no ripple of the drive.
-Neighbouring rows are alike, and files differ in shape along their strokes: the row noise
-counts `alike` times in the mean of a stroke, and `shape` times more often about it.
+where F is the model's friction, its force without added forces. Neighbouring rows are correlated, which multiplies the
+noise variance of all patterns in a stroke by the design effect. Files differ in shape along their strokes, which
+multiplies that of all patterns other than the mean by a further factor, `shape`.
 
-Within a stroke the components move only two numbers: its mean, and how much of F's own variation about its mean it
-holds (zero where F is constant). There a root of the inverse covariance is a chain of rank-one updates, as groups nest;
-all other patterns are only divided by their noise. That is exact, and linear in the number of rows.
+Within a stroke the components change only two numbers: its mean, and its projection on the variation of F about its
+mean (zero if F is constant). For these a root of the inverse covariance is a product of rank-one updates, as groups are
+nested; all other patterns are divided by their noise. This is exact, and linear in the number of rows.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from scipy.sparse import csr_array
 from sealfit.fit.joint.rows import Groups
 from sealfit.fit.joint.tangent import Tangent
 
-FLAT = 1e-9  # of the mean: a force that varies less within a stroke does not vary
+# A force whose variation within a stroke is below this share of its mean is constant there.
+FLAT = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,16 +41,16 @@ class Component:
 
 @dataclass(frozen=True, slots=True)
 class Scatter:
-    """Everything random: row noise sqrt(s0^2 + (gF)^2) and the components above it, finest level first."""
+    """The covariance of the rows: noise sqrt(s0^2 + (gF)^2) and variance components, finest level first."""
 
     s0: float
     g: float
     components: tuple[Component, ...] = ()
-    alike: float = 1.0  # by which neighbours that resemble each other widen the variance of a mean
-    shape: float = 1.0  # by which files' own shapes widen the variance of a pattern along the stroke, beyond that
+    design_effect: float = 1.0  # factor on the variance of a stroke's mean, from correlation of neighbouring rows
+    shape: float = 1.0  # further factor on the variance of patterns along the stroke, from differences between files
 
-    def knows(self, level: str) -> bool:
-        """Whether the variance of a level could be told from that of the others, be it zero."""
+    def estimates(self, level: str) -> bool:
+        """Return whether the variance of a level was estimated separately; the estimate may be zero."""
         return any(part.level == level for part in self.components)
 
     def noise_sd(self, friction: np.ndarray) -> np.ndarray:
@@ -57,7 +58,7 @@ class Scatter:
         return np.sqrt(self.s0**2 + (self.g * friction) ** 2)
 
     def level_variance(self, level: str, force: np.ndarray) -> np.ndarray:
-        """Return the variance that one level adds to a row at `force`, shape of `force`."""
+        """Return the variance of a row at `force` that is due to one level, shape of `force`."""
         total = np.zeros_like(force, dtype=float)
         for part in self.components:
             if part.level == level:
@@ -66,14 +67,14 @@ class Scatter:
 
 
 class Between:
-    """Whitening of a few numbers per group, whose own noise is independent, under the components above it.
+    """Whitening of a few numbers per stroke with independent noise, under the variance components.
 
     Parameters
     ----------
     variance : ndarray, shape (m,)
         Variance of each number's own noise.
     loads : mapping
-        `offset` and `gain` -> how much a unit of it moves each number, shape (m,).
+        `offset` and `gain` -> change of each number per unit of the random effect, shape (m,).
     groups : Groups
         Nested groups of the m numbers.
     components : sequence of Component
@@ -102,13 +103,13 @@ class Between:
             square = np.add.reduceat(load**2, start)
             self.logdet += float(np.log1p(square).sum())
             shrink = (1.0 - 1.0 / np.sqrt(1.0 + square)) / np.maximum(square, 1e-300)
-            # Sums over groups by a sparse product: ten times as fast as reduceat.
+            # A sparse product sums over groups ten times as fast as reduceat.
             inner = csr_array((load * shrink[code], np.arange(load.size), np.r_[start, load.size]))
             self.steps.append((inner, code, load))
             left = self._step(left, *self.steps[-1])
 
     def __call__(self, numbers: np.ndarray) -> np.ndarray:
-        """Return columns over the numbers, shape (m, k), in coordinates where they are independent, of variance 1."""
+        """Return columns over the numbers, shape (m, k), whitened."""
         white = numbers * self.scale[:, None]
         for step in self.steps:
             white = self._step(white, *step)
@@ -120,14 +121,14 @@ class Between:
 
 
 class Whitening:
-    """A root of the inverse covariance of rows, made once and applied to many columns.
+    """A root of the inverse covariance of rows, computed once and applied to many columns.
 
     Parameters
     ----------
     scatter : Scatter
         Row noise and components.
     friction : ndarray, shape (n,)
-        The model's friction, signed: what noise and gains load on.
+        The model's friction, signed; noise and gains are proportional to it.
     groups : Groups
         Nested groups of the rows, strokes first.
 
@@ -141,15 +142,15 @@ class Whitening:
         finest = next(iter(groups.starts))
         start, code = groups.starts[finest], groups.codes[finest]
         n, m = friction.size, start.size
-        self.twice = np.repeat(start, 2)  # a row of the stroke that each of the two numbers is of
-        sd = scatter.noise_sd(friction) * np.sqrt(scatter.alike)
+        self.twice = np.repeat(start, 2)  # first row of the stroke of each of the 2 m numbers
+        sd = scatter.noise_sd(friction) * np.sqrt(scatter.design_effect)
         size = np.sqrt(np.bincount(code, sd**-2.0))
-        mean = 1 / (sd * size[code])  # unit vector along a stroke's mean, in units of the rows' noise
+        mean = 1 / (sd * size[code])  # unit vector along a stroke's mean, rows in units of their noise
         level = np.bincount(code, mean * friction / sd)
         about = friction / sd - level[code] * mean
         spread = np.sqrt(np.bincount(code, about**2))
         flat = spread < FLAT * np.abs(level)
-        about = np.where(flat[code], 0.0, about / np.where(flat, 1.0, spread)[code])  # and along F about its mean
+        about = np.where(flat[code], 0.0, about / np.where(flat, 1.0, spread)[code])  # unit vector along F - mean
         self.root = np.sqrt(scatter.shape)
         self.unit = 1 / (sd * self.root)
         self.back = csr_array(
@@ -169,23 +170,23 @@ class Whitening:
         self.logdet = self.between.logdet + float(2 * np.log(sd).sum() + (n - 2 * m) * np.log(scatter.shape))
 
     def normal(self, tangent: Tangent, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return C' V^-1 C, shape (p, p), and C' V^-1 r of a tangent on the rows: no column is whitened.
+        """Return C' V^-1 C, shape (p, p), and C' V^-1 r, shape (p,), of a tangent C, without whitening its columns.
 
-        `residual`, shape (n,), is white already.
+        `residual`, shape (n,), is whitened already.
         """
         scaled, numbers = tangent.values * self.unit[:, None], self.take @ tangent.values
         between, kept = self.between(numbers), numbers / self.root
         rows, strokes = tangent.layout, tangent.layout.of(self.twice)
         square = rows.gram(scaled, scaled) + strokes.gram(between, between) - strokes.gram(kept, kept)
         pull = Tangent(strokes, between - kept).against(residual @ self.back)
-        return square, tangent.holding(scaled).against(residual) + pull
+        return square, tangent.with_values(scaled).against(residual) + pull
 
     def of(self, tangent: Tangent) -> Tangent:
         """Return a tangent on the rows, whitened."""
-        return tangent.holding(self(tangent.values))
+        return tangent.with_values(self(tangent.values))
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns on the rows, shape (n, k), in coordinates where rows are independent, of unit variance."""
+        """Return columns on the rows, shape (n, k), whitened: rows are uncorrelated with variance 1."""
         white, numbers = columns * self.unit[:, None], self.take @ columns
         white += self.back @ (self.between(numbers) - numbers / self.root)
         return white

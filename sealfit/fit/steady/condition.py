@@ -1,4 +1,4 @@
-"""One condition's model: which of Eq. 14's numbers its speeds can hold, their fit, and what they determine."""
+"""The model of one condition: the parameters of Eq. 14 that its speeds determine, and their fit."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ from sealfit.fit.steady.stribeck import (
 from sealfit.fit.steady.uncertainty import shifts_of, speed_levels
 from sealfit.physics import stribeck_force
 
-FULL, VISCOUS, CONSTANT = 4, 2, 1  # speed levels within one direction that each model needs
+# Number of speed levels within one direction that each model needs.
+FULL, VISCOUS, CONSTANT = 4, 2, 1
+# Level of the test for a Stribeck curve.
 SIGNIFICANT = 0.05
+# Parameters of each model.
 COLUMNS = {4: NAMES, 2: ("mu_c", "sigma_2"), 1: ("mu_c",)}
 
 
 @dataclass
 class Condition:
-    """One condition on its way through the fit: its run means, and then its model and numbers."""
+    """One condition: its run means, and, once it is fitted, its model and estimates."""
 
     name: str
     runs: pd.DataFrame
@@ -52,7 +55,7 @@ class Condition:
 
     @property
     def shifts(self) -> np.ndarray:
-        """Change of F sgn v of each run along the directions of the effects' uncertainty, shape (n, k)."""
+        """Change of F sgn v of each run along the principal directions of the effects' uncertainty, shape (n, k)."""
         return self.runs[shifts_of(self.runs)].to_numpy(float)
 
     @property
@@ -62,11 +65,11 @@ class Condition:
 
     @property
     def df(self) -> int:
-        """Runs less parameters; a parameter at its limit still counts, which errs on the wide side."""
+        """Runs minus parameters; a parameter at its bound counts too, which makes intervals wider."""
         return max(len(self.runs) - len(self.names), 0)
 
     def jacobian(self) -> np.ndarray:
-        """Derivative of F sgn v along the parameters, shape (n, p)."""
+        """Derivative of F sgn v with respect to the parameters, shape (n, p)."""
         speed, load, _, _ = self.arrays
         return tangent(speed, load, self.values) if self.model == FULL else self.columns()
 
@@ -79,12 +82,12 @@ class Condition:
         return stribeck_force(speed, load, mu_s=mu_s, mu_c=mu_c, v_s=v_s, sigma_2=sigma_2)
 
     def offset(self) -> float:
-        """Half the difference between the directions' residuals where it is clear (4 standard errors), else 0.
+        """Half the difference between the residuals of the directions if above 4 standard errors, else 0.
 
-        It is no part of the declared model, but it widens the intervals and can hide a Stribeck curve: worth a word.
+        The declared model has no offset, but it widens the intervals and can mask a Stribeck curve.
         """
-        rest, way = self.runs["force"].to_numpy(float) - self.model_force(), self.runs["direction"].to_numpy()
-        one, other = rest[way > 0], rest[way < 0]
+        rest, direction = self.runs["force"].to_numpy(float) - self.model_force(), self.runs["direction"].to_numpy()
+        one, other = rest[direction > 0], rest[direction < 0]
         halves = self.runs["half"].dropna().to_numpy(float)
         if min(len(one), len(other)) >= 3:
             half = (one.mean() - other.mean()) / 2
@@ -102,7 +105,7 @@ class Condition:
 
 
 def make_condition(name: str, runs: pd.DataFrame) -> Condition:
-    """Return a condition with the richest model its speed levels can hold; `runs` as `run_means`, with `weight`."""
+    """Return a condition with the fullest model that its speed levels determine; `runs` are means with `weight`."""
     loaded = runs["load"].notna().to_numpy()
     has_load = bool(loaded.any())
     kept = runs[loaded] if has_load and not loaded.all() else runs
@@ -137,13 +140,13 @@ def solve(conditions: list[Condition]) -> None:
 def _solve_linear(condition: Condition) -> None:
     _, _, force, weight = condition.arrays
     root = np.sqrt(weight)
-    held = [True] * len(condition.names)
-    condition.values, chi2 = project(condition.columns() * root[:, None], force * root, held)
+    nonnegative = [True] * len(condition.names)
+    condition.values, chi2 = project(condition.columns() * root[:, None], force * root, nonnegative)
     condition.chi2 = float(chi2)
 
 
 def drop_flat_curve(condition: Condition, unit: float, df: float) -> None:
-    """Fall back to mu_c and sigma_2 where mu_s = mu_c is not rejected."""
+    """Drop mu_s and v_s from the model unless a test rejects mu_s = mu_c."""
     speed, _, _, weight = condition.arrays
     full, chi2 = condition.values, condition.chi2
     condition.model = VISCOUS
@@ -156,7 +159,7 @@ def drop_flat_curve(condition: Condition, unit: float, df: float) -> None:
 
 
 def bound(conditions: list[Condition], rise: np.ndarray) -> None:
-    """Set the ends of the intervals; `rise` is how much chi-square may grow, shape (conditions,)."""
+    """Set the ends of the intervals; `rise`, shape (conditions,), is that of chi-square at the ends."""
     full = [k for k, c in enumerate(conditions) if c.model == FULL and np.isfinite(rise[k])]
     if full:
         arrays = stacked([conditions[k] for k in full])
@@ -179,7 +182,7 @@ def bound(conditions: list[Condition], rise: np.ndarray) -> None:
 
 
 def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
-    """Return, per parameter, whether these data determine it and, in words, why not or what is worth a remark."""
+    """Return per parameter whether the data determine it, and a remark."""
     verdict = _judge_form(condition)
     if condition.low is None and condition.model != FULL:
         verdict = {n: (ok, why or "no repeats and no spare run: no interval.") for n, (ok, why) in verdict.items()}
@@ -190,17 +193,17 @@ def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
         verdict[name] = (False, "at its physical limit 0: these runs show no friction that it could be.")
     against = int((condition.runs["force"] < 0).sum())
     if against:
-        told = f"{against} runs have a force along the motion: check the sign of force or displacement."
-        verdict["mu_c"] = (verdict["mu_c"][0], f"{verdict['mu_c'][1]} {told}".strip())
+        remark = f"{against} runs have a force along the motion: check the sign of force or displacement."
+        verdict["mu_c"] = (verdict["mu_c"][0], f"{verdict['mu_c'][1]} {remark}".strip())
     return verdict
 
 
 def _judge_form(condition: Condition) -> dict[str, tuple[bool, str]]:
-    """Return the same by the form that these speeds can hold."""
+    """Return the same from the form of the model alone."""
     most = max(len(values) for values in condition.levels.values())
     verdict = dict.fromkeys(NAMES, (True, ""))
     if condition.model == CONSTANT:
-        lone = "one speed only in each direction: the sliding coefficient at that speed is all these runs hold."
+        lone = "one speed only in each direction: these runs determine the sliding coefficient at that speed."
         verdict |= {name: (False, lone) for name in ("mu_s", "v_s", "sigma_2")}
         verdict["mu_c"] = (True, "the sliding coefficient at the one speed tested, sigma_2 v included.")
     elif condition.model == VISCOUS and most < FULL:

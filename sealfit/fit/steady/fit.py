@@ -1,4 +1,4 @@
-"""Steady distributed LuGre (Eq. 14) per condition, with what the campaign's speeds can and cannot tell."""
+"""The fit of the steady distributed LuGre model (Eq. 14) per condition, and which parameters the speeds determine."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import pandas as pd
 from scipy.special import stdtrit
 
 from sealfit.config import Config
-from sealfit.fit.joint.rows import both_ways_together
+from sealfit.fit.joint.rows import merge_directions
 from sealfit.fit.steady.condition import FULL, Condition, bound, drop_flat_curve, judge, make_condition, solve
 from sealfit.fit.steady.stribeck import NAMES, linearised
 from sealfit.fit.steady.uncertainty import (
     UnitVariance,
-    likelier,
+    more_likely,
     proportional_weights,
     run_means,
     run_weights,
@@ -26,19 +26,23 @@ from sealfit.ingest.scatter import Scatter, repeat_scatter
 from sealfit.tables import STEADY_FIT
 from sealfit.units import Units
 
+# Level of the test for lack of fit.
 SIGNIFICANT = 0.05
-TOGETHER = 250  # conditions whose intervals are found at once, which bounds the memory
-NUMBERS = ("value", "se", "lo95", "hi95", "u_sys")  # columns of a fit table
-FORCES = {"mu_s": "F_s", "mu_c": "F_c"}  # names without load
+# Number of conditions whose intervals are computed together. It bounds the memory.
+BLOCK = 250
+# Numeric columns of a fit table.
+NUMBERS = ("value", "se", "lo95", "hi95", "u_sys")
+# Names of the coefficients if the load is unknown.
+FORCES = {"mu_s": "F_s", "mu_c": "F_c"}
 
 
 def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
-    r"""Fit Eq. 14 to every condition and say what its speeds determine.
+    r"""Fit Eq. 14 to every condition, and mark the parameters that its speeds determine.
 
     .. math:: F\,\mathrm{sgn}\,v = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}] + \sigma_2 |v|
 
-    Both directions together, on run means weighted by the pooled scatter of repeats. mu_s, mu_c and sigma_2 are not
-    negative; mu_s < mu_c is allowed and remarked. Without load the forces F_s and F_c are fitted, in the force's unit.
+    Run means of both directions are fitted together, weighted by the pooled scatter of repeats. mu_s, mu_c and sigma_2
+    are not negative; mu_s < mu_c is allowed and reported. Without load the forces F_s and F_c are fitted.
 
     Parameters
     ----------
@@ -52,34 +56,34 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     DataFrame
         Table `steady_fit` plus the condition columns. `quantity` is "steady" (one row per parameter), "statistics",
         "covariance" (`parameter` "mu_s,mu_c": type A, for the aging fit), "sensor_shift" (change of the parameter if
-        the sensor reads the size of every force one standard uncertainty too high; `u_sys` is its size) or, where
-        effects were taken out of the forces, "effect_shift" (`parameter` "mu_s:1": change along each direction of the
-        effects' uncertainty; it is in the covariance and the intervals, and common to all conditions).
+        the sensor reads every |force| one standard uncertainty too high; `u_sys` is its magnitude) or, if effects were
+        subtracted from the forces, "effect_shift" (`parameter` "mu_s:1": change along each principal direction of the
+        effects' uncertainty; it is included in the covariance and the intervals, and common to all conditions).
 
     Raises
     ------
     FitError
-        If nothing is left to fit.
+        If there is no row to fit.
 
     Notes
     -----
-    Intervals are profile-likelihood intervals throughout, with Student's t. `u_sys` takes the sensor's accuracy as one
-    unknown error of the force's size, the same for all samples, so nothing averages it down. A zero offset of the
-    sensor has opposite signs in the two directions and does at most the same; it is what the loop looks for.
+    Intervals are profile-likelihood intervals with Student's t. `u_sys` assumes one unknown error of |force| for all
+    samples, which no averaging reduces. A zero offset of the sensor has opposite signs in the two directions and
+    changes the parameters by no more; the loop tests for it.
     """
     conditions, scatter, variance = solve_conditions(steady)
     keys = condition_keys(steady, config)
-    blocks = [slice(start, start + TOGETHER) for start in range(0, len(conditions), TOGETHER)]
-    found = [_told(conditions[block], variance.of(block), scatter, config) for block in blocks]
+    blocks = [slice(start, start + BLOCK) for start in range(0, len(conditions), BLOCK)]
+    found = [_table_rows(conditions[block], variance.of(block), scatter, config) for block in blocks]
     table = pd.concat(found, ignore_index=True).merge(keys, on="condition", how="left", validate="many_to_one")
     fixed = STEADY_FIT.names()
     return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
 
 
 def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, UnitVariance]:
-    """Return every condition with its model solved, the scatter of repeats, and how far their variances are widened.
+    """Return the fitted conditions without intervals, the scatter of repeats, and the factors on stated variances.
 
-    Curves that are not told from flat ones are dropped; there are no intervals yet.
+    A Stribeck curve that does not differ significantly from a straight line is dropped.
 
     Parameters
     ----------
@@ -89,13 +93,13 @@ def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, Un
     Raises
     ------
     FitError
-        If nothing is left to fit.
+        If there is no row to fit.
     """
     runs = run_means(steady)
-    scatter = repeat_scatter(both_ways_together(steady[steady["used"].to_numpy(bool)]))
+    scatter = repeat_scatter(merge_directions(steady[steady["used"].to_numpy(bool)]))
     conditions = _solved(runs.assign(weight=run_weights(runs, scatter)))
     if not scatter.df > 0:
-        conditions = _likelier_weighted(conditions)
+        conditions = _more_likely_weights(conditions)
     first = _unit_variance(conditions, scatter)
     for condition, value, df in zip(conditions, first.value, first.df, strict=True):
         if condition.model == FULL:
@@ -109,17 +113,17 @@ def _solved(runs: pd.DataFrame) -> list[Condition]:
     return conditions
 
 
-def _likelier_weighted(even: list[Condition]) -> list[Condition]:
-    """Return the conditions with even weights or with those of a scatter in proportion to friction, the likelier.
+def _more_likely_weights(even: list[Condition]) -> list[Condition]:
+    """Return the conditions fitted with equal weights or with a scatter proportional to friction, the more likely.
 
-    Without repeats only the shape of the scatter can be guessed, and the residuals say which they bear out.
+    Without repeats the residuals have to determine how the scatter depends on the force.
     """
     sizes = np.cumsum([len(c.runs) for c in even])[:-1]
     weight = proportional_weights(np.concatenate([c.model_force() for c in even]))
     other = [replace(c, runs=c.runs.assign(weight=w)) for c, w in zip(even, np.split(weight, sizes), strict=True)]
     solve(other)
     chi2 = [sum(c.chi2 for c in conditions) for conditions in (even, other)]
-    chosen = likelier(chi2, [np.ones(weight.size), weight], sum(c.df for c in even))
+    chosen = more_likely(chi2, [np.ones(weight.size), weight], sum(c.df for c in even))
     return (even, other)[chosen]
 
 
@@ -135,9 +139,9 @@ def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     return first.mask(several).reset_index()
 
 
-# ---------------------------------------------------------------- what the table says
-def _told(conditions: list[Condition], variance: UnitVariance, scatter: Scatter, config: Config) -> pd.DataFrame:
-    """Return the rows of some conditions, their intervals found."""
+# ---------------------------------------------------------------- table
+def _table_rows(conditions: list[Condition], variance: UnitVariance, scatter: Scatter, config: Config) -> pd.DataFrame:
+    """Return the rows of table `steady_fit` for some conditions; this computes their intervals."""
     bound(conditions, variance.rise())
     return pd.DataFrame(
         [
@@ -204,7 +208,7 @@ def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter
 
 
 def _widened(value: float, low: float, high: float, reach: float) -> tuple[float, float]:
-    """Return an interval's ends, a half-width added in quadrature to each side; these numbers are not negative."""
+    """Return the ends of an interval with a half-width added in quadrature on each side, not below 0."""
     return max(value - float(np.hypot(value - low, reach)), 0.0), value + float(np.hypot(high - value, reach))
 
 
@@ -250,7 +254,7 @@ def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterat
 
 
 def parameter_units(units: Units, has_load: bool) -> dict[str, str]:
-    """Return the true unit of mu_s, mu_c (or F_s, F_c), v_s and sigma_2 under the config's units."""
+    """Return the units of mu_s, mu_c (or F_s, F_c), v_s and sigma_2 that follow from the config's units."""
     force, speed, load = units.unit("force"), units.unit("speed"), units.unit("load")
     mu = force if not has_load else "" if force == load else f"{force}/{load}"
     sigma_2 = f"{force} s/{speed.removesuffix('/s')}" if speed.endswith("/s") else f"{force}/{speed}"
@@ -268,7 +272,7 @@ def _finite(value) -> float | None:
 
 
 def table_row(*, quantity: str, parameter: str, unit: str, identified: bool, reason: str = "", **numbers) -> dict:
-    """Return one row of a fit table; None, and an end that is open, become null.
+    """Return one row of a fit table; None and infinite ends become null.
 
     `numbers` are any of value, se, lo95, hi95 and u_sys.
     """

@@ -1,14 +1,14 @@
 r"""mu_s and mu_c of all conditions from the forces, one v_s and one sigma_2 for all days of a series.
 
-The declared model (Eq. 14 with Eq. 15) holds v_s and sigma_2 of a series through its days, and only mu_s and mu_c age.
-Given v_s the force is linear in all else,
+In the declared model (Eq. 14 with Eq. 15) the days of a series share v_s and sigma_2; only mu_s and mu_c age. For a
+given v_s the force is linear in all other parameters,
 
 .. math:: F\,\mathrm{sgn}\,v = N [\mu_c^{(i)} + (\mu_s^{(i)} - \mu_c^{(i)}) e^{-(v/v_s)^2}] + \sigma_2 |v|,
 
-so mu_s and mu_c of the conditions i, with their covariance, hold all that the forces say of any law of aging: a law
-fitted to them by generalised least squares is fitted to the forces. What the days share makes the values surer than
-free fits do, and determines conditions that have too few speeds for a fit of their own. Where the days of a series do
-not agree on v_s and sigma_2 (F test), its conditions keep their free fits; so do days that disagree with the others.
+so mu_s and mu_c of the conditions i, with their covariance, contain all information of the forces on an aging law: a
+law fitted to them by generalised least squares is fitted to the forces. Sharing v_s and sigma_2 reduces the standard
+errors, and determines conditions with too few speeds for a separate fit. If an F test rejects that the days of a
+series share them, its conditions keep their separate fits; so do days with few speeds that disagree with the others.
 """
 
 from __future__ import annotations
@@ -31,10 +31,15 @@ from sealfit.fit.steady.stribeck import search_limits
 from sealfit.fit.steady.uncertainty import UnitVariance, shifts_of
 from sealfit.tables import STEADY_FIT
 
-SHARED_P = 0.01  # below, the days of a series do not share v_s and sigma_2
-PER_DECADE = 30  # points of the search along v_s: of all days of a series together no minimum is narrow
-DETERMINED = 0.3  # standard error over value: above, the forces do not tell it
-RANK = 1e-8  # of the columns of a condition: with one speed mu_s and mu_c are one number
+# Level of the F test for a shared v_s and sigma_2.
+SHARED_P = 0.01
+# Grid points of v_s per decade. With all days of a series together no minimum is narrow.
+PER_DECADE = 30
+# Largest relative standard error of a value that counts as determined.
+DETERMINED = 0.3
+# Singular values of a condition's two columns below this share of the largest count as zero. With one speed mu_s and
+# mu_c are not distinguishable.
+RANK = 1e-8
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ class Levels:
     table : DataFrame
         `condition`, `quantity` and `value`, and the condition's columns of `steady_fit`.
     covariance : ndarray, shape (n, n)
-        Of the values.
+        Covariance of the values.
     """
 
     table: pd.DataFrame
@@ -54,19 +59,19 @@ class Levels:
 
 
 def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
-    """Return what the forces say of mu_s and mu_c at every aged condition and the unaged rubber.
+    """Return mu_s and mu_c, with their covariance, at every aged condition and the unaged rubber.
 
     Parameters
     ----------
     steady : DataFrame
         Table `steady`; rows with `used` false are left out.
     steady_fit : DataFrame
-        Table `steady_fit` with `aging_days`: the free fits, of which only what is identified is used.
+        Table `steady_fit` with `aging_days`: the separate fits, of which only identified values are used.
 
     Raises
     ------
     FitError
-        If nothing is left to fit.
+        If there is no row to fit.
     """
     rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["aging_days"].notna()]
     of_parameters = [name for name in STEADY_FIT.names() if name not in ("condition", "series", "rubber")]
@@ -97,20 +102,20 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
         shift = shift.reshape(len(own), count)
         shifts.append(shift)
         same = own["condition"].to_numpy()[:, None] == own["condition"].to_numpy()[None, :]
-        covariances.append(steady_covariance(own, known_covariances) - same * (shift @ shift.T))  # it comes in below
+        covariances.append(steady_covariance(own, known_covariances) - same * (shift @ shift.T))  # added again below
     table = pd.concat(tables, ignore_index=True) if tables else free
     together = np.concatenate(shifts) if shifts else np.zeros((0, count))
-    covariance = block_diag(*covariances) + together @ together.T  # the effects are those of all conditions
+    covariance = block_diag(*covariances) + together @ together.T  # effects are common to all conditions
     return Levels(table.merge(about, on="condition", how="left", validate="many_to_one"), covariance)
 
 
 def _shared(
     own: Sequence[Condition], variance: UnitVariance, widened: np.ndarray, curved: set[str]
 ) -> tuple[pd.DataFrame, np.ndarray, np.ndarray, set[str]] | None:
-    """Return the values of a series, their covariance, how they move along the directions of the effects' uncertainty,
-    shape (values, k), and the conditions that it speaks for; None for no shared curve.
+    """Return the values of a series on a shared curve, or None if its days do not share one.
 
-    `widened`, shape (conditions,), is each condition's factor on the stated variances.
+    Returns the values, their covariance, their change along the directions of the effects' uncertainty, shape (values,
+    k), and the conditions on the curve. `widened`, shape (conditions,), is the factor on the stated variances.
     """
     is_full = np.array([c.model == FULL for c in own])
     full = [c for c in own if c.model == FULL]
@@ -123,7 +128,7 @@ def _shared(
     free = sum(c.chi2 / w for c, w in zip(full, widened[is_full], strict=True))
     if _worse(curve.rss - free, curve.df - sum(c.df for c in full), df):
         return None
-    if len(full) < len(own):  # days with too few speeds for a fit of their own, if they lie on it too
+    if len(full) < len(own):  # days with too few speeds for a separate fit, if they agree with the others
         every = _Curve(own, widened)
         if not _worse(every.rss - curve.rss, every.df - curve.df, df):
             curve = every
@@ -140,18 +145,18 @@ def _shared(
 
 
 def _worse(rise: float, more: int, df: float) -> bool:
-    """Return whether a sum of squares rises by more than its degrees of freedom explain."""
+    """Return whether an F test rejects that a sum of squares rises by chance; `more` are its degrees of freedom."""
     return more > 0 and bool(fdtrc(more, df, rise / more) < SHARED_P)
 
 
 def _usual_df(variance: UnitVariance) -> float:
-    """Return the degrees of freedom of conditions that are not worse than the others."""
+    """Return the degrees of freedom of conditions without a variance factor of their own."""
     usual = variance.df[np.isfinite(variance.value) & ~variance.own]
     return float(usual[0]) if usual.size else np.nan
 
 
 class _Curve:
-    """Eq. 14 with one v_s and one sigma_2 on several conditions, at the least sum of squares."""
+    """Least-squares fit of Eq. 14 to several conditions with one v_s and one sigma_2."""
 
     def __init__(self, own: Sequence[Condition], widened: np.ndarray) -> None:
         self.own = own
@@ -172,7 +177,7 @@ class _Curve:
         return np.stack([decay, 1 - decay], axis=-1) * (self.load * self.root)[..., None]
 
     def _along(self, log_v_s: np.ndarray) -> np.ndarray:
-        """Return the sums of squares, shape (g,), at many v_s, shape (g,): as `_solve`, by Gram and Schmidt."""
+        """Return the sums of squares at v_s values, shape (g,) -> (g,), as `_solve`, by Gram-Schmidt."""
         columns = np.moveaxis(self._columns(log_v_s[:, None, None]), -1, 0)  # (2, g, conditions, runs)
         size = np.linalg.norm(columns, axis=-1, keepdims=True)
         longer = size[0] >= size[1]
@@ -180,12 +185,12 @@ class _Curve:
         other = other - (other * first).sum(axis=-1, keepdims=True) * first
         beyond = np.linalg.norm(other, axis=-1, keepdims=True)
         second = np.divide(other, beyond, out=np.zeros(other.shape), where=beyond > RANK)
-        left = []
+        residuals = []
         for rest in (self.force * self.root, self.speed * self.root):  # F and |v|
             for column in (first, second):
                 rest = rest - (rest * column).sum(axis=-1, keepdims=True) * column
-            left.append(rest)
-        force, speed = left
+            residuals.append(rest)
+        force, speed = residuals
         own, cross, size = (
             (one * other).sum(axis=(1, 2)) for one, other in ((force, force), (force, speed), (speed, speed))
         )
@@ -200,9 +205,9 @@ class _Curve:
         rest = both - columns @ fitted
         size = float((rest[..., 1] ** 2).sum())
         sigma_2 = max(float((rest[..., 0] * rest[..., 1]).sum()) / size, 0.0) if size > 0 else 0.0
-        left = rest[..., 0] - sigma_2 * rest[..., 1]
+        residual = rest[..., 0] - sigma_2 * rest[..., 1]
         rank = round(float(np.einsum("knp,kpn->", columns, inverse)))
-        return float((left**2).sum()), fitted[..., 0] - sigma_2 * fitted[..., 1], sigma_2, rank
+        return float((residual**2).sum()), fitted[..., 0] - sigma_2 * fitted[..., 1], sigma_2, rank
 
     def names(self) -> Iterator[tuple[str, str]]:
         """Yield condition and quantity of every level, in the order of the tangent's columns."""
@@ -211,7 +216,7 @@ class _Curve:
                 yield condition.name, name if condition.has_load else FORCES[name]
 
     def tangent(self) -> np.ndarray:
-        """Return the weighted derivatives along the levels, ln v_s and sigma_2 where it is not 0, shape (runs, p)."""
+        """Return the weighted derivatives with respect to the levels, ln v_s and sigma_2 if not 0, shape (runs, p)."""
         columns = self._columns(self.log_v_s)
         square = (self.speed / np.exp(self.log_v_s)) ** 2
         bend = np.diff(self.levels[:, ::-1], axis=1) * self.load * np.exp(-square) * 2 * square * self.root

@@ -1,4 +1,4 @@
-"""Eq. 14 fitted to many conditions at once, with exact intervals of coefficients that must not be negative."""
+"""Eq. 14 fitted to many conditions at once, with exact intervals of nonnegative coefficients."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from scipy.special import stdtr
 from sealfit.fit.least_squares import Separable, covariance_of, even_grid, global_optimum, profile, solve_kept
 
 # ---------------------------------------------------------------- interval
-# Exact intervals of coefficients that must not be negative, from the sum of squares alone.
+# Exact intervals of nonnegative coefficients from the sum of squares.
 
-FREE = 1e-12  # share of a column's variance that is its own, below which its coefficient is not bounded at all
+# A coefficient is unbounded if the share of its column's variance that other columns do not explain is below this.
+FREE = 1e-12
 
 
 def constrained_ends(columns, y, limit, nonnegative):
-    """Ends of {c_j : the best sum of squares with c_j fixed, the others not negative, is at most `limit`}.
+    """Return the ends of {c_j : the least sum of squares at fixed c_j, the others nonnegative, is at most `limit`}.
 
-    With c_j fixed, every set of zeros among the others gives a parabola in c_j. The constrained optimum at an end lies
-    on one of them, so the ends are the outermost crossings at which the others come out feasible: exact, no iteration.
+    At fixed c_j every active set of zeros among the others gives a parabola in c_j. The constrained optimum at an end
+    lies on one of them, so that the ends are the outermost feasible crossings: exact, without iteration.
 
     Parameters
     ----------
@@ -31,19 +32,19 @@ def constrained_ends(columns, y, limit, nonnegative):
     limit : ndarray, shape (problems,)
         Largest sum of squares allowed.
     nonnegative : sequence of bool, length p
-        Which coefficients must not be negative.
+        Which coefficients are nonnegative.
 
     Returns
     -------
     low, high : ndarray, shape (problems, g, p)
-        NaN where no c_j reaches the limit; inf where c_j is not bounded.
+        NaN if the sum of squares exceeds the limit everywhere; inf if c_j is unbounded.
     """
     nonnegative = np.asarray(nonnegative, bool)
     p = columns.shape[-1]
     norm = np.sqrt(np.einsum("...np,...np->...p", columns, columns))
     safe = np.where(norm > 0, norm, 1.0)
     scaled = columns / safe[..., None, :]
-    # costs are counted from the unconstrained optimum: no digits are lost to |y|^2
+    # Sums of squares are relative to the unconstrained optimum, which avoids cancellation.
     gram = np.swapaxes(scaled, -1, -2) @ scaled
     everything = np.ones((*gram.shape[:-2], p), bool)
     moment = (np.swapaxes(scaled, -1, -2) @ y[..., None])[..., 0]
@@ -52,7 +53,7 @@ def constrained_ends(columns, y, limit, nonnegative):
     centre = centre + solve_kept(gram, (np.swapaxes(scaled, -1, -2) @ rest[..., None])[..., 0], everything)
     rest = y - (scaled @ centre[..., None])[..., 0]
     floor = np.einsum("...n,...n->...", rest, rest)
-    spare = limit[:, None] - floor  # what c may cost: (c - centre)' gram (c - centre) <= spare
+    spare = limit[:, None] - floor  # the set is (c - centre)' gram (c - centre) <= spare
     low, high = np.full(moment.shape, np.nan), np.full(moment.shape, np.nan)
     for j in range(p):
         others = [k for k in range(p) if k != j and nonnegative[k]]
@@ -69,12 +70,12 @@ def constrained_ends(columns, y, limit, nonnegative):
 
 
 def _ends(gram, centre, spare, j, keep, nonnegative):
-    """Crossings of one parabola: c_k = 0 for k not in `keep`, c_j = t, the rest of `keep` at its best."""
+    """Return the crossings of one parabola: c_k = 0 for k not in `keep`, c_j = t, the others at their optimum."""
     rest = keep.copy()
     rest[j] = False
     mask = np.broadcast_to(rest, centre.shape)
     off = ~keep
-    # cost(t) in d = c - centre: d_k = -centre_k off, d_j = t - centre_j; rest minimised. Linear-quadratic in d_j.
+    # With d = c - centre: d_k = -centre_k outside `keep`, d_j = t - centre_j. The cost is quadratic in d_j.
     fixed = np.where(off, -centre, 0.0)
     pull = (gram @ fixed[..., None])[..., 0]
     by_fixed = solve_kept(gram, pull, mask)  # -d_rest at d_j = 0
@@ -95,7 +96,7 @@ def _ends(gram, centre, spare, j, keep, nonnegative):
         c_rest = centre + d_rest
         feasible = ~np.any((c_rest < -1e-12 * np.abs(centre).max(axis=-1, keepdims=True)) & rest & nonnegative, axis=-1)
         value = np.where(possible & bounded & feasible, centre[..., j] + d_j, np.nan)
-        if sign > 0:  # not bounded: only if moving up for ever breaks nobody's sign
+        if sign > 0:  # unbounded if all coefficients stay feasible as c_j grows
             open_ = ~bounded & (spare - base >= 0) & ~np.any((by_j > 1e-9) & rest & nonnegative, axis=-1)
             value = np.where(open_, np.inf, value)
         ends.append(value)
@@ -105,16 +106,21 @@ def _ends(gram, centre, spare, j, keep, nonnegative):
 # ---------------------------------------------------------------- stribeck
 # Eq. 14 fitted to many conditions at once: F sgn(v) = N mu_s E + N mu_c (1 - E) + sigma_2 |v|, E = exp(-(v/v_s)^2).
 #
-# Written so, the three coefficients of the columns are the parameters themselves, and "not negative" holds for each.
-# All three are held at or above zero: friction takes energy out at every speed. mu_s < mu_c is allowed. Without load, N
-# = 1 and the coefficients are the forces F_s and F_c.
+# In this form the coefficients of the three columns are the parameters. All three are nonnegative, as friction
+# dissipates energy at every speed; mu_s < mu_c is allowed. Without load, N = 1 and the coefficients are F_s and F_c.
 
-SLOWEST, FASTEST = 1 / 5, 20.0  # v_s is sought from a fifth of the slowest speed to twenty times the fastest:
-# below, E is 1e-11 at every speed and nothing changes any more; above, 1 - E is 0.0025 and follows v^2 throughout
-PER_DECADE = 240  # 1 % from one v_s to the next: with four or five speeds a minimum can be that narrow
-HALVINGS = 40  # of one grid cell: ln v_s to 1e-13
-FINE = 61  # points inside the interval of v_s along which the intervals of the others are taken
+# v_s is searched from a fifth of the slowest speed, below which E < 1e-10 at every speed, to twenty times the fastest,
+# above which 1 - E < 0.0025 is proportional to v^2.
+SLOWEST, FASTEST = 1 / 5, 20.0
+# Grid points of v_s per decade, 1 % apart. With four or five speeds a minimum can be that narrow.
+PER_DECADE = 240
+# Bisections of one grid cell. They give ln v_s to 1e-13.
+HALVINGS = 40
+# Points inside the interval of v_s at which the intervals of the other parameters are computed.
+FINE = 61
+
 NAMES = ("mu_s", "mu_c", "v_s", "sigma_2")
+# mu_s, mu_c and sigma_2 are nonnegative.
 PHYSICAL = (True, True, True)
 
 
@@ -131,7 +137,7 @@ class StribeckFit:
 
     @property
     def grid(self) -> np.ndarray:
-        """ln v_s over all that was searched, shape (problems, g)."""
+        """Grid of ln v_s that was searched, shape (problems, g)."""
         return even_grid(*self.limits, PER_DECADE)
 
     def values(self) -> np.ndarray:
@@ -172,7 +178,7 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
     speed, load, force, weight : ndarray, shape (problems, n)
         |v| > 0 in mm/s, N, F sgn(v) in N, 1/variance (0 for padding).
     nonnegative : three bool
-        Whether mu_s, mu_c and sigma_2 are held at or above zero.
+        Whether mu_s, mu_c and sigma_2 are nonnegative.
 
     Raises
     ------
@@ -197,11 +203,11 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
 
 # ---------------------------------------------------------------- intervals
 def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
-    """Ends of the profile-likelihood intervals of mu_s, mu_c, v_s, sigma_2.
+    """Return the ends of the profile-likelihood intervals of mu_s, mu_c, v_s, sigma_2.
 
-    For v_s: where the best sum of squares exceeds the optimum's by no more than `rise`. For the others: the union, over
-    those v_s, of the exact interval at that v_s with the other coefficients held at or above zero. No curvature is
-    used anywhere, so a lopsided or open interval comes out as it is.
+    The interval of v_s is where the least sum of squares exceeds the minimum by at most `rise`. Those of the others are
+    unions, over these v_s, of the exact interval at that v_s with nonnegative coefficients. No quadratic approximation
+    is made, so that intervals may be asymmetric or open.
 
     Parameters
     ----------
@@ -215,7 +221,7 @@ def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
     Returns
     -------
     low, high : ndarray, shape (problems, 4)
-        v_s: 0 or inf where the interval reaches a limit of the search.
+        For v_s 0 or inf if the interval reaches a limit of the search.
     """
     problems = Separable(stribeck_basis(speed, load), force, weight, PHYSICAL)
     limit = fit.rss + rise
@@ -238,7 +244,7 @@ def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
 
 
 def _crossing(problems: Separable, grid, u_best, inside, limit, sign):
-    """Outermost u below (sign -1) or above (+1) the optimum within the limit, and whether the search saw no end."""
+    """Return the outermost u below (sign -1) or above (+1) the optimum within the limit, and whether it is open."""
     along = sign * grid
     near = np.maximum(np.max(np.where(inside, along, -np.inf), axis=1), sign * u_best)
     far = np.min(np.where(along > near[:, None], along, np.inf), axis=1)
@@ -253,7 +259,7 @@ def _crossing(problems: Separable, grid, u_best, inside, limit, sign):
 
 
 def conditional_ends(problems: Separable, u, limit):
-    """Union over u of the constrained intervals of the coefficients, shape (problems, p) each."""
+    """Return the union over u of the constrained intervals of the coefficients, shape (problems, p) each."""
     root = np.sqrt(problems.weight)[:, None, :]
     columns = problems.basis(u, np.arange(len(u)))
     y = np.broadcast_to(problems.y[:, None, :] * root, columns.shape[:-1])
@@ -264,7 +270,7 @@ def conditional_ends(problems: Separable, u, limit):
 
 # ---------------------------------------------------------------- one condition
 def tangent(speed, load, values) -> np.ndarray:
-    """Derivative of F sgn(v) along mu_s, mu_c, v_s, sigma_2 at `values`, shape (n, 4)."""
+    """Return the derivatives of F sgn(v) with respect to mu_s, mu_c, v_s, sigma_2 at `values`, shape (n, 4)."""
     mu_s, mu_c, v_s, _ = values
     square = (speed / v_s) ** 2
     decay = np.exp(-square)
@@ -272,11 +278,10 @@ def tangent(speed, load, values) -> np.ndarray:
 
 
 def linearised(jacobian, weight, values, names, moved=None):
-    """Covariance at unit variance, shape (p, p), and the change of the parameters when the forces move.
+    """Return the covariance at unit variance, shape (p, p), and the change of the parameters with the forces.
 
-    Without `moved`, shape (n, k), every force is 1 larger and the change has shape (p,), else (p, k).
-
-    A coefficient at its limit 0 is held there: zero variance, no change.
+    `moved`, shape (n, k), are changes of the forces, and the result has shape (p, k). Without it every force is 1
+    larger, and the result has shape (p,). A coefficient at its bound 0 is fixed: its variance and change are 0.
     """
     free = np.array([name == "v_s" or value > 0 for name, value in zip(names, values, strict=True)])
     root = np.sqrt(weight)
@@ -286,11 +291,11 @@ def linearised(jacobian, weight, values, names, moved=None):
 
 
 def flat_p_value(speed, columns, weight, grid, statistic, df) -> float:
-    r"""Chance of so large a gain from mu_s != mu_c where in truth the two are equal, v_s being free to gain most.
+    r"""Return the p-value of mu_s = mu_c against a Stribeck curve with free v_s.
 
-    Under mu_s = mu_c no v_s exists, so the gain is a maximum over v_s, not one chi-square. The unit vector that the
-    Stribeck column leaves after mu and sigma_2 are projected out runs along a curve of length kappa on the sphere as
-    v_s moves; a tube around it has
+    Under mu_s = mu_c v_s is not defined, so that the statistic is a maximum over v_s and not chi-square. As v_s varies,
+    the normalised Stribeck column, with mu and sigma_2 projected out, moves along a curve of length kappa on the unit
+    sphere. The volume of a tube around it gives
 
     .. math:: p = \frac{\kappa}{\pi} (1 + c^2/\nu)^{-\nu/2} + P(|t_\nu| > c)
 
@@ -299,13 +304,13 @@ def flat_p_value(speed, columns, weight, grid, statistic, df) -> float:
     speed, weight : ndarray, shape (n,)
         One condition.
     columns : ndarray, shape (n, 1) or (n, 2)
-        Those of the model without Stribeck curve that are free: the load, and the speed unless sigma_2 is held.
+        Columns of the free parameters without Stribeck curve: the load, and the speed unless sigma_2 is at 0.
     grid : ndarray, shape (g,)
-        ln v_s that was searched.
+        Grid of ln v_s.
     statistic : float
         c^2: fall of the sum of squares over the variance of unit weight.
     df : float
-        Degrees of freedom of that variance; inf where it is known.
+        Degrees of freedom of that variance; inf if it is known.
 
     Notes
     -----
@@ -318,11 +323,11 @@ def flat_p_value(speed, columns, weight, grid, statistic, df) -> float:
     q = q[:, np.abs(np.diag(r)) > 1e-10]
     curve = np.exp(-((speed * np.exp(-grid)[:, None]) ** 2)) * columns[:, 0] * root
     size = np.linalg.norm(curve, axis=1)
-    left = curve - (curve @ q) @ q.T
-    length = np.linalg.norm(left, axis=1)
-    clear = length > 1e-7 * np.maximum(size, 1e-300)  # less is rounding, and its direction means nothing
+    residual = curve - (curve @ q) @ q.T
+    length = np.linalg.norm(residual, axis=1)
+    clear = length > 1e-7 * np.maximum(size, 1e-300)  # shorter residuals are rounding
     clear &= size > 1e-280
-    unit = left[clear] / length[clear][:, None]
+    unit = residual[clear] / length[clear][:, None]
     chord = np.linalg.norm(np.diff(unit, axis=0), axis=1)
     kappa = float(np.sum(2 * np.arcsin(np.minimum(chord / 2, 1.0))))
     c2 = max(float(statistic), 0.0)

@@ -1,9 +1,9 @@
-"""What the fits weigh with: run means, their variance from pooled repeats, and how set-up scatter widens it.
+"""Run means, their variance from pooled repeats, and the Birge ratio of set-up scatter.
 
-The unit of evidence is the run. Strokes of a file are averaged first, then the files (repeats) of a run; the scatter of
-repeats, pooled over the campaign, gives each run mean its variance. Where run means disagree with the model by more
-than that, because the rig was set up anew for each run or because the model lacks something, the intervals are widened
-by the Birge ratio, the root of the reduced chi-square.
+The unit of evidence is the run. Strokes of a file are averaged first, then the files (repeats) of a run. The scatter of
+repeats, pooled over the campaign, gives the variance of each run mean. If run means disagree with the model by more,
+because the rig is set up for each run or because the model lacks an effect, the intervals are widened by the Birge
+ratio, the square root of the reduced chi-square.
 """
 
 from __future__ import annotations
@@ -17,14 +17,21 @@ from scipy.special import fdtrc, stdtrit
 
 from sealfit.errors import FitError
 from sealfit.fit.joint.declared import speed_clusters
-from sealfit.fit.joint.rows import BOTH, both_ways_together
+from sealfit.fit.joint.rows import BOTH_DIRECTIONS, merge_directions
 from sealfit.ingest.scatter import Scatter
 
-POOLING_P = 0.25  # Bancroft's level for "is there set-up scatter at all": at 5 % it would too often be missed
-WORSE_P = 0.01  # a condition that disagrees more than the others at this level is widened by its own ratio
-SMALLEST_SD = 1e-9  # of the largest force: repeats that agree to the last digit do not make a run infinitely certain
-SMALLEST_SHARE = 0.05  # of the largest force: a scatter in proportion to the force does not vanish with it
-SHIFT = "effects_u"  # columns of `steady_after`: directions in which the effects taken out are uncertain
+# Level of the preliminary test for set-up scatter (Bancroft 1944). A level of 5 % would miss it too often.
+POOLING_P = 0.25
+# Level at which a condition with more lack of fit than the others is widened by its own ratio.
+WORSE_P = 0.01
+# Smallest standard deviation of a run mean, as a share of the largest force. It keeps the weights of identical repeats
+# finite.
+SMALLEST_SD = 1e-9
+# Smallest force in a scatter proportional to the force, as a share of the largest force.
+SMALLEST_SHARE = 0.05
+# Prefix of the columns of `steady_after` with the directions of the subtracted effects' uncertainty.
+SHIFT = "effects_u"
+
 NEEDED = ("condition", "series", "rubber", "run_id", "file", "direction", "speed_mm_s", "load_N", "force_N", "used")
 
 
@@ -34,19 +41,19 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     Parameters
     ----------
     steady : DataFrame
-        Table `steady`; rows with `used` false are left out. The two ways of a file are taken together.
+        Table `steady`; rows with `used` false are left out. The two directions of a file are merged.
 
     Returns
     -------
     DataFrame
         `condition`, `run_id`, `direction`, `speed` (|v|), `set` (commanded |v|, NaN where unknown), `load` (NaN where
-        unknown), `force` (F sgn v), `half` (half of the difference between the two ways, where a row stands for both)
-        and `files`, sorted by the first three; and the columns of `SHIFT`.
+        unknown), `force` (F sgn v), `half` (half of the difference between the directions in a merged row) and `files`,
+        sorted by the first three; and the columns of `SHIFT`.
 
     Raises
     ------
     FitError
-        If a column is missing, no row is used, or a run stands still.
+        If a column is missing, no row is used, or a run has speed 0.
     """
     missing = [name for name in NEEDED if name not in steady.columns]
     if missing:
@@ -54,7 +61,7 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     rows = steady[steady["used"].to_numpy(bool) & steady["condition"].notna().to_numpy()]
     if rows.empty:
         raise FitError("no steady window is left to fit.", fix="Look in table quality why each was left out.")
-    rows = both_ways_together(rows)
+    rows = merge_directions(rows)
     commanded = rows["speed_set_mm_s"] if "speed_set_mm_s" in rows.columns else pd.Series(np.nan, rows.index)
     numbers = pd.DataFrame(
         {
@@ -65,7 +72,7 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
             "speed": rows["speed_mm_s"].astype(float).abs(),
             "set": commanded.astype(float).abs(),
             "load": rows["load_N"].astype(float),
-            "force": rows["force_N"].astype(float) * rows["direction"].astype(int).replace(BOTH, 1),
+            "force": rows["force_N"].astype(float) * rows["direction"].astype(int).replace(BOTH_DIRECTIONS, 1),
             "half": rows["half_N"],
             **{name: rows[name].astype(float) for name in shifts_of(rows)},
         }
@@ -85,7 +92,7 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
 
 
 def shifts_of(table: pd.DataFrame) -> list[str]:
-    """Return the columns along which the effects that were taken out are uncertain; none before the loop."""
+    """Return the names of the columns with the subtracted effects' uncertainty; none before the loop."""
     return [name for name in table.columns if str(name).startswith(SHIFT)]
 
 
@@ -99,20 +106,20 @@ def run_weights(runs: pd.DataFrame, scatter: Scatter) -> np.ndarray:
 
 
 def proportional_weights(fitted_N: np.ndarray) -> np.ndarray:
-    """Return 1/variance of run means whose scatter is in proportion to the friction, shape (n,), up to a factor.
+    """Return 1/variance of run means with a scatter proportional to the friction, shape (n,), up to a factor.
 
     Parameters
     ----------
     fitted_N : ndarray, shape (n,)
-        Friction of every run by a fit with even weights. A run's own force will not do: its error would
-        set its weight, and where an offset leaves the force of one direction near zero, that run would decide alone.
+        Friction of every run from a fit with equal weights. With the measured force the weight would depend on its
+        error, and a run whose force an offset brings near zero would dominate.
     """
     size = np.abs(fitted_N)
     return 1.0 / np.maximum(size, SMALLEST_SHARE * size.max(initial=0.0) or 1.0) ** 2
 
 
-def likelier(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float) -> int:
-    """Return which weights the residuals bear out: least n ln(chi2/df) - sum ln w, twice the negative log likelihood.
+def more_likely(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float) -> int:
+    """Return the number of the most likely weights: the least n ln(chi2/df) - sum ln w, -2 log likelihood.
 
     Parameters
     ----------
@@ -131,7 +138,7 @@ def likelier(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float) ->
 
 @dataclass(frozen=True)
 class UnitVariance:
-    """Factor on the stated variances, per condition, with what it rests on; NaN where nothing can be said."""
+    """Factor on the stated variances per condition, and the tests behind it; NaN if not determined."""
 
     value: np.ndarray  # (conditions,), Birge ratio squared
     df: np.ndarray  # (conditions,), of the Student t of the intervals
@@ -139,26 +146,26 @@ class UnitVariance:
     p: np.ndarray
     pooled: float  # reduced chi-square of all conditions together
     pooled_p: float
-    own: np.ndarray  # (conditions,) bool: widened by its own ratio, being worse than the others
+    own: np.ndarray  # (conditions,) bool: whether the condition has its own ratio
 
     def of(self, some: slice) -> UnitVariance:
-        """Return what is said of some of the conditions."""
+        """Return the factors of some conditions."""
         own = {name: getattr(self, name)[some] for name in ("value", "df", "f", "p", "own")}
         return replace(self, **own)
 
     def rise(self) -> np.ndarray:
-        """Return by how much chi-square may exceed its minimum inside a 95 % interval, shape (conditions,)."""
+        """Return the rise of chi-square above its minimum at the ends of a 95 % interval, shape (conditions,)."""
         with np.errstate(invalid="ignore"):
             return stdtrit(self.df, 0.975) ** 2 * self.value
 
 
 def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
-    """Return how far the variances stated by the weights must be widened.
+    """Return the factors on the variances stated by the weights.
 
-    With repeats (`pure_df` > 0): chi-square over its degrees of freedom, pooled over the conditions, is tested against
-    pure error. At `POOLING_P` or below there is scatter between runs: the pooled ratio is the factor, on the pooled
-    degrees of freedom, and never below 1. Else the factor is 1 on `pure_df`. A condition that is worse than the pooled
-    ratio at `WORSE_P` gets its own. Without repeats the weights are relative and the pooled ratio is the variance.
+    With repeats (`pure_df` > 0) the reduced chi-square, pooled over the conditions, is tested against pure error. If
+    its p-value is at most `POOLING_P`, the factor is the pooled ratio, at least 1, with the pooled degrees of freedom.
+    Else it is 1 with `pure_df`. A condition whose ratio exceeds that at level `WORSE_P` gets its own ratio. Without
+    repeats the weights are relative and the pooled ratio is the variance.
 
     Parameters
     ----------
@@ -200,13 +207,14 @@ def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
 def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
     """Return the distinct speed levels of one condition, rising, per direction: {+1: (k,), -1: (m,)}.
 
-    Commanded speeds where every run of the direction has one, else measured speeds grouped within 25 %. Directions are
-    kept apart: a direction offset between a slow way out and a fast way back would be taken for a Stribeck curve.
+    They are commanded speeds if every run of the direction has one, else measured speeds grouped within 25 %. Each
+    direction is counted separately: an offset between slow strokes forward and fast ones backward could be taken for a
+    Stribeck curve.
     """
-    ways, commanded, measured = (runs[name].to_numpy() for name in ("direction", "set", "speed"))
+    directions, commanded, measured = (runs[name].to_numpy() for name in ("direction", "set", "speed"))
     levels = {}
     for direction in (1, -1):
-        own = (ways == direction) | (ways == BOTH)
+        own = (directions == direction) | (directions == BOTH_DIRECTIONS)
         if not own.any():
             continue
         speeds = commanded[own].astype(float)

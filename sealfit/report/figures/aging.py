@@ -55,7 +55,7 @@ MOST_TRACES = 6
 def draw_aging(
     ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Units, before: pd.DataFrame | None = None
 ) -> None:
-    """Draw what aging does to the coefficients of one series: the law with its band, and each condition's fit.
+    """Draw the coefficients of one series over aging time: the law with its band, and the fit of each condition.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def draw_aging(
 
 
 def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
-    """Return the aging curves, a panel per series, or None if this campaign does not age rubber."""
+    """Return the aging curves, a panel per series, or None without aging days."""
     curves = tables["aging_curves"]
     if curves.empty or not config.aging:
         return None
@@ -108,7 +108,7 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         "series",
     )
     if note:
-        note += " All stand in steady_fit.parquet and aging_curves.parquet."
+        note += " steady_fit.parquet and aging_curves.parquet have all."
     rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
     before = tables.get("aging_curves_before", curves.iloc[:0])
     shown = pd.concat([curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"]]).dropna()
@@ -137,7 +137,7 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
 
 
 def _law_misfits(points: pd.DataFrame, curves: pd.DataFrame) -> dict[str, float]:
-    """Return how far the conditions of every series lie from its law, as an rms of all coefficients."""
+    """Return the rms deviation of the conditions of every series from its law, over all coefficients."""
     laws = {place: curve.sort_values("aging_days") for place, curve in curves.groupby(["series", "quantity"])}
     gaps: dict[str, list[float]] = {}
     for (name, quantity), own in points.groupby(["series", "quantity"]):
@@ -148,7 +148,7 @@ def _law_misfits(points: pd.DataFrame, curves: pd.DataFrame) -> dict[str, float]
 
 
 def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str], names: ConditionNames) -> pd.DataFrame:
-    """Return the identified coefficients of every condition with the days they belong to."""
+    """Return the identified coefficients of every condition with its aging days."""
     rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["identified"].astype(bool)]
     rows = rows[rows["parameter"].isin(list(quantities))]
     of = {c: 0.0 if is_unaged(c) else names.number(c, "aging_days") for c in rows["condition"].unique()}
@@ -189,7 +189,7 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
 
 
 def along_motion(traces: pd.DataFrame) -> pd.DataFrame:
-    """Return traces with the force counted in the direction of motion: a force that opposes it is positive."""
+    """Return traces with the force positive where it opposes the motion."""
     return traces.assign(force_N=traces["force_N"] * traces["direction"])
 
 
@@ -231,7 +231,7 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     fewer = bool((counts.min() < counts.max()).any())
     legend = (
         Key("mean of all repeats", AFTER),
-        *([Key("of fewer repeats", SKY)] if fewer else []),
+        *([Key("mean of fewer repeats", SKY)] if fewer else []),
         Key("± standard error", AFTER, "band"),
         Key("steady window", QUIET, "band"),
     )
@@ -273,7 +273,7 @@ def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 
 
 # ---------------------------------------------------------------- figures laws
-# The master curve: every condition's value over its aging time, scaled by the rate at its temperature.
+# The master curve: the values of all conditions over aging time scaled by the rate at their temperature.
 
 MARKERS = "os^Dv<>"
 SCALED = "scaled aging time"
@@ -349,5 +349,5 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
     legend = [Key(f"{given(t)} °C", colour, "point") for t, colour in spread(list(colours.items()), MOST_KEYS)]
     legend += [Key("unaged", BLACK, "point"), Key("law, 95 % band", FLOOR, "band")]
     legend += [Key("before, without the effects", FLOOR, "dotted")] if len(before) else []
-    note = "" if len(groups) == len(panels) else f"{len(panels)} of {len(groups)}; all stand in master_curve.parquet."
+    note = "" if len(groups) == len(panels) else f"{len(panels)} of {len(groups)}; master_curve.parquet has all."
     return Plot("master_curve", "Master curve", tuple(panels), tuple(legend), note)

@@ -1,4 +1,4 @@
-"""Errors before and after, the residual along every channel, and what the effects look like."""
+"""Errors before and after, the residual by level and variable, and the shapes of the effects."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from sealfit.report.style import (
 from sealfit.units import Units
 
 # ---------------------------------------------------------------- figures loop
-# Errors before and after, and the level at which the residual sits.
+# Errors before and after, and the variance of the residual by level.
 
 LEVELS = ("specimen", "run", "file", "stroke", "sample")
 ERRORS = (("rmse_N", "all bins"), ("rmse_runs_N", "run means"), ("heldout_rmse_N", "held out"))
@@ -78,7 +78,7 @@ def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
 
 
 def draw_histogram(ax: Axes, before: np.ndarray, after: np.ndarray, units: Units, held_out: bool) -> None:
-    """Draw how the errors of the run means are spread, before and after, in the same classes."""
+    """Draw histograms of the errors of the run means, before and after, in the same classes."""
     both = np.concatenate([before, after])
     edge = float(np.max(np.abs(both))) or 1.0
     edges = np.linspace(-edge, edge, 2 * int(np.clip(np.sqrt(len(before)), 4, 15)) + 2)
@@ -94,7 +94,7 @@ def draw_histogram(ax: Axes, before: np.ndarray, after: np.ndarray, units: Units
 
 
 def run_means(residuals: pd.DataFrame, column: str) -> pd.Series:
-    """Return the mean of `column` over every run, each file weighing the same."""
+    """Return the mean of `column` over every run, with equal weights of its files."""
     files = residuals.groupby(["run_id", "file"], sort=True)[column].mean()
     return files.groupby(level="run_id", sort=True).mean().dropna()
 
@@ -110,17 +110,18 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, co
     ]
     floor = closure.get("noise_floor_N")
     alt = f"Rms errors: {'; '.join(pairs)}; noise floor {f'{number(floor)} {unit}' if known(floor) else 'unknown'}."
-    panels = [Panel("Errors and the noise floor", alt, lambda ax: draw_errors(ax, closure, config.units), left=0.86)]
+    panels = [Panel("Errors and noise floor", alt, lambda ax: draw_errors(ax, closure, config.units), left=0.86)]
     before, after = tables["residuals_before"], tables["residuals_after"]
     if len(before) and len(after):
         held = before["heldout_residual_N"].notna().any() and after["heldout_residual_N"].notna().any()
         column = "heldout_residual_N" if held else "residual_N"
         a, b = run_means(before, column).to_numpy(), run_means(after, column).to_numpy()
         if len(a) >= 4 and len(b) >= 4:
-            alt = f"Errors of {len(a)} run means: standard deviation {number(float(np.std(a)))} before, "
+            alt = f"{'Held-out errors' if held else 'Errors'} of {len(a)} run means: standard deviation "
+            alt += f"{number(float(np.std(a)))} before, "
             alt += f"{number(float(np.std(b)))} {unit} after."
             panels.append(
-                Panel("Errors of the run means", alt, lambda ax: draw_histogram(ax, a, b, config.units, bool(held)))
+                Panel("Errors of run means", alt, lambda ax: draw_histogram(ax, a, b, config.units, bool(held)))
             )
     same = closure["before"] == closure["after"]
     legend = (
@@ -169,10 +170,10 @@ def variance_levels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot 
     parts = [f"{row.level} {row.stage} {number(row.sd_N)} {unit}" for row in whole.itertuples()]
     alt = f"Standard deviation of the residual by level: {', '.join(parts)}."
     height = 0.82 + 0.42 * whole["level"].nunique()
-    title = f"Variance by level, and its root in {unit}"
+    title = f"Variance by level (labels: sd in {unit})"
     panel = Panel(title, alt, lambda ax: draw_levels(ax, levels, config.units), height=max(height, 1.6), left=0.86)
     legend = (Key("before", BEFORE, "bar"), Key("after", AFTER, "bar"))
-    return Plot("variance_levels", "Where the residual's variance sits", (panel,), legend)
+    return Plot("variance_levels", "Residual variance by level", (panel,), legend)
 
 
 # ---------------------------------------------------------------- figures residual
@@ -203,7 +204,7 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
     log = numeric and is_logarithmic(x, LOG_SPAN)
     if numeric and channel in ("speed_mm_s", "speed_set_mm_s"):  # as force against speed is drawn
         log = bool(x.min() > 0 and x.max() / x.min() > SPEED_SPAN)
-    # side by side, a little apart on the page, so that neither hides the other
+    # The two stages are drawn side by side, so that neither hides the other.
     apart = 0.008 * (np.ptp(np.log(x)) if log else np.ptp(x)) if numeric else 0.09
     ax.axhline(0.0, color=QUIET, linewidth=0.8, zorder=1)
     many = not numeric and len(rows) > MANY_CATEGORIES  # drawn finer, or they are one blot
@@ -244,7 +245,7 @@ def categories(rows: pd.DataFrame, channel: str) -> list[str]:
 
 
 def channel_order(channels: pd.DataFrame) -> list[str]:
-    """Return the channels, the one that orders the residual most before the others."""
+    """Return the channels by the variance of the residual that they explain, the largest first."""
     z2 = (channels["before_N"] / channels["before_se_N"].replace(0.0, np.nan)) ** 2
     strength = z2.groupby(channels["channel"], sort=False).mean().fillna(0.0)
     return strength.sort_values(ascending=False, kind="stable").index.tolist()
@@ -275,7 +276,7 @@ def residual_channels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plo
         alt += f"; p {p_value(found)} before." if found is not None else "."
         panels.append(Panel(short(capital(words), 38), alt, draw))
     legend = (Key("before", BEFORE, "open"), Key("after", AFTER, "point"))
-    return Plot("residual_channels", "Residual by channel", tuple(panels), legend)
+    return Plot("residual_channels", "Residual by variable", tuple(panels), legend)
 
 
 def _span(channels: pd.DataFrame) -> tuple[float, float]:
@@ -336,7 +337,7 @@ def shape_scale(effect: Mapping) -> float:
 
 
 def shape_label(rows: pd.DataFrame, effect: Mapping, units: Units, symbol: Callable[[str], str] = symbol_plain) -> str:
-    """Return what a shape's values are, with the unit: "added force (N)", "change of μ (%)"."""
+    """Return the axis label of a shape, with the unit: "added force (N)", "change of μ (%)"."""
     target = effect.get("acts_on", "force")
     force = plain(units.quantity("force"))
     if effect.get("operation") == "multiply":

@@ -1,4 +1,4 @@
-"""Force against speed, a panel per series; and how the force comes up at a few speeds."""
+"""Force against speed, a panel per series; and the pre-sliding rise at selected speeds."""
 
 from __future__ import annotations
 
@@ -274,7 +274,7 @@ def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict
 def _telling(
     groups: dict[str, list[str]], aged: int, tables: Mapping[str, pd.DataFrame], names: ConditionNames
 ) -> tuple[dict[str, list[str]], str]:
-    """Return the panels that are drawn, and in words which of how many, and of how many conditions, they are."""
+    """Return the panels that are drawn, and a note on the selection."""
     misfit = condition_misfits(tables) if len(groups) > MOST_PANELS else {}
     titles, note = telling(
         list(groups),
@@ -285,8 +285,8 @@ def _telling(
     groups = {title: groups[title] for title in titles}
     drawn = sum(len(group) for group in groups.values())
     if drawn < aged:
-        note = f"{note} Of {count(aged, 'condition')} {drawn} are in them.".strip()
-    return groups, f"{note} All stand in steady.parquet and curves.parquet." if note else ""
+        note = f"{note} They hold {drawn} of {count(aged, 'condition')}.".strip()
+    return groups, f"{note} steady.parquet and curves.parquet have all." if note else ""
 
 
 def _differ(curves: pd.DataFrame) -> bool:
@@ -305,7 +305,7 @@ def _level_label(name: str, level: str, names: ConditionNames) -> str:
 
 
 # ---------------------------------------------------------------- figures dynamic
-# How the force comes up: the mean start at a few speeds, and the dynamic model's.
+# The pre-sliding rise: the mean force from the start of motion at selected speeds, and the dynamic model.
 
 MOST_START_PANELS = 6
 MOST_SPEEDS = 3
@@ -314,7 +314,7 @@ BEYOND = 1.5  # of that distance is shown
 
 
 def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], units: Units) -> None:
-    """Draw the mean starts of a condition over the distance slid, with their standard error, and the model's.
+    """Draw the mean pre-sliding force of a condition over the distance slid, its standard error, and the model.
 
     Parameters
     ----------
@@ -346,7 +346,7 @@ def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], un
 
 
 def _reach(curves: pd.DataFrame) -> float:
-    """Return the distance to which starts are drawn: to where the slowest of them is over, and half of it beyond."""
+    """Return the distance to draw: 1.5 times the distance at which the slowest rise has ended."""
     ends = []
     for _, curve in curves.groupby(["speed_set_mm_s", "direction"], dropna=False):
         curve = curve.sort_values("distance_mm")
@@ -356,7 +356,7 @@ def _reach(curves: pd.DataFrame) -> float:
 
 
 def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
-    """Return the mean starts of up to six conditions at up to three speeds each, or None if no trace shows one."""
+    """Return the pre-sliding force of up to six conditions at up to three speeds each, or None without one."""
     curves = tables["dynamic_curves"]
     if curves.empty:
         return None
@@ -379,14 +379,14 @@ def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
             draw_starts(ax, own, colours, units)
             ax.set_ylim(*span)
 
-        alt = f"Starts of {names(condition)}: {units.quantity('force')} from {number(own['force_N'].min())} to "
+        alt = f"Pre-sliding, {names(condition)}: {units.quantity('force')} from {number(own['force_N'].min())} to "
         alt += f"{number(own['force_N'].max())} {units.unit('force')} over {number(_reach(own))} "
         alt += f"{units.unit('displacement')}."
         panels.append(Panel(short(names(condition)), alt, draw))
     legend = [Key(f"{given(speed)} {units.unit('speed')}", colour) for speed, colour in colours.items()]
-    legend.append(Key("mean of the starts", FLOOR, "point"))
+    legend.append(Key("mean of the strokes", FLOOR, "point"))
     if (shown["direction"] < 0).any():
         legend.append(Key("backward", FLOOR, "left"))
     if shown["model_N"].notna().any():
         legend.append(Key("dynamic model", FLOOR, "line"))
-    return Plot("starts", "Starts", tuple(panels), tuple(legend))
+    return Plot("starts", "Pre-sliding", tuple(panels), tuple(legend))

@@ -1,0 +1,394 @@
+"""Trace files of arrays, not of text: TDMS, MATLAB and Parquet, each read by the library made for it.
+
+Every reader gives the same: header lines `name<tab>text`, names of the columns, and a column each. What follows is done
+as for text. The libraries are optional (`pip install 'sealfit[formats]'`) and loaded where a file needs them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import re
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import date, datetime, time, timedelta
+from pathlib import PurePosixPath
+from types import ModuleType
+
+import numpy as np
+
+from sealfit.config import TraceFormat
+from sealfit.errors import BadFile, CampaignError, Fault, SealfitError
+from sealfit.ingest.columns import suggestion
+
+# ---------------------------------------------------------------- kinds
+# Which files are of which kind, and the library that reads them.
+
+ENDINGS = {
+    ".xlsx": "xlsx",
+    ".xlsm": "xlsx",
+    ".xls": "xlsx",  # which is refused, and said how to save it
+    ".tdms": "tdms",
+    ".mat": "mat",
+    ".parquet": "parquet",
+    ".pq": "parquet",
+}
+OF_ARRAYS = ("tdms", "mat", "parquet")
+CALLED = {"xlsx": "an Excel workbook", "tdms": "a TDMS file", "mat": "a MAT-file", "parquet": "a Parquet file"}
+_LIBRARIES = {"xlsx": "openpyxl", "tdms": "nptdms"}  # that every file of the kind needs
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]+")
+
+
+def kind_of(file: str, settings: TraceFormat | None = None) -> str:
+    """Return how a file is written: by the config's `format`, else by its ending; "csv" for all other endings.
+
+    Examples
+    --------
+    >>> kind_of("raw/Run 1.TDMS"), kind_of("run.asc"), kind_of("run.dat", TraceFormat(format="mat"))
+    ('tdms', 'csv', 'mat')
+    """
+    if settings is not None and settings.format is not None:
+        return settings.format
+    return ENDINGS.get(PurePosixPath(file).suffix.lower(), "csv")
+
+
+def library(name: str, file: str) -> ModuleType:
+    """Return the library that reads `file`.
+
+    Raises
+    ------
+    CampaignError
+        If it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        reason = f"{name}, which reads this file, is not installed."
+        fix = "Install it: pip install 'sealfit[formats]'"
+        raise CampaignError([Fault("missing_library", reason, file=file, fix=fix)]) from None
+
+
+def require_libraries(files: Sequence[str], settings: TraceFormat) -> None:
+    """Raise `CampaignError` if a library that some of the files need is not installed."""
+    first: dict[str, str] = {}
+    for file in files:
+        first.setdefault(kind_of(file, settings), file)
+    for kind, name in _LIBRARIES.items():
+        if kind in first:
+            library(name, first[kind])
+
+
+@contextmanager
+def damage_named(file: str, kind: str) -> Iterator[None]:
+    """Turn whatever a library raises into a fault of the file; a library meets damage with any kind of exception."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on styles and the like, which are of no concern here
+            yield
+    except (SealfitError, MemoryError):
+        raise
+    except Exception as error:
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
+        fix = "It is damaged or of another format: export it again, or set trace.format in the rig config."
+        raise bad(file, "damaged_file", f"cannot be read as {CALLED[kind]} ({said}).", fix) from error
+
+
+def bad(file: str, check: str, reason: str, fix: str, **place) -> BadFile:
+    """Return the error of a file that is left out."""
+    return BadFile(Fault(check, reason, file=file, action="file left out", fix=fix, **place))
+
+
+# ---------------------------------------------------------------- arrays
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrays:
+    """A file's header lines, the names of its columns and the columns, each of shape (n,).
+
+    `names` is empty where columns go by position. A column holds float64, datetime64, or text as objects (None where
+    empty); `faults` name what is no column.
+    """
+
+    header: tuple[str, ...]
+    names: tuple[str, ...] = ()
+    columns: tuple[np.ndarray, ...] = ()
+    faults: tuple[Fault, ...] = ()
+
+
+def read_arrays(raw: bytes, file: str, settings: TraceFormat, *, head: bool = False) -> Arrays:
+    """Return what a file of one of the kinds `OF_ARRAYS` holds; with `head` its header lines at least.
+
+    Raises
+    ------
+    BadFile
+        If it is damaged, holds no columns or several tables of which none is chosen.
+    CampaignError
+        If the library that reads it is not installed.
+    """
+    kind = kind_of(file, settings)
+    with damage_named(file, kind):
+        found = _READERS[kind](raw, file, settings, head)
+    if not head and not max((len(column) for column in found.columns), default=0):
+        raise bad(file, "no_rows", "holds no column of data.", "Export it again.")
+    return found
+
+
+def header_line(name: str, value: object) -> str:
+    """Return a named value as a line of a header."""
+    return f"{name}\t{value_text(value)}"
+
+
+def value_text(value: object) -> str:
+    """Return one value as text that gives it back without loss: dates in ISO 8601, durations in seconds.
+
+    Examples
+    --------
+    >>> value_text(80.0), value_text(0.1), value_text(True), value_text(datetime(2024, 3, 1, 9, 30)), value_text(None)
+    ('80', '0.1', 'TRUE', '2024-03-01T09:30:00', '')
+    """
+    if value is None:
+        return ""
+    if isinstance(value, bool | np.bool_):
+        return str(bool(value)).upper()
+    if isinstance(value, timedelta):
+        value = value.total_seconds()
+    if isinstance(value, int | float | np.number):
+        whole = isinstance(value, int | np.integer) or (float(value).is_integer() and abs(value) < 2**53)
+        return str(int(value)) if whole else repr(float(value))
+    text = value.isoformat() if isinstance(value, datetime | date | time) else str(value)
+    return _CONTROL.sub(" ", text)
+
+
+def _column(values: np.ndarray) -> np.ndarray | None:
+    """Return the values as a column of `Arrays`; None where they are none."""
+    if values.dtype.kind in "fiub":
+        return values.astype(float)
+    if values.dtype.kind == "M":
+        return values
+    if values.dtype.kind == "m":
+        return values / np.timedelta64(1, "s")
+    if values.dtype.kind in "UO" and all(value is None or isinstance(value, str) for value in values.tolist()):
+        return np.array([(value or "").strip() or None for value in values.tolist()], dtype=object)
+    return None
+
+
+def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceFormat, file: str) -> Arrays:
+    """Return named columns, those of another length than the longest, and those of other things, left out and named.
+
+    Raises
+    ------
+    BadFile
+        If one of these is a column that the config names.
+    """
+    needed, kept, faults = set(settings.their_columns.values()), {}, []
+    rows = max((len(values) for values in found.values()), default=0)
+    for name, values in found.items():
+        column = _column(values)
+        if column is not None and len(column) == rows:
+            kept[name] = column
+            continue
+        reason = (
+            "holds neither numbers nor text" if column is None else f"has {len(values)} values where others have {rows}"
+        )
+        if name in needed:
+            fix = "Export all channels at one rate." if column is not None else "Export it as numbers."
+            raise bad(file, "column_shape", f"{reason}.", fix, column=name)
+        place = {"file": file, "column": name, "severity": "info", "action": "kept"}
+        faults.append(Fault("channel_left_out", f"{reason}; the column is not used.", **place))
+    return Arrays(tuple(header), tuple(kept), tuple(kept.values()), tuple(faults))
+
+
+def _chosen(
+    options: Mapping[str, Collection[str]], key: str, settings: TraceFormat, file: str, derived: str | int | None = None
+) -> str:
+    """Return the one of several tables in a file that the config names, or the only one that fits it.
+
+    Parameters
+    ----------
+    options : mapping of str to collection of str
+        The tables, and the names of their columns.
+    key : str
+        The key of the config: "group" or "variable".
+    derived : str, optional
+        A column that need not be in the file.
+    """
+    wanted = getattr(settings, key)
+    if not options:
+        raise bad(file, "no_rows", "holds no column of data.", "Export it again.")
+    if wanted is not None:
+        if wanted in options:
+            return wanted
+        fix = suggestion(wanted, list(options)).replace("columns are", f"{key}s are")
+        raise bad(file, "missing_table", f"holds no {key} '{wanted}' (trace.{key}) with data.", fix)
+    names = {
+        name for ours, name in settings.their_columns.items() if isinstance(name, str) and ours not in settings.optional
+    }
+    fitting = [option for option, columns in options.items() if names - {derived} <= set(columns)]
+    if len(options) == 1 or len(fitting) == 1:
+        return [*fitting, *options][0]
+    named = ", ".join(repr(option) for option in options)
+    fix = f'Choose one in the rig config: {key} = "..." under [trace].'
+    raise bad(file, "several_tables", f"holds several {key}s with data: {named}.", fix)
+
+
+# ---------------------------------------------------------------- TDMS
+
+
+def _tdms(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
+    nptdms = library("nptdms", file)
+    nptdms.log.log_manager.set_level("ERROR")  # what it warns of is a fault below
+    read = nptdms.TdmsFile.read_metadata if head else nptdms.TdmsFile.read
+    tdms = read(io.BytesIO(raw))
+    if tdms.file_status.incomplete_final_segment:
+        raise bad(file, "damaged_file", "is cut off: its last segment is not complete.", "Copy it again from the rig.")
+    groups = {group.name: group for group in tdms.groups() if any(len(channel) for channel in group.channels())}
+    time_name = settings.their_columns.get("time_s")
+    names = {name: [channel.name for channel in group.channels()] for name, group in groups.items()}
+    group = groups[_chosen(names, "group", settings, file, derived=time_name)]
+    header = [header_line(name, value) for name, value in tdms.properties.items()]
+    header += [header_line(f"{group.name}/{name}", value) for name, value in group.properties.items()]
+    for channel in group.channels():
+        header += [header_line(f"{group.name}/{channel.name}/{k}", value) for k, value in channel.properties.items()]
+    if head:
+        return Arrays(tuple(header))
+    filled = {channel.name: channel for channel in group.channels() if len(channel)}
+    made = _arrays(header, {name: np.asarray(channel[:]) for name, channel in filled.items()}, settings, file)
+    if not isinstance(time_name, str) or time_name in names[group.name]:
+        return made
+    return _with_time(made, time_name, [filled[name].properties for name in made.names])
+
+
+def _with_time(made: Arrays, name: str, properties: Sequence[Mapping[str, object]]) -> Arrays:
+    """Return the columns and one of time, from the increment that the waveforms of all channels share."""
+    clocks = {(p.get("wf_start_offset", 0.0), p["wf_increment"]) for p in properties if p.get("wf_increment")}
+    if len(clocks) != 1:
+        return made  # the column is missed where it is looked for
+    ((start, step),) = clocks
+    times = float(start) + float(step) * np.arange(len(made.columns[0]))
+    return Arrays(made.header, (*made.names, name), (*made.columns, times), made.faults)
+
+
+# ---------------------------------------------------------------- MATLAB
+
+VECTORS = "(vectors)"  # what `variable` calls the vectors that stand in the file by themselves
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
+def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
+    if raw.startswith(_HDF5) or raw[512:520] == _HDF5:  # version 7.3
+        with library("h5py", file).File(io.BytesIO(raw), "r") as opened:
+            variables = _hdf5(opened)
+    else:
+        from scipy.io import loadmat
+
+        loaded = loadmat(io.BytesIO(raw), simplify_cells=True)
+        variables = {name: value for name, value in loaded.items() if not name.startswith("__")}
+    header = [header_line(name, value) for name, value in _scalars(variables)]
+    if head:
+        return Arrays(tuple(header))
+    tables = _tables(variables)
+    if not tables:
+        fix = "Save the columns as vectors, as a matrix or as a struct: s = table2struct(T, 'ToScalar', true)."
+        raise bad(file, "no_rows", "holds no vectors, matrix or struct of numbers.", fix)
+    options = {name: table if isinstance(table, dict) else () for name, table in tables.items()}
+    name = _chosen(options, "variable", settings, file)
+    table = tables[name]
+    if isinstance(table, dict):
+        return _arrays(header, table, settings, file)
+    if table.shape[0] < table.shape[1]:
+        reason = f"variable '{name}' has {table.shape[0]} rows and {table.shape[1]} columns; samples are rows."
+        raise bad(file, "column_shape", reason, "Save its transpose.")
+    return Arrays(tuple(header), (), tuple(table.T.astype(float)))
+
+
+def _is_vector(value: object) -> bool:
+    return isinstance(value, np.ndarray) and value.ndim == 1 and value.size > 1
+
+
+def _tables(variables: Mapping[str, object], inside: str = "") -> dict[str, dict[str, np.ndarray] | np.ndarray]:
+    """Return every matrix, and the vectors of every struct and of the file itself, by their names."""
+    found: dict[str, dict[str, np.ndarray] | np.ndarray] = {}
+    vectors = {name: value for name, value in variables.items() if _is_vector(value)}
+    if any(_column(value) is not None for value in vectors.values()):
+        found[inside or VECTORS] = vectors
+    for name, value in variables.items():
+        path = f"{inside}.{name}" if inside else name
+        if isinstance(value, dict):
+            found |= _tables(value, path)
+        elif isinstance(value, np.ndarray) and value.ndim == 2 and value.size and value.dtype.kind in "fiub":
+            found[path] = value
+    return found
+
+
+def _scalars(variables: Mapping[str, object], inside: str = "") -> Iterator[tuple[str, object]]:
+    """Yield name and value of every number and text, those in structs as `struct.field`."""
+    for name, value in variables.items():
+        if isinstance(value, dict):
+            yield from _scalars(value, f"{inside}{name}.")
+        elif isinstance(value, str | bool | int | float | np.number):
+            yield f"{inside}{name}", value
+
+
+def _hdf5(folder: Mapping) -> dict[str, object]:
+    """Return the variables of a file of version 7.3 as `loadmat` gives those of earlier ones."""
+    found: dict[str, object] = {}
+    for name, item in folder.items():
+        if name.startswith("#"):  # where cells and objects are kept
+            continue
+        value = _hdf5(item) if hasattr(item, "items") else _hdf5_value(item)
+        if value is not None:
+            found[name] = value
+    return found
+
+
+def _hdf5_value(item) -> np.ndarray | float | str | None:
+    """Return an array, which MATLAB writes transposed, without dimensions of length 1; a number or text as such."""
+    if "MATLAB_empty" in item.attrs or item.dtype.kind not in "fiub":
+        return None
+    values = np.squeeze(item[()].T)
+    if item.attrs.get("MATLAB_class", b"") in (b"char", "char"):
+        return "".join(map(chr, np.atleast_1d(values).tolist())) if values.ndim < 2 else None
+    return values.item() if values.ndim == 0 else values
+
+
+# ---------------------------------------------------------------- Parquet
+
+_OF_WRITERS = (b"pandas", b"ARROW:schema")  # what writers keep for themselves
+
+
+def _parquet(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    opened = pq.ParquetFile(pa.BufferReader(raw))
+    about = {k.decode(): v.decode("utf-8", "replace") for k, v in (opened.schema_arrow.metadata or {}).items()}
+    header = [header_line(name, text) for name, text in about.items() if name.encode() not in _OF_WRITERS]
+    if head:
+        return Arrays(tuple(header))
+    table = opened.read(use_threads=False)
+    names = [name for name in table.column_names if not name.startswith("__index_level_")]
+    if len(set(names)) < len(names):
+        raise bad(file, "duplicate_column", "has two columns of one name.", "Rename one.")
+    return _arrays(header, {name: _from_arrow(table.column(name)) for name in names}, settings, file)
+
+
+def _from_arrow(column) -> np.ndarray:
+    import pyarrow as pa
+
+    kind = column.type
+    if pa.types.is_dictionary(kind):
+        column, kind = column.cast(kind.value_type), kind.value_type
+    if pa.types.is_decimal(kind) or pa.types.is_null(kind) or pa.types.is_boolean(kind) or pa.types.is_integer(kind):
+        return column.cast(pa.float64(), safe=False).to_numpy()
+    if pa.types.is_date(kind):
+        column = column.cast(pa.timestamp("s"))
+    return column.to_numpy()
+
+
+_READERS: dict[str, Callable[[bytes, str, TraceFormat, bool], Arrays]] = {
+    "tdms": _tdms,
+    "mat": _mat,
+    "parquet": _parquet,
+}

@@ -1,0 +1,252 @@
+"""Excel workbooks and tables of runs to text: lines of cells between tabs, read as those of any other text file.
+
+The number of a line is that of the sheet's row. Numbers are written without loss, dates in ISO 8601.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from xml.etree import ElementTree
+
+from sealfit.config import Config
+from sealfit.errors import nearest
+from sealfit.ingest.files import as_utf8, read_bytes
+from sealfit.ingest.formats import CALLED, bad, damage_named, kind_of, library, value_text
+
+# ---------------------------------------------------------------- sheets
+
+HEAD_ROWS = 1000  # a header longer than this is no header
+_OLE = b"\xd0\xcf\x11\xe0"  # of .xls, and of the shell that Excel puts around an encrypted workbook
+_ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
+_MERGED = re.compile(rb'mergeCell\b[^>]*?\bref="([A-Z]+\d+:[A-Z]+(\d+))"')
+_RELATION = "{http://schemas.openxmlformats.org/officeDocument/2006/relationships}id"
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """The text of a sheet, and its merged cells: as `A1:B2`, with the last of their rows."""
+
+    text: bytes
+    merged: tuple[tuple[str, int], ...]
+
+    def check(self, first_row: int, file: str) -> None:
+        """Raise `BadFile` if cells are merged at or below the first row of data.
+
+        A merged cell has its value in its first row only; those below it would be taken as empty.
+        """
+        for reference, last in self.merged:
+            if last >= first_row:
+                fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
+                row = int(re.findall(r"\d+", reference)[0])
+                raise bad(file, "merged_cells", f"the cells {reference} are merged.", fix, line=row)
+
+
+def read_sheet(
+    raw: bytes, file: str, sheet: str | int | None, *, decimal: str = ".", first: bool = False, head: bool = False
+) -> Sheet:
+    """Return a sheet of a workbook as text.
+
+    Parameters
+    ----------
+    raw : bytes
+        The workbook.
+    file : str
+        What messages call it.
+    sheet : str, int or None
+        Name or number (from 1) of the sheet; None for the only one with cells in it.
+    decimal : str
+        Mark with which numbers are written.
+    first : bool
+        Whether None means the first sheet.
+    head : bool
+        Whether `HEAD_ROWS` rows are enough.
+
+    Raises
+    ------
+    BadFile
+        If it is no workbook that can be read, has no such sheet, or formulas without values.
+    CampaignError
+        If openpyxl is not installed.
+    """
+    _refuse_others(raw, file)
+    openpyxl = library("openpyxl", file)
+    with damage_named(file, "xlsx"):
+        with _Book(openpyxl, raw, formulas=True) as book:
+            title = _title(book, sheet, first, file)
+            lines, formulas = _lines(book[title], decimal, head)
+        if formulas:
+            with _Book(openpyxl, raw, formulas=False) as book:
+                lines, _ = _lines(book[title], decimal, head)
+                _refuse_unsaved(book[title], formulas, openpyxl.utils.get_column_letter, file)
+        return Sheet("\n".join(lines).encode("utf-8", "replace"), () if head else _merged(raw, title))
+
+
+class _Book:
+    """An open workbook, read row by row, with its formulas or with the values that Excel kept of them."""
+
+    def __init__(self, openpyxl, raw: bytes, *, formulas: bool):
+        options = {"read_only": True, "data_only": not formulas, "keep_links": False}
+        self.book = openpyxl.load_workbook(io.BytesIO(raw), **options)
+
+    def __enter__(self):
+        for sheet in self.book.worksheets:
+            sheet.reset_dimensions()  # some writers note a size that is not so
+        return self.book
+
+    def __exit__(self, *_):
+        self.book.close()
+
+
+def _refuse_others(raw: bytes, file: str) -> None:
+    if not raw.startswith(_OLE):
+        if not raw.startswith(b"PK"):
+            fix = "Export it again, or name it for what it is."
+            raise bad(file, "binary_file", "is not an Excel workbook (.xlsx).", fix)
+        return
+    if _ENCRYPTED in raw:
+        fix = "Save it without (File > Info > Protect Workbook > Encrypt with Password)."
+        raise bad(file, "binary_file", "is protected by a password.", fix)
+    raise bad(file, "binary_file", "is a workbook of old Excel (.xls).", "Save it as .xlsx.")
+
+
+def _title(book, wanted: str | int | None, first: bool, file: str) -> str:
+    """Return the name of the sheet that is meant."""
+    titles = [sheet.title for sheet in book.worksheets]
+    if isinstance(wanted, int):
+        if 0 < wanted <= len(titles):
+            return titles[wanted - 1]
+        raise bad(file, "missing_sheet", f"there is no sheet {wanted}: it has {len(titles)}.", _listed(titles))
+    if wanted is not None:
+        if wanted in titles:
+            return wanted
+        close = nearest(wanted, titles)
+        raise bad(
+            file,
+            "missing_sheet",
+            f"there is no sheet '{wanted}'.",
+            f"Did you mean '{close}'?" if close else _listed(titles),
+        )
+    if first and titles:
+        return titles[0]
+    filled = [sheet.title for sheet in book.worksheets if _is_filled(sheet)]
+    if not filled:
+        raise bad(file, "empty_file", "has no sheet with cells.", "Export it again.")
+    if len(filled) > 1:
+        fix = f"Choose one in the rig config: sheet = {filled[0]!r} under [trace]. {_listed(filled)}"
+        raise bad(file, "several_tables", f"has {len(filled)} sheets with cells.", fix)
+    return filled[0]
+
+
+def _listed(titles: list[str]) -> str:
+    return f"The sheets are {', '.join(repr(title) for title in titles)}."
+
+
+def _is_filled(sheet) -> bool:
+    return any(cell is not None for row in sheet.iter_rows(values_only=True) for cell in row)
+
+
+def _lines(sheet, decimal: str, head: bool) -> tuple[list[str], list[tuple[int, int]]]:
+    """Return the rows as lines, and row and column (from 1) of every formula.
+
+    A row is at least as long as the longest above it: what it lacks are empty cells.
+    """
+    lines, formulas, width = [], [], 0
+    for number, row in enumerate(sheet.iter_rows(max_row=HEAD_ROWS if head else None, values_only=True), start=1):
+        cells = []
+        for place, value in enumerate(row, start=1):
+            if (isinstance(value, str) and value.startswith("=")) or hasattr(value, "ref"):  # a range of formulas
+                formulas.append((number, place))
+            cells.append(_cell(value, decimal))
+        while cells and not cells[-1]:
+            cells.pop()
+        width = max(width, len(cells))
+        lines.append("\t".join(cells + [""] * (width - len(cells))) if cells else "")
+    while lines and not lines[-1]:
+        lines.pop()
+    return lines, formulas
+
+
+def _cell(value: object, decimal: str) -> str:
+    text = value_text(value)
+    if isinstance(value, int | float | timedelta):
+        return text.replace(".", decimal)
+    return '"' + text.replace('"', '""') + '"' if '"' in text else text
+
+
+def _refuse_unsaved(sheet, formulas: list[tuple[int, int]], letter: Callable[[int], str], file: str) -> None:
+    """Raise `BadFile` if Excel kept no value of a formula."""
+    places = set(formulas)
+    rows = sheet.iter_rows(max_row=max(row for row, _ in formulas), values_only=True)
+    for number, row in enumerate(rows, start=1):
+        for place, value in enumerate(row, start=1):
+            if value is None and (number, place) in places:
+                reason = "the cell holds a formula whose value was not saved."
+                fix = "Open it in Excel and save it, or paste values over the formulas."
+                raise bad(file, "formula", reason, fix, line=number, column=letter(place))
+
+
+def _merged(raw: bytes, title: str) -> tuple[tuple[str, int], ...]:
+    """Return the merged cells of a sheet, which openpyxl does not read row by row."""
+    found: dict[str, int] = {}
+    with zipfile.ZipFile(io.BytesIO(raw)) as packed, packed.open(_part(packed, title)) as part:
+        rest = b""
+        while block := part.read(1 << 20):
+            rest += block
+            found |= {match[1].decode(): int(match[2]) for match in _MERGED.finditer(rest)}
+            rest = rest[-200:]
+    return tuple(found.items())
+
+
+def _part(packed: zipfile.ZipFile, title: str) -> str:
+    """Return the file inside a workbook that holds a sheet."""
+    sheets = ElementTree.fromstring(packed.read("xl/workbook.xml")).iter()
+    number = next(sheet.get(_RELATION) for sheet in sheets if sheet.get("name") == title and sheet.get(_RELATION))
+    relations = ElementTree.fromstring(packed.read("xl/_rels/workbook.xml.rels"))
+    target = next(relation.get("Target") for relation in relations if relation.get("Id") == number)
+    return target.removeprefix("/") if target.startswith("/") else f"xl/{target}"
+
+
+# ---------------------------------------------------------------- tables of runs
+
+
+def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]:
+    """Return a table of runs as UTF-8 and the delimiter of its cells, "" where that is to be found out.
+
+    Of a sheet, and of a Parquet file, the names are the first line: rows count from 2.
+
+    Raises
+    ------
+    BadFile
+        If it cannot be read, or is of another format.
+    CampaignError
+        If the library that reads it is not installed.
+    """
+    raw, kind = read_bytes(campaign, file), kind_of(file)
+    if kind == "csv":
+        return as_utf8(raw, "auto", file), ""
+    if kind == "parquet":
+        with damage_named(file, kind):
+            return _parquet_text(raw), "\t"
+    if kind == "xlsx":
+        sheet = read_sheet(raw, file, config.files.runs_sheet, first=True)
+        sheet.check(1, file)
+        return sheet.text, "\t"
+    fix = "Save it as .csv, .xlsx or .parquet."
+    raise bad(file, "binary_file", f"is {CALLED[kind]}, which is no table of runs.", fix)
+
+
+def _parquet_text(raw: bytes) -> bytes:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.ParquetFile(pa.BufferReader(raw)).read(use_threads=False)
+    table = table.select([name for name in table.column_names if not name.startswith("__index_level_")])
+    rows = zip(*(column.to_pylist() for column in table.columns), strict=True)
+    lines = ["\t".join(_cell(value, ".") for value in row) for row in (table.column_names, *rows)]
+    return "\n".join(lines).encode("utf-8", "replace")
