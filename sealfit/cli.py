@@ -14,7 +14,7 @@ import typer
 
 from sealfit import __version__
 from sealfit.engine import one_thread
-from sealfit.errors import SealfitError
+from sealfit.errors import SealfitError, grouped, told
 
 # ---------------------------------------------------------------- options
 # Arguments and options that several commands share.
@@ -320,8 +320,8 @@ def check(
     if as_json:
         print_json({"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]})
     else:
-        for fault in faults:
-            typer.echo(f"{fault.severity}: {fault}")
+        for group in grouped(faults):
+            typer.echo(f"{group[0].severity}: {told(group)}")
         for line in summary_lines.ingest_lines(found) if found["files"] else ():
             typer.echo(line)
         typer.echo(

@@ -7,14 +7,24 @@ from __future__ import annotations
 
 import re
 import tomllib
+from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-from sealfit.errors import ConfigError
-from sealfit.units import Units
+from sealfit.errors import ConfigError, did_you_mean, nearest
+from sealfit.units import Conversion, Units, conversion
 
 AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
 
@@ -23,6 +33,44 @@ class Strict(BaseModel):
     """A table of a config or SPEC: unknown keys refused, values fixed, numbers finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class FileColumn(Strict):
+    """A column of a file: `force_N = "Kraft"`, or with its unit `force_N = {name = "Kraft", unit = "kgf"}`.
+
+    `name` is what the file calls it, or its position from 1; `unit` is that of its numbers in the file where it is
+    another than ours. The numbers are converted to our unit when they are read.
+    """
+
+    name: str | int
+    unit: str | None = None
+
+
+def _in_full(columns: object) -> object:
+    """Return a config's table of columns with each of them in its long form; one without a name has ours."""
+    if not isinstance(columns, dict):
+        return columns  # refused by the type
+    full = dict(columns)
+    for ours, column in columns.items():
+        if isinstance(column, str | int):
+            full[ours] = {"name": column}
+        elif isinstance(column, dict):
+            full[ours] = {"name": ours, **column}
+    return full
+
+
+FileColumns = Annotated[dict[str, FileColumn], BeforeValidator(_in_full)]
+
+
+def _as_list(formats: object) -> object:
+    return [formats] if isinstance(formats, str) else formats
+
+
+class StartedAt(Strict):
+    """Columns of date and time of day, where these are two: `started_at = {date = "Datum", time = "Zeit"}`."""
+
+    date: str
+    time: str
 
 
 class TraceFormat(Strict):
@@ -46,9 +94,9 @@ class TraceFormat(Strict):
     units_row: bool = Field(False, description="a row of units follows the names")
     trailing_separator: bool = Field(False, description="lines end in stray separators; strip them")
     drop_first_rows: int = Field(0, ge=0)
-    columns: dict[str, str | int] = Field(
-        default_factory=lambda: {"time_s": "time_s", "displacement_mm": "displacement_mm", "force_N": "force_N"},
-        description="our name = the file's column name, or its position from 1",
+    columns: FileColumns = Field(
+        default_factory=lambda: {name: FileColumn(name=name) for name in ("time_s", "displacement_mm", "force_N")},
+        description="our name = the file's column name, or its position from 1; with a unit {name = .., unit = ..}",
     )
     optional: list[str] = Field(default_factory=list, description="of `columns`, those a file may lack")
     other_columns: Literal["channels", "ignore"] = Field("channels", description="columns not listed above")
@@ -65,6 +113,11 @@ class TraceFormat(Strict):
     )
     integrate_displacement: str | None = Field(None, description="speed column whose time integral is displacement")
     integrate_per: Literal["s", "min"] = Field("s", description="time unit of that speed: rpm is per min")
+
+    @property
+    def their_columns(self) -> dict[str, str | int]:
+        """Our name = the file's column name, or its position from 1."""
+        return {ours: column.name for ours, column in self.columns.items()}
 
 
 class Files(Strict):
@@ -86,9 +139,54 @@ class Files(Strict):
     compute: dict[str, str] = Field(
         default_factory=dict, description="column = safe expression over parts, e.g. speed_mm_s = 'sign * rpm'"
     )
-    runs_columns: dict[str, str] = Field(default_factory=dict, description="our name = runs.csv's column name")
+    units: dict[str, str] = Field(
+        default_factory=dict, description="unit of a part or column that names of files give: temperature_C = 'degF'"
+    )
+    date_format: Annotated[list[str], BeforeValidator(_as_list)] = Field(
+        default_factory=list, description="formats of started_at as strptime has them, one or several, tried in order"
+    )
+    started_at: StartedAt | None = Field(None, description="columns of date and time of day, where these are two")
+    runs_columns: FileColumns = Field(
+        default_factory=dict, description="our name = runs.csv's column name; with a unit {name = .., unit = ..}"
+    )
     runs_table: str | None = Field(None, description="table to read as runs.csv: .csv, .xlsx or .parquet")
     runs_sheet: str | int | None = Field(None, description="xlsx: name or number (from 1) of its sheet")
+
+    @property
+    def copies(self) -> dict[str, str]:
+        """Columns that are a part as it stands, by the template "{T}" or the expression T, and that part."""
+        whole = {name: text[1:-1] for name, text in self.columns.items() if re.fullmatch(r"\{[^{}]*\}", text)}
+        return {name: text.strip() for name, text in self.compute.items() if text.strip().isidentifier()} | whole
+
+    @property
+    def text_parts(self) -> tuple[str, ...]:
+        """Parts of names that stay text, with their leading zeros: date and time of day."""
+        return () if self.started_at is None else (self.started_at.date, self.started_at.time)
+
+    @field_validator("date_format")
+    @classmethod
+    def _formats_are_known(cls, formats: list[str]) -> list[str]:
+        for one in formats:
+            try:
+                day = datetime(2024, 2, 1, 9, 30, tzinfo=UTC).strftime(one)
+                datetime.strptime(day, one)
+            except ValueError as error:
+                raise ValueError(f"{one!r} is no date format: {error}. Write for example '%d.%m.%Y %H:%M'") from None
+            if not {"%d", "%j", "%x", "%c"} & set(re.findall("%.", one)):
+                raise ValueError(f"{one!r} has no day. Write for example '%d.%m.%Y %H:%M'")
+        return formats
+
+
+class Runs(Strict):
+    """What is worked out from runs.csv, or what it leaves out."""
+
+    compute: dict[str, str] = Field(
+        default_factory=dict,
+        description="column = safe expression over what is known of a file: load_N = 'm_kg * 9.81'",
+    )
+    constants: dict[str, float | str] = Field(
+        default_factory=dict, description="columns with one value, where the log has none: load_N = 49.03"
+    )
 
 
 class Quantity(Strict):
@@ -162,6 +260,7 @@ class Config(Strict):
     position_origin: Literal["rig", "file"] = "rig"
     trace: TraceFormat = TraceFormat()
     files: Files = Files()
+    runs: Runs = Runs()
     quantities: dict[Literal["force", "displacement", "speed", "load", "time"], Quantity] = Field(default_factory=dict)
     column_units: dict[str, str] = Field(default_factory=dict, description="units of the campaign's own channels")
     strokes: Strokes = Strokes()
@@ -169,6 +268,8 @@ class Config(Strict):
     quality: Quality = Quality()
     sensor: Sensor = Sensor()
     loop: Loop = Loop()
+    _conversions: dict[str, dict[str, Conversion]] = PrivateAttr(default_factory=dict)
+    _kept_units: dict[str, str] = PrivateAttr(default_factory=dict)
 
     @field_validator("condition")
     @classmethod
@@ -197,6 +298,7 @@ class Config(Strict):
 
         rows = {f"trace.compute.{k}": (v, False) for k, v in self.trace.compute.items()}
         rows |= {f"files.compute.{k}": (v, False) for k, v in self.files.compute.items()}
+        rows |= {f"runs.compute.{k}": (v, False) for k, v in self.runs.compute.items()}
         if self.trace.keep is not None:
             rows["trace.keep"] = (self.trace.keep, True)
         for place, (text, condition) in rows.items():
@@ -206,10 +308,38 @@ class Config(Strict):
                 raise ValueError(f"{place}: {error}") from None
         return self
 
+    @model_validator(mode="after")
+    def _units_convert(self) -> Config:
+        units = self.units
+        for table, place, name, unit in self._units_of_files():
+            # A channel of the campaign's own has no unit of ours: it keeps its numbers, and labels show its unit.
+            to = units.of(name) or self._kept_units.setdefault(name, unit)
+            try:
+                self._conversions.setdefault(table, {})[name] = conversion(unit, to)
+            except ConfigError as error:
+                raise ValueError(f"{place}.{name}: {error}") from None
+        return self
+
+    def _units_of_files(self) -> list[tuple[str, str, str, str]]:
+        """Return every column whose unit is given: its table, its place in the config, its name and the unit."""
+        parts, ours = self.files.units, self.units
+        copies = {n: parts[p] for n, p in self.files.copies.items() if p in parts and not ours.of(p)}
+        tables = (
+            ("trace", "trace.columns", {name: column.unit for name, column in self.trace.columns.items()}),
+            ("runs", "files.runs_columns", {name: column.unit for name, column in self.files.runs_columns.items()}),
+            ("names", "files.units", copies | parts),
+        )
+        return [(table, place, n, unit) for table, place, units in tables for n, unit in units.items() if unit]
+
+    def conversions(self, table: Literal["trace", "runs", "names"]) -> dict[str, Conversion]:
+        """Return the conversion of every column of traces, runs.csv or file names whose unit the config gives."""
+        return self._conversions.get(table, {})
+
     @property
     def units(self) -> Units:
         """True unit of every slot."""
-        return Units({slot: (q.quantity, q.unit) for slot, q in self.quantities.items()}, self.column_units)
+        declared = {slot: (q.quantity, q.unit) for slot, q in self.quantities.items()}
+        return Units(declared, self._kept_units | self.column_units)
 
     @property
     def aging(self) -> bool:
@@ -249,7 +379,8 @@ def read_config(path: ConfigPath = None) -> str:
     try:
         return Path(path).read_text("utf-8-sig")  # Windows editors begin with a byte-order mark
     except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, fix="Check --config.") from error
+        fix = did_you_mean(Path(path), Path.is_file) or "Check --config."
+        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, fix=fix) from error
     except UnicodeDecodeError as error:
         raise ConfigError("is not UTF-8.", file=path, fix="Save it as UTF-8.") from error
 
@@ -267,16 +398,39 @@ def parse_config(text: str, name: str) -> Config:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
     except ValidationError as error:
-        raise ConfigError(explain(error), file=name, fix="See the README for every key.") from error
+        raise ConfigError(explain(error, Config), file=name, fix="See the README for every key.") from error
 
 
-def explain(error: ValidationError) -> str:
-    """Return one sentence per fault of a config or SPEC."""
+def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
+    """Return one sentence per fault of a config or SPEC; one of `model`'s keys is named for an unknown key."""
     lines = []
     for fault in error.errors():
         key, text = ".".join(str(part) for part in fault["loc"]), fault["msg"].removeprefix("Value error, ")
         if fault["type"] == "extra_forbidden":
-            lines.append(f"unknown key '{key}'.")
-        else:
-            lines.append(f"key '{key}': {text.rstrip('.')}." if key else f"{text.rstrip('.')}.")
+            meant = _nearest_key(fault["loc"], model) if model is not None else ""
+            lines.append(f"unknown key '{key}'." + (f" Did you mean '{meant}'?" if meant else ""))
+            continue
+        end = "" if text.endswith(("?", ".")) else "."
+        lines.append(f"key '{key}': {text}{end}" if key else f"{text}{end}")
     return " ".join(lines)
+
+
+def _nearest_key(place: tuple[int | str, ...], model: type[BaseModel]) -> str:
+    """Return the key that is most likely meant: one of the same table, else one of that name in another; "" if none."""
+    *above, wrong = place
+    here = model
+    for part in above:
+        field = here.model_fields.get(str(part))
+        here = here if field is None else _table_of(field.annotation) or here
+    if close := nearest(str(wrong), here.model_fields):
+        return ".".join([*map(str, above), close])
+    tables = {name: _table_of(field.annotation) for name, field in model.model_fields.items()}
+    elsewhere = (f"{name}.{wrong}" for name, table in tables.items() if table and wrong in table.model_fields)
+    return next(elsewhere, "")
+
+
+def _table_of(annotation: object) -> type[BaseModel] | None:
+    """Return the model of a table of a config, or that of the tables that it holds; None where it holds none."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((table for part in get_args(annotation) if (table := _table_of(part))), None)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+import re
+import shlex
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -47,6 +50,132 @@ class Fault:
         return {name: getattr(self, name) for name in self.__slots__}
 
 
+# ---------------------------------------------------------------- groups
+# A fault that many files share is one message.
+
+EXAMPLES = 3  # places that such a message names; no more files than that are named each by itself
+RUNS_TABLES = ("runs.csv", "runs.xlsx", "runs.parquet")  # their lines are trace files
+
+
+def grouped(faults: Iterable[Fault]) -> list[list[Fault]]:
+    """Return the faults with those that more than `EXAMPLES` files share together, in the order of the first of each.
+
+    Faults are shared that differ in the file, the line, the value and in numbers of their reason only.
+    """
+    faults = list(faults)
+    alike: dict[tuple, list[Fault]] = {}
+    for fault in faults:
+        alike.setdefault(_shared(fault), []).append(fault)
+    together = {key for key, group in alike.items() if len({_place(fault) for fault in group}) > EXAMPLES}
+    found: list[list[Fault]] = []
+    for fault in faults:
+        group = alike.get(key := _shared(fault), [])
+        if key not in together:
+            found.append([fault])
+        elif fault is group[0]:
+            found.append(group)
+    return found
+
+
+def told(group: Sequence[Fault]) -> str:
+    """Return the message of one group: the fault, or how many files have it and examples.
+
+    Examples
+    --------
+    >>> told([Fault("empty_file", "is empty.", file=f"{i}.csv", fix="Export it again.") for i in range(84)])
+    '84 files: is empty. For example 0.csv; 1.csv; 2.csv. Export it again.'
+    """
+    if len(group) == 1:
+        return str(group[0])
+    first = group[0]
+    column = f"column '{first.column}': " if first.column is not None else ""
+    reason = f"{first.reason} For example " if one_reason(group) else "for example "
+    return f"{how_many(group)}: {column}{reason}{'; '.join(examples(group))}. {first.fix}".strip()
+
+
+def how_many(group: Sequence[Fault]) -> str:
+    """Return how many files a group concerns, and how often where that is more."""
+    files = len({_place(fault) for fault in group})
+    return f"{files} files" if files == len(group) else f"{files} files, {len(group)} times"
+
+
+def examples(group: Sequence[Fault]) -> list[str]:
+    """Return the places of a group, three at most, with value, and reason where it differs from file to file."""
+    whole, places = one_reason(group), {}
+    for fault in group:
+        places.setdefault(_place(fault), fault)
+    return [
+        ": ".join(
+            part
+            for part in (
+                f"{fault.file or ''}{'' if fault.line is None else f':{fault.line}'}",
+                "" if fault.value is None or not whole else repr(fault.value),
+                "" if whole else fault.reason.rstrip("."),
+            )
+            if part
+        )
+        for fault in list(places.values())[:EXAMPLES]
+    ]
+
+
+def one_reason(group: Sequence[Fault]) -> bool:
+    """Return whether all faults of a group have the same reason, word by word."""
+    return len({fault.reason for fault in group}) == 1
+
+
+def _place(fault: Fault) -> tuple:
+    return (fault.file, fault.line) if fault.file in RUNS_TABLES else (fault.file,)
+
+
+def _shared(fault: Fault) -> tuple:
+    """Return what the faults of a group have in common."""
+    words = tuple(
+        re.sub(r"\d[\d.,]*", "#", text.replace(fault.file, "") if fault.file else text)
+        for text in (fault.reason, fault.fix)
+    )
+    return (fault.check, fault.severity, fault.action, fault.column, fault.file in RUNS_TABLES, *words)
+
+
+# ---------------------------------------------------------------- the nearest
+# What somebody who mistyped a name most likely means.
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return the known name that `name` most likely means: the same in other case, or a close one; "" if none."""
+    known = [other for other in known if other]
+    by_case = [other for other in known if other.lower() == name.lower()]
+    folded = {other.lower(): other for other in known}
+    close = difflib.get_close_matches(name.lower(), list(folded), n=1, cutoff=0.6)
+    return by_case[0] if by_case else folded[close[0]] if close else ""
+
+
+def did_you_mean(path: Path, fits: Callable[[Path], bool] = Path.is_dir) -> str:
+    """Return a fix for a path that is not there: the nearest name beside it, or beside its missing folder; "" if none.
+
+    `fits` says which files or folders can be meant.
+    """
+    parent = path.absolute().parent
+    missing = None
+    while not parent.is_dir():
+        missing, parent = parent, parent.parent
+    try:
+        there = sorted(
+            child.name for child in parent.iterdir() if not child.name.startswith(".") and (missing or fits(child))
+        )
+    except OSError:
+        return ""
+    likely = nearest((missing or path.absolute()).name, there)
+    return f"Did you mean {quoted(path.parent / likely if missing is None else parent / likely)}?" if likely else ""
+
+
+def quoted(path: Path) -> str:
+    """Return a path as a shell reads it."""
+    return shlex.quote(str(path))
+
+
+# ---------------------------------------------------------------- errors
+
+
 class SealfitError(Exception):
     """Something the user can fix: one line on stderr, exit code 1."""
 
@@ -82,7 +211,7 @@ class CampaignError(SealfitError):
 
     def __init__(self, faults: Sequence[Fault]):
         self.faults = tuple(faults)
-        super().__init__("\n".join(str(fault) for fault in self.faults))
+        super().__init__("\n".join(told(group) for group in grouped(self.faults)))
 
     def __reduce__(self):
         return type(self), (self.faults,)  # so that it comes back whole from a worker process

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -239,7 +240,8 @@ def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) ->
     with timed("writing tables"):
         _write(staged, {**closure.tables, **after})
     started = store.read("runs", ["started_at"])["started_at"].dropna()
-    staged.json("model", {**closure.model, "first_started_at": min(started) if len(started) else None})
+    first = min(started, key=_instant) if len(started) else None
+    staged.json("model", {**closure.model, "first_started_at": first})
     staged.json("closure", closure.document)
     return len(closure.tables["residuals_before"]), "bins"
 
@@ -251,6 +253,12 @@ def _write(staged: Staged, tables: Mapping[str, pd.DataFrame]) -> None:
     for name, table in tables.items():
         for part, rows in stored(name, table).items():
             staged.table(part, rows)
+
+
+def _instant(text: str) -> datetime:
+    """Return the instant of a time as `runs` has it; one without a zone counts as UTC, as in `elapsed_h`."""
+    time = datetime.fromisoformat(text)
+    return time if time.tzinfo else time.replace(tzinfo=UTC)
 
 
 def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:

@@ -10,7 +10,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TextIO
 
-from sealfit.errors import Fault
+from sealfit.errors import Fault, grouped, told
 
 # ---------------------------------------------------------------- progress
 # What a command says while it works: plain lines, or a moving bar where somebody watches a terminal.
@@ -53,13 +53,17 @@ class Lines(Silent):
         self.say(f"warning: {text}")
 
     def faults(self, faults: Iterable[Fault]) -> None:
-        """List the faults found in a campaign, the first of them if they are many."""
-        shown = [fault for fault in faults if fault.severity != "info"]
-        for fault in shown[:FAULTS_SHOWN]:
-            left_out = "" if fault.action == "kept" else f" [{fault.action}]"
-            self.say(f"{fault.severity}: {fault}{left_out}")
-        if len(shown) > FAULTS_SHOWN:
-            more = len(shown) - FAULTS_SHOWN
+        """List the faults found in a campaign, those of all of it first; only the first of them if they are many.
+
+        One that many files share is one line.
+        """
+        groups = grouped(fault for fault in faults if fault.severity != "info")
+        groups.sort(key=lambda group: group[0].file is not None)
+        for group in groups[:FAULTS_SHOWN]:
+            left_out = "" if group[0].action == "kept" else f" [{group[0].action}]"
+            self.say(f"{group[0].severity}: {told(group)}{left_out}")
+        if len(groups) > FAULTS_SHOWN:
+            more = sum(len(group) for group in groups[FAULTS_SHOWN:])
             self.say(f"... and {more} more: `sealfit check` lists them all, the quality table too.")
 
     @contextlib.contextmanager

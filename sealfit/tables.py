@@ -80,7 +80,7 @@ RUNS = Schema(
         LOAD,
         RUN_ORDER,
         ELAPSED,
-        Column("started_at", "", TEXT, "start as given, ISO 8601; null if not given"),
+        Column("started_at", "", TEXT, "start of the file, ISO 8601, as given where it is; null if not given"),
         Column("used", "", BOOL, "false where the stroke was left out; quality says why"),
     ),
     open_=True,

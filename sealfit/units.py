@@ -1,13 +1,17 @@
 """The true unit of every column: what a slot such as `force_N` holds; a config may declare another quantity and unit.
 
 Column names are fixed (design: "Units"); `Units.of` gives the true unit, and that is what the Parquet metadata and
-every label show.
+every label show. Numbers of files that are in other units are converted by `conversion`, once, when they are read.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import cache
+
+from sealfit.errors import ConfigError
 
 _DEFAULT = {
     "force": ("friction force", "N"),
@@ -92,3 +96,105 @@ def _without_unit(column: str) -> str:
         if column.endswith(ending):
             return column.removesuffix(ending)
     return column
+
+
+# ---------------------------------------------------------------- conversion
+# Units of files to ours, by pint.
+
+_COMMON = {  # units that rigs write, by what they measure: for messages
+    "force": ("N", "kN", "mN", "uN", "kgf", "gf", "lbf", "ozf"),
+    "length": ("mm", "um", "nm", "cm", "m", "in", "mil", "ft"),
+    "time": ("s", "ms", "us", "min", "h", "d", "week"),
+    "speed": ("mm/s", "um/s", "cm/s", "m/s", "mm/min", "m/min", "in/s", "in/min", "km/h"),
+    "temperature": ("degC", "degF", "K"),
+    "torque": ("N*m", "mN*m", "N*mm", "N*cm", "lbf*in", "ozf*in"),
+    "rotational speed": ("rpm", "turn/s", "rad/s", "deg/s"),
+    "angle or ratio": ("%", "turn", "deg", "rad", "1"),
+    "pressure": ("bar", "mbar", "MPa", "kPa", "Pa", "psi"),
+    "mass": ("kg", "g", "lb", "oz"),
+}
+_FAR = 1000.0  # a scale with an offset is read here and at 0: its factor then keeps all digits
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """From the unit of a file's numbers to ours: a number or an array times `factor`, plus `offset`."""
+
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def __call__(self, value):
+        """Return the value in our unit."""
+        return value * self.factor + self.offset
+
+    def of_cell(self, value: float) -> float:
+        """Return a number that somebody typed, in our unit, to 12 digits: 60, not 60.00000000000006."""
+        return float(f"{self(value):.12g}")
+
+
+@cache
+def conversion(unit: str, to: str) -> Conversion:
+    """Return the conversion of numbers in `unit` to the unit `to`.
+
+    Parameters
+    ----------
+    unit, to : str
+        Units as pint reads them: kgf, lbf, in, mm/min, ms, degF, h, um, kN, N*m.
+
+    Raises
+    ------
+    ConfigError
+        If `unit` is unknown or of another dimension than `to`; the fix names the nearest unit.
+
+    Examples
+    --------
+    >>> conversion("kgf", "N")(2.0), round(conversion("degF", "degC")(212.0), 9)
+    (19.6133, 100.0)
+    """
+    if unit == to:
+        return Conversion()
+    registry = _registry()
+    ours, theirs = _dimension(to), _dimension(unit)
+    if ours is None:
+        raise ConfigError(f"nothing can be converted to {to!r}, which is no known unit.", fix="Drop the unit.")
+    if theirs is None:
+        raise ConfigError(f"{unit!r} is no known unit; {_name(ours)} ({to}) is expected.", fix=_nearest(unit, ours))
+    if theirs != ours:
+        reason = f"the unit {unit!r} is one of {_name(theirs)}; {_name(ours)} ({to}) is expected."
+        raise ConfigError(reason, fix=_nearest(unit, ours))
+
+    def converted(value: float) -> float:
+        return float(registry.Quantity(value, registry.Unit(unit)).m_as(registry.Unit(to)))
+
+    offset = converted(0.0)
+    return Conversion(converted(1.0)) if offset == 0 else Conversion((converted(_FAR) - offset) / _FAR, offset)
+
+
+@cache
+def _registry():
+    import pint  # here, as it takes half a second to load and few configs name a unit
+
+    return pint.UnitRegistry()
+
+
+@cache
+def _dimension(unit: str) -> str | None:
+    """Return what dimension a unit is of, as text; None if there is no such unit."""
+    registry = _registry()
+    try:
+        return str(dict(sorted(registry.Unit(unit).dimensionality.items())))
+    except Exception:  # pint raises whatever the parser of Python does: a dozen kinds of errors
+        return None
+
+
+def _name(dimension: str) -> str:
+    known = (name for name, units in _COMMON.items() if _dimension(units[0]) == dimension)
+    return next(known, f"dimension {dimension}")
+
+
+def _nearest(unit: str, dimension: str) -> str:
+    """Return a fix: the unit of that dimension that is written most like `unit`."""
+    own = [one for units in _COMMON.values() for one in units if _dimension(one) == dimension]
+    close = get_close_matches(unit, own, n=1, cutoff=0.3)
+    named = close or [one for one in own if one.lower() == unit.lower()]
+    return f"Did you mean '{named[0]}'?" if named else f"Units: {', '.join(own)}." if own else ""

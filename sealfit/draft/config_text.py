@@ -135,10 +135,12 @@ def date_lines(when: When) -> tuple[Guess | None, tuple[str, ...]]:
     if not when.format:
         evidence = f"header line {when.line}, in every file looked at: '{when.text}'"
         return Guess("trace.header_fields.started_at", when.pattern, evidence), ()
-    lines = [f"[trace.header_fields] started_at = {literal(when.pattern)}"]
+    day = "started_day" if when.clock else "started_at"
+    lines = [f"[trace.header_fields] {day} = {literal(when.pattern)}"]
     if when.clock:
-        lines.append(f"the time of day is in the line below: {literal(when.clock)}")
-    return None, (*lines, f"date_format = {literal(when.format)}")
+        lines.append(f"[trace.header_fields] started_clock = {literal(when.clock)}")
+        lines.append(f"[files] started_at = {toml({'date': day, 'time': 'started_clock'})}")
+    return None, (*lines, f"[files] date_format = {literal(when.format)}")
 
 
 # ---------------------------------------------------------------- text

@@ -311,7 +311,8 @@ def _dates_doubt(table: RunsTable, notes: Notes) -> None:
         full = [cell for cell in cells if cell]
         if name not in table.ours and full and all(dates.search(cell) for cell in full):
             reason = f"column '{name}' of {table.file} holds dates that are not ISO 8601, such as '{full[0]}'."
-            notes.doubt("files.runs_columns", reason, "They are not read yet. Write them as 2024-03-01T09:30:00.")
+            fix = f"Name it, started_at = '{name}', and give files.date_format, such as '%d.%m.%Y %H:%M'."
+            notes.doubt("files.runs_columns", reason, fix)
             return
 
 

@@ -328,7 +328,7 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
             notes.guesses.append(guess)
         else:
             reason = f"header line {when.line} gives a date that is not ISO 8601: {_shown(when.text)}."
-            fix = "It is not read yet; the draft holds the lines that would read it."
+            fix = "Put the lines below into their tables if day and month are in this order."
             notes.doubt("trace.header_fields", reason, fix, lines)
     settings = [one for one in settings_in(headers, found.dialect.decimal) if one.ours not in given]
     for one in settings:

@@ -14,10 +14,10 @@ import pyarrow as pa
 
 from sealfit.config import Config
 from sealfit.engine.run_map import run_map
-from sealfit.errors import CampaignError, Fault
+from sealfit.errors import CampaignError, Fault, grouped
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, plan_parts, shaped
-from sealfit.ingest.quality import incomplete_columns, quality_table
+from sealfit.ingest.quality import improbable_loads, incomplete_columns, quality_table
 from sealfit.ingest.repeat_checks import constant_strokes, outlying_files, reversed_strokes
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.stored_parts import (
@@ -97,7 +97,7 @@ OF_SAMPLES = (
     "n",
 )  # their means are in `steady`
 FAULTY = ("warning", "error")
-SHOWN = 20  # faults that a campaign without a single usable stroke lists
+SHOWN = 20  # faults that a campaign without a single usable stroke lists, those that files share as one
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,9 @@ def ingest_campaign(
         raise CampaignError(_nothing_left(faults, len(listing)))
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
-    faults += incomplete_columns(steady)
+    faults += incomplete_columns(steady, config.series_columns if config.aging else ()) + improbable_loads(
+        steady, config
+    )
     strokes = strokes.assign(used=_still_used(strokes, steady))
     parts = reader.reestimated(parts, _ruled_out(plan, strokes, files))
     used = np.zeros(len(listing), bool)
@@ -338,6 +340,7 @@ def _stacked(tables: Sequence[pa.Table]) -> pd.DataFrame:
 
 def _nothing_left(faults: Sequence[Fault], files: int) -> list[Fault]:
     errors = [fault for fault in faults if fault.severity == "error"]
-    more = len(errors) - SHOWN
+    shown = [fault for group in grouped(errors)[:SHOWN] for fault in group]
+    more = len(errors) - len(shown)
     reason = f"none of {files} trace files can be used" + (f"; {more} more faults are not shown." if more > 0 else ".")
-    return [*errors[:SHOWN], Fault("nothing_left", reason, fix="Fix what is said above; start with one file.")]
+    return [*shown, Fault("nothing_left", reason, fix="Fix what is said above; start with one file.")]

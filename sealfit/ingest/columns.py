@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from sealfit.config import Config, TraceFormat
-from sealfit.errors import BadFile, Fault
+from sealfit.errors import BadFile, Fault, nearest
 from sealfit.ingest.cells import OVERLOAD, ColumnOfFile, listed
 from sealfit.ingest.expression import parse
 from sealfit.ingest.files import Layout, as_number, split_line
@@ -44,7 +43,7 @@ def locate(layout: Layout, width: int, settings: TraceFormat, file: str) -> dict
     """
     found: dict[int, str] = {}
     faults = []
-    for ours, theirs in settings.columns.items():
+    for ours, theirs in settings.their_columns.items():
         if isinstance(theirs, int):
             positions = [theirs - 1] if 0 < theirs <= width else []
         else:
@@ -82,15 +81,6 @@ def beside(name: str, taken: Collection[str]) -> str:
                 name = f"{name.removesuffix(unit)}_file{unit}"
                 break
     return name
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return the known name that `name` most likely means: the same in other case, or a close one; "" if none."""
-    known = [other for other in known if other]
-    by_case = [other for other in known if other.lower() == name.lower()]
-    folded = {other.lower(): other for other in known}
-    close = difflib.get_close_matches(name.lower(), list(folded), n=1, cutoff=0.6)
-    return by_case[0] if by_case else folded[close[0]] if close else ""
 
 
 def suggestion(name: str, known: Sequence[str]) -> str:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Sequence
-from datetime import UTC, datetime
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
-import pandas as pd
 
 from sealfit.config import Config
-from sealfit.errors import Fault
+from sealfit.errors import CampaignError, ConfigError, Fault
 from sealfit.ingest.categorical import Column, Columns, condition_columns, keys_of, known, mapped, over, put, where
+from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.file_names import TEXT_COLUMNS
 from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import Entries, Entry
+from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- run values
 # Cells of runs.csv and of file names to values: which columns are numbers, which are labels, and what cannot be.
@@ -23,6 +24,98 @@ from sealfit.ingest.listing import Entries, Entry
 NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
 COUNTS = {"repeat": "repeats", "stroke": "strokes"}  # whole numbers
 _MOSTLY = 0.8  # a column with this share of numbers is one of numbers, and the rest of its cells are slips
+
+
+UNAGED_WORDS = ("unaged", "fresh", "new", "rt")  # RT: kept at room temperature
+_AGED_ONLY = ("temperature_C", "compression_ratio_pct")  # of unaged rubber nobody reads them
+
+
+def with_day_0(columns: Columns, config: Config) -> Columns:
+    """Return the columns with the days of unaged rubber as 0, and with none of its words where numbers stand.
+
+    Unaged is what has 0, or one of `UNAGED_WORDS`, in its days; or, where no days are given, such a word in another
+    condition column. Its temperature and compression may hold any word.
+
+    Examples
+    --------
+    >>> with_day_0({"aging_days": ["fresh", "4"], "temperature_C": ["RT", "60"]}, Config())
+    {'aging_days': [0.0, '4'], 'temperature_C': [None, '60']}
+    """
+    others = [n for n in condition_columns(config) if n in columns and n != "aging_days" and n not in config.rubber]
+    if not config.aging or not columns:
+        return columns
+    files = len(next(iter(columns.values())))
+    days = columns.get("aging_days", [None] * files)
+    said = where(days, _means_unaged)
+    for name in others:
+        said |= ~known(days) & where(columns[name], _means_unaged)
+    unaged = said | where(days, lambda value: _number(value) == 0)
+    if not unaged.any():
+        return columns
+    changed = {"aging_days": put(days, dict.fromkeys(np.flatnonzero(said).tolist(), 0.0))}
+    for name in others:
+        words = where(columns[name], _is_word if name in _AGED_ONLY else _means_unaged)
+        changed[name] = put(columns[name], dict.fromkeys(np.flatnonzero(unaged & words).tolist()))
+    return columns | changed
+
+
+def _means_unaged(cell: float | str) -> bool:
+    return isinstance(cell, str) and cell.strip().lower() in UNAGED_WORDS
+
+
+def _is_word(cell: float | str) -> bool:
+    return math.isnan(_number(cell))
+
+
+def with_computed(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
+    """Return the columns with the config's constants and computed columns, without helpers; faults of the latter.
+
+    A constant stands where a file has no value. Helpers are columns whose name begins with "_".
+
+    Raises
+    ------
+    CampaignError
+        If an expression reads a column that is not there, or words as numbers.
+    """
+    columns, faults = dict(columns), []
+    for name, value in config.runs.constants.items():
+        columns[name] = over(columns.get(name, [None] * len(entries)), [value] * len(entries))
+    for name, text in config.runs.compute.items():
+        expression = parse(text)
+        read = {column: columns[column] for column in expression.names if column in columns}
+        try:
+            values = evaluate(expression, {column: _as_array(cells) for column, cells in read.items()})
+        except ConfigError as error:
+            place = {"file": f"config '{config.name}'", "column": f"runs.compute.{name}", "fix": error.fix}
+            raise CampaignError([Fault("config", error.message, **place)]) from error
+        values = np.broadcast_to(values, len(entries)).astype(float)
+        whole = np.all([np.ones(len(entries), bool), *(where(cells, _is_fine) for cells in read.values())], axis=0)
+        wrong = whole & ~np.isfinite(values)
+        fix = "Correct the cells that it reads, or the expression."
+        faults += [
+            entries[i].fault("not_finite", f'is computed as "{text}", which is no number here.', name, fix=fix)
+            for i in np.flatnonzero(wrong).tolist()
+        ]
+        known_here = np.where(whole, values, math.nan).tolist()
+        columns[name] = [_of_its_kind(name, value) if math.isfinite(value) else None for value in known_here]
+    return {name: column for name, column in columns.items() if not name.startswith("_")}, faults
+
+
+def _is_fine(value: float | str) -> bool:
+    return isinstance(value, str) or math.isfinite(value)
+
+
+def _as_array(column: Column) -> np.ndarray:
+    """Return a column as an expression reads it: numbers with nan, or words with "", where there is no value."""
+    words = any(isinstance(value, str) for value in column)
+    return np.array([("" if words else math.nan) if value is None else value for value in column])
+
+
+def _of_its_kind(name: str, value: float) -> float | str:
+    """Return a computed number as its column holds it: a whole number of repeats or strokes, a name as text."""
+    if name in COUNTS and value == int(value):
+        return int(value)
+    return f"{value:g}" if name in TEXT_COLUMNS else value
 
 
 def to_values(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
@@ -70,6 +163,17 @@ def _column(name: str, cells: Column, entries: Entries, config: Config) -> tuple
 def _number(cell: float | str) -> float:
     number = cell if isinstance(cell, float) else as_number(cell)
     return math.nan if number is None else number
+
+
+def in_our_units(columns: Columns, conversions: Mapping[str, Conversion]) -> Columns:
+    """Return the columns with numbers of other units converted; cells that are no numbers stay as they are."""
+
+    def converted(cell: float | str, convert: Conversion) -> float | str:
+        number = _number(cell)
+        return convert.of_cell(number) if math.isfinite(number) else cell
+
+    changed = {name: convert for name, convert in conversions.items() if name in columns}
+    return columns | {name: mapped(columns[name], partial(converted, convert=c)) for name, c in changed.items()}
 
 
 def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
@@ -142,43 +246,6 @@ def _one_setting(column: Column) -> Column:
             group.append(value)
             usual.update(dict.fromkeys(group, max(group, key=count.__getitem__)))
     return mapped(column, lambda value: usual.get(value, value))
-
-
-def add_order(entries: Entries, columns: Columns) -> tuple[Columns, list[Fault]]:
-    """Return the columns with `run_order` and `elapsed_h` where files say when they were started; faults of bad times.
-
-    Equal times share the order of the first of them. A time without a zone is taken as UTC, so that one campaign
-    with and without zones keeps one order.
-    """
-    if "started_at" not in columns:
-        return columns, []
-    texts = mapped(columns["started_at"], lambda value: str(value).strip())
-    times = mapped(texts, _time)
-    fix = "Write it as 2024-03-01T09:30:00."
-    faults = [
-        entries[i].fault("not_a_time", "is not an ISO 8601 time.", "started_at", value=text, fix=fix)
-        for i, (text, time) in enumerate(zip(texts, times, strict=True))
-        if text is not None and time is None
-    ]
-    if any(time.tzinfo for time in times if time is not None):
-        times = mapped(times, lambda time: (time if time.tzinfo else time.replace(tzinfo=UTC)).astimezone(UTC))
-    moments = pd.Series(pd.to_datetime(pd.Series(times, dtype=object), utc=True))
-    if not moments.notna().any():
-        return columns, faults
-    hours = (moments - moments.min()) / pd.Timedelta(hours=1)
-    derived = {"run_order": moments.rank(method="min"), "elapsed_h": hours}
-    return columns | {name: _with_none(values) for name, values in derived.items()}, faults
-
-
-def _with_none(values: pd.Series) -> Column:
-    return [None if math.isnan(value) else value for value in values.tolist()]
-
-
-def _time(text: str) -> datetime | None:
-    try:
-        return datetime.fromisoformat(text)
-    except ValueError:
-        return None
 
 
 def add_specimens(columns: Columns, conditions: list[str]) -> Columns:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -13,6 +16,7 @@ from sealfit.errors import ConfigError
 from sealfit.ingest.categorical import Columns, taken
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.files import as_number
+from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- refs
 
@@ -78,6 +82,7 @@ class NameParts:
 
 
 SAYS_NOTHING = NameParts(True, {})
+SAME_UNITS: Mapping[str, Conversion] = {}
 
 
 def names_speak(settings: Files) -> bool:
@@ -85,11 +90,12 @@ def names_speak(settings: Files) -> bool:
     return bool(settings.name_pattern is not None or settings.compute or settings.columns)
 
 
-def name_parts(file: str, settings: Files) -> NameParts:
+def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion] = SAME_UNITS) -> NameParts:
     """Return what the relative path `file` says under the config's `files`.
 
     Every named group of `name_pattern` is a part; a part with a value map takes the mapped value where the map has
     one; numbers become numbers; `compute` and the templates of `columns` then add columns. Empty parts say nothing.
+    Numbers in other units than ours are converted, those of parts first.
 
     Raises
     ------
@@ -115,17 +121,75 @@ def name_parts(file: str, settings: Files) -> NameParts:
             mapped = settings.values.get(name, {}).get(text)
             if mapped is None:
                 texts[name] = text
-                values[name] = text if name in TEXT_COLUMNS else _value(text)
+                values[name] = text if name in TEXT_COLUMNS or name in settings.text_parts else _value(text)
             else:
                 texts[name] = f"{mapped:g}" if isinstance(mapped, int | float) else mapped
                 values[name] = float(mapped) if isinstance(mapped, int | float) else mapped
+            _convert(name, texts, values, conversions)
     for name, expression in settings.compute.items():
         values[name] = float(evaluate(parse(expression), values))
         texts[name] = f"{values[name]:g}"
+        _convert(name, texts, values, conversions)
     for name, template in settings.columns.items():
         texts[name] = _FIELD.sub(lambda found: _part(found.group(1), texts, template), template)  # noqa: B023
         values[name] = texts[name] if name in TEXT_COLUMNS else _value(texts[name])
+        _convert(name, texts, values, conversions)
     return NameParts(True, {name: value for name, value in values.items() if value != "" or name.startswith("_")})
+
+
+_OPEN = re.compile(r"(\((\?(:|P<\w+>|=|!|<=|<!|<)?)?|\|)$")  # a group or a choice of which nothing is there yet
+
+
+def matched_part(pattern: str, file: str) -> tuple[str, str]:
+    """Return as much of a path as the longest part of a pattern matches that matches at all, and the pattern's rest.
+
+    Examples
+    --------
+    >>> matched_part(r"T(?P<T>\\d+)_d(?P<aging_days>\\d+)[.]csv", "T80_C20_d4.csv")
+    ('T80_', 'd(?P<aging_days>\\\\d+)[.]csv')
+    """
+    for part, length in _parts_of(pattern):
+        if found := part.match(file):
+            return found.group(), pattern[length:]
+    return "", pattern
+
+
+@cache
+def _parts_of(pattern: str) -> list[tuple[re.Pattern, int]]:
+    """Return the beginnings of a pattern that are patterns, open groups closed, and their lengths, longest first."""
+    found = []
+    for length in range(len(pattern), 0, -1):
+        begin = pattern[:length]
+        for closing in ("", ")", "))", ")))") if not _OPEN.search(begin) else ():
+            with suppress(re.error), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of half a set
+                found.append((re.compile(begin + closing), length))
+                break
+    return found
+
+
+def unmatched(file: str, pattern: str) -> tuple[str, str]:
+    """Return why a path does not match the config's pattern, without the path, and the fix."""
+    begin, rest = matched_part(pattern, file)
+    up_to = f"it fits up to '{begin}', then" if begin else "from its start"
+    where = f"{up_to} the pattern has {_short(rest)} and the path {_short(file[len(begin) :])}"
+    reason = f"the whole path below the campaign folder does not match files.name_pattern: {where}."
+    fix = "Rename it, widen the pattern, or list it under files.exclude."
+    if "/" in file and re.fullmatch(pattern, file.rpartition("/")[2]):
+        fix = "The pattern matches the name without its folders: begin it with '(?:.*/)?'."
+    return reason, fix
+
+
+def _short(text: str) -> str:
+    shown = text if len(text) <= 30 else f"{text[:27]}..."
+    return f"'{shown}'" if text else "nothing"
+
+
+def _convert(name: str, texts: dict[str, str], values: dict, conversions: Mapping[str, Conversion]) -> None:
+    """Change the number of a column to our unit, where the config gives the one that it is in."""
+    if name in conversions and isinstance(values[name], float):
+        values[name] = conversions[name].of_cell(values[name])
+        texts[name] = f"{values[name]:.12g}"
 
 
 def _value(text: str) -> float | str:

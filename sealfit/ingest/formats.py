@@ -182,7 +182,7 @@ def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceF
     BadFile
         If one of these is a column that the config names.
     """
-    needed, kept, faults = set(settings.columns.values()), {}, []
+    needed, kept, faults = set(settings.their_columns.values()), {}, []
     rows = max((len(values) for values in found.values()), default=0)
     for name, values in found.items():
         column = _column(values)
@@ -222,7 +222,9 @@ def _chosen(
             return wanted
         fix = suggestion(wanted, list(options)).replace("columns are", f"{key}s are")
         raise bad(file, "missing_table", f"holds no {key} '{wanted}' (trace.{key}) with data.", fix)
-    names = {name for ours, name in settings.columns.items() if isinstance(name, str) and ours not in settings.optional}
+    names = {
+        name for ours, name in settings.their_columns.items() if isinstance(name, str) and ours not in settings.optional
+    }
     fitting = [option for option, columns in options.items() if names - {derived} <= set(columns)]
     if len(options) == 1 or len(fitting) == 1:
         return [*fitting, *options][0]
@@ -242,7 +244,7 @@ def _tdms(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
     if tdms.file_status.incomplete_final_segment:
         raise bad(file, "damaged_file", "is cut off: its last segment is not complete.", "Copy it again from the rig.")
     groups = {group.name: group for group in tdms.groups() if any(len(channel) for channel in group.channels())}
-    time_name = settings.columns.get("time_s")
+    time_name = settings.their_columns.get("time_s")
     names = {name: [channel.name for channel in group.channels()] for name, group in groups.items()}
     group = groups[_chosen(names, "group", settings, file, derived=time_name)]
     header = [header_line(name, value) for name, value in tdms.properties.items()]

@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from difflib import SequenceMatcher
+from difflib import SequenceMatcher, get_close_matches
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path, PurePosixPath
@@ -15,9 +15,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from sealfit.config import Config
-from sealfit.errors import BadFile, CampaignError, Fault
+from sealfit.errors import BadFile, CampaignError, Fault, nearest
 from sealfit.ingest.categorical import Columns, mapped
-from sealfit.ingest.columns import nearest, suggestion
+from sealfit.ingest.columns import suggestion
 from sealfit.ingest.files import Folder, as_number, split_line
 from sealfit.ingest.workbooks import text_of_runs
 from sealfit.store.paths import RUNS as RUNS_CSV
@@ -37,6 +37,7 @@ KNOWN = (
 
 
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
+FILES_LOOKED_AT = 2000  # for the one that is most like a glob; a campaign's names are much alike
 _BLANK = b" \t,;\n"  # a line of nothing else is none
 
 
@@ -188,7 +189,7 @@ def _rows(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) ->
 
 def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault]]:
     """Return our name of every column of runs.csv, and faults: missing, doubled, or misspelt columns."""
-    ours = {theirs: name for name, theirs in config.files.runs_columns.items()}
+    ours = {str(theirs.name): name for name, theirs in config.files.runs_columns.items()}
     names = [ours.get(name, name) for name in header]
     faults = []
     for name in sorted({name for name in names if name and names.count(name) > 1}):
@@ -224,8 +225,8 @@ def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
         raise _stop("path_outside", f"files.glob = {glob!r} leads outside the campaign folder.", "Make it relative.")
     files = sorted((p.relative_to(campaign).as_posix() for p in campaign.glob(glob) if not p.is_dir()), key=natural)
     if not files:
-        fix = "Check the folder, or files.glob in the rig config."
-        raise _stop("missing_file", f"no file in '{campaign}' matches files.glob = {glob!r}.", fix)
+        reason = f"no file in '{campaign}' matches files.glob = {glob!r}, which stands for paths below that folder."
+        raise _stop("missing_file", reason, _nearest_file(campaign, glob))
     faults, kept = [], []
     for file in files:
         if pattern := next((p for p in config.files.exclude if fnmatchcase(file, p)), None):
@@ -234,6 +235,13 @@ def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
         else:
             kept.append(file)
     return Entries(kept), faults
+
+
+def _nearest_file(campaign: Path, glob: str) -> str:
+    """Return a fix for a glob that matches nothing: the file whose path is most like it."""
+    files = (path.relative_to(campaign).as_posix() for path in campaign.rglob("*") if path.is_file())
+    close = get_close_matches(glob, list(islice(files, FILES_LOOKED_AT)), n=1, cutoff=0.0)
+    return f"The nearest file is '{close[0]}'." if close else "There is no file in it: check the folder."
 
 
 def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:

@@ -7,18 +7,30 @@ a stuck one, nor a slow rig for a gappy one. Single samples and the commanded sp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import pandas as pd
 
 from sealfit.config import Config, Quality
-from sealfit.errors import Fault
+from sealfit.errors import ConfigError, Fault
 from sealfit.ingest.strokes import Stroke
 from sealfit.ingest.trace_checks import resolution
 from sealfit.tables import QUALITY, STEADY
+from sealfit.units import conversion
 
 LOAD_TOLERANCE = 0.1  # dead weights are better than that, and a wrong plate is worse
+# Seals on a full film of oil slide at about 0.01, soft dry rubber at up to about 4. Dry rubber at 0.6 to 1 is above
+# with its load in kg, which makes mu 9.81 times too large, and below with its load in g: 102 times too small.
+MU_RANGE = (0.01, 5.0)
+_HEAVIER = (
+    'Is the load in kg or lb, or the force in mN? Give the unit in the rig config: load_N = {unit = "kgf"} under '
+    "[files.runs_columns] (kg is a mass; its weight is kgf, or 9.80665 times the kg in N)."
+)
+_LIGHTER = (
+    'Is the load in g, or the force in kg or kN? Give the unit in the rig config: load_N = {unit = "gf"} under '
+    '[files.runs_columns], or force_N = {name = "..", unit = "kgf"} under [trace.columns].'
+)
 FINE = 0.3  # share of equal neighbours below which noise is plainly larger than the sensor's steps
 # Above this share (noise of a third of a step) a reading that rests in the middle of a step, as long as the force does,
 # cannot be told from a stuck one.
@@ -232,6 +244,36 @@ def load_faults(measured: float, declared: float, unit: str) -> list[Fault]:
     ]
 
 
+def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
+    """Return that the friction force over the load is no coefficient of friction, in some conditions or in all.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`; rows with `used` false, and those without a load, are left out.
+    config : Config
+        Its units: where force and load are not of one dimension (a torque over a load), nothing is said.
+    """
+    if "load_N" not in steady:
+        return []
+    try:
+        in_load_units = conversion(config.units.unit("force"), config.units.unit("load"))
+    except ConfigError:
+        return []
+    rows = steady[steady["used"].to_numpy(bool) & (np.abs(steady["load_N"].to_numpy(float)) > 0)]
+    ratio = in_load_units(rows["force_N"].abs()) / rows["load_N"].abs()
+    mu = ratio.groupby(rows["condition"].to_numpy()).mean()
+    faults = []
+    for wrong, fix in ((mu > MU_RANGE[1], _HEAVIER), (mu < MU_RANGE[0], _LIGHTER)):
+        if wrong.any():
+            middle = float(mu[wrong].median())
+            reason = f"the friction force is {middle:.2g} times the load in {wrong.sum()} of {len(mu)} conditions; "
+            reason += f"coefficients of friction are {MU_RANGE[0]:g} to {MU_RANGE[1]:g}."
+            place = {"column": "load_N", "value": middle, "severity": "warning", "action": "kept"}
+            faults.append(Fault("improbable_load", reason, fix=fix, **place))
+    return faults
+
+
 def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame:
     """Return table `quality`: a row per finding, and one "ok" for every file of `files` without any.
 
@@ -272,21 +314,24 @@ NO_VALUE = "(no value)"  # level of a category in files without one
 CALENDAR = ("run_order", "elapsed_h")  # both from started_at
 
 
-def incomplete_columns(steady: pd.DataFrame) -> list[Fault]:
+def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) -> list[Fault]:
     """Return, for every column that some files have no value of, how many, what that does, and the fix.
 
     Parameters
     ----------
     steady : DataFrame
         Table `steady`; rows with `used` false are left out.
+    aged_only : collection of str
+        Columns that unaged rubber need not have: how others are aged.
     """
     used = steady[steady["used"].to_numpy(bool)]
+    aged = used["aging_days"] != 0 if aged_only else True
     files = used["file"].nunique()
     fixed, faults = set(STEADY.names()) - set(CALENDAR) - {"load_N"}, []
     for name in used.columns:
         if name in fixed:
             continue
-        missing = used["file"][used[name].isna()].nunique()
+        missing = used["file"][used[name].isna() & (aged if name in aged_only else True)].nunique()
         if 0 < missing < files:
             reason = f"{missing} of {files} files have no value: {_what_follows(name, used[name], missing / files)}."
             fix = "Fill started_at." if name in CALENDAR else "Fill it for these files too."

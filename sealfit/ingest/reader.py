@@ -193,13 +193,15 @@ def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trac
     rows = Rows({name: cells.columns[i] for i, name in ours.items() if i in cells.columns}, cells.line)
     known: Mapping[str, object] = {}
     if settings.compute or settings.keep is not None:
-        known = {**ref.channels, **name_parts(file, config.files).values, **header_fields(layout.header, settings)}
+        named = name_parts(file, config.files, config.conversions("names")).values
+        known = {**ref.channels, **named, **header_fields(layout.header, settings)}
     faults = list(cells.faults)
     good = ~cells.bad
     first = settings.drop_first_rows
     counted = max(len(good) - first, 1)
     columns, dropped, found = channel_columns(rows.columns, good, rows.line, config, file)
     faults += found
+    columns = _in_our_units(columns, config, layout, file)
     good &= ~dropped
     bad = len(good[first:]) - int(np.count_nonzero(good[first:]))
     good[:first] = False
@@ -217,6 +219,17 @@ def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trac
         if fault.action == "file left out":
             raise BadFile(*faults)
     return Trace(ref, _named_beside(rows, ref, settings), rows.line, len(good), tuple(faults))
+
+
+def _in_our_units(columns: dict[str, np.ndarray], config: Config, layout: Layout, file: str) -> dict[str, np.ndarray]:
+    """Return the columns with numbers of other units converted; raises `BadFile` where they are labels."""
+    changed = {name: convert for name, convert in config.conversions("trace").items() if name in columns}
+    for name in changed:
+        if columns[name].dtype.kind != "f":
+            fix = "Take its unit out of [trace.columns], or export numbers."
+            fault = _bad_file("not_a_number", "has a unit in the rig config and holds no numbers.", file, fix)
+            raise BadFile(replace(fault, column=name, line=layout.names_line))
+    return columns | {name: convert(columns[name]) for name, convert in changed.items()}
 
 
 def _derive(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import codecs
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,20 +30,31 @@ from sealfit.ingest.categorical import (
 )
 from sealfit.ingest.columns import RESERVED, beside, suggestion
 from sealfit.ingest.derived_columns import (
-    add_order,
     add_repeats,
     add_runs,
     add_specimens,
     as_set,
     condition_keys,
     disagreements,
+    in_our_units,
     out_of_range,
     to_values,
+    with_computed,
+    with_day_0,
 )
-from sealfit.ingest.file_names import TEXT_COLUMNS, Listing, TraceRef, name_parts, names_speak
+from sealfit.ingest.file_names import (
+    TEXT_COLUMNS,
+    Listing,
+    TraceRef,
+    matched_part,
+    name_parts,
+    names_speak,
+    unmatched,
+)
 from sealfit.ingest.formats import require_libraries
 from sealfit.ingest.listing import Entries, list_entries
 from sealfit.ingest.reader import read_header, read_trace
+from sealfit.ingest.start_times import add_order, join_date_and_time
 from sealfit.ingest.trace_checks import measured_speed, speed_factor
 
 
@@ -74,8 +85,13 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     kept, named, found = _named(entries, config)
     faults += found
     entries, cells = _kept(kept, entries, cells)
+    cells = in_our_units(cells, config.conversions("runs"))
     columns = in_order(overlaid(_headers(campaign, entries, config), named, cells))
-    columns, found = to_values(entries, columns, config)
+    columns, found = join_date_and_time(entries, columns, config)
+    faults += found
+    columns, found = to_values(entries, with_day_0(columns, config), config)
+    faults += found
+    columns, found = with_computed(entries, columns, config)
     faults += found
     needed = _Needed.of(config)
     columns, measured, left_out, found = _from_traces(campaign, entries, columns, config, needed)
@@ -85,7 +101,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     entries, columns = _kept(kept, entries, columns)
     columns, measured = in_order(columns), [measured[i] for i in kept.tolist()]
     faults += found + _missing(entries, columns, needed) + out_of_range(entries, columns)
-    columns, found = add_order(entries, columns)
+    columns, found = add_order(entries, columns, config)
     faults += found
     _stop_at_errors(faults)
     columns = as_set(columns)
@@ -144,13 +160,13 @@ def _config_faults(config: Config) -> list[Fault]:
             "cannot be a condition column: it differs within a condition.",
             "Take it out of condition.",
         )
-    named = {} if settings.names != "none" else {k: v for k, v in settings.columns.items() if isinstance(v, str)}
-    for ours, theirs in named.items():
+    named = {ours: theirs for ours, theirs in settings.their_columns.items() if isinstance(theirs, str)}
+    for ours, theirs in named.items() if settings.names == "none" else ():
         fix = "Give its position, counted from 1, or names = 'header'."
         add(f"trace.columns.{ours}", theirs, "is a name, but the files have none.", fix)
     checks = {"quantities": lambda: speed_factor(config.units)}
     if config.files.name_pattern is None:
-        checks["files"] = lambda: name_parts("", config.files)
+        checks["files"] = lambda: name_parts("", config.files, config.conversions("names"))
     for column, check in checks.items():
         try:
             check()
@@ -182,13 +198,12 @@ def _named(entries: Entries, config: Config) -> tuple[np.ndarray, Columns, list[
     kept, parts, faults = [], [], []
     for i, entry in enumerate(entries):
         try:
-            named = name_parts(entry.file, config.files)
+            named = name_parts(entry.file, config.files, config.conversions("names"))
         except ConfigError as error:
             raise CampaignError([entry.fault("file_name", error.message, error.column, fix=error.fix)]) from error
         if not named.matched:
             listed = entry.line is not None
-            reason = f"the name '{entry.file}' does not match files.name_pattern."
-            fix = "Rename it, widen the pattern, or list it under files.exclude."
+            reason, fix = unmatched(entry.file, config.files.name_pattern)
             place = {"severity": "warning", "action": "kept" if listed else "file left out", "fix": fix}
             faults.append(Fault("not_matched", reason, file=entry.file, **place))
             if not listed:
@@ -196,9 +211,10 @@ def _named(entries: Entries, config: Config) -> tuple[np.ndarray, Columns, list[
         kept.append(i)
         parts.append(named.channels)
     if not kept:
-        fix = "Check files.name_pattern in the rig config."
-        reason = f"none of {len(entries)} file names is matched."
-        raise CampaignError([*faults[:3], Fault("not_matched", reason, fix=fix)])
+        pattern = config.files.name_pattern
+        nearest = max(faults, key=lambda fault: len(pattern) - len(matched_part(pattern, fault.file)[1]))
+        reason = f"none of {len(entries)} files is matched; of this one, the nearest, {nearest.reason}"
+        raise CampaignError([replace(nearest, reason=reason, severity="error", action="stopped")])
     return np.array(kept), columns_of(parts), faults
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from sealfit.config import Config
-from sealfit.ingest.columns import nearest
+from sealfit.errors import nearest
 from sealfit.ingest.files import as_utf8, read_bytes
 from sealfit.ingest.formats import CALLED, bad, damage_named, kind_of, library, value_text
 

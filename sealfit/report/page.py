@@ -12,6 +12,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from sealfit.config import Config
+from sealfit.errors import Fault, examples, grouped, how_many, one_reason
 from sealfit.progress import timed
 from sealfit.report import page
 from sealfit.report.figures import draw_all
@@ -96,22 +97,39 @@ def quality_counts(quality: pd.DataFrame) -> list[dict]:
 
 
 def quality_findings(quality: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
-    """Return the findings other than mere information, the most severe first, and their number."""
+    """Return the findings other than mere information, the most severe first, and the number of rows.
+
+    What many files share is one row with a count and examples.
+    """
     if quality.empty:
         return [], 0
-    listed = quality[(quality["severity"] != "info") | (quality["action"].fillna("kept") != "kept")]
-    rank = listed["severity"].map({name: k for k, name in enumerate(SEVERITIES)}).fillna(9)
-    listed = listed.assign(rank=rank).sort_values("rank", kind="stable").drop(columns="rank")
-    shown = listed.head(MOST_FINDINGS).astype(object)
-    rows = []
-    for row in shown.where(shown.notna(), None).to_dict("records"):
-        place = f"line {int(row['line'])}" if row["line"] is not None else ""
-        if row["stroke"] is not None:
-            place = f"stroke {int(row['stroke'])}{', ' + place if place else ''}"
-        texts = {name: true_units(row[name] or "", config.units) for name in ("reason", "fix")}
-        column = channel_label(row["column"], config.units) if row["column"] else ""
-        rows.append({**row, **texts, "place": place, "column": column, "check": (row["check"] or "").replace("_", " ")})
-    return rows, len(listed)
+    told = quality[(quality["severity"] != "info") | (quality["action"].fillna("kept") != "kept")]
+    rank = told["severity"].map({name: k for k, name in enumerate(SEVERITIES)}).fillna(9)
+    ordered = told.assign(rank=rank).sort_values("rank", kind="stable").drop(columns="rank").astype(object)
+    faults = [_fault(row) for row in ordered.where(ordered.notna(), None).to_dict("records")]
+    groups = grouped(faults)
+    return [_finding(group, config) for group in groups[:MOST_FINDINGS]], len(groups)
+
+
+def _fault(row: Mapping) -> Fault:
+    texts = {name: row[name] or "" for name in ("check", "reason", "fix", "severity")}
+    return Fault(**{**row, **texts, "action": row["action"] or "kept"})
+
+
+def _finding(group: list[Fault], config: Config) -> dict:
+    """Return a row of the list: one finding, or one that many files share, with the places of three."""
+    first = group[0]
+    row = first.as_dict()
+    row |= {name: true_units(row[name], config.units) for name in ("reason", "fix")}
+    row["column"] = channel_label(first.column, config.units) if first.column else ""
+    row["check"] = first.check.replace("_", " ")
+    if len(group) > 1:
+        reason = row["reason"] if one_reason(group) else ""
+        return {**row, "reason": reason, "file": how_many(group), "value": None, "place": "; ".join(examples(group))}
+    place = f"line {int(first.line)}" if first.line is not None else ""
+    if first.stroke is not None:
+        place = f"stroke {int(first.stroke)}{', ' + place if place else ''}"
+    return {**row, "place": place}
 
 
 def provenance_facts(provenance: Mapping) -> dict:

@@ -306,7 +306,7 @@ def load_spec(path: Path) -> Spec:
             f"is not TOML: {error}.", file=path, fix="See sample_data/simulated.spec.toml for an example."
         ) from error
     except ValidationError as error:
-        raise ConfigError(explain(error), file=path, fix="sample_data/README.md lists every key.") from error
+        raise ConfigError(explain(error, Spec), file=path, fix="sample_data/README.md lists every key.") from error
     try:
         resolve_effects(spec.effects)
     except ConfigError as error:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
-from difflib import get_close_matches
 from pathlib import Path
 
 from sealfit.config import Config
-from sealfit.errors import CampaignError, ConfigError, Fault, RequestError
+from sealfit.errors import CampaignError, ConfigError, Fault, RequestError, did_you_mean, quoted
 from sealfit.store.manifest import STATE, ConfigCopy, fingerprint
 
 # ---------------------------------------------------------------- places
@@ -38,18 +36,18 @@ def campaign_folder(path: Path, config: Config) -> Path:
     """
     if path.is_file():
         fix = (
-            f"Give its folder: {_quoted(path.parent)}"
+            f"Give its folder: {quoted(path.parent)}"
             if path.name in RUNS_TABLES
             else f"Give the folder that holds {RUNS}."
         )
         raise CampaignError([Fault("campaign_folder", f"{path} is a file, not a campaign folder.", fix=fix)])
     if not path.is_dir():
-        raise CampaignError([Fault("campaign_folder", f"there is no folder {path}.", fix=_did_you_mean(path))])
+        raise CampaignError([Fault("campaign_folder", f"there is no folder {path}.", fix=did_you_mean(path))])
     if config.files.glob is None and config.files.runs_table is None and not runs_tables(path, config):
         below = sorted(child.parent for child in path.glob(f"*/{RUNS}"))
         fix = f"It lists the trace files; or set files.glob in a config (--config). Files here: {_some_files(path)}"
         if below:
-            fix = "Did you mean " + " or ".join(_quoted(folder) for folder in below[:3]) + "?"
+            fix = "Did you mean " + " or ".join(quoted(folder) for folder in below[:3]) + "?"
         raise CampaignError([Fault("runs_csv", f"{path} has no {RUNS}.", file=RUNS, fix=fix)])
     return path
 
@@ -64,8 +62,8 @@ def existing_out(out: Path) -> Path:
     """
     if out.is_dir():
         return out
-    fix = _did_you_mean(out, lambda folder: (folder / STATE).is_file())
-    raise RequestError(f"there is no folder {out}.", fix=fix or f"Make it: sealfit run CAMPAIGN --out {_quoted(out)}")
+    fix = did_you_mean(out, lambda folder: (folder / STATE).is_file())
+    raise RequestError(f"there is no folder {out}.", fix=fix or f"Make it: sealfit run CAMPAIGN --out {quoted(out)}")
 
 
 def existing_file(path: Path, what: str) -> Path:
@@ -74,25 +72,7 @@ def existing_file(path: Path, what: str) -> Path:
         return path
     if path.is_dir():
         raise RequestError(f"{path} is a folder, not a {what}.", fix="Give the file itself.")
-    raise RequestError(f"there is no {what} {path}.", fix=_did_you_mean(path, Path.is_file))
-
-
-def _did_you_mean(path: Path, fits=Path.is_dir) -> str:
-    parent = path.absolute().parent
-    missing = None
-    while not parent.is_dir():
-        missing, parent = parent, parent.parent
-    wanted = (missing or path.absolute()).name
-    try:
-        there = sorted(
-            child.name for child in parent.iterdir() if not child.name.startswith(".") and (missing or fits(child))
-        )
-    except OSError:
-        return ""
-    likely = get_close_matches(wanted, there, n=1, cutoff=0.5)
-    if likely:
-        return f"Did you mean {_quoted(path.parent / likely[0] if missing is None else parent / likely[0])}?"
-    return ""
+    raise RequestError(f"there is no {what} {path}.", fix=did_you_mean(path, Path.is_file))
 
 
 def _some_files(folder: Path) -> str:
@@ -100,10 +80,6 @@ def _some_files(folder: Path) -> str:
     if not names:
         return "none."
     return ", ".join(names[:5]) + (", ..." if len(names) > 5 else ".")
-
-
-def _quoted(path: Path) -> str:
-    return shlex.quote(str(path))
 
 
 # ---------------------------------------------------------------- own effects
@@ -146,7 +122,7 @@ def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Pat
             fix=f"Name the folder by {OPTION}, or move the config.",
         )
     if not folder.is_dir():
-        raise ConfigError(f"{said}: there is no folder {folder}.", fix="Fix the path.")
+        raise ConfigError(f"{said}: there is no folder {folder}.", fix=did_you_mean(folder) or "Fix the path.")
     for path in (folder, *sorted(folder.glob("*.py"))):
         if place := _place_of(path, data):
             raise ConfigError(

@@ -25,7 +25,8 @@ def campaign(folder, columns, header="", strokes=1, delimiter=",", decimals=5):
 
 
 def slots(made):
-    return parse_config(made.text, "rig.toml").trace.columns
+    columns = parse_config(made.text, "rig.toml").trace.columns
+    return {ours: column.name for ours, column in columns.items()}
 
 
 # ---------------------------------------------------------------- columns
@@ -197,7 +198,7 @@ def test_a_measured_load_goes_before_that_of_the_header(tmp_path):
 
     header = "Normal load: 50 N\n\nt [s];x [mm];F [N];Fz [N]\n"
     config = parse_config(campaign(tmp_path, columns, header, delimiter=";").text, "rig.toml")
-    assert config.trace.columns["load_N"] == "Fz [N]"
+    assert config.trace.columns["load_N"].name == "Fz [N]"
     assert config.trace.header_fields == {}
 
 

@@ -133,7 +133,7 @@ def test_a_german_date_in_the_header_is_a_doubt_with_the_lines_that_would_read_i
 def test_the_format_of_a_date_in_the_header_is_found(name, date_format, tmp_path):
     exports.EXPORTS[name](tmp_path)
     (doubt,) = [doubt for doubt in draft(tmp_path).doubts if "ISO 8601" in doubt.reason]
-    assert doubt.lines[-1] == f"date_format = '{date_format}'"
+    assert doubt.lines[-1] == f"[files] date_format = '{date_format}'"
 
 
 def test_a_compression_of_20_is_taken_as_a_height_of_80_and_said(tmp_path):

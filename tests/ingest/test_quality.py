@@ -2,9 +2,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sealfit.config import Config, Quality, Strokes
+from sealfit.config import Config, Quality, Strokes, parse_config
 from sealfit.errors import Fault
-from sealfit.ingest.quality import load_faults, quality_table, speed_column_faults, stroke_faults, stuck_samples
+from sealfit.ingest.quality import (
+    improbable_loads,
+    incomplete_columns,
+    load_faults,
+    quality_table,
+    speed_column_faults,
+    stroke_faults,
+    stuck_samples,
+)
 from sealfit.ingest.repeat_checks import constant_strokes, outlying_files, reversed_strokes
 from sealfit.ingest.strokes import Stroke, find_strokes
 from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, resolution
@@ -252,3 +260,42 @@ def test_the_quality_table_has_a_row_per_finding_and_one_for_every_sound_file():
     assert table["value"].tolist()[2] == "1.5"
     assert table.columns.tolist() == QUALITY.names()
     assert quality_table([], []).columns.tolist() == QUALITY.names()
+
+
+def steady_of(load, force=47.07, **more):
+    rows = {"condition": ["a", "a", "b"], "force_N": [force, -force, force], "load_N": load, "used": True}
+    return pd.DataFrame(rows | more)
+
+
+@pytest.mark.parametrize(
+    ("load", "said", "fix"),
+    [
+        (5.0, "9.4 times the load in 2 of 2 conditions", "kgf"),  # 5 kg
+        (5000.0, "0.0094 times the load in 2 of 2 conditions", "gf"),  # 5000 g
+        ([49.03, 49.03, 5.0], "9.4 times the load in 1 of 2 conditions", "kgf"),
+    ],
+)
+def test_a_load_in_kg_or_g_is_a_warning(load, said, fix):
+    (fault,) = improbable_loads(steady_of(load), Config())
+    assert (fault.check, fault.severity, fault.action, fault.column) == ("improbable_load", "warning", "kept", "load_N")
+    assert said in fault.reason
+    assert f'unit = "{fix}"' in fault.fix
+
+
+def test_true_loads_are_not_blamed_nor_what_is_not_used_nor_a_torque():
+    assert improbable_loads(steady_of(49.03), Config()) == []
+    assert improbable_loads(steady_of(5.0, used=False), Config()) == []
+    assert improbable_loads(steady_of(5.0).drop(columns="load_N"), Config()) == []
+    torque = parse_config('[quantities]\nforce = {quantity = "torque", unit = "mN m"}\n', "rig.toml")
+    assert improbable_loads(steady_of(5.0), torque) == []
+    small = parse_config('[quantities]\nforce = {quantity = "friction force", unit = "mN"}\n', "rig.toml")
+    assert improbable_loads(steady_of(49.03, force=47070.0), small) == []
+
+
+def test_unaged_rubber_needs_no_temperature_and_aged_rubber_does():
+    rows = {"file": ["a", "b", "c"], "used": True, "aging_days": [0.0, 4.0, 8.0]}
+    unaged = pd.DataFrame(rows | {"temperature_C": [np.nan, 60.0, 60.0]})
+    assert incomplete_columns(unaged, ["temperature_C"]) == []
+    aged = pd.DataFrame(rows | {"temperature_C": [np.nan, np.nan, 60.0]})
+    (fault,) = incomplete_columns(aged, ["temperature_C"])
+    assert (fault.column, fault.value) == ("temperature_C", 1.0)

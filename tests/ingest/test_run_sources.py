@@ -103,7 +103,7 @@ def test_configs_that_cannot_be_meant_are_refused_before_any_file_is_opened(tmp_
 def test_a_folder_in_which_nothing_fits_stops_the_run(tmp_path):
     trace(tmp_path, "raw/no1/x.csv")
     (*_, fault) = faults(tmp_path, NAMED)
-    assert "none of 1 file names is matched" in fault.reason
+    assert "none of 1 files is matched" in fault.reason
     (tmp_path / "raw/no1/x.csv").rename(tmp_path / "raw/no1/5.csv")
     only_excluded = NAMED.replace("**/steps/*", "**/5.csv")
     assert [fault.check for fault in faults(tmp_path, only_excluded)] == ["excluded", "nothing_left"]
@@ -122,3 +122,44 @@ def test_globs_stay_inside(tmp_path, glob):
 def test_natural_order_is_that_of_the_numbers(numbers):
     names = sorted((f"run{number}.csv" for number in numbers), key=natural)
     assert names == [f"run{number}.csv" for number in sorted(numbers)]
+
+
+RIG = r"""condition = ["temperature_C", "aging_days"]
+[files]
+glob = "**/*.csv"
+name_pattern = 'T(?P<temperature_C>\d+)_C(?P<c>\d+)_d(?P<aging_days>\d+)_v(?P<speed_mm_s>\d+)[.]csv'
+"""
+
+
+@pytest.mark.parametrize(
+    ("files", "nearest", "said"),
+    [
+        (["T80_C20_day4_v5.csv", "notes.csv"], "T80_C20_day4_v5.csv", "'T80_C20_d', then the pattern has '(?P<aging_"),
+        (
+            ["T80_C20_d4_v5_r2.csv"],
+            "T80_C20_d4_v5_r2.csv",
+            "'T80_C20_d4_v5', then the pattern has '[.]csv' and the path",
+        ),
+        (["notes.csv"], "notes.csv", "from its start the pattern has 'T(?P<temperature_C>\\d+)_C(?...' and"),
+    ],
+)
+def test_a_pattern_that_matches_no_file_says_where_it_broke_on_the_nearest(tmp_path, files, nearest, said):
+    for file in files:
+        trace(tmp_path, file)
+    (fault,) = faults(tmp_path, RIG)
+    assert (fault.check, fault.file) == ("not_matched", nearest)
+    assert "the whole path below the campaign folder does not match files.name_pattern" in fault.reason
+    assert said in fault.reason
+
+
+def test_a_pattern_for_names_without_folders_says_how_to_begin_it(tmp_path):
+    trace(tmp_path, "week 1/T80_C20_d4_v5.csv")
+    (fault,) = faults(tmp_path, RIG)
+    assert fault.fix == "The pattern matches the name without its folders: begin it with '(?:.*/)?'."
+    assert len(channels(tmp_path, RIG.replace("'T(", "'(?:.*/)?T("))) == 1
+
+
+def test_a_glob_that_matches_nothing_shows_the_nearest_file(tmp_path):
+    trace(tmp_path, "raw/a.txt")
+    (fault,) = faults(tmp_path, RIG)
+    assert fault.fix == "The nearest file is 'raw/a.txt'."

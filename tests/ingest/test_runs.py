@@ -177,7 +177,7 @@ def test_unaged_rubbers_are_told_apart():
         ("4,49.03,5,2024-03-01T10", "4,30,5,2024-03-01T10", "run_disagrees", 3, "load_N", "line 2"),
         ("4,49.03,5,2024-03-01T10", "4,,5,2024-03-01T10", "run_disagrees", 3, "load_N", "line 2"),
         ("4,49.03,5,2024-03-01T10", "8,49.03,5,2024-03-01T10", "run_disagrees", 3, "condition", "line 2"),
-        ("2024-03-01T10:30:00", "1.3.2024 10:30", "not_a_time", 3, "started_at", "2024-03-01T09:30:00"),
+        ("2024-03-01T10:30:00", "1.3.2024 10:30", "not_a_time", 3, "started_at", "date_format = '%d.%m.%Y %H:%M'"),
         ("b.csv,r1,2", "../b.csv,r1,2", "path_outside", 3, "file", "outside"),
         ("b.csv,r1,2", "/etc/hostname,r1,2", "path_outside", 3, "file", "outside"),
         ("b.csv,r1,2", "C:\\b.csv,r1,2", "path_outside", 3, "file", "outside"),
