@@ -170,11 +170,11 @@ def test_too_few_specimens_to_show_their_scatter_are_said_to_be(null):
     bins = make_bins(1, temperatures=(60.0,), days=(1.0, 4.0, 16.0), repeats=2, bins=4, specimen=0.01)
     made = close(bins)
     assert "specimen" not in {s["level"] for s in made.document["scatter"]}
-    assert any("how specimens scatter" in run["why"] for run in made.document["next_runs"])
+    assert any("scatter of specimens" in run["why"] for run in made.document["next_runs"])
     answer = predict(made.model, bins.head(2))
     assert answer["note"].str.contains("scatter of specimens is not known").all()
     assert answer["force_after_N"].notna().all()
-    assert not any("how specimens scatter" in run["why"] for run in null[1].document["next_runs"])
+    assert not any("scatter of specimens" in run["why"] for run in null[1].document["next_runs"])
 
 
 def test_what_ripples_gain_is_seen_inside_strokes():
