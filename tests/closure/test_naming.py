@@ -32,7 +32,7 @@ class HandFit:
     def __init__(self, deviance, terms, values, errors, left=0.0):
         ends = np.cumsum([0, *(len(term.effect.parameters) for term in terms)])
         self.deviance = deviance
-        self.model = SimpleNamespace(terms=terms, values=values, place=lambda k: slice(ends[k], ends[k + 1]))
+        self.model = SimpleNamespace(terms=terms, values=values, term_slice=lambda k: slice(ends[k], ends[k + 1]))
         self.covariance = np.diag(np.square(np.asarray(errors, dtype=float)))
         self.white_jacobian = Tangent.dense(np.eye(ends[-1]))
         self.rows = SimpleNamespace(groups=Groups.of({"run": np.arange(ends[-1])}))

@@ -329,9 +329,9 @@ def test_a_moved_campaign_is_warned_of(out, tutorial, tmp_path):
     folder = tutorial[1] / "sample_data"
     folder.rename(tmp_path / "elsewhere")
     try:
-        with pytest.warns(UserWarning, match="is not there: whether it has changed cannot be told"):
+        with pytest.warns(UserWarning, match="is missing, so changes cannot be detected"):
             results = sealfit.open(out)
-        with pytest.warns(UserWarning, match="is not there"):
+        with pytest.warns(UserWarning, match="is missing"):
             assert results.verdict["verdict"].tolist() == ["closed"]
     finally:
         (tmp_path / "elsewhere").rename(folder)

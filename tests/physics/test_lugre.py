@@ -126,8 +126,8 @@ def test_friction_that_falls_with_pressure_grows_less_than_the_load():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"time_s": [0.0, 0.0]}, "rising times"),
-        ({"time_s": []}, "rising times"),
+        ({"time_s": [0.0, 0.0]}, "increasing"),
+        ({"time_s": []}, "increasing"),
         ({"speed_mm_s": [1.0]}, "one speed a time"),
         ({"sigma_0": 0.0}, "stiffness must be positive"),
         ({"sigma_1": -1.0}, "neither can be negative"),
