@@ -214,6 +214,8 @@ def quality_clause(closure: Mapping) -> str:
     """Return how the error compares with the scatter of repeats, in a clause."""
     quality = closure.get("fit_quality") or {"state": "unknown"}
     if quality["state"] == "unknown":
+        if closure.get("noise_floor_N") is not None:
+            return "the model has too many parameters for these runs to test its lack of fit"
         return "without repeats it is not known whether the error exceeds the scatter"
     if quality["state"] == "within_scatter":
         return "the error is within the scatter of repeats"

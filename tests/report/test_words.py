@@ -4,6 +4,7 @@ from report.made_campaigns import aging_campaign, torque_campaign
 from report.made_tables import empty, shapes
 
 from sealfit.config import Config
+from sealfit.report.summary import quality_clause
 from sealfit.report.words import acts, does, left_over, verdict, with_left_channels
 
 NUMBERS = {
@@ -202,3 +203,9 @@ def test_made_campaign_reads_as_the_example():
     made = aging_campaign()
     text = said(made.closure, made.tables["shapes"])
     assert text.startswith("The declared model lacks warming by sliding (time; μ falls by up to 6.1 % [5.5, 6.7]")
+
+
+def test_why_the_lack_of_fit_is_not_known_is_said():
+    unknown = {"fit_quality": {"state": "unknown", "ratio": None, "p_value": None}}
+    assert "without repeats" in quality_clause({**unknown, "noise_floor_N": None})
+    assert "too many parameters" in quality_clause({**unknown, "noise_floor_N": 0.1})
