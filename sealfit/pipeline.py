@@ -85,7 +85,7 @@ def run(
     progress: Silent | None = None,
     **options,
 ) -> dict:
-    """Do every step of `steps` that is out of date, in order, and return the summary of all of them.
+    """Run the out-of-date steps among `steps`, in order, and return the summary of all of them.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ def run(
     effects_folder: str | Path | None = None,
     **options: object,
 ) -> Results:
-    """Do every step that is not current, as `sealfit run` does, and return the results.
+    """Run all out-of-date steps, as `sealfit run` does, and return the results.
 
     Parameters
     ----------
