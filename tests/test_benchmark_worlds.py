@@ -10,13 +10,16 @@ from worlds.campaign import draw_points, points_csv, truth_record, write_campaig
 from worlds.effects import FAMILIES, Effect
 from worlds.main import read
 from worlds.motion import batches, force_at, integrate
-from worlds.parameters import aged_series, laws_inside
+from worlds.parameters import EXCLUDES_SCATTER, HOLDS_FOR_TESTED, aged_series, laws_inside
 from worlds.priors import PRIORS
 from worlds.run import command, copies, read_closure, true_effects
 from worlds.score import NONE, RIGHT, SAME_AT_DESIGN, Target, explained_by, grade, named_rightly, on_variables, scored
 from worlds.summary import alarmed, summarise
 from worlds.true_form import candidates, make_rows, p_units, z_values
 from worlds.world import draw_world
+
+from sealfit.closure.predict import TESTED_ONLY
+from sealfit.fit.aging.law_table import NO_SCATTER
 
 SEED = "tests"
 RIPPLE = Target(("displacement_mm",), (), ("trace",), ("ripple",), True)
@@ -285,6 +288,11 @@ def test_processor_time_is_that_of_all_of_a_commands_processes():
     ended = command([sys.executable, "-c", inner], 60.0)
     assert ended.code == 0
     assert 0.4 <= ended.cpu_seconds < ended.seconds + 0.4
+
+
+def test_the_words_by_which_intervals_say_what_they_leave_out_are_those_of_sealfit():
+    assert HOLDS_FOR_TESTED in TESTED_ONLY
+    assert EXCLUDES_SCATTER in NO_SCATTER
 
 
 def test_intervals_of_the_law_are_held_to_the_series_truth(tmp_path):

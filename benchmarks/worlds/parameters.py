@@ -14,20 +14,23 @@ import pandas as pd
 from worlds.world import World
 
 LAW = ("mu_0", "a", "b")
+# What an interval says that excludes the scatter of specimens, in aging_fit and in the notes of `predict`.
+EXCLUDES_SCATTER = "the interval excludes the scatter between specimens"
+HOLDS_FOR_TESTED = "intervals hold for the tested ones"
 DAYS_FOR_LIFETIME = 4  # aged days; with fewer a law can hardly be told
 
 
 def laws_inside(world: World, out: Path) -> dict[str, list[int]]:
     """Return for each parameter of Eq. 15 how many intervals hold the truth, and how many there are.
 
-    Intervals that are said to leave out the scatter of specimens are not asked.
+    Intervals that say that they exclude the scatter of specimens are not counted.
     """
     counts = {name: [0, 0] for name in LAW}
     steady = pd.read_parquet(out / "steady_fit.parquet")
     flat = steady[steady["parameter"].isin(("mu_s", "F_s")) & ~steady["identified"]]  # mu_c is then no mu_c of Eq. 14
     table = pd.read_parquet(out / "aging_fit.parquet")
     table = table[table["identified"] & table["lo95"].notna() & table["parameter"].isin(LAW)]
-    table = table[~table["reason"].fillna("").str.contains("leaves out how specimens scatter")]
+    table = table[~table["reason"].fillna("").str.contains(EXCLUDES_SCATTER)]
     load = float(world.loads_N[0])
     for row in table.itertuples():
         end = {"mu_s": "s", "mu_c": "c", "F_s": "s", "F_c": "c"}.get(row.quantity)

@@ -18,7 +18,7 @@ from process_tree import memory, tree
 
 from worlds.campaign import draw_points, points_csv, truth_record, write_campaign
 from worlds.motion import force_at
-from worlds.parameters import laws_inside, lifetime_answer, lifetime_question
+from worlds.parameters import HOLDS_FOR_TESTED, laws_inside, lifetime_answer, lifetime_question
 from worlds.score import Target, explained_by, on_variables, scored
 from worlds.true_form import CLAIM_LEVEL, CLEAR, Rows, codes, error_at, make_rows, unit_of, z_values
 from worlds.world import World, draw_world
@@ -243,7 +243,7 @@ def predicted(task: Task, world: World, rows: Rows, home: Path) -> dict:
     outside = answer["extrapolated"].astype(str).str.lower().isin(["true", "1"]).to_numpy()
     good = np.isfinite(after) & np.isfinite(before) & ~outside
     oracle = error_at(world, rows, points)
-    own_only = answer["note"].astype(str).str.contains("those of the tested ones").to_numpy()
+    own_only = answer["note"].astype(str).str.contains(HOLDS_FOR_TESTED).to_numpy()
     meant = np.where(own_only, force_at(world, points, tested=True), exact)  # what each interval says it is of
     inside = (low <= meant) & (meant <= high) & good
     given = np.isfinite(low) & np.isfinite(high) & good

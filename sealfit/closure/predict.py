@@ -30,6 +30,7 @@ BEYOND = 1e-6  # Relative tolerance of the tested range.
 ANSWERS = (
     "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N", "meas_lo95_N", "meas_hi95_N",
 )  # fmt: skip
+TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
 
 
 def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None = None) -> pd.DataFrame:
@@ -61,7 +62,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     answer = pd.DataFrame({name: np.full(len(table), np.nan) for name in ANSWERS})
     if not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
         for k in np.flatnonzero(good):
-            notes[k].append("the scatter of specimens is not known: intervals hold for the tested ones")
+            notes[k].append(TESTED_ONLY)
     if model["df"] == 0:
         for k in np.flatnonzero(good):
             notes[k].append("no interval: as many parameters in the model as runs; test repeats or more speeds")
