@@ -8,6 +8,7 @@ import pytest
 
 from sealfit.closure.score_test import (
     FLIPS,
+    MOST_FLIPS,
     Candidate,
     ScoreTestResult,
     adjust,
@@ -65,7 +66,28 @@ def test_a_test_that_is_made_twice_counts_once():
 
 
 def test_no_p_value_is_smaller_than_the_flips_resolve():
-    assert adjust([alike(60)], np.random.default_rng(0)) == pytest.approx([1 / (FLIPS + 1)])
+    assert adjust([alike(60)], np.random.default_rng(0)) == pytest.approx([1 / (MOST_FLIPS + 1)])
+
+
+def test_a_p_value_near_the_level_hardly_depends_on_the_seed():
+    """Of twelve units 2 of 4,096 flips agree on all: p = 0.0005, known to a third of itself."""
+    found = [adjust([alike(12)], np.random.default_rng(seed))[0] for seed in range(20)]
+    assert np.std(found) < 1.2 * 0.0005 / np.sqrt(MOST_FLIPS * 2 / 4096)
+    assert np.mean(found) == pytest.approx(2 / 4096, rel=0.3)
+
+
+def test_a_large_p_value_needs_no_more_flips():
+    class Counted:
+        def __init__(self):
+            self.rng, self.count = np.random.default_rng(0), 0
+
+        def choice(self, values, size):
+            self.count += size[0]
+            return self.rng.choice(values, size)
+
+    rng = Counted()
+    assert adjust([alike(5)], rng)[0] == pytest.approx(2 / 32, abs=0.02)
+    assert rng.count == FLIPS
 
 
 def test_the_critical_value_is_where_the_adjusted_p_value_is_the_level():
