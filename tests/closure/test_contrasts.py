@@ -171,7 +171,9 @@ def test_what_two_specimens_show_is_a_candidate_and_the_verdict_cannot_tell():
     assert document["verdict"] == "cannot_tell"
     (candidate,) = document["effects"]
     assert candidate["candidate"]
-    assert candidate["channels"][0] in ("displacement_mm", "distance_mm")
+    # With one load and constant speeds, heating by power over time is a line along the distance.
+    forms = [candidate, *candidate["alternatives"]]
+    assert any(form["channels"][0] in ("displacement_mm", "distance_mm") for form in forms)
 
 
 def test_what_one_specimen_of_two_holds_alone_is_not_said_to_differ_between_them():

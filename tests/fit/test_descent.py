@@ -140,6 +140,14 @@ def test_a_column_that_does_nothing_stays_where_it_is():
     assert np.isfinite(found).all()
 
 
+def test_the_bounds_of_a_column_that_does_nothing_may_be_beyond_what_numbers_resolve():
+    """An amplitude of 8e29 at a shape that underflows: its bounds less its value are equal."""
+    columns = np.column_stack([np.linspace(1.0, 2.0, 9), np.full(9, 1e-30)])
+    low, high = np.array([-0.2, -8e29]), np.array([0.3, -8e29])
+    found = within(columns.T @ columns, columns.T @ (2 * columns[:, 0]), low, high)
+    npt.assert_allclose(found, [0.3, -8e29], rtol=1e-6)
+
+
 def test_series_are_searched_though_every_row_of_one_is_held_out():
     model, rows, curved = astray(one_specimen=False, aging=True)
     found = search_nonlinear(model, rows.subset(rows.values("temperature_C") != 80.0), SCATTER)

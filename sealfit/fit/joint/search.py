@@ -241,16 +241,18 @@ def least_squares_within(
     normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, free: np.ndarray
 ) -> np.ndarray:
     """Return the minimiser of `least_squares` within bounds, shape (k,); `free` is the one without bounds."""
-    if np.all((free >= low) & (free <= high)):
+    inside = np.clip(free, low, high)  # stays for columns of zeros
+    if np.all(inside == free):
         return free
     square = np.diag(normal)
-    acts = square > 1e-30 * square.max()  # a column of zeros keeps its scale
-    scale = 1 / np.sqrt(np.where(acts, square, 1.0))
-    size, axes = np.linalg.eigh(normal * np.outer(scale, scale))
+    acts = np.flatnonzero(square > 1e-30 * square.max())
+    scale = 1 / np.sqrt(square[acts])
+    size, axes = np.linalg.eigh(normal[np.ix_(acts, acts)] * np.outer(scale, scale))
     kept = size > 1e-10 * size[-1]
     root, axes = np.sqrt(size[kept]), axes[:, kept]
-    inside = lsq_linear(root[:, None] * axes.T, (axes.T @ (gradient * scale)) / root, (low / scale, high / scale))
-    return inside.x * scale
+    bounds = (low[acts] / scale, high[acts] / scale)
+    inside[acts] = lsq_linear(root[:, None] * axes.T, (axes.T @ (gradient[acts] * scale)) / root, bounds).x * scale
+    return inside
 
 
 def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
