@@ -35,7 +35,8 @@ from sealfit.closure.criteria import (
     PAIR_FACTOR,
     SEARCHES,
 )
-from sealfit.closure.score_test import Candidate, ScoreTests, adjust_all
+from sealfit.closure.multiplicity import adjust_all
+from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.small_sample_test import log_p_of
 from sealfit.effects.free import BENDS, evenly
 from sealfit.fit.joint.estimate import Fitted

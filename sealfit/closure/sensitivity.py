@@ -32,7 +32,8 @@ from sealfit.closure.criteria import (
     TARGET_POWER,
     WEAK_P,
 )
-from sealfit.closure.score_test import Candidate, ScoreTests, critical_many, critical_small_sample, project
+from sealfit.closure.multiplicity import critical_many, critical_small_sample
+from sealfit.closure.score_test import Candidate, ScoreTests, project
 from sealfit.closure.selection import Selection
 from sealfit.closure.small_sample_test import (
     N_VARIANCES,

@@ -6,19 +6,16 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.closure.score_test import (
+from sealfit.closure.multiplicity import (
     FLIPS,
     MOST_FLIPS,
-    Candidate,
-    ScoreTestResult,
     adjust,
     adjust_all,
     adjust_slopes,
     adjust_small_sample,
     critical_many,
-    log_p_of,
-    score_statistic,
 )
+from sealfit.closure.score_test import Candidate, ScoreTestResult, log_p_of, score_statistic
 from sealfit.closure.small_sample_test import ContrastTest, SmallSampleTest, slope_log_p
 from sealfit.closure.small_sample_test import log_p_of as small_sample_log_p
 

@@ -1,0 +1,152 @@
+"""P-values adjusted for the whole search: all channels, quantities and numbers of columns."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sealfit.closure import small_sample_test
+from sealfit.closure.criteria import JACKKNIFE_UNITS, SEARCHES
+from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of, score_statistic
+from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest, slope_log_p
+from sealfit.fit.joint.estimate import Fitted
+
+# The signs of whole units are flipped at random many times. The largest T over all candidates gives the p-value
+# adjusted for the search (Westfall & Young 1993; sign flips of score contributions: Hemerik, Goeman & Finos 2020,
+# doi:10.1111/rssb.12369). P-values by the jackknife are adjusted for the number of candidates (Bonferroni); each of the
+# two tests has half of the error rate. Tests on few specimens are adjusted by random draws (`small_sample`), contrasts
+# in few units by their number (`slopes`).
+#
+# Draws continue until the smallest p-value is known well enough for the decision not to depend on them (sequential
+# Monte Carlo p-values: Besag & Clifford 1991, Biometrika 78(2), 301-304, doi:10.1093/biomet/78.2.301).
+
+FLIPS = 1999  # Number of random sign flips, or draws, that are made at a time.
+MOST_FLIPS = 25 * FLIPS  # Their largest number: a p-value of 0.00125, four times which is 0.005, has an error of 13 %.
+ENOUGH = 50  # Number of draws below the smallest p-value that determine it well enough.
+MOST_SIGNS = 1 << 22  # Signs of all units that are drawn at once (34 MB), or beyond `FLIPS`.
+
+
+def adjust_all(tests: ScoreTests, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
+    """Return candidates with p-values adjusted over all of them, strongest evidence first."""
+    results = [c.test_result for c in candidates]
+    p_values = np.ones(len(candidates))
+    many = [k for k, r in enumerate(results) if r.small_sample is None and not r.slopes]
+    if many:
+        p_values[many] = adjust([results[k] for k in many], rng)
+    for k in many:
+        if results[k].scores.shape[0] >= JACKKNIFE_UNITS:  # two tests, each with half of the error rate
+            p_values[k] = 2 * min(p_values[k], len(many) * np.exp(results[k].log_p_jackknife))
+    small = np.min([adjust_small_sample(units, results, rng) for units in tests.cluster_tests.values()], axis=0)
+    p_values = np.minimum(p_values, np.minimum(small, adjust_slopes(results)))
+    p_values[[r.small_sample is not None and bool(r.slopes) for r in results]] *= 2  # two tests here as well
+    found = [replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)]
+    return sorted(found, key=lambda c: -c.evidence)
+
+
+def adjust(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:
+    """Return each p-value adjusted over all results by the maximum over sign flips, shape (m,).
+
+    Results with the same number of units are flipped with the same signs, so that their correlation is used.
+    """
+    own = [j.log_p for j in results]
+    return _adjusted(own, _drawn(lambda: _least(results, rng, flips), min(own), max(j.units for j in results)))
+
+
+def _drawn(draw: Callable[[], np.ndarray], smallest: float, units: int) -> np.ndarray:
+    """Return draws of the smallest log p-value until `ENOUGH` are below the smallest observed one, or no more fit."""
+    least = draw()
+    most = min(MOST_FLIPS, MOST_SIGNS // units)
+    while np.count_nonzero(least <= smallest) < ENOUGH and least.size < most:
+        least = np.concatenate([least, draw()])
+    return least
+
+
+def critical_many(results: Sequence[ScoreTestResult], level: float, rng: np.random.Generator) -> float:
+    """Return the critical value at a level of the smallest log p-value (not adjusted) of all results."""
+    return float(np.quantile(_least(results, rng, FLIPS), level))
+
+
+def critical_small_sample(fitted: Fitted, tests: Sequence[SmallSampleTest], level: float) -> float:
+    """Return the same for the small-sample tests of one level."""
+    units = ClusterTests(fitted, tests[0].level)
+    for test in tests:
+        units.numbers(test.target)
+    return float(np.quantile(_least_small_sample(units, tests, np.random.default_rng(0), FLIPS), level))
+
+
+def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int) -> np.ndarray:
+    """Return the smallest log p-value of all results under each of many random flips."""
+    by_units = defaultdict(lambda: defaultdict(list))
+    for test_result in results:
+        units, df = test_result.scores.shape
+        by_units[units][df].append(test_result.scores)
+    least = np.zeros(flips)
+    for units, by_df in by_units.items():
+        scores = np.column_stack([own for scores in by_df.values() for own in scores])
+        totals = _flipped(scores, flips, rng)
+        first = 0
+        for df, scores in by_df.items():
+            most = np.zeros(flips)  # the largest T has the smallest p-value where units and df are the same
+            for own in scores:
+                most = np.maximum(most, score_statistic(totals[:, first : first + df], own))
+                first += df
+            least = np.minimum(least, log_p_of(most, df, units))
+    return least
+
+
+def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the sums of scores, shape (units, m), under random signs -> (flips, m); a few flips at a time."""
+    part = max(1, MOST_SIGNS // scores.shape[0])
+    return np.concatenate(
+        [
+            rng.choice([-1.0, 1.0], size=(min(part, flips - first), scores.shape[0])) @ scores
+            for first in range(0, flips, part)
+        ]
+    )
+
+
+def adjust_small_sample(
+    units: ClusterTests, results: Sequence[ScoreTestResult], rng: np.random.Generator, draws: int = FLIPS
+) -> np.ndarray:
+    """Return the p-values of the small-sample tests of a level, adjusted over all, shape (m,); 1 if not tested."""
+    p_values = np.ones(len(results))
+    tried = [k for k, j in enumerate(results) if j.small_sample is not None and j.small_sample.level == units.level]
+    if tried:
+        tests = [results[k].small_sample for k in tried]
+        logs = np.array([test.log_p for test in tests])
+        count = max(results[k].units for k in tried)
+        least = _drawn(lambda: _least_small_sample(units, tests, rng, draws), logs.min(), count)
+        # Bonferroni is for p-values that are smaller than the draws resolve.
+        p_values[tried] = np.minimum(_adjusted(logs, least), len(tried) * np.exp(logs))
+    return p_values
+
+
+def _least_small_sample(
+    units: ClusterTests, tests: Sequence[SmallSampleTest], rng: np.random.Generator, draws: int
+) -> np.ndarray:
+    """Return the smallest log p-value of all small-sample tests of one level in each of many draws."""
+    drawn = units.draws(draws, rng)
+    return np.min([small_sample_test.log_p_of(drawn[test.target], test.basis, test.known) for test in tests], axis=0)
+
+
+def adjust_slopes(results: Sequence[ScoreTestResult]) -> np.ndarray:
+    """Return the p-values of the contrasts in few units, times their number, shape (m,); 1 if not tested.
+
+    A candidate has the p-value of its strongest contrast in its weakest variant.
+    """
+    p_values = np.ones(len(results))
+    tried = [k for k, j in enumerate(results) if j.slopes]
+    if tried:
+        logs = iter(slope_log_p([test for k in tried for test in results[k].slopes]))
+        least = [max(float(next(logs).min()) for _ in results[k].slopes) for k in tried]
+        count = sum(results[k].slopes[0].slope.size for k in tried)
+        p_values[tried] = np.minimum(count * np.exp(least), 1.0)
+    return p_values
+
+
+def _adjusted(own: Sequence[float], least: np.ndarray) -> np.ndarray:
+    """Return adjusted p-values from log p and many draws of the smallest log p under the null hypothesis."""
+    return (1 + np.searchsorted(np.sort(least), own, side="right")) / (least.size + 1)
