@@ -2,10 +2,11 @@
 
     python benchmarks/after.py [KIND ...] [--campaigns N] [--seed S] [--strength STRENGTH] [--workers W]
 
-Kinds are those of campaigns.py. Every campaign is read, its loop closed, and everything fitted once more with the
-effects taken out, as `sealfit run` does. Counted are mu_0, a and b of every series (of the table `aging_fit_after`, and
-of `aging_fit` beside it) and the days to the value that mu_s has after 10 days at the lowest temperature, by the
-likeliest law and over all laws (`sealfit lifetime`, after and before). The truth is that at the effects' reference.
+Kinds are those of campaigns.py. Every campaign is read, its loop closed, and everything fitted once more with
+the effects taken out, as `sealfit run` does. Counted are mu_0, a and b of every series (of the table
+`aging_fit_after`, and of `aging_fit` beside it) and the days to the value that mu_s has after 10 days at the
+lowest temperature, by the likeliest law and over all laws (`sealfit lifetime`, after and before). The truth
+is that at the effects' reference.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def count(kind: str, seed: int, strength: str) -> list[Entry]:
 
 
 def _factor(spec: Spec, after: Fitted) -> float:
-    """Return the true factor on mu at the reference of the model's effects, where a column changes mu in proportion."""
+    """Return the true factor on mu at the effects' reference, where a column changes mu in proportion."""
     factor = 1.0
     for effect in spec.effects:
         if effect.id == "lab_temperature":
@@ -78,7 +79,11 @@ def _factor(spec: Spec, after: Fitted) -> float:
 def _laws(model: str, fit: pd.DataFrame, laws: dict, factor: float) -> Iterator[Entry]:
     rows = fit[fit["quantity"].isin(["mu_s", "mu_c"]) & fit["parameter"].isin(["mu_0", "a", "b"])]
     for row in rows.dropna(subset="value").itertuples():
-        true = next(law for law in laws.values() if law["temperature_C"] == row.temperature_C and law["aging_days"] > 0)
+        true = next(
+            law
+            for law in laws.values()
+            if law["temperature_C"] == row.temperature_C and law["aging_days"] > 0
+        )
         value = true[f"{row.parameter}{'' if row.parameter == 'mu_0' else '_'}{row.quantity[-1]}"]
         value *= 1.0 if row.parameter == "b" else factor
         yield Entry(f"{model} {row.parameter}", value, row.lo95, row.hi95, row.identified)
@@ -98,7 +103,9 @@ def _life(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("kinds", nargs="*", default=KINDS, metavar="KIND")
     parser.add_argument("--campaigns", type=int, default=4, help="of each kind")
     parser.add_argument("--seed", type=int, default=1)

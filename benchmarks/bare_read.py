@@ -2,8 +2,8 @@
 
     python benchmarks/bare_read.py CAMPAIGN
 
-Prints the seconds of the loop alone, without starting Python and importing pyarrow. Nothing is kept, checked or
-written. The call is as it comes: on one core that took less time than with `use_threads=False`.
+Prints the seconds of the loop alone, without starting Python and importing pyarrow. Nothing is kept, checked
+or written. The call is as it comes: on one core that took less time than with `use_threads=False`.
 """
 
 from __future__ import annotations

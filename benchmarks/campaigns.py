@@ -1,13 +1,14 @@
-"""Named campaigns for counting false alarms and missed effects: nulls, effects in three strengths, and the paper's own.
+"""Named campaigns to count false alarms and missed effects: nulls, effects in three strengths, the paper's.
 
-    python benchmarks/campaigns.py NAME --seed N --out DIR [--size small|large] [--strength weak|medium|strong]
+    python benchmarks/campaigns.py NAME --seed N --out DIR [--size small|large]
+                                   [--strength weak|medium|strong]
     python benchmarks/campaigns.py --list
 
-`campaign(name, ...)` gives the SPEC; `sealfit.simulation.simulate` writes it. Small campaigns have about 200 files,
-large ones about 600. Strengths are chosen against the scatter of `RIG`: weak has an RMS of 0.25 to 1 times one file's,
-medium is three times, strong ten times that; faint is beyond what the files can show. The kinds of effect stand in
-`effect_kinds.py`. Draws depend on the seed and on what they are for only: two nulls of one seed share their run order
-and specimens, so count on different seeds.
+`campaign(name, ...)` gives the SPEC; `sealfit.simulation.simulate` writes it. Small campaigns have about 200
+files, large ones about 600. Strengths are chosen against the scatter of `RIG`: weak has an RMS of 0.25 to 1
+times one file's, medium is three times, strong ten times that; faint is beyond what the files can show. The
+kinds of effect stand in `effect_kinds.py`. Draws depend on the seed and on what they are for only: two nulls
+of one seed share their run order and specimens, so count on different seeds.
 """
 
 from __future__ import annotations
@@ -29,7 +30,11 @@ FAINT = 0.002
 
 SPEEDS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 50.0)
 ONE_WAY: dict[Size, dict] = {
-    "small": {"temperatures_C": (60.0, 80.0), "compressions_pct": (80.0,), "days": (1.0, 4.0, 8.0, 16.0)},  # 216 files
+    "small": {
+        "temperatures_C": (60.0, 80.0),
+        "compressions_pct": (80.0,),
+        "days": (1.0, 4.0, 8.0, 16.0),
+    },  # 216 files
     "large": {
         "temperatures_C": (60.0, 80.0),
         "compressions_pct": (80.0, 90.0),
@@ -37,7 +42,11 @@ ONE_WAY: dict[Size, dict] = {
     },
 }
 BOTH_WAYS: dict[Size, dict] = {
-    "small": {"temperatures_C": (60.0,), "days": (1.0, 4.0, 8.0, 16.0), "speeds_mm_s": SPEEDS[:7]},  # 210 files
+    "small": {
+        "temperatures_C": (60.0,),
+        "days": (1.0, 4.0, 8.0, 16.0),
+        "speeds_mm_s": SPEEDS[:7],
+    },  # 210 files
     "large": {"temperatures_C": (60.0, 80.0), "days": (1.0, 2.0, 4.0, 8.0, 12.0, 16.0)},  # 624 files
 }
 RIG = (
@@ -51,7 +60,10 @@ WHITE = {"kind": "white", "sd_N": 0.05}  # no sensor is without
 # ---------------------------------------------------------------- nulls: (noise, channels)
 NULLS: dict[str, tuple[tuple[dict, ...], tuple[dict, ...]]] = {
     "null_white": (({"kind": "white", "sd_N": 0.2},), ()),
-    "null_autocorrelated": (({"kind": "autocorrelated", "sd_N": 0.2, "length": 2.0, "unit": "mm"}, WHITE), ()),
+    "null_autocorrelated": (
+        ({"kind": "autocorrelated", "sd_N": 0.2, "length": 2.0, "unit": "mm"}, WHITE),
+        (),
+    ),
     "null_quantised": (({"kind": "quantised", "resolution_N": 0.2}, WHITE), ()),
     "null_repeat_gain": (({"kind": "repeat_gain", "sd_rel": 0.01}, WHITE), ()),
     "null_run_setup": (({"kind": "run_setup", "sd_rel": 0.01, "sd_N": 0.1}, WHITE), ()),
@@ -72,8 +84,10 @@ def names() -> list[str]:
     return [*NULLS, *EFFECT_CAMPAIGNS, "paper"]
 
 
-def campaign(name: str, *, seed: int = 1, size: Size = "small", strength: Strength = "medium", rows: int = 400) -> Spec:
-    """SPEC of a named campaign; `strength` has no meaning for nulls and `paper`, `size` and `rows` none for `paper`."""
+def campaign(
+    name: str, *, seed: int = 1, size: Size = "small", strength: Strength = "medium", rows: int = 400
+) -> Spec:
+    """SPEC of a named campaign; nulls and `paper` have no `strength`, `paper` has no `size` and no `rows`."""
     if name == "paper":
         return paper_campaign(seed=seed)
     if name not in names():
@@ -94,15 +108,22 @@ def campaign(name: str, *, seed: int = 1, size: Size = "small", strength: Streng
         **DESIGNS.get(name, {}).get(size, {}),
     }
     return Spec(
-        name=name, seed=seed, physics={"growth": {}}, design=design, effects=effects, channels=channels, noise=noise
+        name=name,
+        seed=seed,
+        physics={"growth": {}},
+        design=design,
+        effects=effects,
+        channels=channels,
+        noise=noise,
     )
 
 
 def paper_campaign(*, seed: int = 1, effects: tuple[dict, ...] = (), channels: tuple[dict, ...] = ()) -> Spec:
     """SPEC of the paper's tests: 73 conditions x 8 speeds x 3 repeats = 1,752 files of about 1,000 rows.
 
-    Wu et al. 2020, Polymers 12(1) 102, doi:10.3390/polym12010102: 20 to 80 °C, 80 to 100 % height, 1 to 16 days and
-    unaged, 5 kg dead weight. The paper does not print its speeds, nor a law for every series; those are ours.
+    Wu et al. 2020, Polymers 12(1) 102, doi:10.3390/polym12010102: 20 to 80 °C, 80 to 100 % height, 1 to 16
+    days and unaged, 5 kg dead weight. The paper does not print its speeds, nor a law for every series; those
+    are ours.
     """
     return Spec(
         name="paper",
@@ -141,7 +162,9 @@ def main(arguments: list[str] | None = None) -> int:
     if given.name is None or given.out is None:
         parser.error("give NAME and --out DIR, or --list")
     try:
-        spec = campaign(given.name, seed=given.seed, size=given.size, strength=given.strength, rows=given.rows)
+        spec = campaign(
+            given.name, seed=given.seed, size=given.size, strength=given.strength, rows=given.rows
+        )
         simulate(spec, given.out)
     except SealfitError as error:
         print(f"campaigns: {error}", file=sys.stderr)

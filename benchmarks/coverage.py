@@ -2,11 +2,11 @@
 
     python benchmarks/coverage.py [steady] [aging] [laws] [dynamic] [--campaigns N] [--seed S] [--workers W]
 
-Prints, per design and number, the share of the intervals that contain the truth, the share called identified and the
-median half-width relative to the truth; and per part all of them pooled, with a standard error that takes campaigns as
-clusters. "laws" counts the law for all series fitted to the forces, what evidence chooses, and lifetimes by the true
-law and over all laws; "dynamic" starts from traces and also counts break-aways found where there is none. Intervals of
-`predict` are counted by loop.py.
+Prints, per design and number, the share of the intervals that contain the truth, the share called identified
+and the median half-width relative to the truth; and per part all of them pooled, with a standard error that
+takes campaigns as clusters. "laws" counts the law for all series fitted to the forces, what evidence chooses,
+and lifetimes by the true law and over all laws; "dynamic" starts from traces and also counts break-aways
+found where there is none. Intervals of `predict` are counted by loop.py.
 """
 
 from __future__ import annotations
@@ -59,9 +59,13 @@ DESIGNS = {
         "6 speeds one way, repeats only": {"noise": 0.01, "speeds": SIX, "ways": (1,)},
         "6 speeds one way, set-up 1 %": {"noise": 0.01, "setup": 0.01, "speeds": SIX, "ways": (1,)},
         "6 speeds one way, no repeats": {"noise": 0.01, "speeds": SIX, "ways": (1,), "repeats": 1},
-        "8 speeds one way, no repeats, noise in N": {"noise": 0.0, "constant": 0.3, "ways": (1,), "repeats": 1},
+        "8 speeds one way, no repeats, noise in N": {
+            "noise": 0.0, "constant": 0.3, "ways": (1,), "repeats": 1,
+        },
         "6 speeds both ways in one file": {"noise": 0.01, "speeds": SIX, "together": True},
-        "6 speeds both ways in one file, set-up 1 %": {"noise": 0.01, "setup": 0.01, "speeds": SIX, "together": True},
+        "6 speeds both ways in one file, set-up 1 %": {
+            "noise": 0.01, "setup": 0.01, "speeds": SIX, "together": True,
+        },
         "5 speeds one way, noise 4 %": {"noise": 0.04, "speeds": FIVE, "ways": (1,)},
     },
     "aging": {
@@ -86,7 +90,8 @@ DESIGNS = {
         }),
         "6 speeds one way": (BRISTLES, {"speeds_mm_s": (0.5, 2.0, 5.0, 10.0, 25.0, 50.0)}),
         "6 speeds one way, slow ramps": (BRISTLES, {
-            "speeds_mm_s": (0.5, 2.0, 5.0, 8.0, 10.0, 12.0), "ramp_s": 2.0, "sampling_Hz": 400.0, "max_rows": 4000,
+            "speeds_mm_s": (0.5, 2.0, 5.0, 8.0, 10.0, 12.0), "ramp_s": 2.0, "sampling_Hz": 400.0,
+            "max_rows": 4000,
         }),
         "no break-away, 8 speeds one way": (FLAT, {}),
     },
@@ -118,15 +123,24 @@ def aging(settings: dict, seed: int) -> Iterator[Entry]:
     for quantity, law in LAWS.items():
         truth = law | {"c": -law["a"] * np.log(law["b"])}
         for row in fit[(fit["quantity"] == quantity)].dropna(subset="value").itertuples():
-            yield Entry(f"{quantity} {row.parameter}", truth[row.parameter], row.lo95, row.hi95, row.identified)
+            yield Entry(
+                f"{quantity} {row.parameter}", truth[row.parameter], row.lo95, row.hi95, row.identified
+            )
 
 
 def laws(settings: dict, seed: int) -> Iterator[Entry]:
-    """Yield the intervals of one law for all series, of lifetimes by it and by the likeliest, and what was chosen."""
+    """Yield the intervals of one law for all series, and of lifetimes by it and by the likeliest law.
+
+    Yield also what was chosen.
+    """
     middle = tuple(float(np.median(np.unique(column))) for column in zip(*settings["series"], strict=True))
-    varied = {"E": ENERGY} | ({"kappa": KAPPA} if len({percent for _, percent in settings["series"]}) > 1 else {})
+    varied = {"E": ENERGY} | (
+        {"kappa": KAPPA} if len({percent for _, percent in settings["series"]}) > 1 else {}
+    )
     true = {
-        (celsius, percent): tuple({**law, "b": law["b"] / _rate(celsius, percent, middle)} for law in LAWS.values())
+        (celsius, percent): tuple(
+            {**law, "b": law["b"] / _rate(celsius, percent, middle)} for law in LAWS.values()
+        )
         for celsius, percent in settings["series"]
     }
     table = steady_rows(
@@ -140,7 +154,9 @@ def laws(settings: dict, seed: int) -> Iterator[Entry]:
             yield Entry(f"{quantity} {name}", (law | varied)[name], low, high, known)
         likely = [(one.loss.name, one.acts_on) for one in (chosen[0], *rivals_of(chosen))]
         yield Entry(f"{quantity}: the true law is the likeliest", likely[0] == ("log", "rate"), None, None)
-        yield Entry(f"{quantity}: the true law is the likeliest or a rival", ("log", "rate") in likely, None, None)
+        yield Entry(
+            f"{quantity}: the true law is the likeliest or a rival", ("log", "rate") in likely, None, None
+        )
         yield from _lives(quantity, law, fitted, chosen, middle, seed)
 
 
@@ -168,19 +184,23 @@ def _rate(celsius: float, percent: float, middle: tuple[float, float]) -> float:
 
 
 def dynamic(settings: tuple[dict, dict], seed: int) -> Iterator[Entry]:
-    """Yield the intervals of fit-dynamic on one condition, from traces; without a peak, whether one is found."""
+    """Yield intervals of fit-dynamic on one condition, from traces; without a peak, whether one is found."""
     physics, design = settings
     fit = _dynamic_fit(physics, design, RIG, seed)
     broken = fit[fit["quantity"] == "break_away"]
     if physics is FLAT:
-        found = (broken["parameter"] == "F_ba/F") & broken["identified"].astype(bool) & (broken["reason"] == "")
+        found = (
+            (broken["parameter"] == "F_ba/F") & broken["identified"].astype(bool) & (broken["reason"] == "")
+        )
         yield Entry("a break-away where there is none", bool(found.any()), None, None)
         return
     for row in fit[fit["quantity"] == "dynamic"].dropna(subset="value").itertuples():
         yield Entry(row.parameter, physics[row.parameter], row.lo95, row.hi95, row.identified)
     truth = _true_peaks(design)
     for row in broken.dropna(subset="lo95").itertuples():
-        yield Entry(row.parameter, truth[row.parameter, row.speed_set_mm_s, row.direction], row.lo95, row.hi95)
+        yield Entry(
+            row.parameter, truth[row.parameter, row.speed_set_mm_s, row.direction], row.lo95, row.hi95
+        )
 
 
 def _dynamic_fit(physics: dict, design: dict, noise: Sequence[dict], seed: int):
@@ -189,7 +209,9 @@ def _dynamic_fit(physics: dict, design: dict, noise: Sequence[dict], seed: int):
         place = Path(folder) / "campaign"
         simulate(Spec(seed=seed, physics=physics, design={**ONE, **design}, noise=tuple(noise)), place)
         tables = ingest_campaign(place, config, workers=1).tables
-    return fit_dynamic(tables["traces"], tables["steady"], fit_conditions(tables["steady"], config), config).fit
+    return fit_dynamic(
+        tables["traces"], tables["steady"], fit_conditions(tables["steady"], config), config
+    ).fit
 
 
 PEAKS: dict[str, dict] = {}  # of the designs counted so far, in this process
@@ -239,7 +261,9 @@ def held(entries: Sequence[Entry], name: str | None = None) -> tuple[int, int]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("parts", nargs="*", choices=[*DESIGNS, []], metavar="PART", help=", ".join(DESIGNS))
     parser.add_argument("--campaigns", type=int, default=100, help="of each design")
     parser.add_argument("--seed", type=int, default=1)

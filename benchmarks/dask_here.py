@@ -33,8 +33,12 @@ class DaskHere:
         self._log = (folder / "log.txt").open("w")
         scheduler = "--host 127.0.0.1 --port 0 --no-dashboard --scheduler-file"
         self.scheduler = self._start("dask_scheduler", f"{scheduler} {self.file}")
-        worker = f"--scheduler-file {self.file} --nthreads 1 --no-nanny --no-dashboard --local-directory {folder}"
-        self.workers = [self._start("dask_worker", f"{worker} --name worker-{number}") for number in range(workers)]
+        worker = (
+            f"--scheduler-file {self.file} --nthreads 1 --no-nanny --no-dashboard --local-directory {folder}"
+        )
+        self.workers = [
+            self._start("dask_worker", f"{worker} --name worker-{number}") for number in range(workers)
+        ]
 
     def _start(self, what: str, options: str) -> subprocess.Popen:
         command = [sys.executable, "-m", f"distributed.cli.{what}", *options.split()]

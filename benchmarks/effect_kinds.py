@@ -1,7 +1,8 @@
 """The kinds of effect in benchmark campaigns: of the catalogue and outside of it, one to three at once.
 
-`EFFECT_CAMPAIGNS[name](k)` gives (effects, channels) of a SPEC at strength k; `DESIGNS[name]` what the kind's design
-needs beyond the common one, by size. At k = 1 each effect has an RMS of 0.25 to 2 times one file's scatter.
+`EFFECT_CAMPAIGNS[name](k)` gives (effects, channels) of a SPEC at strength k; `DESIGNS[name]` what the kind's
+design needs beyond the common one, by size. At k = 1 each effect has an RMS of 0.25 to 2 times one file's
+scatter.
 """
 
 from __future__ import annotations
@@ -14,10 +15,21 @@ Ingredients = tuple[tuple[dict, ...], tuple[dict, ...]]
 
 COLUMN = {"kind": "numeric", "name": "oil_ppm", "level": "run", "mean": 50.0, "sd": 10.0}
 OTHER = {"kind": "numeric", "name": "dust_mg", "level": "run", "mean": 5.0, "sd": 1.0}
-GRADES = {"kind": "category", "name": "cleaner", "level": "run", "labels": ("K", "L", "M"), "assignment": "balanced"}
+GRADES = {
+    "kind": "category",
+    "name": "cleaner",
+    "level": "run",
+    "labels": ("K", "L", "M"),
+    "assignment": "balanced",
+}
 LABORATORY = {"kind": "slow", "name": "lab_temperature_C", "mean": 22.0, "sd": 1.0, "correlation_h": 12.0}
 # No two files alike, and neither repeats nor the calendar order it: 5 to 740 s.
-REST = {"kind": "formula", "name": "rest_s", "formula": "5 * exp(2.5 + 2.5 * sin(12.9898 * run_order))", "decimals": 1}
+REST = {
+    "kind": "formula",
+    "name": "rest_s",
+    "formula": "5 * exp(2.5 + 2.5 * sin(12.9898 * run_order))",
+    "decimals": 1,
+}
 
 CURRENT = {"kind": "trace", "name": "motor_current_A", "mean": 2.0, "sd": 0.2, "correlation_s": 1.0}
 
@@ -45,7 +57,9 @@ def _warming_distance(k: float) -> dict:
 
 
 def _warming_conduction(k: float) -> dict:
-    return _factor("warming_conduction", A=0.006 * k) | {"reference": {"speed_mm_s_ref": 10.0, "distance_mm_ref": 20.0}}
+    return _factor("warming_conduction", A=0.006 * k) | {
+        "reference": {"speed_mm_s_ref": 10.0, "distance_mm_ref": 20.0}
+    }
 
 
 def _drift(k: float) -> dict:
@@ -69,15 +83,22 @@ def _laboratory(k: float) -> dict:
 
 
 def _column(k: float) -> dict:
-    return _factor("linear", A=0.0007 * k) | {"channels": ("oil_ppm",), "reference": {"x_ref": COLUMN["mean"]}}
+    return _factor("linear", A=0.0007 * k) | {
+        "channels": ("oil_ppm",),
+        "reference": {"x_ref": COLUMN["mean"]},
+    }
 
 
 def _column_mu_c(k: float) -> dict:
-    return _one("linear", {"A": 0.0015 * k}, "mu_c", "multiply", channels=("oil_ppm",), reference={"x_ref": 50.0})
+    return _one(
+        "linear", {"A": 0.0015 * k}, "mu_c", "multiply", channels=("oil_ppm",), reference={"x_ref": 50.0}
+    )
 
 
 def _current(k: float) -> dict:
-    return _one("linear", {"A": 0.4 * k}, "force", "add", channels=("motor_current_A",), reference={"x_ref": 2.0})
+    return _one(
+        "linear", {"A": 0.4 * k}, "force", "add", channels=("motor_current_A",), reference={"x_ref": 2.0}
+    )
 
 
 def _hum(k: float) -> dict:
@@ -146,7 +167,10 @@ EFFECT_CAMPAIGNS: dict[str, Callable[[float], Ingredients]] = {
         (_one("stribeck_speed_aging", {"A": 0.015 * k, "t_0": 1.0}, "v_s", "multiply"),),
         (),
     ),
-    "viscosity_aging": lambda k: ((_one("viscosity_aging", {"A": 0.003 * k, "t_0": 1.0}, "sigma_2", "add"),), ()),
+    "viscosity_aging": lambda k: (
+        (_one("viscosity_aging", {"A": 0.003 * k, "t_0": 1.0}, "sigma_2", "add"),),
+        (),
+    ),
     "aging_floor": lambda k: ((_factor("aging_floor", A=0.012 * k, t_f=4.0),), ()),
     "aging_induction": lambda k: ((_factor("aging_induction", A=0.015 * k, t_i=3.0),), ()),
     "lab_temperature": lambda k: ((_laboratory(k),), (LABORATORY,)),
@@ -165,7 +189,10 @@ EFFECT_CAMPAIGNS: dict[str, Callable[[float], Ingredients]] = {
     "speed_times_days": lambda k: ((_expression(SPEED_TIMES_DAYS, 0.006 * k),), ()),
     # pairs and triples
     "two_at_once": lambda k: ((_ripple(k), _conditioning(k)), ()),
-    "two_warming_and_category": lambda k: ((_warming_distance(k), _grades(k, "force", "add", 0.2)), (GRADES,)),
+    "two_warming_and_category": lambda k: (
+        (_warming_distance(k), _grades(k, "force", "add", 0.2)),
+        (GRADES,),
+    ),
     "two_offset_and_asymmetry": lambda k: ((_zero_offset(k), _asymmetry(k)), ()),
     "two_laboratory_and_step": lambda k: ((_laboratory(k), _column_step(k)), (LABORATORY, COLUMN)),
     "three_at_once": lambda k: ((_warming_distance(k), _column(k), _ripple(k)), (COLUMN,)),
@@ -176,7 +203,11 @@ EFFECT_CAMPAIGNS: dict[str, Callable[[float], Ingredients]] = {
 }
 NEEDS_BOTH_WAYS = ("zero_offset", "asymmetry", "two_offset_and_asymmetry")
 
-_LOADS = {"temperatures_C": (60.0,), "loads_N": (25.0, 50.0, 75.0), "speeds_mm_s": (0.5, 2.0, 4.0, 8.0, 16.0, 50.0)}
+_LOADS = {
+    "temperatures_C": (60.0,),
+    "loads_N": (25.0, 50.0, 75.0),
+    "speeds_mm_s": (0.5, 2.0, 4.0, 8.0, 16.0, 50.0),
+}
 _LONG_AGED = {"days": (1.0, 2.0, 4.0, 8.0, 16.0, 32.0), "temperatures_C": (60.0, 80.0)}
 DESIGNS: dict[str, dict[Size, dict]] = {
     # The calendar follows the days where a day's tests wait for the rubber: here they do not.

@@ -4,7 +4,8 @@
     python benchmarks/false_alarms.py --effects --strength strong   the kinds with effects
     python benchmarks/false_alarms.py --seeds 2 NAME NAME ...       those campaigns (campaigns.py --list)
 
-One line per campaign: verdict, effects claimed, errors before and after; then the counts with Clopper-Pearson bounds.
+One line per campaign: verdict, effects claimed, errors before and after; then the counts with Clopper-Pearson
+bounds.
 """
 
 from __future__ import annotations
@@ -37,9 +38,13 @@ def close(name: str, seed: int, *, size: str, strength: str) -> tuple[dict, floa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("names", nargs="*", help="campaigns; default: the null kinds")
-    parser.add_argument("--effects", action="store_true", help="the campaigns with effects, not the null kinds")
+    parser.add_argument(
+        "--effects", action="store_true", help="the campaigns with effects, not the null kinds"
+    )
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--size", default="small", choices=("small", "large"))
@@ -51,7 +56,8 @@ def main() -> None:
         for seed in range(given.first_seed, given.first_seed + given.seeds):
             found, seconds = close(name, seed, size=given.size, strength=given.strength)
             effects = [
-                f"{e['id']}({','.join(e['channels'])})->{e['acts_on']}/{e['operation']}" for e in found["effects"]
+                f"{e['id']}({','.join(e['channels'])})->{e['acts_on']}/{e['operation']}"
+                for e in found["effects"]
             ]
             before, after = found["before"]["heldout_rmse_N"], found["after"]["heldout_rmse_N"]
             claims = "; ".join(effects) or "-"
@@ -65,7 +71,10 @@ def main() -> None:
             claimed += bool(effects) or found["verdict"] == "unexplained"
             worse += after > 1.02 * before
     low, high = bounds(claimed, total)
-    print(f"claimed or unexplained: {claimed} of {total} [{low:.3f}, {high:.3f}]; after above 1.02 x before: {worse}")
+    print(
+        f"claimed or unexplained: {claimed} of {total} [{low:.3f}, {high:.3f}]; "
+        f"after above 1.02 x before: {worse}"
+    )
 
 
 if __name__ == "__main__":

@@ -12,11 +12,13 @@ from pathlib import Path
 PACKAGES = ("sealfit", "numpy", "pandas", "scipy", "pyarrow", "typer")
 
 
-def in_turns(measured: Mapping[str, Callable[[], Mapping[str, float]]], repeats: int) -> dict[str, list[float]]:
+def in_turns(
+    measured: Mapping[str, Callable[[], Mapping[str, float]]], repeats: int
+) -> dict[str, list[float]]:
     """Return every figure of every turn; in each turn everything is measured once, in order.
 
-    `measured` gives by name what measures it and returns its figures, which are kept under `name` (for the figure "")
-    or `name, figure`.
+    `measured` gives by name what measures it and returns its figures, which are kept under `name` (for the
+    figure "") or `name, figure`.
     """
     figures: dict[str, list[float]] = {}
     for _ in range(repeats):
@@ -41,7 +43,10 @@ def heading(seed: int | None, cores: Iterable[int]) -> None:
     """Print the machine, the versions and the date."""
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
     print(f"{date.today()}, {cpu_model()}, cores used {', '.join(map(str, cores))}, seed {seed}")
-    print(f"{platform.system()} {platform.release()}, Python {platform.python_version()}, {versions}", flush=True)
+    print(
+        f"{platform.system()} {platform.release()}, Python {platform.python_version()}, {versions}",
+        flush=True,
+    )
 
 
 def cpu_model() -> str:
@@ -50,4 +55,7 @@ def cpu_model() -> str:
         lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
     except OSError:
         return platform.processor() or platform.machine()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+    return next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
+        platform.machine(),
+    )

@@ -1,25 +1,27 @@
 """Invariance of claims: campaigns are changed in irrelevant ways and analysed again.
 
     python benchmarks/invariances.py --list
-    python benchmarks/invariances.py --out out/invariances.jsonl [--campaigns ripple drift] [--changes jitter_time_1e-6]
+    python benchmarks/invariances.py --out out/invariances.jsonl [--campaigns ripple drift]
+                                     [--changes jitter_time_1e-6]
 
-A campaign is changed (measured numbers jittered by 1e-6 to 1e-3 of themselves, files renamed, shuffled and split into
-strokes, other units and signs through the config, idle columns, another seed, ...) and analysed again. Verdict and
-effects (id, channels, acts_on, operation) must stay, and numbers move by at most a tenth of a standard error, after
-conversion of units; the error after over that before by at most a tenth. The table says, per campaign and change, what
-moved. Each pair is kept with the build that ran it (commit, and a hash of what differs from it). Pairs that are in the
-file already are not run again; those of another build are, so that no table mixes builds.
+A campaign is changed (measured numbers jittered by 1e-6 to 1e-3 of themselves, files renamed, shuffled and
+split into strokes, other units and signs through the config, idle columns, another seed, ...) and analysed
+again. Verdict and effects (id, channels, acts_on, operation) must stay, and numbers move by at most a tenth
+of a standard error, after conversion of units; the error after over that before by at most a tenth. The table
+says, per campaign and change, what moved. Each pair is kept with the build that ran it (commit, and a hash of
+what differs from it). Pairs that are in the file already are not run again; those of another build are, so
+that no table mixes builds.
 
 Two kinds of change do alter what the data say, and their numbers are held to what must follow from that.
 
-A clock or a scale that is off by 1e-3 in each file is another measurement: a wavelength known to 3e-4 follows it. The
-numbers must follow smoothly, without a decision that flips: they stay, or move ten times as far as under the same
-jitter of 1e-4, within a tenth of a standard error; under that one they stay.
+A clock or a scale that is off by 1e-3 in each file is another measurement: a wavelength known to 3e-4 follows
+it. The numbers must follow smoothly, without a decision that flips: they stay, or move ten times as far as
+under the same jitter of 1e-4, within a tenth of a standard error; under that one they stay.
 
 Estimates from all data and from all but a share f of them differ by chance, with a standard deviation of
-sqrt(f / (1 - f)) standard errors (Hausman 1978, doi:10.2307/1913827: the variance of the difference is the difference
-of the variances). Three of these are allowed. A file that is left out costs at most what its run says, as contrasts
-between repeats go with it, and half of its rows cost half of that.
+sqrt(f / (1 - f)) standard errors (Hausman 1978, doi:10.2307/1913827: the variance of the difference is the
+difference of the variances). Three of these are allowed. A file that is left out costs at most what its run
+says, as contrasts between repeats go with it, and half of its rows cost half of that.
 """
 
 from __future__ import annotations
@@ -71,7 +73,12 @@ NULLS = {
     "null_rig": RIG,
     "null_setup": ({"kind": "run_setup", "sd_rel": 0.01, "sd_N": 0.1}, {"kind": "white", "sd_N": 0.05}),
 }
-MANY_RUNS = {**ONE_WAY, "days": (4.0,), "speeds_mm_s": tuple(np.geomspace(0.5, 50.0, 16).round(2)), "repeats": 2}
+MANY_RUNS = {
+    **ONE_WAY,
+    "days": (4.0,),
+    "speeds_mm_s": tuple(np.geomspace(0.5, 50.0, 16).round(2)),
+    "repeats": 2,
+}
 # A design of ten files.
 SHORT = {**ONE_WAY, "days": (), "repeats": 2}
 DESIGNS = {
@@ -178,7 +185,13 @@ def spec(name: str) -> Spec:
         channels = own or channels
     design = {"max_rows": ROWS, **DESIGNS.get(name, ONE_WAY)}
     return Spec(
-        name=name, seed=7, physics={"growth": {}}, design=design, effects=effects, channels=channels, noise=noise
+        name=name,
+        seed=7,
+        physics={"growth": {}},
+        design=design,
+        effects=effects,
+        channels=channels,
+        noise=noise,
     )
 
 
@@ -271,7 +284,9 @@ def turned(column: str) -> Change:
             "compute": {column: "-raw"},
             "drop_columns": ["raw"],
         }
-        return given.each(lambda t: t.rename(columns={column: "raw"}).assign(raw=-t[column])).told(trace=trace)
+        return given.each(lambda t: t.rename(columns={column: "raw"}).assign(raw=-t[column])).told(
+            trace=trace
+        )
 
     return Change(make)
 
@@ -292,13 +307,19 @@ def moved(shift_mm: float) -> Change:
 
 def column(values: Callable[[pd.DataFrame, np.random.Generator], object], **aliases: str) -> Change:
     """Add a column `extra` to runs.csv."""
-    return Change(lambda given, rng: replace(given, runs=given.runs.assign(extra=values(given.runs, rng))), **aliases)
+    return Change(
+        lambda given, rng: replace(given, runs=given.runs.assign(extra=values(given.runs, rng))), **aliases
+    )
 
 
 def copied(given: Campaign, rng: np.random.Generator) -> Campaign:
     """Add a copy of the campaign's own column, or of the load."""
-    own = next((name for name in ("oil_ppm", "cleaner", "set_pressure_bar", "load_N") if name in given.runs), None)
-    return given if own is None else replace(given, runs=given.runs.assign(**{f"{own}_again": given.runs[own]}))
+    own = next(
+        (name for name in ("oil_ppm", "cleaner", "set_pressure_bar", "load_N") if name in given.runs), None
+    )
+    return (
+        given if own is None else replace(given, runs=given.runs.assign(**{f"{own}_again": given.runs[own]}))
+    )
 
 
 def halved(given: Campaign, rng: np.random.Generator) -> Campaign:
@@ -330,8 +351,11 @@ def split(given: Campaign, rng: np.random.Generator) -> Campaign:
 
 
 CHANGES: dict[str, Change] = {
-    **{f"jitter_{what}_{size}": jitter(name, float(size), tenth=f"jitter_{what}_1e-4" if size == "1e-3" else "")
-       for what, name in (("time", "time_s"), ("position", "displacement_mm")) for size in ("1e-6", "1e-4", "1e-3")},
+    **{f"jitter_{what}_{size}": jitter(
+           name, float(size), tenth=f"jitter_{what}_1e-4" if size == "1e-3" else ""
+       )
+       for what, name in (("time", "time_s"), ("position", "displacement_mm"))
+       for size in ("1e-6", "1e-4", "1e-3")},
     "jitter_samples_1e-6": jitter("displacement_mm", 1e-6, samples=True),
     "jitter_force_1e-6": jitter("force_N", 1e-6, samples=True),
     "jitter_commanded_1e-6": jitter_commanded(1e-6),
@@ -367,7 +391,9 @@ def closed(given: Campaign) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         given.write(Path(folder))
         tables = ingest_campaign(Path(folder), config, workers=1).tables
-    return json.loads(json.dumps(close_loop(tables["bins"], tables["traces"], config).document, default=float))
+    return json.loads(
+        json.dumps(close_loop(tables["bins"], tables["traces"], config).document, default=float)
+    )
 
 
 def toml(table: Mapping) -> str:
@@ -397,7 +423,9 @@ def in_proportion(before: dict, tenth: dict) -> dict:
     found, effects = _by_key(tenth["effects"], {}), []
     for key, effect in _by_key(before["effects"], {}).items():
         near = {p["name"]: p["value"] for p in found.get(key, effect)["parameters"]}
-        numbers = [{**p, "value": _ten_times(p["name"], p["value"], near[p["name"]])} for p in effect["parameters"]]
+        numbers = [
+            {**p, "value": _ten_times(p["name"], p["value"], near[p["name"]])} for p in effect["parameters"]
+        ]
         effects.append({**effect, "parameters": numbers})
     return {**before, "effects": effects}
 
@@ -409,7 +437,7 @@ def _ten_times(name: str, a: float | None, b: float | None) -> float | None:
 
 
 def moves(before: dict, after: dict, change: Change) -> list[str]:
-    """Return what differs between two closures beyond what the change allows, in words; none if nothing does."""
+    """Return in words what differs between two closures beyond what a change allows; none if nothing does."""
     found = []
     if before["verdict"] != after["verdict"]:
         found.append(f"verdict {before['verdict']} -> {after['verdict']}")
@@ -493,7 +521,9 @@ def factor(unit: str) -> float:
 # ---------------------------------------------------------------- the table
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line, print the table, and return 1 if any result changed."""
-    parser = argparse.ArgumentParser(description="Close the loop again on campaigns changed in what does not matter.")
+    parser = argparse.ArgumentParser(
+        description="Close the loop again on campaigns changed in what does not matter."
+    )
     parser.add_argument("--list", action="store_true", help="print campaigns and changes")
     parser.add_argument("--campaigns", nargs="+", choices=names(), default=names(), metavar="NAME")
     parser.add_argument("--changes", nargs="+", choices=list(CHANGES), default=list(CHANGES), metavar="NAME")
@@ -531,7 +561,11 @@ def _read(path: Path, own: str) -> dict[tuple[str, str], dict]:
 
 def _run(name: str, change: str, made: Campaign) -> dict:
     began = time.monotonic()
-    row = {"campaign": name, "change": change, "runs": int(made.runs.get("run_id", made.runs["file"]).nunique())}
+    row = {
+        "campaign": name,
+        "change": change,
+        "runs": int(made.runs.get("run_id", made.runs["file"]).nunique()),
+    }
     try:
         rng = np.random.default_rng(5)
         closure = closed(made if change == "as it is" else CHANGES[change].make(made, rng))
@@ -554,7 +588,9 @@ def table(done: Mapping, campaigns: list[str], changes: list[str]) -> Moved:
     lines, count, pairs = ["| campaign | change | what moved |", "|---|---|---|"], 0, 0
     for name in campaigns:
         base = done.get((name, "as it is"), {})
-        closures = {change: row["closure"] for (own, change), row in done.items() if own == name and "closure" in row}
+        closures = {
+            change: row["closure"] for (own, change), row in done.items() if own == name and "closure" in row
+        }
         verdict = base.get("closure", {}).get("verdict", base.get("error", "not run"))
         effects = [_words(_key(e, {})) for e in base.get("closure", {}).get("effects", ())]
         lines.append(f"| {name} | as it is | {verdict}: {'; '.join(effects) or 'no effect'} |")

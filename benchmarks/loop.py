@@ -1,11 +1,13 @@
 """Close the loop on simulated campaigns, and compare claims, predictions and intervals with the truth.
 
-    python benchmarks/loop.py --out FILE [--kinds K ...] [--seeds 1 2 3 4] [--strengths weak medium strong] [--nulls]
+    python benchmarks/loop.py --out FILE [--kinds K ...] [--seeds 1 2 3 4] [--strengths weak medium strong]
+                              [--nulls]
     python benchmarks/loop.py --summary FILE
 
-Each campaign's result is a line of FILE (JSON) as soon as it is there; what FILE holds already is not run again, so a
-run can be stopped and taken up. Two processes, each with one thread. The last of the seeds 4 (effects) and 20 (nulls)
-has some 600 files, the others 200. The summary is Markdown; the power curve is drawn beside FILE as PNG.
+Each campaign's result is a line of FILE (JSON) as soon as it is there; what FILE holds already is not run
+again, so a run can be stopped and taken up. Two processes, each with one thread. The last of the seeds 4
+(effects) and 20 (nulls) has some 600 files, the others 200. The summary is Markdown; the power curve is drawn
+beside FILE as PNG.
 """
 
 from __future__ import annotations
@@ -27,14 +29,16 @@ from one_campaign import Task, run_campaign
 from sealfit.engine import ONE_THREAD
 
 LARGE_SEED = {"effects": 4, "nulls": 20}
-RIVALS_ON_NULLS = 2  # first seeds of each kind of null on which the rivals are learned too: there is nothing to learn
+RIVALS_ON_NULLS = (
+    2  # first seeds of each kind of null on which the rivals are learned too: there is nothing to learn
+)
 FAINT_SEEDS = (1, 2)
 
 
 def plan(
     kinds: list[str], strengths: list[str], seeds: list[int], null_seeds: list[int], *, rivals: bool
 ) -> list[Task]:
-    """Return every campaign to run, by seed, so that a run that is stopped has all kinds; nulls have no strength."""
+    """Return every campaign to run, by seed, so that a stopped run has all kinds; nulls have no strength."""
     from campaigns import NULLS
 
     tasks = []
@@ -44,7 +48,9 @@ def plan(
             own = null_seeds if null else [s for s in seeds if strength != "faint" or s in FAINT_SEEDS]
             for seed in own:
                 large = seed == LARGE_SEED["nulls" if null else "effects"] and strength != "faint"
-                with_rivals = rivals and not large and (not null or seed <= RIVALS_ON_NULLS) and strength != "faint"
+                with_rivals = (
+                    rivals and not large and (not null or seed <= RIVALS_ON_NULLS) and strength != "faint"
+                )
                 tasks.append(Task(kind, strength, seed, "large" if large else "small", with_rivals))
     return sorted(tasks, key=lambda t: t.seed)
 
@@ -68,7 +74,9 @@ def run(tasks: list[Task], out: Path, workers: int, *, limit: float) -> None:
             file.write(json.dumps(record) + "\n")
             file.flush()
             count += 1
-            print(f"{count:4d}/{len(todo)} {time.monotonic() - started:6.0f} s  {line(record)}", file=sys.stderr)
+            print(
+                f"{count:4d}/{len(todo)} {time.monotonic() - started:6.0f} s  {line(record)}", file=sys.stderr
+            )
             if time.monotonic() - started < limit and (task := next(waiting, None)) is not None:
                 running.add(pool.submit(guarded, task))
 
@@ -86,7 +94,7 @@ def key(record: dict) -> tuple:
 
 
 def read(path: Path) -> list[dict]:
-    """Return the records of a file, the last of each campaign; failures are left out so that they run again."""
+    """Return the records of a file, the last of each campaign; failures are left out, so they run again."""
     if not path.exists():
         return []
     records = [json.loads(text) for text in path.read_text("utf-8").splitlines() if text.strip()]
@@ -99,7 +107,8 @@ def line(record: dict) -> str:
     if "error" in record:
         return f"{head} FAILED: {record['error'].strip().splitlines()[-1]}"
     marks = " ".join(
-        f"z={e['z']:.1f}:{('missed', 'lenient', 'found')[e['grade']]}{'' if e['named'] else '/' + str(e['claimed_id'])}"
+        f"z={e['z']:.1f}:{('missed', 'lenient', 'found')[e['grade']]}"
+        f"{'' if e['named'] else '/' + str(e['claimed_id'])}"
         for e in record["effects"]
     )
     claims = "; ".join(
@@ -107,25 +116,36 @@ def line(record: dict) -> str:
     )
     errors = " ".join(f"{name} {value:.3f}" for name, value in record["errors"].items())
     spent = " ".join(f"{name} {value:.0f}" for name, value in record["seconds"].items() if value >= 0.5)
-    return f"{head} {record['verdict']:15s} {marks} | {claims or '-'} | extra {record['extra']} | {errors} | s: {spent}"
+    return (
+        f"{head} {record['verdict']:15s} {marks} | {claims or '-'} | extra {record['extra']} | {errors} | "
+        f"s: {spent}"
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run, then summarise; the exit code."""
     from campaigns import NULLS
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, metavar="FILE", help="JSON lines, one a campaign; taken up where it ends")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="JSON lines, one a campaign; taken up where it ends"
+    )
     parser.add_argument("--summary", type=Path, metavar="FILE", help="only summarise")
     parser.add_argument("--kinds", nargs="+", choices=[*NULLS, *EFFECT_CAMPAIGNS], metavar="KIND")
     parser.add_argument("--nulls", action="store_true", help="only the kinds of null")
     parser.add_argument("--effects", action="store_true", help="only the kinds with effects")
     strengths = ["faint", *STRENGTHS]
     parser.add_argument("--strengths", nargs="+", choices=strengths, default=strengths)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4], help="of the kinds with effects")
+    parser.add_argument(
+        "--seeds", nargs="+", type=int, default=[1, 2, 3, 4], help="of the kinds with effects"
+    )
     parser.add_argument("--null-seeds", nargs="+", type=int, default=list(range(1, 21)))
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="start no campaign after this long")
+    parser.add_argument(
+        "--minutes", type=float, default=float("inf"), help="start no campaign after this long"
+    )
     parser.add_argument("--no-rivals", action="store_true")
     given = parser.parse_args(arguments)
     if (given.out is None) == (given.summary is None):

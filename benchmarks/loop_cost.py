@@ -2,9 +2,9 @@
 
     python benchmarks/loop_cost.py [KIND] [--strength strong] [--seed 1] [--workers 2]
 
-Runs `sealfit ingest`, the fits, and `sealfit close-loop`, which alone is timed. Memory is that of the process tree,
-looked at every 0.2 s (`process_tree.py`): resident sets added up (pages that processes share count once for each), and
-proportional sets where the system tells them (shared pages divided among them).
+Runs `sealfit ingest`, the fits, and `sealfit close-loop`, which alone is timed. Memory is that of the process
+tree, looked at every 0.2 s (`process_tree.py`): resident sets added up (pages that processes share count once
+for each), and proportional sets where the system tells them (shared pages divided among them).
 """
 
 from __future__ import annotations
@@ -34,11 +34,15 @@ OTHERS = (
 
 def with_idle_columns(spec: Spec) -> Spec:
     """Return a SPEC with 10 more columns that have no influence."""
-    return Spec.model_validate(spec.model_dump() | {"channels": [*spec.model_dump()["channels"], *NUMBERS, *OTHERS]})
+    return Spec.model_validate(
+        spec.model_dump() | {"channels": [*spec.model_dump()["channels"], *NUMBERS, *OTHERS]}
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("kind", nargs="?", default="three_at_once", metavar="KIND")
     parser.add_argument("--strength", default="strong")
     parser.add_argument("--seed", type=int, default=1)
@@ -53,7 +57,9 @@ def main() -> None:
         simulate(spec, place)
         files = len(list((place / "traces").iterdir()))
         workers = ["--workers", str(given.workers)]
-        subprocess.run([*sealfit, "ingest", str(place), "--out", str(out)], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [*sealfit, "ingest", str(place), "--out", str(out)], check=True, stdout=subprocess.DEVNULL
+        )
         for step in ("fit-steady", "fit-aging", "fit-dynamic"):  # close-loop wants them to be there
             subprocess.run([*sealfit, step, str(out)], check=True, stdout=subprocess.DEVNULL)
         cost = watched([*sealfit, "close-loop", str(out), *workers], proportional=True, show_errors=True)

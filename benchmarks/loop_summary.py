@@ -1,7 +1,7 @@
-"""The loop benchmark's results as Markdown for README.md: each figure with its count, its bound and what it must reach.
+"""Results of the loop benchmark as Markdown for README.md: each figure with its count, bound and target.
 
-An effect is clear where its true-form test has z >= 8, too weak to see where z <= 0.5; between them a power curve is
-drawn. A campaign is clear where all its effects are.
+An effect is clear where its true-form test has z >= 8, too weak to see where z <= 0.5; between them a power
+curve is drawn. A campaign is clear where all its effects are.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def share(flags: Iterable[bool]) -> str:
 
 
 def clustered(counts: Sequence[tuple[int, int]]) -> tuple[float, float]:
-    """Return a pooled share and its standard error, by campaigns as clusters: (inside, of) of each; NaN where none.
+    """Return a pooled share and its standard error, campaigns as clusters: (inside, of) of each; NaN if none.
 
     Ratio estimator: p = sum inside / sum of, and its variance G/(G-1) sum (inside - p of)^2 / (sum of)^2.
     """
@@ -67,10 +67,18 @@ def summarise(records: list[dict]) -> str:
     """Return all tables."""
     nulls = [r for r in records if r["strength"] == "-"]
     effects = [r for r in records if r["strength"] != "-"]
-    parts = [_made(nulls, effects), _figures(nulls, effects), _kinds(effects), _errors(effects, nulls), _times(records)]
+    parts = [
+        _made(nulls, effects),
+        _figures(nulls, effects),
+        _kinds(effects),
+        _errors(effects, nulls),
+        _times(records),
+    ]
     missing = {name: why for r in records for name, why in r["missing"].items()}
     if missing:
-        parts.append("Rivals left out: " + "; ".join(f"{name} ({why})" for name, why in sorted(missing.items())) + ".")
+        parts.append(
+            "Rivals left out: " + "; ".join(f"{name} ({why})" for name, why in sorted(missing.items())) + "."
+        )
     return "\n\n".join(parts)
 
 
@@ -92,7 +100,7 @@ def clear(record: dict) -> bool:
 
 
 def right(record: dict) -> bool:
-    """Whether all its effects are clear, found, and named right where the catalogue has them, and nothing else is."""
+    """Whether all its effects are clear, found, and named right if in the catalogue, and nothing else is."""
     return (
         clear(record)
         and not record["extra"]
@@ -112,17 +120,19 @@ def _figures(nulls: list[dict], effects: list[dict]) -> str:
     rows = [
         ("nulls with an effect claimed", share(bool(r["claims"]) for r in nulls), "at most 2 of 160"),
         ("nulls called unexplained", share(r["verdict"] == "unexplained" for r in nulls), "-"),
-        (f"nulls with held-out after above {WORSE} x before", share(r["after"] > WORSE * r["before"] for r in nulls),
-         f"none (largest ratio {worst:.3f})"),
-        ("effect campaigns with an effect beyond the true ones", share(r["extra"] > 0 for r in effects), "at most 2 %"),
+        (f"nulls with held-out after above {WORSE} x before",
+         share(r["after"] > WORSE * r["before"] for r in nulls), f"none (largest ratio {worst:.3f})"),
+        ("effect campaigns with an effect beyond the true ones", share(r["extra"] > 0 for r in effects),
+         "at most 2 %"),
         ("... those whose only extra is a true effect's channel under a wrong quantity left out",
          share(r["extra"] > r["misplaced"] for r in effects), "-"),
-        ("clear effects found (channels, level, acts_on, operation)", share(e["grade"] == 2 for e in seen), "97 %"),
+        ("clear effects found (channels, level, acts_on, operation)", share(e["grade"] == 2 for e in seen),
+         "97 %"),
         ("... or one that this design cannot tell from it", share(e["grade"] > 0 for e in seen), "-"),
         ("clear effects named right, of those in the catalogue", share(e["named"] for e in listed), "90 %"),
         ("... or the same equation under another id", share(e["named_leniently"] for e in listed), "-"),
-        ("two or three clear effects: all found", share(all(e["grade"] == 2 for e in r["effects"]) for r in several),
-         "90 %"),
+        ("two or three clear effects: all found",
+         share(all(e["grade"] == 2 for e in r["effects"]) for r in several), "90 %"),
         ("... leniently", share(all(e["grade"] > 0 for e in r["effects"]) for r in several), "-"),
         (f"campaigns with all z <= {UNSEEN}: nothing claimed", share(not r["claims"] for r in unseen), "all"),
         ("... and held-out error the same before and after", share(quiet), "all"),
@@ -165,13 +175,15 @@ def _kinds(effects: list[dict]) -> str:
 
 
 def _errors(effects: list[dict], nulls: list[dict]) -> str:
-    """Return the error of the mean force at unseen points, RMS over the seeds of each kind and strength, in N."""
+    """Return the error of the mean force at unseen points, RMS over seeds of each kind and strength, in N."""
     rows, near, least = [], [], []
     every = sorted(effects, key=lambda r: (r["kind"], ORDER.index(r["strength"]))) + sorted(
         nulls, key=lambda r: r["kind"]
     )
     for (kind, strength), some in _grouped(every, lambda r: (r["kind"], r["strength"])):
-        both = [r for r in some if all(name in r["errors"] for name in ("boosting", "ebm", "pygam", "pysindy"))]
+        both = [
+            r for r in some if all(name in r["errors"] for name in ("boosting", "ebm", "pygam", "pysindy"))
+        ]
         whole = {name: _root(some, name) for name in ("after", "true_form")}
         own = {name: _root(both or some, name) for name in ("after", *RIVALS)}
         others = {name: own[name] for name in RIVALS if np.isfinite(own[name])}
@@ -183,13 +195,14 @@ def _errors(effects: list[dict], nulls: list[dict]) -> str:
         named = [f"{own[name]:.3f}" if np.isfinite(own[name]) else "-" for name in RIVALS]
         mark = "" if ratio <= NEAR else " **"
         rows.append(
-            (kind, strength, f"{whole['after']:.3f}", f"{whole['true_form']:.3f}", f"{ratio:.2f}{mark}", *named,
-             "" if own["after"] <= others[best] * (1 + 1e-9) else best)
+            (kind, strength, f"{whole['after']:.3f}", f"{whole['true_form']:.3f}", f"{ratio:.2f}{mark}",
+             *named, "" if own["after"] <= others[best] * (1 + 1e-9) else best)
         )  # fmt: skip
     header = ("kind", "strength", "after", "true form", "ratio", *RIVALS, "better than after")
     lead = (
-        f"Error of `predict` against the noise-free force at {200} unseen points, RMS over seeds, N. After at most "
-        f"{NEAR} x the true form: {share(near)} of kinds and strengths; no alternative below it: {share(least)}."
+        f"Error of `predict` against the noise-free force at {200} unseen points, RMS over seeds, N. "
+        f"After at most {NEAR} x the true form: {share(near)} of kinds and strengths; "
+        f"no alternative below it: {share(least)}."
     )
     return lead + "\n\n" + table(header, rows)
 
@@ -214,7 +227,10 @@ def _times(records: list[dict]) -> str:
         cells = [f"{np.mean(v):.1f} (at most {max(v):.0f})" if v else "-" for v in own.values()]
         total = sum(sum(v) for v in own.values())
         rows.append((size, str(len(some)), *cells, f"{total / 60:.0f} min"))
-    lead = "CPU seconds of a campaign by part, mean and most; the last column is the sum over campaigns, one core."
+    lead = (
+        "CPU seconds of a campaign by part, mean and most; "
+        "the last column is the sum over campaigns, one core."
+    )
     return lead + "\n\n" + table(("size", "campaigns", *names, "sum"), rows)
 
 
@@ -232,9 +248,16 @@ def draw_power(records: list[dict], path: Path) -> None:
         if own:
             share_, (least, most) = float(np.mean(own)), bounds(sum(own), len(own))
             ax.errorbar(
-                (low + high) / 2, share_, [[share_ - least], [most - share_]], (high - low) / 2, fmt="o", color="C0"
+                (low + high) / 2,
+                share_,
+                [[share_ - least], [most - share_]],
+                (high - low) / 2,
+                fmt="o",
+                color="C0",
             )
             ax.annotate(f"{len(own)}", ((low + high) / 2, 1.03), ha="center", fontsize=8)
-    ax.set(xlabel="z of the true-form test", ylabel="share of effects found", xlim=(0, CLEAR), ylim=(-0.05, 1.12))
+    ax.set(
+        xlabel="z of the true-form test", ylabel="share of effects found", xlim=(0, CLEAR), ylim=(-0.05, 1.12)
+    )
     figure.savefig(path, dpi=150)
     plt.close(figure)

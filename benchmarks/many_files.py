@@ -1,16 +1,18 @@
-"""Write a campaign of as many files as wanted, quickly: for measuring how ingest and fits grow with the campaign.
+"""Write a campaign of as many files as wanted, fast: to measure how ingest and fits grow with the campaign.
 
-    python benchmarks/many_files.py --files 100000 --out DIR [--rows 80] [--seed 1]     (100,000 files: half a minute)
+    python benchmarks/many_files.py --files 100000 --out DIR [--rows 80] [--seed 1]
                                     [--effect conditioning] [--strength 1]
 
-Every file is a ramp, a pre-sliding rise and steady sliding with noise; forces follow Eq. 14 and 15 of
-`sealfit.physics`, so that fits make sense. Eight speeds and three repeats a condition; with the number of files grow
-the temperatures, the compressions, the days, the loads and the specimens, as they do in laboratories. At most 1,000
-files a folder. With --effect something that nobody declared is in all of them, of the size that `effect_kinds.py` gives
-it at that strength.
+100,000 files take half a minute.
 
-Text is put together from cells that are formatted once: positions and times per speed and starting point, forces in
-steps of 0.01 N. `sealfit simulate` knows far more and is some fifty times slower.
+Every file is a ramp, a pre-sliding rise and steady sliding with noise; forces follow Eq. 14 and 15 of
+`sealfit.physics`, so that fits make sense. Eight speeds and three repeats a condition; with the number of
+files grow the temperatures, the compressions, the days, the loads and the specimens, as they do in
+laboratories. At most 1,000 files a folder. With --effect something that nobody declared is in all of them, of
+the size that `effect_kinds.py` gives it at that strength.
+
+Text is put together from cells that are formatted once: positions and times per speed and starting point,
+forces in steps of 0.01 N. `sealfit simulate` knows far more and is some fifty times slower.
 """
 
 from __future__ import annotations
@@ -41,7 +43,10 @@ V_S, SIGMA_2 = 5.0, 0.05
 EFFECTS = ("conditioning", "warming_distance", "ripple")
 BEGIN = datetime(2024, 1, 8, 8)
 HEADER = "time_s,displacement_mm,force_N\n"
-RUNS = "file,run_id,repeat,specimen_id,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s,started_at\n"
+RUNS = (
+    "file,run_id,repeat,specimen_id,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s,"
+    "started_at\n"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +65,13 @@ class Design:
 
     @property
     def conditions(self) -> np.ndarray:
-        """Temperature, compression and days of every condition, shape (conditions, 3); a series' days in a row."""
+        """Temperature, compression and days of conditions, shape (conditions, 3); a series' days in a row."""
         grid = np.meshgrid(self.temperatures_C, self.compressions_pct, self.days, indexing="ij")
         return np.vstack([[23.0, 100.0, 0.0], np.column_stack([axis.ravel() for axis in grid])])
 
 
 def design_for(files: int) -> Design:
-    """Return a design of at least so many files: 42 conditions of 24 files for 1,000, 1,043 of 96 for 100,000."""
+    """Return a design of at least `files`: 42 conditions of 24 files for 1,000, 1,043 of 96 for 100,000."""
     loads = (49.03,) if files < 5_000 else (49.03, 98.07)
     specimens = 1 if files < 50_000 else 2
     conditions = max(int(np.ceil(files / (len(loads) * specimens * len(SPEEDS) * REPEATS))) - 1, 1)
@@ -84,7 +89,13 @@ def design_for(files: int) -> Design:
 
 
 def write_campaign(
-    folder: Path, files: int, *, rows: int = 80, seed: int = 1, effect: str | None = None, strength: float = 1.0
+    folder: Path,
+    files: int,
+    *,
+    rows: int = 80,
+    seed: int = 1,
+    effect: str | None = None,
+    strength: float = 1.0,
 ) -> Design:
     """Write runs.csv and the trace files into `folder`, one of EFFECTS in them; the design they follow."""
     rng = np.random.default_rng(seed)
@@ -95,7 +106,9 @@ def write_campaign(
         place = folder / "traces" / f"{first // PER_FOLDER:04d}"
         place.mkdir(parents=True, exist_ok=True)
         block = slice(first, min(first + PER_FOLDER, files))
-        for path, text in zip(runs.path[block], motions.texts(runs, block, rng, effect, strength), strict=True):
+        for path, text in zip(
+            runs.path[block], motions.texts(runs, block, rng, effect, strength), strict=True
+        ):
             (folder / path).write_text(text, "ascii")
     (folder / "runs.csv").write_text(RUNS + "".join(runs.lines()), "ascii")
     return design
@@ -144,7 +157,9 @@ class _Runs:
     def __post_init__(self) -> None:
         if self.path is None:
             names = zip(self.names(), self.repeat.tolist(), strict=True)
-            self.path = [f"traces/{k // PER_FOLDER:04d}/{name}_r{repeat}.csv" for k, (name, repeat) in enumerate(names)]
+            self.path = [
+                f"traces/{k // PER_FOLDER:04d}/{name}_r{repeat}.csv" for k, (name, repeat) in enumerate(names)
+            ]
 
     @classmethod
     def of(cls, design: Design, files: int, rng: np.random.Generator) -> _Runs:
@@ -186,7 +201,7 @@ class _Runs:
 
 @dataclass(slots=True)
 class _Motions:
-    """The platform's motion for every speed and starting point: cells as text, and what the force depends on."""
+    """The platform's motion for every speed and start: cells as text, and what the force depends on."""
 
     cells: list[list[list[str]]]  # "time,displacement," of every row
     speed_mm_s: np.ndarray  # shape (speeds, rows)
@@ -226,7 +241,12 @@ class _Motions:
         return cls(cells, np.array(speeds), slid, starts, -np.expm1(-slid / RISE_MM))
 
     def texts(
-        self, runs: _Runs, block: slice, rng: np.random.Generator, effect: str | None = None, strength: float = 1.0
+        self,
+        runs: _Runs,
+        block: slice,
+        rng: np.random.Generator,
+        effect: str | None = None,
+        strength: float = 1.0,
     ) -> list[str]:
         """Return the text of every file of a block."""
         kind = runs.speed[block]
@@ -279,7 +299,9 @@ def _hidden_N(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--files", type=int, required=True)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--rows", type=int, default=80, help="of every file")

@@ -1,7 +1,7 @@
 """Campaigns made of the measured data that the environment variable SEALFIT_MEASURED names.
 
-EMPS (Janot, Gautier and Brunot 2019) is one record of trapezoidal moves; its parts at constant speed are cut out here,
-one file each, where the mass does not accelerate and the force of the drive is friction.
+EMPS (Janot, Gautier and Brunot 2019) is one record of trapezoidal moves; its parts at constant speed are cut
+out here, one file each, where the mass does not accelerate and the force of the drive is friction.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def kidney(source: Path, folder: Path) -> Path:
 
 
 def kidney_plain(source: Path, folder: Path) -> Path:
-    """Write pneuseal-kidney as a campaign with the default columns, force on the piston less the pressure's part.
+    """Write pneuseal-kidney as a campaign with default columns, force on the piston less the pressure's part.
 
     The author's piston area, and without the first 15 rows of each file, as `configs/kidney.toml` has it.
     """
@@ -61,7 +61,12 @@ def kidney_plain(source: Path, folder: Path) -> Path:
     for path in sorted((source / "pneuseal-kidney" / "raw").glob("*.csv")):
         raw = np.loadtxt(path)[15:]
         force = raw[:, 6] - raw[:, 5] * 1e5 * np.pi * (0.0257 / 2) ** 2
-        trace = {"time_s": raw[:, 0] / 1000, "displacement_mm": raw[:, 4], "force_N": force, "pressure_bar": raw[:, 5]}
+        trace = {
+            "time_s": raw[:, 0] / 1000,
+            "displacement_mm": raw[:, 4],
+            "force_N": force,
+            "pressure_bar": raw[:, 5],
+        }
         pd.DataFrame(trace).to_csv(folder / path.name, index=False)
         rows.append({"file": path.name, "set_pressure_bar": int(path.stem[-4])})
     pd.DataFrame(rows).to_csv(folder / "runs.csv", index=False)
@@ -71,7 +76,10 @@ def kidney_plain(source: Path, folder: Path) -> Path:
 
 
 def emps_plateaus(source: Path, folder: Path, most: int = 16) -> Path:
-    """Write the first `most` plateaus of EMPS to the campaign `folder`, a file each; return its config, beside it."""
+    """Write the first `most` plateaus of EMPS to the campaign `folder`, a file each.
+
+    Return its config, which is written beside it.
+    """
     table = pd.read_csv(source / "emps" / "csv" / "DATA_EMPS.csv")
     time, place = table["time_s"].to_numpy(), 1e3 * table["position_m"].to_numpy()
     speed = _smooth(np.gradient(place, time), 51)

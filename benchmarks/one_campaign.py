@@ -138,7 +138,9 @@ def _rows(bins: pd.DataFrame, spec: Spec, config) -> Rows:
     """Return the rows the loop works on: merged as it does, bins as they are where there is a ripple."""
     counted = numbered(bins.reset_index(drop=True))
     as_they_are = any(e.id == "ripple" for e in spec.effects)  # merged bins would blur it
-    return make_rows(counted if as_they_are else merged_bins(counted, config.loop.seed), has_aging=config.aging)
+    return make_rows(
+        counted if as_they_are else merged_bins(counted, config.loop.seed), has_aging=config.aging
+    )
 
 
 def _scatter(record: dict) -> Scatter:
@@ -151,10 +153,14 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
-def _score(true: list[TrueEffect], closure: Closure, before: Model, after: Model, rows: Rows, scatter) -> dict:
+def _score(
+    true: list[TrueEffect], closure: Closure, before: Model, after: Model, rows: Rows, scatter
+) -> dict:
     """Return what each true effect and each claim came to."""
     claims = closure.document["effects"]
-    targets = [Target(t.id, t.channels, t.level, t.term.acts_on, t.term.operation, t.catalogued) for t in true]
+    targets = [
+        Target(t.id, t.channels, t.level, t.term.acts_on, t.term.operation, t.catalogued) for t in true
+    ]
     alike = np.zeros((len(true), len(claims)))
     if true and claims:
         whole = evaluate(after, rows, jacobian=False)[0]
@@ -199,7 +205,10 @@ def _silenced(model: Model, number: int) -> Model:
     term, values = model.terms[number], dict(model.values[number])
     values |= dict.fromkeys(term.effect.linear, 0.0)
     return Model(
-        model.declared, model.theta, model.terms, (*model.values[:number], values, *model.values[number + 1 :])
+        model.declared,
+        model.theta,
+        model.terms,
+        (*model.values[:number], values, *model.values[number + 1 :]),
     )
 
 

@@ -1,10 +1,11 @@
-"""A script for this campaign with pandas and scipy, as an engineer would write it, to compare with `sealfit run`.
+"""A script for this campaign with pandas and scipy, as an engineer writes it, to compare with `sealfit run`.
 
-    python benchmarks/pandas_script.py CAMPAIGN OUT [--resamples 200]     (some minutes for the paper's 1,752 files)
+    python benchmarks/pandas_script.py CAMPAIGN OUT [--resamples 200]
 
-For ingest and fits alone, and straightforward on purpose: one loop over the files, one `curve_fit` per condition, 95 %
-intervals from refits to resampled repeats, one `curve_fit` per aging series. It knows this campaign's layout, checks
-nothing, and writes CSV. The last line it prints has the seconds of its parts as JSON.
+It takes some minutes for the paper's 1,752 files. For ingest and fits alone, and straightforward on purpose:
+one loop over the files, one `curve_fit` per condition, 95 % intervals from refits to resampled repeats, one
+`curve_fit` per aging series. It knows this campaign's layout, checks nothing, and writes CSV. The last line
+it prints has the seconds of its parts as JSON.
 """
 
 import argparse
@@ -97,7 +98,12 @@ def fit_conditions(runs):
     """Fit every condition; one row each."""
     rows = []
     for key, table in runs.groupby(CONDITION):
-        rows.append({**dict(zip(CONDITION, key, strict=True)), **dict(zip(PARAMETERS, fit_steady(table), strict=True))})
+        rows.append(
+            {
+                **dict(zip(CONDITION, key, strict=True)),
+                **dict(zip(PARAMETERS, fit_steady(table), strict=True)),
+            }
+        )
     return pd.DataFrame(rows)
 
 
@@ -131,7 +137,9 @@ def fit_aging(fits):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("campaign", type=Path, metavar="CAMPAIGN")
     parser.add_argument("out", type=Path, metavar="OUT")
     parser.add_argument("--resamples", type=int, default=200, help="of the intervals; 0: none")
@@ -157,7 +165,9 @@ def main():
     clock.append(time.perf_counter())
 
     print(f"{len(runs)} files, {len(fits)} conditions, {len(laws)} aging laws -> {given.out}")
-    print(json.dumps(dict(zip(("ingest", "fits", "bootstrap", "aging"), np.diff(clock).tolist(), strict=True))))
+    print(
+        json.dumps(dict(zip(("ingest", "fits", "bootstrap", "aging"), np.diff(clock).tolist(), strict=True)))
+    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
-"""The source paper's campaign, simulated with its published numbers, analysed and drawn beside what it printed.
+"""The source paper's campaign, simulated with published numbers, analysed and drawn beside what it printed.
 
     python benchmarks/paper.py [--seed N] [--work DIR] [--docs DIR]      (about 3 minutes)
 
-Simulates 4 temperatures x 3 compressions x 6 days and the unaged rubber, 8 speeds, 3 repeats, 49.03 N (1,752 files),
-runs the whole pipeline on it and writes docs/paper/: our counterparts of figures 4, 5 and 8 to 15, and README.md with
-every published number, ours, and the difference. Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102.
+Simulates 4 temperatures x 3 compressions x 6 days and the unaged rubber, 8 speeds, 3 repeats, 49.03 N (1,752
+files), runs the whole pipeline on it and writes docs/paper/: our counterparts of figures 4, 5 and 8 to 15,
+and README.md with every published number, ours, and the difference. Wu et al. 2020, Polymers 12(1), 102,
+doi:10.3390/polym12010102.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from sealfit.simulation import simulate
 from sealfit.simulation.model import Growth, Physics
 from sealfit.store.out_folder import Store
 
-# Published: 0.835 and 0.822 at 60 degC without and with compression to 80 %, where unaged rubber has 0.93513: the loss
-# is 0.885 of that at 80 %. 35.1 N of 49.4 N are left at 80 degC, 0.70319 of 0.93513 at 60 degC: the loss is 1.17 times.
+# Published: 0.835 and 0.822 at 60 degC without and with compression to 80 %, where unaged rubber has 0.93513:
+# the loss is 0.885 of that at 80 %. 35.1 N of 49.4 N are left at 80 degC, 0.70319 of 0.93513 at 60 degC: the
+# loss is 1.17 times.
 GROWTH = {"doubling_C": 89.8, "per_pct": 0.00575}
 TEXT = """# The source paper, simulated and analysed
 
@@ -75,11 +77,13 @@ Figures 8 to 15 follow the paper's sections 4.1 to 4.4, two to a section: points
 repeats, or fits with 95 % intervals), lines the model.
 
 {figures}
-"""
+"""  # noqa: E501
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=2020)
     parser.add_argument("--work", type=Path, default=Path("out/paper"), help="where campaign and results go")
     parser.add_argument("--docs", type=Path, default=Path("docs/paper"), help="where the page goes")
@@ -92,7 +96,9 @@ def main() -> None:
     simulate(spec, campaign)
     run(campaign, out, None, steps=STEPS, workers=cores(), force=False, strict=False, progress=to_stderr())
     store = Store.open(out)
-    tables = {name: store.read(name) for name in ("steady", "steady_fit", "aging_fit", "aging_curves", "inputs")}
+    tables = {
+        name: store.read(name) for name in ("steady", "steady_fit", "aging_fit", "aging_curves", "inputs")
+    }
     found = Found(tables, store.config)
     given.docs.mkdir(parents=True, exist_ok=True)
     shown = []
@@ -124,7 +130,9 @@ def _numbers(lines: list[Line]) -> str:
                 line.section,
                 line.what,
                 f"{line.published:g}",
-                f"{line.ours:.4g} [{line.low:.4g}, {line.high:.4g}]" if line.low is not None else f"{line.ours:.4g}",
+                f"{line.ours:.4g} [{line.low:.4g}, {line.high:.4g}]"
+                if line.low is not None
+                else f"{line.ours:.4g}",
                 f"{100 * (line.ours / line.published - 1):+.1f} %",
             )
             for line in lines

@@ -1,4 +1,4 @@
-"""Our counterparts of the source paper's figures: the sensitivity of the model, and what aging does to the friction."""
+"""Counterparts of the source paper's figures: the model's sensitivity, and what aging does to friction."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from sealfit.report.notation import ConditionNames, symbol_math
 from sealfit.report.style import BLACK, CYCLE, FLOOR, QUIET, Key, Panel, Plot, shades
 
 TEMPERATURES, COMPRESSIONS, DAYS = (20, 40, 60, 80), (80, 90, 100), (1, 2, 4, 8, 12, 16)
-SENSITIVITY = {"mu_s": (0.25, 0.275, 0.30, 0.325, 0.35), "mu_c": (0.20, 0.225, 0.25, 0.275, 0.30)}  # its section 2.3
+SENSITIVITY = {
+    "mu_s": (0.25, 0.275, 0.30, 0.325, 0.35),
+    "mu_c": (0.20, 0.225, 0.25, 0.275, 0.30),
+}  # its section 2.3
 HELD = {"mu_s": 0.30, "mu_c": 0.30, "v_s": 5.0, "sigma_2": 0.2}
 # Normal load in N.
 LOAD = 50.0
@@ -37,7 +40,9 @@ class Found:
         name = condition(at)
         curves = curve_lines({**self.tables, "curves": pd.DataFrame()}, self.config)
         points = run_points(self.tables["steady"], self.config)
-        return Line(label, colour, (curves[curves["condition"] == name],), points[points["condition"] == name])
+        return Line(
+            label, colour, (curves[curves["condition"] == name],), points[points["condition"] == name]
+        )
 
     def values(self, quantity: str, places: Sequence[At | None]) -> pd.DataFrame:
         """Return value, lo95 and hi95 of a coefficient at some conditions."""
@@ -80,14 +85,18 @@ def _sensitivity(name: str, title: str, quantity: str) -> Plot:
         ax.set_xlabel("speed (mm/s)")
         ax.set_ylabel("friction force (N)")
 
-    alt = f"Friction force over speed from -30 to 30 mm/s for {quantity} from {values[0]:g} to {values[-1]:g}."
+    alt = (
+        f"Friction force over speed from -30 to 30 mm/s for {quantity} from {values[0]:g} to {values[-1]:g}."
+    )
     legend = [Key(f"{value:g}", colour) for value, colour in zip(values, shades(len(values)), strict=True)]
     return Plot(name, title, (Panel("", alt, draw, height=3.2),), tuple(legend))
 
 
 def _forces(found: Found, name: str, title: str, places: Sequence[tuple[At, str]]) -> Plot:
     shown = [found.line(None, UNAGED, BLACK)]
-    shown += [found.line(at, label, colour) for (at, label), colour in zip(places, shades(len(places)), strict=True)]
+    shown += [
+        found.line(at, label, colour) for (at, label), colour in zip(places, shades(len(places)), strict=True)
+    ]
 
     def draw(ax: Axes) -> None:
         draw_force_speed(ax, shown, found.config.units, log=True)
@@ -100,7 +109,12 @@ def _forces(found: Found, name: str, title: str, places: Sequence[tuple[At, str]
 
 
 def _coefficients(
-    found: Found, name: str, title: str, label: str, x: Sequence[float], by_day: Sequence[tuple[float, Sequence[At]]]
+    found: Found,
+    name: str,
+    title: str,
+    label: str,
+    x: Sequence[float],
+    by_day: Sequence[tuple[float, Sequence[At]]],
 ) -> Plot:
     colours, panels = shades(len(by_day)), []
     for quantity in ("mu_s", "mu_c"):

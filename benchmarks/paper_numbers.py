@@ -11,7 +11,10 @@ import pandas as pd
 from sealfit.physics import aging_law, aging_law_as_printed
 from sealfit.simulation.model import Law, Physics, declared_parameters
 
-PUBLISHED_LAWS = {"mu_s": Law(mu_0=0.93513, a=0.04448, b=0.0804), "mu_c": Law(mu_0=0.609, a=0.03307, b=0.1324)}
+PUBLISHED_LAWS = {
+    "mu_s": Law(mu_0=0.93513, a=0.04448, b=0.0804),
+    "mu_c": Law(mu_0=0.609, a=0.03307, b=0.1324),
+}
 PUBLISHED_C = {"mu_s": 0.11159, "mu_c": 0.06621}
 UNAGED = "unaged"
 MEASURED = (  # section, quantity, condition (°C, %, days), value; None for unaged rubber
@@ -71,12 +74,16 @@ def compared(tables: Mapping[str, pd.DataFrame]) -> list[Line]:
     lines = []
     for section, quantity, at, published in MEASURED:
         row = steady.loc[(condition(at), quantity)]
-        lines.append(Line(section, f"{quantity}, {words(at)}", published, row["value"], row["lo95"], row["hi95"]))
+        lines.append(
+            Line(section, f"{quantity}, {words(at)}", published, row["value"], row["lo95"], row["hi95"])
+        )
     for quantity, printed in PUBLISHED_LAWS.items():
         for name, published in (("a", printed.a), ("b", printed.b), ("c", PUBLISHED_C[quantity])):
             row = law.loc[(quantity, name)]
             lines.append(
-                Line("4.4", f"{name} of Eq. 15, {quantity}", published, row["value"], row["lo95"], row["hi95"])
+                Line(
+                    "4.4", f"{name} of Eq. 15, {quantity}", published, row["value"], row["lo95"], row["hi95"]
+                )
             )
     curves = tables["aging_curves"][tables["aging_curves"]["series"] == SERIES]
     for quantity, day, published in PREDICTED:
@@ -85,7 +92,9 @@ def compared(tables: Mapping[str, pd.DataFrame]) -> list[Line]:
         lines.append(Line("4.4", f"Eq. 15 for {quantity} at day {day:g}", published, *ours))
     runs = tables["steady"].groupby(["condition", "run_id"])["force_N"].mean()
     for at, published in LARGEST:
-        lines.append(Line("4.4", f"largest force in N, {words(at)}", published, float(runs[condition(at)].max())))
+        lines.append(
+            Line("4.4", f"largest force in N, {words(at)}", published, float(runs[condition(at)].max()))
+        )
     return lines
 
 
@@ -115,7 +124,9 @@ def agreement(tables: Mapping[str, pd.DataFrame], physics: Physics) -> pd.DataFr
             physics, {name: own[name].to_numpy(float) for name in ("temperature_C", "compression_ratio_pct")}
         )
         end = quantity[-1]
-        truth = aging_law(days, mu_0=declared[f"mu_0{end}"][0], a=declared[f"a_{end}"][0], b=declared[f"b_{end}"][0])
+        truth = aging_law(
+            days, mu_0=declared[f"mu_0{end}"][0], a=declared[f"a_{end}"][0], b=declared[f"b_{end}"][0]
+        )
         at = own.iloc[0]
         rows.append(
             {
@@ -138,9 +149,9 @@ def as_printed(quantity: str, days, start: float | None = None) -> np.ndarray:
 def printed_errors() -> dict[str, float]:
     """Return what the printed numbers say of one another: errors of Eq. 15 for mu_c in percent, and gaps.
 
-    `start` is the mu_0 that the printed prediction of day 16 needs; `needed_4`, `needed_16` are the errors with it at
-    the printed values of days 4 and 16, `own_4`, `own_16` with the printed start; `spare` is the largest |c + a ln b|;
-    `warm` is Eq. 15 for mu_s after 2 days.
+    `start` is the mu_0 that the printed prediction of day 16 needs; `needed_4`, `needed_16` are the errors
+    with it at the printed values of days 4 and 16, `own_4`, `own_16` with the printed start; `spare` is the
+    largest |c + a ln b|; `warm` is Eq. 15 for mu_s after 2 days.
     """
     law = PUBLISHED_LAWS["mu_c"]
     measured = {at[2]: value for _, quantity, at, value in MEASURED if quantity == "mu_c" and at is not None}

@@ -1,4 +1,4 @@
-"""Points that the loop did not see: tested conditions and days between, any speed in range, channels by their laws."""
+"""Points new to the loop: tested conditions and days between, any speed in range, channels by their laws."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ BETWEEN = 0.5
 def draw_points(bins: pd.DataFrame, spec: Spec, count: int, rng: np.random.Generator) -> pd.DataFrame:
     """Return points to predict at, with every channel of `bins`.
 
-    Each starts as a row of `bins`, so that position, distance and stroke go together. Then the speed is drawn anew,
-    log-uniform in the tested range, and time stretched with it; for half of the aged points the days are drawn
-    log-uniform between that series' first and last, and the calendar moved along where tests follow it; loads are
-    drawn in their range, and the SPEC's channels by their laws, within what was tested.
+    Each starts as a row of `bins`, so that position, distance and stroke go together. Then the speed is drawn
+    anew, log-uniform in the tested range, and time stretched with it; for half of the aged points the days
+    are drawn log-uniform between that series' first and last, and the calendar moved along where tests follow
+    it; loads are drawn in their range, and the SPEC's channels by their laws, within what was tested.
     """
     table = bins.iloc[rng.integers(len(bins), size=count)].reset_index(drop=True)
     speed = np.abs(table["speed_mm_s"].to_numpy())
@@ -48,13 +48,17 @@ def draw_points(bins: pd.DataFrame, spec: Spec, count: int, rng: np.random.Gener
     return table.drop(columns=["force_N", "force_sd_N", "n", "bin", "started_at"], errors="ignore")
 
 
-def _other_days(table: pd.DataFrame, bins: pd.DataFrame, spec: Spec, rng: np.random.Generator) -> pd.DataFrame:
+def _other_days(
+    table: pd.DataFrame, bins: pd.DataFrame, spec: Spec, rng: np.random.Generator
+) -> pd.DataFrame:
     days = table["aging_days"].to_numpy(dtype=float)
     aged = bins[bins["aging_days"] > 0].groupby("series")["aging_days"].agg(["min", "max"])
     moved = (days > 0) & (rng.random(len(table)) < BETWEEN)
     low = table["series"].map(aged["min"]).to_numpy(dtype=float)
     high = table["series"].map(aged["max"]).to_numpy(dtype=float)
-    drawn = np.round(np.exp(rng.uniform(np.log(np.where(moved, low, 1)), np.log(np.where(moved, high, 1)))), 3)
+    drawn = np.round(
+        np.exp(rng.uniform(np.log(np.where(moved, low, 1)), np.log(np.where(moved, high, 1)))), 3
+    )
     new = np.where(moved, drawn, days)
     changed = {"aging_days": new}
     if spec.design.order == "calendar" and "elapsed_h" in table:

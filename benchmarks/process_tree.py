@@ -1,8 +1,9 @@
-"""Wall seconds and peak memory of a command with all the processes it starts, each command in a fresh process.
+"""Wall seconds and peak memory of a command with all the processes it starts, each one in a fresh process.
 
-Memory is looked at every `LOOK_EVERY_S`: the resident sets of the tree added up (pages that processes share count once
-for each), and if asked for the proportional sets, in which shared pages are divided among them; those take time to
-read, so not where seconds matter. `largest` is the system's own peak of the largest process, which no look can miss.
+Memory is looked at every `LOOK_EVERY_S`: the resident sets of the tree added up (pages that processes share
+count once for each), and if asked for the proportional sets, in which shared pages are divided among them;
+those take time to read, so not where seconds matter. `largest` is the system's own peak of the largest
+process, which no look can miss.
 """
 
 from __future__ import annotations

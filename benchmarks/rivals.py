@@ -1,9 +1,9 @@
-"""What people would use instead of the loop: the plain model's residual, learned from the same rows of `bins`.
+"""What people would use instead of the loop: the plain model's residual, learned from the same `bins` rows.
 
-Each rival gets the channels that the loop's search may read (the rows' numeric channels and categories that vary, no
-grouping, the speed as its size), at most `MOST_ROWS` rows drawn at random, and its package's defaults or what is said
-at its function. Its prediction is the plain model's force plus the learned residual. A package that is not there
-leaves its rival out, by name.
+Each rival gets the channels that the loop's search may read (the rows' numeric channels and categories that
+vary, no grouping, the speed as its size), at most `MOST_ROWS` rows drawn at random, and its package's
+defaults or what is said at its function. Its prediction is the plain model's force plus the learned residual.
+A package that is not there leaves its rival out, by name.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from sealfit.closure.channels import find_channels
 from sealfit.fit.joint.rows import Rows
 
 MOST_ROWS = 4000
-EBM_ROUNDS = 500  # by itself it goes on, as a file's rows stand on both sides of its validation: no better, 90 s
+EBM_ROUNDS = (
+    500  # by itself it goes on, as a file's rows stand on both sides of its validation: no better, 90 s
+)
 # Ridge penalty on standardised columns, relative to the number of rows, as several channels are collinear.
 RIDGE = 0.01
 # Largest number of different values of a numeric channel that is a factor in the additive model.
@@ -90,23 +92,31 @@ def explainable_boosting(inputs: Inputs, residual: np.ndarray, seed: int) -> np.
 
 
 def additive(inputs: Inputs, residual: np.ndarray, seed: int) -> np.ndarray:
-    """Return the residual by pyGAM's LinearGAM: a spline per number, a factor per category, default penalty; (m,)."""
+    """Return the residual by pyGAM's LinearGAM; shape (m,).
+
+    It has a spline per number, a factor per category and the default penalty.
+    """
     from pygam import LinearGAM, f, s
 
     terms = None
     for k, category in enumerate(inputs.categories):
         count = np.unique(inputs.train[:, k]).size
-        own = f(k) if category else s(k, n_splines=min(20, max(count, 4)), spline_order=min(3, max(count, 4) - 1))
+        own = (
+            f(k)
+            if category
+            else s(k, n_splines=min(20, max(count, 4)), spline_order=min(3, max(count, 4) - 1))
+        )
         terms = own if terms is None else terms + own
     return LinearGAM(terms).fit(inputs.train, residual).predict(inputs.at)
 
 
 def sparse(inputs: Inputs, residual: np.ndarray, seed: int) -> np.ndarray:
-    """Return the residual by PySINDy: sequentially thresholded least squares on its library of terms; shape (m,).
+    """Return the residual by PySINDy: sequentially thresholded least squares on its library of terms; (m,).
 
-    The library holds polynomials to second order and two Fourier terms of every channel, each scaled to -1 to 1 (the
-    speed on a logarithmic scale). Its columns are standardised; a term stays while it gives 5 % of the residual's SD.
-    The ridge is kept in the last fit, which otherwise runs away at new points where channels say the same.
+    The library holds polynomials to second order and two Fourier terms of every channel, each scaled to -1 to
+    1 (the speed on a logarithmic scale). Its columns are standardised; a term stays while it gives 5 % of the
+    residual's SD. The ridge is kept in the last fit, which otherwise runs away at new points where channels
+    say the same.
     """
     import pysindy
 
@@ -119,7 +129,9 @@ def sparse(inputs: Inputs, residual: np.ndarray, seed: int) -> np.ndarray:
                 values[:, k], a[k], b[k] = np.log(values[:, k]), np.log(low[k]), np.log(high[k])
         return np.clip(2 * (values - a) / (b - a) - 1, -1.0, 1.0)
 
-    library = pysindy.PolynomialLibrary(degree=2, include_bias=False) + pysindy.FourierLibrary(n_frequencies=2)
+    library = pysindy.PolynomialLibrary(degree=2, include_bias=False) + pysindy.FourierLibrary(
+        n_frequencies=2
+    )
     x = scaled(inputs.train)
     columns = np.asarray(library.fit_transform(x))
     mean, spread = columns.mean(axis=0), columns.std(axis=0)
@@ -149,8 +161,10 @@ class Rivalled:
     missing: dict[str, str]
 
 
-def rival_forces(rows: Rows, residual: np.ndarray, points: pd.DataFrame, plain_N: np.ndarray, seed: int) -> Rivalled:
-    """Return every rival's force at points, shape (m,) each: the plain model's plus the residual it has learned."""
+def rival_forces(
+    rows: Rows, residual: np.ndarray, points: pd.DataFrame, plain_N: np.ndarray, seed: int
+) -> Rivalled:
+    """Return every rival's force at points, shape (m,) each: the plain model's plus the learned residual."""
     inputs = make_inputs(rows, points)
     chosen = np.random.default_rng(seed).permutation(residual.size)[:MOST_ROWS]
     some = Inputs(inputs.train[chosen], inputs.at, inputs.names, inputs.categories)

@@ -1,18 +1,21 @@
 """Claims of closure.json against the truth: which true effects were found, which claims match none.
 
-An effect is found strictly where a claim has the same channels (as sets, direction included where it counts), level,
-acts_on and operation. It is found leniently also where
+An effect is found strictly where a claim has the same channels (as sets, direction included where it counts),
+level, acts_on and operation. It is found leniently also where
 
-- channels and level are the same, and what claim and truth add to the force has a correlation of at least 0.98 after
-  projection on the declared model's tangent space (two such are one effect at this design), or the claim names the
-  truth's acts_on with these channels among its `alternatives`; mu and the whole friction force are so exchanged where
-  sigma_2 v is a small part; or
-- that correlation is reached with other channels, and the claim names the truth's channels among its `alternatives`.
+- channels and level are the same, and what claim and truth add to the force has a correlation of at least
+  0.98 after
+  projection on the declared model's tangent space (two such are one effect at this design), or the claim
+  names the truth's acts_on with these channels among its `alternatives`; mu and the whole friction force are
+  so exchanged where sigma_2 v is a small part; or
+- that correlation is reached with other channels, and the claim names the truth's channels among its
+  `alternatives`.
 
-Named right is a found effect whose claim has the true id, when the catalogue has it; leniently also one whose claim is
-the same equation of the same channel under another id (`SAME_EQUATION`). Each claim stands for one true effect at most;
-claims left over are extra. Of those, a claim on exactly the channels of a true effect that was not found is called
-misplaced (the right place, the wrong quantity or form), and counts as extra all the same.
+Named right is a found effect whose claim has the true id, when the catalogue has it; leniently also one whose
+claim is the same equation of the same channel under another id (`SAME_EQUATION`). Each claim stands for one
+true effect at most; claims left over are extra. Of those, a claim on exactly the channels of a true effect
+that was not found is called misplaced (the right place, the wrong quantity or form), and counts as extra all
+the same.
 """
 
 from __future__ import annotations
@@ -69,7 +72,7 @@ def grade(target: Target, claim: Mapping, correlation: float) -> int:
 def match(
     targets: Sequence[Target], claims: Sequence[Mapping], correlation: np.ndarray
 ) -> list[tuple[int | None, int]]:
-    """Return for each true effect the number of its claim (None where not found) and the grade; the best pairing.
+    """Return for each true effect its claim's number (None if not found) and the grade; the best pairing.
 
     Parameters
     ----------
@@ -80,7 +83,9 @@ def match(
     correlation : ndarray, shape (targets, claims)
         Of what they add to the force, projected.
     """
-    grades = np.array([[grade(t, c, correlation[j, k]) for k, c in enumerate(claims)] for j, t in enumerate(targets)])
+    grades = np.array(
+        [[grade(t, c, correlation[j, k]) for k, c in enumerate(claims)] for j, t in enumerate(targets)]
+    )
     slots = [*range(len(claims)), *[None] * len(targets)]
     best, most = [(None, NONE)] * len(targets), (-1.0, -1.0)
     for chosen in set(permutations(slots, len(targets))) if len(slots) <= 9 else [_greedy(grades)]:
@@ -110,7 +115,7 @@ def named_right(target: Target, claim: Mapping | None) -> tuple[bool, bool]:
 
 
 def misplaced(targets: Sequence[Target], found: Sequence[int | None], claims: Sequence[Mapping]) -> list[int]:
-    """Return the extra claims on the channels of a true effect that was not found, one for each such effect."""
+    """Return the extra claims on channels of a true effect that was not found, one for each such effect."""
     free = [k for k in range(len(claims)) if k not in found]
     chosen = []
     for target, own in zip(targets, found, strict=True):

@@ -4,12 +4,13 @@
     python benchmarks/sensitivity.py --out out/sensitivity.jsonl --summary
     python benchmarks/sensitivity.py --out out/files.jsonl --files
 
-Each number draws a rig at random: design, noise, and scatter at every level. Of a campaign in which nothing is missing
-the stated sizes are read, for up to three entries of different levels. Each is then put into the same design with fresh
-noise and scatter: linear in the entry's variable at the entry's level, on the entry's quantity, of the stated RMS; an
-offset for the direction. Found: an effect of that variable was added. Same: one of another variable that these data
-cannot tell from it. With --files the campaign is made as much larger as `files_needed` says, by more specimens, and the
-effect is 1 % of the force. Bins are drawn directly, and the loop runs without its last held-out folds.
+Each number draws a rig at random: design, noise, and scatter at every level. Of a campaign in which nothing
+is missing the stated sizes are read, for up to three entries of different levels. Each is then put into the
+same design with fresh noise and scatter: linear in the entry's variable at the entry's level, on the entry's
+quantity, of the stated RMS; an offset for the direction. Found: an effect of that variable was added. Same:
+one of another variable that these data cannot tell from it. With --files the campaign is made as much larger
+as `files_needed` says, by more specimens, and the effect is 1 % of the force. Bins are drawn directly, and
+the loop runs without its last held-out folds.
 
 A number that OUT holds already is not run again. The summary gives shares with 95 % Clopper-Pearson bounds.
 """
@@ -65,11 +66,16 @@ def files_of(design: dict) -> int:
     """Return how many files a design has."""
     lists = ("speeds", "directions")
     conditions = 1 + len(design["temperatures"]) * len(design["days"])
-    return conditions * design["specimens"] * design["repeats"] * int(np.prod([len(design[n]) for n in lists]))
+    return (
+        conditions * design["specimens"] * design["repeats"] * int(np.prod([len(design[n]) for n in lists]))
+    )
 
 
 def _drawn(rng: np.random.Generator) -> dict:
-    scatter = {name: float(rng.choice([0, 1]) * 10 ** rng.uniform(-3, -1.7)) for name in ("stroke", "run", "condition")}
+    scatter = {
+        name: float(rng.choice([0, 1]) * 10 ** rng.uniform(-3, -1.7))
+        for name in ("stroke", "run", "condition")
+    }
     return {
         "temperatures": [60.0, 80.0][: rng.integers(1, 3)],
         "days": [1.0, 4.0, 16.0, 32.0, 64.0][: rng.integers(1, 6)],
@@ -100,7 +106,9 @@ def design_table(number: int, design: dict) -> pd.DataFrame:
         runs = [runs[k] for k in rng.permutation(len(runs))]
     names = ["temperature_C", "compression_ratio_pct", "aging_days", "piece", "speed_set_mm_s", "direction"]
     table = pd.DataFrame(runs, columns=names)
-    table["series"] = np.where(table.aging_days > 0, table.temperature_C.map("temperature_C={:g}".format), "unaged")
+    table["series"] = np.where(
+        table.aging_days > 0, table.temperature_C.map("temperature_C={:g}".format), "unaged"
+    )
     table["condition"] = table.series + table.aging_days.map(", {:g}".format)
     table["specimen_id"] = table.condition + table.piece.map(" piece {}".format)
     table["run_id"] = table.specimen_id + (table.speed_set_mm_s * table.direction).map(" {:g}".format)
@@ -110,7 +118,9 @@ def design_table(number: int, design: dict) -> pd.DataFrame:
     table = table.drop(columns="piece").loc[table.index.repeat(design["repeats"])].reset_index(drop=True)
     table["repeat"] = table.groupby("run_id").cumcount() + 1
     order = np.arange(len(table), dtype=float)
-    table = table.assign(file=[f"f{k:05d}.csv" for k in range(len(table))], run_order=order, elapsed_h=0.1 * order)
+    table = table.assign(
+        file=[f"f{k:05d}.csv" for k in range(len(table))], run_order=order, elapsed_h=0.1 * order
+    )
     table["humidity_pct"] = rng.normal(50, 5, len(table))
     table["chamber_C"] = 22 + rng.normal(0, 1, len(table))
     table = table.loc[table.index.repeat(design["strokes"])].reset_index(drop=True)
@@ -120,14 +130,18 @@ def design_table(number: int, design: dict) -> pd.DataFrame:
     distance = (table.bin + 0.5) * 40.0 / BINS
     displacement = np.where(table.direction > 0, distance, 40.0 - distance)
     table["chamber_C"] += rng.normal(0, 1, len(table))
-    return table.assign(distance_mm=distance, displacement_mm=displacement, time_s=distance / table.speed_set_mm_s)
+    return table.assign(
+        distance_mm=distance, displacement_mm=displacement, time_s=distance / table.speed_set_mm_s
+    )
 
 
 def friction(table: pd.DataFrame) -> np.ndarray:
     """Return the coefficient times load, with the sign of the motion."""
     days, speed = table["aging_days"], table["speed_set_mm_s"]
     mu_c, mu_s = 0.61 - 0.033 * np.log1p(days / 0.13), 0.93 - 0.0445 * np.log1p(days / 0.08)
-    return (table["direction"] * table["load_N"] * (mu_c + (mu_s - mu_c) * np.exp(-((speed / 15) ** 2)))).to_numpy()
+    return (
+        table["direction"] * table["load_N"] * (mu_c + (mu_s - mu_c) * np.exp(-((speed / 15) ** 2)))
+    ).to_numpy()
 
 
 def measured(table: pd.DataFrame, design: dict, effect: np.ndarray | float, seed: list[int]) -> pd.DataFrame:
@@ -138,7 +152,12 @@ def measured(table: pd.DataFrame, design: dict, effect: np.ndarray | float, seed
         code = table.groupby(GROUPS[level], sort=False).ngroup().to_numpy()
         factor += design["gain"][level] * rng.normal(size=code.max() + 1)[code]
     code = table.groupby("run_id", sort=False).ngroup().to_numpy()
-    factor += design["tilt"] * rng.normal(size=code.max() + 1)[code] * (table["displacement_mm"].to_numpy() - 20) / 20
+    factor += (
+        design["tilt"]
+        * rng.normal(size=code.max() + 1)[code]
+        * (table["displacement_mm"].to_numpy() - 20)
+        / 20
+    )
     force = (friction(table) + 0.02 * table["speed_mm_s"].to_numpy() + effect) * factor
     force += design["noise"] * 30 * rng.normal(size=len(table))
     return table.assign(force_N=force, force_sd_N=60 * design["noise"], n=20)
@@ -157,14 +176,21 @@ def effect_of(table: pd.DataFrame, entry: dict, several: bool) -> np.ndarray:
             shape = at_level(table, shape, entry["level"])
     else:
         shape = (values == sorted(values.unique())[1]).to_numpy(dtype=float)
-    added = shape * friction(table) if entry.get("acts_on", "mu" if name != "direction" else "force") == "mu" else shape
+    added = (
+        shape * friction(table)
+        if entry.get("acts_on", "mu" if name != "direction" else "force") == "mu"
+        else shape
+    )
     return added * entry["smallest_N"] / np.sqrt(np.mean(added**2))
 
 
 def at_level(table: pd.DataFrame, shape: np.ndarray, level: str) -> np.ndarray:
-    """Return the part of a variable that varies at a level: group means less those of the next coarser groups."""
+    """Return the part of a variable varying at a level: group means less those of the next coarser groups."""
     levels = ["trace", *GROUPS]
-    means = [shape, *(pd.Series(shape).groupby([table[c] for c in own]).transform("mean") for own in GROUPS.values())]
+    means = [
+        shape,
+        *(pd.Series(shape).groupby([table[c] for c in own]).transform("mean") for own in GROUPS.values()),
+    ]
     k = levels.index(level)
     return np.asarray(means[k] - (means[k + 1] if k + 1 < len(levels) else 0.0))
 
@@ -172,7 +198,9 @@ def at_level(table: pd.DataFrame, shape: np.ndarray, level: str) -> np.ndarray:
 def close(bins: pd.DataFrame) -> Selection:
     """Return the end of the loop."""
     rows = make_rows(merged_bins(numbered(bins), CONFIG.loop.seed), has_aging=True)
-    traces = bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(presliding_N=0.0, steady=True)
+    traces = bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(
+        presliding_N=0.0, steady=True
+    )
     return select_effects(rows, steady_samples(traces, rows), Context(CONFIG, EFFECTS))
 
 
@@ -225,7 +253,9 @@ def run(number: int, *, files: bool) -> list[dict]:
         found = close(measured(own, larger, effect, [number, 5, k]))
         rows = found.before.rows
         at = effect[rows.order] if rows.force.size == effect.size else np.zeros(rows.force.size)
-        records.append({**facts, **entry, "outcome": outcome(found, entry, at), "null_claims": len(null.added)})
+        records.append(
+            {**facts, **entry, "outcome": outcome(found, entry, at), "null_claims": len(null.added)}
+        )
     return records or [{**facts, "outcome": "no entry"}]
 
 
@@ -245,11 +275,15 @@ def line(title: str, outcomes: list[str]) -> None:
     counts = Counter(outcomes)
     found, of = counts["found"] + counts["same"], len(outcomes)
     low, high = bounds(found, of) if of else (0.0, 1.0)
-    print(f"{title:32s} {found:4d} of {of:4d} {found / max(of, 1):5.0%} [{low:.0%}, {high:.0%}]  {dict(counts)}")
+    print(
+        f"{title:32s} {found:4d} of {of:4d} {found / max(of, 1):5.0%} [{low:.0%}, {high:.0%}]  {dict(counts)}"
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=Path("out/sensitivity.jsonl"))
     parser.add_argument("--first", type=int, default=0, help="number of the first design")
     parser.add_argument("--count", type=int, default=40, help="designs")

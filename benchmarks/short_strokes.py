@@ -1,15 +1,16 @@
-"""Null campaigns with slow strokes of few bristle lengths: false claims of the loop, and coverage of its intervals.
+"""Null campaigns with slow strokes of few bristle lengths: false claims and interval coverage of the loop.
 
-    python benchmarks/short_strokes.py                                      all ratios, 4 seeds of every design
+    python benchmarks/short_strokes.py                                     all ratios, 4 seeds of every design
     python benchmarks/short_strokes.py --ratios 3 11 --seeds 2 --designs plain noisy
 
-A campaign has unaged rubber and one series of four days, six speeds from 0.5 to 20 mm/s, and a LuGre bristle of
-sigma_0 = 100 N/mm: its length G(v) / sigma_0 is 0.3 to 0.45 mm. Strokes at the three lowest speeds are `ratio` lengths
-of the slowest bristle long, the others 40 mm. Nothing is missing: whatever the loop claims is invented. The truth is
-integrated here, step by step of constant speed, independent of `sealfit simulate`.
+A campaign has unaged rubber and one series of four days, six speeds from 0.5 to 20 mm/s, and a LuGre bristle
+of sigma_0 = 100 N/mm: its length G(v) / sigma_0 is 0.3 to 0.45 mm. Strokes at the three lowest speeds are
+`ratio` lengths of the slowest bristle long, the others 40 mm. Nothing is missing: whatever the loop claims is
+invented. The truth is integrated here, step by step of constant speed, independent of `sealfit simulate`.
 
-One line per campaign: verdict, how many 95 % intervals hold the truth (mu_s and mu_c of fit-steady; `predict` at every
-condition and speed), the error of `predict` before and after, and the effects claimed. Then the counts.
+One line per campaign: verdict, how many 95 % intervals hold the truth (mu_s and mu_c of fit-steady; `predict`
+at every condition and speed), the error of `predict` before and after, and the effects claimed. Then the
+counts.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ STEPS = 16
 
 @dataclass(frozen=True)
 class Rig:
-    """How a design is measured: sampling, noise of a displacement sample, repeats, the start and the speed ramp."""
+    """How a design is measured: sampling, noise of displacement samples, repeats, start and speed ramp."""
 
     sampling_Hz: float = 500.0
     displacement_sd_mm: float = 0.002
@@ -57,7 +58,9 @@ class Rig:
     lag: bool = False  # the speed comes up as by a first-order lag of ramp_s / 3
     force_sd_N: float = 0.1
     all_short: bool = False
-    sag: float = 0.0  # share by which the speed is higher where cruising begins; half of it is left 3 mm further
+    sag: float = (
+        0.0  # share by which the speed is higher where cruising begins; half of it is left 3 mm further
+    )
 
 
 DESIGNS: Mapping[str, Rig] = {
@@ -86,7 +89,9 @@ def limit_N(speed: np.ndarray, days: float, gain: float) -> np.ndarray:
     return gain * LOAD * (mu_c + (mu_s - mu_c) * np.exp(-((speed / V_S) ** 2)))
 
 
-def trace(rig: Rig, speed: float, length: float, days: float, gain: float, random: np.random.Generator) -> pd.DataFrame:
+def trace(
+    rig: Rig, speed: float, length: float, days: float, gain: float, random: np.random.Generator
+) -> pd.DataFrame:
     """Return one file: rest, ramp, cruise, and a sudden stop after the last row."""
     rest = min(0.3, 0.1 * length / speed)
     ramp = min(rig.ramp_s, 0.3 * length / speed)
@@ -131,7 +136,16 @@ def write(folder: Path, rig: Rig, ratio: float, seed: int) -> None:
                 name = f"d{days:g}_v{speed:g}_r{repeat}.csv"
                 trace(rig, speed, length, days, gain, random).to_csv(folder / name, index=False)
                 rows.append((name, f"d{days:g}_v{speed:g}", repeat, 60.0, 80.0, days, LOAD, speed))
-    names = ("file", "run_id", "repeat", "temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
+    names = (
+        "file",
+        "run_id",
+        "repeat",
+        "temperature_C",
+        "compression_ratio_pct",
+        "aging_days",
+        "load_N",
+        "speed_mm_s",
+    )
     pd.DataFrame(rows, columns=names).to_csv(folder / "runs.csv", index=False)
 
 
@@ -150,7 +164,10 @@ def one(rig: Rig, ratio: float, seed: int) -> dict:
     asked = pd.DataFrame(list(product(DAYS, SPEEDS)), columns=["aging_days", "speed_mm_s"])
     asked = asked.assign(temperature_C=60.0, compression_ratio_pct=80.0, load_N=LOAD, repeat=1, stroke=1)
     answer = predict(closure.model, asked.assign(displacement_mm=20.0, distance_mm=20.0, time_s=20.0))
-    truth = [limit_N(np.array(p.speed_mm_s), p.aging_days, 1.0) + SIGMA_2 * p.speed_mm_s for p in asked.itertuples()]
+    truth = [
+        limit_N(np.array(p.speed_mm_s), p.aging_days, 1.0) + SIGMA_2 * p.speed_mm_s
+        for p in asked.itertuples()
+    ]
     held["predict"] = list((answer["force_after_lo95_N"] <= truth) & (truth <= answer["force_after_hi95_N"]))
     document = closure.document
     return {
@@ -163,7 +180,9 @@ def one(rig: Rig, ratio: float, seed: int) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--ratios", type=float, nargs="*", default=RATIOS)
     parser.add_argument("--designs", nargs="*", default=list(DESIGNS), choices=list(DESIGNS))
     parser.add_argument("--seeds", type=int, default=4)

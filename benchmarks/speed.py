@@ -1,17 +1,19 @@
-"""Measure how fast `sealfit` is beside what else there is: each command in a fresh process, in turns, medians.
+"""Measure how fast `sealfit` is beside what else there is: commands in fresh processes, in turns, medians.
 
-    python benchmarks/speed.py ingest  [--campaign DIR] [--repeats 5]    beside a bare loop of pyarrow.csv.read_csv
-    python benchmarks/speed.py memory  [--files 1752 17520]              peak memory of ingest with ten times the files
-    python benchmarks/speed.py run     [--campaign DIR] [--repeats 3]    beside `pandas_script.py`
-    python benchmarks/speed.py startup [--repeats 20]                    beside `python -c "import typer"`; imports
-    python benchmarks/speed.py cluster [--campaign DIR] [--repeats 3]    a Dask cluster beside processes, both of here
+    python benchmarks/speed.py ingest  [--campaign DIR] [--repeats 5]  beside a bare pyarrow.csv.read_csv loop
+    python benchmarks/speed.py memory  [--files 1752 17520]            peak memory of ingest, 10x the files
+    python benchmarks/speed.py run     [--campaign DIR] [--repeats 3]  beside `pandas_script.py`
+    python benchmarks/speed.py startup [--repeats 20]                  beside `import typer`; imports
+    python benchmarks/speed.py cluster [--campaign DIR] [--repeats 3]  local: a Dask cluster beside processes
     python benchmarks/speed.py growth  [--files 1000 10000 100000] [--steps all] [--effect conditioning]
 
-Several parts may be named at once. Without --campaign the paper's own, 1,752 files of 1,000 rows, is simulated first.
-What is written goes to a temporary folder, or to --work DIR, where campaigns are kept for the next time.
+Several parts may be named at once. Without --campaign the paper's own, 1,752 files of 1,000 rows, is
+simulated first. What is written goes to a temporary folder, or to --work DIR, where campaigns are kept for
+the next time.
 
-Seconds are wall time of whole processes, from start to end, with the files in the system's cache: each campaign is read
-once before. What runs on "one core" is pinned to one, everything else to the first two. Memory: see `process_tree.py`.
+Seconds are wall time of whole processes, from start to end, with the files in the system's cache: each
+campaign is read once before. What runs on "one core" is pinned to one, everything else to the first two.
+Memory: see `process_tree.py`.
 """
 
 from __future__ import annotations
@@ -54,7 +56,9 @@ def main() -> None:
                 case "ingest":
                     speed_ingest.ingest(campaign, cores, repeats, work)
                 case "memory":
-                    speed_ingest.peaks(sizes, rows=given.rows or 1000, seed=given.seed, cores=cores, work=work)
+                    speed_ingest.peaks(
+                        sizes, rows=given.rows or 1000, seed=given.seed, cores=cores, work=work
+                    )
                 case "run":
                     speed_run.run(campaign, cores, repeats, given.resamples, work)
                 case "startup":
@@ -77,15 +81,21 @@ def growth(given: argparse.Namespace, sizes: Sequence[int], cores: Sequence[int]
 
 def arguments() -> argparse.Namespace:
     """Return what the command line asks for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("parts", nargs="+", choices=PARTS, metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--campaign", type=Path, help="instead of the paper's, for ingest and run")
-    parser.add_argument("--work", type=Path, help="folder for campaigns and results, kept; default: a temporary one")
+    parser.add_argument(
+        "--work", type=Path, help="folder for campaigns and results, kept; default: a temporary one"
+    )
     parser.add_argument("--repeats", type=int, help=f"turns; default: {REPEATS}")
     parser.add_argument("--files", type=int, nargs="+", help=f"sizes of memory and growth; default: {FILES}")
     parser.add_argument("--rows", type=int, help="of a file of memory and growth; default: 1000 and 80")
     parser.add_argument("--workers", type=int, default=2, help="of growth")
-    parser.add_argument("--steps", choices=("ingest", "all"), default="ingest", help="of growth: the later steps too")
+    parser.add_argument(
+        "--steps", choices=("ingest", "all"), default="ingest", help="of growth: the later steps too"
+    )
     parser.add_argument("--effect", choices=EFFECTS, help="in the files of growth; default: none")
     parser.add_argument("--resamples", type=int, default=200, help="of the script's bootstrap")
     parser.add_argument("--seed", type=int, default=1, help="of the campaigns")
@@ -106,4 +116,6 @@ if __name__ == "__main__":
     try:
         main()
     except subprocess.CalledProcessError as error:
-        raise SystemExit(f"speed: {' '.join(error.cmd)} ended with {error.returncode}:\n{error.output}") from None
+        raise SystemExit(
+            f"speed: {' '.join(error.cmd)} ended with {error.returncode}:\n{error.output}"
+        ) from None

@@ -1,4 +1,4 @@
-"""What a Dask cluster adds to ingest: the same campaign by processes and by a cluster of here; an empty task."""
+"""What a Dask cluster adds to ingest: one campaign by processes and by a local cluster; an empty task."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WORKERS = (2, 128, 1024)
 
 
 def cluster(campaign: Path, cores: Sequence[int], repeats: int, work: Path) -> None:
-    """Print seconds of ingest by two processes and by a cluster of two workers, and what a task costs by itself."""
+    """Print seconds of ingest by two processes and by a cluster of two workers, and of a task by itself."""
     print("\ncluster of a scheduler and two workers on the same cores")
     with TemporaryDirectory() as folder:
         dask = DaskHere(Path(folder), workers=2, paths=(Path(__file__).parent,))
@@ -60,9 +60,16 @@ def reckon(empty_s: float, reading_s: float, here_s: float) -> None:
     """Print what so many files would take, step by step of the reckoning."""
     tasks = MANY / PER_PART
     print(f"  reckoned for {MANY:,} files like these, {PER_PART} a task: {tasks:,.0f} tasks")
-    print(f"    reading  {MANY:,} x {1e3 * reading_s:.3f} ms = {MANY * reading_s / 3600:.1f} hours of workers")
-    print(f"    sending  {tasks:,.0f} x {1e3 * empty_s:.2f} ms = {tasks * empty_s / 60:.1f} minutes, while they work")
-    print(f"    here     {MANY:,} x {1e3 * here_s:.4f} ms = {MANY * here_s / 60:.0f} minutes, before and after")
+    print(
+        f"    reading  {MANY:,} x {1e3 * reading_s:.3f} ms = {MANY * reading_s / 3600:.1f} hours of workers"
+    )
+    print(
+        f"    sending  {tasks:,.0f} x {1e3 * empty_s:.2f} ms = {tasks * empty_s / 60:.1f} minutes, "
+        "while they work"
+    )
+    print(
+        f"    here     {MANY:,} x {1e3 * here_s:.4f} ms = {MANY * here_s / 60:.0f} minutes, before and after"
+    )
     for workers in WORKERS:
         seconds = MANY * here_s + max(MANY * reading_s / workers, tasks * empty_s)
         print(f"    with {workers:5,d} workers: {seconds / 3600:.1f} hours")
@@ -75,7 +82,9 @@ def _seconds(campaign: Path, cores: Sequence[int], work: Path, how: Sequence[str
 def _ingest(campaign: Path, cores: Sequence[int], work: Path, how: Sequence[str]) -> Watched:
     out = work / "cluster_out"
     return watched(
-        [sys.executable, "-m", "sealfit", "ingest", campaign, "--out", out, "--force", *how], cores=cores, look=False
+        [sys.executable, "-m", "sealfit", "ingest", campaign, "--out", out, "--force", *how],
+        cores=cores,
+        look=False,
     )
 
 

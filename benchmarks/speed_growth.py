@@ -1,10 +1,11 @@
 """How the cost of `sealfit` grows with the number of files: a part of `speed.py`, which says how to run it.
 
-Every campaign is written by `many_files.py` if it is not there. Measured are a first ingest (wall seconds a file, peak
-of the tree's resident sets), the same again with nothing changed, again after three files more (a new run of a
-condition that was there), and reading one condition of table `bins` beside reading all of it: seconds and bytes, in a
-process of its own. With all steps also what each later step takes, on the tables without the three files; with an
-effect in the files close-loop has something to find, and to find again in every fold.
+Every campaign is written by `many_files.py` if it is not there. Measured are a first ingest (wall seconds a
+file, peak of the tree's resident sets), the same again with nothing changed, again after three files more (a
+new run of a condition that was there), and reading one condition of table `bins` beside reading all of it:
+seconds and bytes, in a process of its own. With all steps also what each later step takes, on the tables
+without the three files; with an effect in the files close-loop has something to find, and to find again in
+every fold.
 """
 
 from __future__ import annotations
@@ -92,7 +93,9 @@ def measure(
 def each_further_file(seconds: Sequence[tuple[int, float]]) -> None:
     """Print what a further file costs between the sizes: seconds a file without what every start costs."""
     for (few, before), (many, after) in itertools.pairwise(sorted(seconds)):
-        print(f"  from {few:,} to {many:,} files: {1e3 * (after - before) / (many - few):.3f} ms a further file")
+        print(
+            f"  from {few:,} to {many:,} files: {1e3 * (after - before) / (many - few):.3f} ms a further file"
+        )
 
 
 def line(what: str, cost: Watched, more: str = "") -> None:

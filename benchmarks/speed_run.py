@@ -37,7 +37,12 @@ def run(campaign: Path, cores: Sequence[int], repeats: int, resamples: int, work
         shutil.rmtree(out)
         return cost
 
-    measured = {"script": script(resamples), "plain": script(0), "one": sealfit(1, one), "two": sealfit(2, two)}
+    measured = {
+        "script": script(resamples),
+        "plain": script(0),
+        "one": sealfit(1, one),
+        "two": sealfit(2, two),
+    }
     found = in_turns(measured, repeats)
     print(f"\nwhole run of {campaign.name}, {repeats} turns")
     show(f"pandas script, {resamples} resamples", found["script"])

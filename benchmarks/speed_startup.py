@@ -35,12 +35,16 @@ def startup(cores: Sequence[int], repeats: int) -> None:
     show("sealfit --help", found["help"], "s", "at most 0.3, or twice typer")
     show("sealfit --help / import typer", ratios(found["help"], found["typer"]), "x", "at most 2, or 0.3 s")
     print(
-        "\nheavy packages that a command imports, on the simulated sample; matplotlib should be in report and run only"
+        "\nheavy packages that a command imports, on the simulated sample; "
+        "matplotlib should be in report and run only"
     )
     with tempfile.TemporaryDirectory() as folder:
         for name, words in commands(Path(folder)):
             there = imported(words, cores)
-            print(f"  {name:14s}{', '.join(package for package in HEAVY if package in there) or 'none'}", flush=True)
+            print(
+                f"  {name:14s}{', '.join(package for package in HEAVY if package in there) or 'none'}",
+                flush=True,
+            )
 
 
 def commands(folder: Path) -> Iterator[tuple[str, list]]:
@@ -62,6 +66,8 @@ def commands(folder: Path) -> Iterator[tuple[str, list]]:
 
 def imported(words: Sequence[str | Path], cores: Sequence[int]) -> set[str]:
     """Return the packages that a command imports."""
-    said = watched([sys.executable, "-X", "importtime", "-m", "sealfit", *words], cores=cores, look=False).output
+    said = watched(
+        [sys.executable, "-X", "importtime", "-m", "sealfit", *words], cores=cores, look=False
+    ).output
     lines = (line.rpartition("|")[2].strip() for line in said.splitlines() if line.startswith("import time:"))
     return {line.partition(".")[0] for line in lines}

@@ -1,4 +1,4 @@
-"""Tables `steady` with known truth, made from the equations without any traces: for counts of many campaigns."""
+"""Tables `steady` with known truth, made from the equations without traces: for counts of many campaigns."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""What the truth file of a campaign says, in the terms of the joint model: true effects as terms, tested and fitted.
+"""What a campaign's truth file says in terms of the joint model: true effects as terms, tested and fitted.
 
-The true-form test of an effect: the declared model with every true effect in its true form, what is nonlinear in them
-held at its true value, fitted by the loop's own estimator to the rows the loop works on; z is the effect's amplitude
-over its standard error, the wider of the fitted scatter's and the one that whole groups of the effect's own unit show
-(as in the loop's intervals), with the sign of the true amplitude. For k amplitudes at once it is
-sqrt(max(W - (k - 1), 0)), W the Wald statistic.
+The true-form test of an effect: the declared model with every true effect in its true form, what is nonlinear
+in them held at its true value, fitted by the loop's own estimator to the rows the loop works on; z is the
+effect's amplitude over its standard error, the wider of the fitted scatter's and the one that whole groups of
+the effect's own unit show (as in the loop's intervals), with the sign of the true amplitude. For k amplitudes
+at once it is sqrt(max(W - (k - 1), 0)), W the Wald statistic.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ NO_INTERVAL = {("step", "x_0")}
 
 @dataclass(frozen=True)
 class TrueEffect:
-    """One true effect: its term, its true numbers in the term's parameters, and what it adds to each row's force."""
+    """One true effect: its term, the true numbers of its parameters, and what it adds to each row's force."""
 
     id: str
     term: Term
@@ -89,16 +89,22 @@ def evidence_unit(term: Term, rows: Rows) -> str:
 
 
 def true_term(entry, channels: tuple[str, ...]) -> tuple[Term, dict[str, float]]:
-    """Return an effect of a SPEC as a term of the joint model, and its true numbers in the term's parameters."""
+    """Return an effect of a SPEC as a term of the joint model, and its true numbers in its parameters."""
     target = (entry.acts_on, entry.operation)
     if entry.id == LEVELS:
         categories = sorted(entry.parameters)
         base = entry.parameters[categories[0]]
         scale = 1.0 + base if entry.operation == "multiply" else 1.0
-        values = {f"d_{k}": (entry.parameters[c] - base) / scale for k, c in enumerate(categories[1:], start=1)}
-        return Term(levels_effect(categories), channels, *target, fixed={"categories": tuple(categories)}), values
+        values = {
+            f"d_{k}": (entry.parameters[c] - base) / scale for k, c in enumerate(categories[1:], start=1)
+        }
+        return Term(
+            levels_effect(categories), channels, *target, fixed={"categories": tuple(categories)}
+        ), values
     if entry.formula is not None:
-        return Term(formula_effect(entry.formula, entry.parameters, target), channels, *target), dict(entry.parameters)
+        return Term(formula_effect(entry.formula, entry.parameters, target), channels, *target), dict(
+            entry.parameters
+        )
     return Term(EFFECTS[entry.id], channels, *target, fixed=dict(entry.reference)), dict(entry.parameters)
 
 
@@ -123,7 +129,9 @@ class Tested:
     z_expected: float
 
 
-def test_true_forms(declared: Model, rows: Rows, scatter, true: list[TrueEffect]) -> tuple[list[Tested], Fitted]:
+def test_true_forms(
+    declared: Model, rows: Rows, scatter, true: list[TrueEffect]
+) -> tuple[list[Tested], Fitted]:
     """Return the test of each true effect, and the fit of the true form with all parameters free."""
     held = declared
     for effect in true:
@@ -150,7 +158,7 @@ def test_true_forms(declared: Model, rows: Rows, scatter, true: list[TrueEffect]
 
 
 def _between(effect: TrueEffect, rows: Rows) -> dict[str, float]:
-    """Return the place of a step as a fit finds it: halfway between the values of its channel on both sides."""
+    """Return the place of a step as a fit finds it: halfway between its channel's values on both sides."""
     if effect.id != "step":
         return {}
     values, place = rows.values(effect.term.channels[0]), effect.values["x_0"]
@@ -174,12 +182,14 @@ def _z(amplitude: np.ndarray, covariance: np.ndarray) -> float:
     return float(np.sqrt(max(score_statistic - (amplitude.size - 1), 0.0)))
 
 
-def truth_in_claim(effect: TrueEffect, claimed: Term, found: Mapping[str, float], rows: Rows) -> dict[str, float]:
-    """Return the true numbers as the claimed term would write them: its references, its phase's turn, its sign.
+def truth_in_claim(
+    effect: TrueEffect, claimed: Term, found: Mapping[str, float], rows: Rows
+) -> dict[str, float]:
+    """Return the true numbers as the claimed term writes them: its references, its phase's turn, its sign.
 
-    Two forms with other references are one effect where 1 + h' = c (1 + h) for a factor, or h' = h + c for a change:
-    the constant goes into the declared model. Amplitudes follow from least squares over the rows; nonlinear numbers
-    mean the same in both. Only for a claim with the true id and target.
+    Two forms with other references are one effect where 1 + h' = c (1 + h) for a factor, or h' = h + c for a
+    change: the constant goes into the declared model. Amplitudes follow from least squares over the rows;
+    nonlinear numbers mean the same in both. Only for a claim with the true id and target.
     """
     values = dict(effect.values)
     if "phi" in values:
@@ -193,7 +203,8 @@ def truth_in_claim(effect: TrueEffect, claimed: Term, found: Mapping[str, float]
         return values
     zero = dict.fromkeys(effect.term.effect.linear, 0.0)
     columns = [
-        claimed.effect.shape(claimed.inputs(rows), **{**values, **zero, name: 1.0}) for name in claimed.effect.linear
+        claimed.effect.shape(claimed.inputs(rows), **{**values, **zero, name: 1.0})
+        for name in claimed.effect.linear
     ]
     if effect.term.operation == "multiply":  # c (1 + own) - sum A g = 1
         matrix, wanted = np.column_stack([*(-c for c in columns), 1 + own]), np.ones_like(own)

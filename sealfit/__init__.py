@@ -1,7 +1,7 @@
 """From a friction rig's files to the LuGre model of an aging rubber seal, and to what that model lacks.
 
-`sealfit.run` does what the command of the same name does and returns a `Results`; `sealfit.open` returns those that are
-there. Both are loaded when they are first asked for, so that the command line starts at once.
+`sealfit.run` does what the command of the same name does and returns a `Results`; `sealfit.open` returns
+those that are there. Both are loaded when they are first asked for, so that the command line starts at once.
 """
 
 from typing import TYPE_CHECKING
@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from sealfit.notebook.results import open as open
 
 __version__ = "0.1.0"
-__all__ = ["Lifetime", "Results", "run"]  # without `open`: `from sealfit import *` is not to hide Python's own
+# Without `open`: `from sealfit import *` is not to hide Python's own.
+__all__ = ["Lifetime", "Results", "run"]
 
 _LOADED = (*__all__, "open")
 

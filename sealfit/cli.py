@@ -19,21 +19,33 @@ from sealfit.errors import SealfitError, grouped, told
 # ---------------------------------------------------------------- options
 # Arguments and options that several commands share.
 
-Campaign = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder: runs.csv and the trace files.")]
-Results = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results that `ingest` or `run` made.")]
+Campaign = Annotated[
+    Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder: runs.csv and the trace files.")
+]
+Results = Annotated[
+    Path, typer.Argument(metavar="OUT", help="Folder of results that `ingest` or `run` made.")
+]
 Out = Annotated[Path, typer.Option("--out", help="Folder of results; created if it is missing.")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="Rig config (TOML); default: as the README's table.")]
-Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Processes to use. [default: all cores]")]
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", help="Rig config (TOML); default: as the README's table.")
+]
+Workers = Annotated[
+    int | None, typer.Option("--workers", min=1, help="Processes to use. [default: all cores]")
+]
 Scheduler = Annotated[
     str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on: tcp://host:port, or its file."),
+    typer.Option(
+        "--scheduler", metavar="ADDRESS", help="Dask scheduler to work on: tcp://host:port, or its file."
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Redo steps that are up to date, too.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
 Profile = Annotated[bool, typer.Option("--profile", help="Print seconds and rows per step.")]
 EffectsFolder = Annotated[
     Path | None,
-    typer.Option("--effects-folder", metavar="FOLDER", help="Folder of your own effects. Python is run from it."),
+    typer.Option(
+        "--effects-folder", metavar="FOLDER", help="Folder of your own effects. Python is run from it."
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
 
@@ -61,20 +73,24 @@ def print_json(document: dict) -> None:
 
 
 def exit_code(app: typer.Typer) -> int:
-    """Run the command line and say how it ended: 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
+    """Run the command line and return 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
     one_thread()
     try:
         code = app(standalone_mode=False, prog_name="sealfit") or 0
         return _interrupted() if code == INTERRUPTED else code
     except SealfitError as error:
         return _fail(f"sealfit: {error}", error.as_dicts(), 1)
-    except (KeyboardInterrupt, typer.Abort):  # typer hands on a Ctrl-C as one of these or as the code, by version
+    except (
+        KeyboardInterrupt,
+        typer.Abort,
+    ):  # typer hands on a Ctrl-C as one of these or as the code, by version
         return _interrupted()
     except BrokenPipeError:  # `sealfit effects | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
-        # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they can do.
+        # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they
+        # can do.
         if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):
             return _bug(error)
         text = error.format_message()
@@ -94,7 +110,7 @@ def _fail(message: str, errors: list[dict], code: int) -> int:
 
 
 def _bug(error: Exception) -> int:
-    """Say that the program, not its input, is at fault: the traceback on stderr, one line of it under --json."""
+    """Report a fault of the program, not its input: the traceback on stderr, one line of it under --json."""
     traceback.print_exception(error)
     told = " ".join("".join(traceback.format_exception_only(error)).split())
     fix = "Please report it, with the traceback on stderr."
@@ -113,7 +129,8 @@ def _error(reason: str) -> dict:
 # ---------------------------------------------------------------- cli
 
 app = typer.Typer(
-    help="From a friction rig's CSV files to the LuGre model of an aging rubber seal, and to what that model lacks.",
+    help="From a friction rig's CSV files to the LuGre model of an aging rubber seal, and to what that "
+    "model lacks.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -130,7 +147,8 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _sealfit(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end."),
     ] = False,
 ) -> None:
     pass
@@ -189,7 +207,9 @@ def _fit_command(step: str) -> Callable[..., None]:
 
 app.command("fit-steady", help="Fit steady LuGre to each condition.")(_fit_command("fit-steady"))
 app.command("fit-aging", help="Fit the aging law across days.")(_fit_command("fit-aging"))
-app.command("fit-dynamic", help="Fit sigma_0 and sigma_1 to the pre-sliding part.")(_fit_command("fit-dynamic"))
+app.command("fit-dynamic", help="Fit sigma_0 and sigma_1 to the pre-sliding part.")(
+    _fit_command("fit-dynamic")
+)
 
 
 @app.command("close-loop")
@@ -238,8 +258,12 @@ def run(
 @app.command()
 def predict(
     out: Results,
-    points: Annotated[Path, typer.Option("--points", help="CSV of points: condition columns, speed, channels.")],
-    output: Annotated[Path, typer.Option("--output", help="CSV to write: the points with their predictions.")],
+    points: Annotated[
+        Path, typer.Option("--points", help="CSV of points: condition columns, speed, channels.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", help="CSV to write: the points with their predictions.")
+    ],
     effects_folder: EffectsFolder = None,
     as_json: Json = False,
 ) -> None:
@@ -255,17 +279,25 @@ def predict(
 def lifetime(
     out: Results,
     quantity: Annotated[str, typer.Option("--quantity", help="mu_s, mu_c, F_s or F_c.")] = "mu_s",
-    threshold: Annotated[float | None, typer.Option("--threshold", help="Value at which the life ends.")] = None,
+    threshold: Annotated[
+        float | None, typer.Option("--threshold", help="Value at which the life ends.")
+    ] = None,
     loss: Annotated[
         float | None, typer.Option("--loss", help="Or the loss at which it ends, in percent of the start.")
     ] = None,
-    temperature: Annotated[float | None, typer.Option("--temperature", help="Temperature in use, in degC.")] = None,
-    compression: Annotated[float | None, typer.Option("--compression", help="Height in use, in percent.")] = None,
+    temperature: Annotated[
+        float | None, typer.Option("--temperature", help="Temperature in use, in degC.")
+    ] = None,
+    compression: Annotated[
+        float | None, typer.Option("--compression", help="Height in use, in percent.")
+    ] = None,
     years: Annotated[
         float | None, typer.Option("--years", help="Find the temperature at which it lasts so many years.")
     ] = None,
     law: Annotated[str | None, typer.Option("--law", help="log, stretched, power, induction.")] = None,
-    model: Annotated[str, typer.Option("--model", help="after (with the loop's effects) or before.")] = "after",
+    model: Annotated[
+        str, typer.Option("--model", help="after (with the loop's effects) or before.")
+    ] = "after",
     as_json: Json = False,
 ) -> None:
     """Compute the days until a quantity reaches a threshold."""
@@ -278,7 +310,9 @@ def lifetime(
 
 @app.command()
 def effects(
-    out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="Results, for their units and effects.")] = None,
+    out: Annotated[
+        Path | None, typer.Argument(metavar="[OUT]", help="Results, for their units and effects.")
+    ] = None,
     effects_folder: EffectsFolder = None,
     as_json: Json = False,
 ) -> None:
@@ -300,7 +334,12 @@ def simulate(
     from sealfit import commands
 
     made = commands.simulate(spec, out, force=force)
-    end("simulate", made, lambda m: [f"{m['files']} trace files in {m['campaign']}", f"truth: {m['truth']}"], as_json)
+    end(
+        "simulate",
+        made,
+        lambda m: [f"{m['files']} trace files in {m['campaign']}", f"truth: {m['truth']}"],
+        as_json,
+    )
 
 
 @app.command()
@@ -316,16 +355,22 @@ def check(
     from sealfit import commands, progress
     from sealfit.report import summary_lines
 
-    found, faults = commands.check(campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr())
+    found, faults = commands.check(
+        campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr()
+    )
     if as_json:
-        print_json({"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]})
+        print_json(
+            {"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]}
+        )
     else:
         for group in grouped(faults):
             typer.echo(f"{group[0].severity}: {told(group)}")
         for line in summary_lines.ingest_lines(found) if found["files"] else ():
             typer.echo(line)
         typer.echo(
-            f"{len(faults)} {'fault' if len(faults) == 1 else 'faults'} found." if faults else "No faults found."
+            f"{len(faults)} {'fault' if len(faults) == 1 else 'faults'} found."
+            if faults
+            else "No faults found."
         )
     if faults:
         raise typer.Exit(1)
@@ -333,7 +378,12 @@ def check(
 
 # ---------------------------------------------------------------- what the commands share
 def _single(step: str, out: Path, profile: bool, as_json: bool, **options: object) -> None:
-    _do(step, profile, as_json, lambda pipeline, progress: pipeline.single(step, out, progress=progress, **options))
+    _do(
+        step,
+        profile,
+        as_json,
+        lambda pipeline, progress: pipeline.single(step, out, progress=progress, **options),
+    )
 
 
 def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
@@ -345,7 +395,12 @@ def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
         made = work(pipeline, progress.to_stderr())
     if profile:
         made["profile"] = progress.as_dicts(parts)
-    end(command, made, lambda made: summary_lines.lines(made) + progress.lines(made.get("profile", ())), as_json)
+    end(
+        command,
+        made,
+        lambda made: summary_lines.lines(made) + progress.lines(made.get("profile", ())),
+        as_json,
+    )
 
 
 def _options(workers: int | None, scheduler: str | None, **more: object) -> dict:
@@ -358,12 +413,14 @@ def _workers(workers: int | None, scheduler: str | None) -> int:
     from sealfit.engine import run_map
 
     if workers is not None and scheduler is not None:
-        raise typer.BadParameter("use either --workers (this computer) or --scheduler (a Dask cluster), not both.")
+        raise typer.BadParameter(
+            "use either --workers (this computer) or --scheduler (a Dask cluster), not both."
+        )
     return workers or run_map.cores()
 
 
 def main() -> None:
-    """Run the command line; the exit code is 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
+    """Run the command line and exit with 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
     sys.exit(exit_code(app))
 
 

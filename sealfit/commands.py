@@ -31,7 +31,7 @@ MODELS = ("after", "before")  # with the loop's effects taken out at their refer
 
 
 def init(folder: Path, output: Path, *, force: bool = False) -> dict:
-    """Write the draft of a config that reads the files in a folder; return the guesses, the doubts and what is next.
+    """Write the draft of a config that reads the files in a folder; return guesses, doubts and what is next.
 
     Raises
     ------
@@ -43,14 +43,20 @@ def init(folder: Path, output: Path, *, force: bool = False) -> dict:
     from sealfit.draft.draft import draft
 
     if output.suffix.lower() != ".toml":
-        raise OutError("is no name for a config.", file=output, fix="Give --output a name that ends in .toml.")
+        raise OutError(
+            "is no name for a config.", file=output, fix="Give --output a name that ends in .toml."
+        )
     if output.exists() and not force:
-        raise OutError("is there already.", file=output, fix="Choose another --output, or replace it with --force.")
+        raise OutError(
+            "is there already.", file=output, fix="Choose another --output, or replace it with --force."
+        )
     made = draft(folder)
     try:
         output.write_text(made.text, "utf-8")
     except OSError as error:
-        raise OutError(f"cannot be written ({error.strerror}).", file=output, fix="Choose another --output.") from error
+        raise OutError(
+            f"cannot be written ({error.strerror}).", file=output, fix="Choose another --output."
+        ) from error
     return {
         "config": str(output),
         "folder": str(folder),
@@ -110,8 +116,8 @@ def predict(
     StaleError
         If the loop has not been closed on the campaign as it stands, or with other effects of the user's own.
     RequestError
-        If the points cannot be read, lack a column that the model needs, the answers cannot be written, or the model
-        needs the user's own effects and no folder of them is given.
+        If the points cannot be read, lack a column that the model needs, the answers cannot be written, or
+        the model needs the user's own effects and no folder of them is given.
     """
     from sealfit.closure.prediction_csv import read_points, write_answers
 
@@ -125,7 +131,7 @@ def predict(
 
 
 def answers_to(points: pd.DataFrame, store: Store) -> pd.DataFrame:
-    """Return points with their answers, by the model that the loop of `store` recorded; errors as `predict`."""
+    """Return points with their answers, by the model that `store`'s loop recorded; errors as `predict`."""
     from sealfit.closure.predict import predict as answer
 
     return answer(store.read_json("model"), points, _own_effects(store.effects))
@@ -135,7 +141,8 @@ def answers_to(points: pd.DataFrame, store: Store) -> pd.DataFrame:
 class LifetimeRequest:
     """What `lifetime` is asked: the end of life is a value (`threshold`) or a loss in percent of the start.
 
-    With `years` the temperature is sought at which a seal lasts so long. Without `law` the likeliest one answers.
+    With `years` the temperature is sought at which a seal lasts so long. Without `law` the likeliest one
+    answers.
     """
 
     quantity: str = "mu_s"
@@ -149,7 +156,7 @@ class LifetimeRequest:
 
 
 def lifetime(out: Path, asked: LifetimeRequest) -> dict:
-    """Return the days until a quantity reaches a threshold by the likeliest law and by its rivals, with intervals.
+    """Return the days to a threshold of a quantity, by the likeliest law and by its rivals, with intervals.
 
     Raises
     ------
@@ -184,7 +191,7 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
 
 
 def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame], list[dict]]:
-    """Return table `steady` and the fit of its conditions of a model, and the effects that were taken out of them."""
+    """Return a model's table `steady`, the fit of its conditions, and the effects taken out of them."""
     from sealfit.fit.stored_tables import whole_steady_fit
 
     if model == "before":
@@ -213,8 +220,8 @@ def _own_effects(folder: Path | None) -> dict:
 def effects(out: Path | None = None, effects_folder: Path | None = None) -> dict:
     """Return the catalogue; with OUT, in its units and with those that its loop added.
 
-    With `effects_folder`, whose files are run, the user's own effects too. `note` says if OUT has others, or some and
-    none are given.
+    With `effects_folder`, whose files are run, the user's own effects too. `note` says if OUT has others, or
+    some and none are given.
     """
     from sealfit.effects import EFFECTS
     from sealfit.report import summary

@@ -1,6 +1,7 @@
 """Rig configs: `configs/*.toml`, checked on load, unknown keys refused.
 
-A config says what one rig's files look like; the default, inside the package, reads exactly the table of the README.
+A config says what one rig's files look like; the default, inside the package, reads exactly the table of the
+README.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ class Strict(BaseModel):
 class FileColumn(Strict):
     """A column of a file: `force_N = "Kraft"`, or with its unit `force_N = {name = "Kraft", unit = "kgf"}`.
 
-    `name` is what the file calls it, or its position from 1; `unit` is that of its numbers in the file where it is
-    another than ours. The numbers are converted to our unit when they are read.
+    `name` is what the file calls it, or its position from 1; `unit` is that of its numbers in the file where
+    it is another than ours. The numbers are converted to our unit when they are read.
     """
 
     name: str | int
@@ -67,7 +68,7 @@ def _as_list(formats: object) -> object:
 
 
 class StartedAt(Strict):
-    """Columns of date and time of day, where these are two: `started_at = {date = "Datum", time = "Zeit"}`."""
+    """Columns of date and time of day, if these are two: `started_at = {date = "Datum", time = "Zeit"}`."""
 
     date: str
     time: str
@@ -79,7 +80,9 @@ class TraceFormat(Strict):
     format: Literal["csv", "xlsx", "tdms", "mat", "parquet"] | None = Field(
         None, description="what the files are; without it their endings say so"
     )
-    sheet: str | int | None = Field(None, description="xlsx: name or number (from 1) of the sheet with the data")
+    sheet: str | int | None = Field(
+        None, description="xlsx: name or number (from 1) of the sheet with the data"
+    )
     group: str | None = Field(None, description="tdms: group of the channels")
     variable: str | None = Field(None, description="mat: struct or matrix with the data, or '(vectors)'")
     encoding: str = Field(
@@ -87,31 +90,47 @@ class TraceFormat(Strict):
     )
     delimiter: str = Field(",", description="one character, 'tab' or 'whitespace'")
     decimal: Literal[".", ","] = "."
-    header_lines: int | None = Field(None, ge=0, description="lines before the first data row, column names included")
-    header_ends_at: str | None = Field(None, description="regular expression; the header ends with the line it matches")
-    names: Literal["header", "none"] = Field("header", description="'none': no line of names, columns are by position")
-    names_line: int | None = Field(None, description="line of names counted back from the header's end: 1 = the last")
+    header_lines: int | None = Field(
+        None, ge=0, description="lines before the first data row, column names included"
+    )
+    header_ends_at: str | None = Field(
+        None, description="regular expression; the header ends with the line it matches"
+    )
+    names: Literal["header", "none"] = Field(
+        "header", description="'none': no line of names, columns are by position"
+    )
+    names_line: int | None = Field(
+        None, description="line of names counted back from the header's end: 1 = the last"
+    )
     units_row: bool = Field(False, description="a row of units follows the names")
     trailing_separator: bool = Field(False, description="lines end in stray separators; strip them")
     drop_first_rows: int = Field(0, ge=0)
     columns: FileColumns = Field(
-        default_factory=lambda: {name: FileColumn(name=name) for name in ("time_s", "displacement_mm", "force_N")},
-        description="our name = the file's column name, or its position from 1; with a unit {name = .., unit = ..}",
+        default_factory=lambda: {
+            name: FileColumn(name=name) for name in ("time_s", "displacement_mm", "force_N")
+        },
+        description="our name = the file's column name, or its position from 1; with a unit "
+        "{name = .., unit = ..}",
     )
     optional: list[str] = Field(default_factory=list, description="of `columns`, those a file may lack")
     other_columns: Literal["channels", "ignore"] = Field("channels", description="columns not listed above")
     header_fields: dict[str, str] = Field(
-        default_factory=dict, description="channel = regular expression with one group, searched in the header lines"
+        default_factory=dict,
+        description="channel = regular expression with one group, searched in the header lines",
     )
     keep: str | None = Field(None, description="row filter, e.g. 'load_N > 4.9'")
     compute: dict[str, str] = Field(
-        default_factory=dict, description="column = safe expression over columns, file-name parts and constants"
+        default_factory=dict,
+        description="column = safe expression over columns, file-name parts and constants",
     )
     constants: dict[str, float] = Field(default_factory=dict)
     drop_columns: list[str] = Field(
-        default_factory=list, description="columns that `compute`, `keep` or the integral read and that are no channels"
+        default_factory=list,
+        description="columns that `compute`, `keep` or the integral read and that are no channels",
     )
-    integrate_displacement: str | None = Field(None, description="speed column whose time integral is displacement")
+    integrate_displacement: str | None = Field(
+        None, description="speed column whose time integral is displacement"
+    )
     integrate_per: Literal["s", "min"] = Field("s", description="time unit of that speed: rpm is per min")
 
     @property
@@ -137,17 +156,23 @@ class Files(Strict):
         default_factory=dict, description="our column = template over parts, e.g. run_id = '{rig}_{bar}bar'"
     )
     compute: dict[str, str] = Field(
-        default_factory=dict, description="column = safe expression over parts, e.g. speed_mm_s = 'sign * rpm'"
+        default_factory=dict,
+        description="column = safe expression over parts, e.g. speed_mm_s = 'sign * rpm'",
     )
     units: dict[str, str] = Field(
-        default_factory=dict, description="unit of a part or column that names of files give: temperature_C = 'degF'"
+        default_factory=dict,
+        description="unit of a part or column that names of files give: temperature_C = 'degF'",
     )
     date_format: Annotated[list[str], BeforeValidator(_as_list)] = Field(
-        default_factory=list, description="formats of started_at as strptime has them, one or several, tried in order"
+        default_factory=list,
+        description="formats of started_at as strptime has them, one or several, tried in order",
     )
-    started_at: StartedAt | None = Field(None, description="columns of date and time of day, where these are two")
+    started_at: StartedAt | None = Field(
+        None, description="columns of date and time of day, where these are two"
+    )
     runs_columns: FileColumns = Field(
-        default_factory=dict, description="our name = runs.csv's column name; with a unit {name = .., unit = ..}"
+        default_factory=dict,
+        description="our name = runs.csv's column name; with a unit {name = .., unit = ..}",
     )
     runs_table: str | None = Field(None, description="table to read as runs.csv: .csv, .xlsx or .parquet")
     runs_sheet: str | int | None = Field(None, description="xlsx: name or number (from 1) of its sheet")
@@ -156,7 +181,9 @@ class Files(Strict):
     def copies(self) -> dict[str, str]:
         """Columns that are a part as it stands, by the template "{T}" or the expression T, and that part."""
         whole = {name: text[1:-1] for name, text in self.columns.items() if re.fullmatch(r"\{[^{}]*\}", text)}
-        return {name: text.strip() for name, text in self.compute.items() if text.strip().isidentifier()} | whole
+        return {
+            name: text.strip() for name, text in self.compute.items() if text.strip().isidentifier()
+        } | whole
 
     @property
     def text_parts(self) -> tuple[str, ...]:
@@ -171,7 +198,9 @@ class Files(Strict):
                 day = datetime(2024, 2, 1, 9, 30, tzinfo=UTC).strftime(one)
                 datetime.strptime(day, one)
             except ValueError as error:
-                raise ValueError(f"{one!r} is no date format: {error}. Write for example '%d.%m.%Y %H:%M'") from None
+                raise ValueError(
+                    f"{one!r} is no date format: {error}. Write for example '%d.%m.%Y %H:%M'"
+                ) from None
             if not {"%d", "%j", "%x", "%c"} & set(re.findall("%.", one)):
                 raise ValueError(f"{one!r} has no day. Write for example '%d.%m.%Y %H:%M'")
         return formats
@@ -199,11 +228,19 @@ class Quantity(Strict):
 class Strokes(Strict):
     """How strokes and their steady windows are found."""
 
-    smooth_samples: int = Field(7, ge=1, description="displacement is smoothed over this many samples to find turns")
-    min_travel_mm: float | None = Field(None, description="shorter strokes are not strokes; default: 5 % of the range")
+    smooth_samples: int = Field(
+        7, ge=1, description="displacement is smoothed over this many samples to find turns"
+    )
+    min_travel_mm: float | None = Field(
+        None, description="shorter strokes are not strokes; default: 5 % of the range"
+    )
     min_samples: int = Field(20, ge=4, description="fewer samples in the steady window: too short")
-    speed_tolerance: float = Field(0.1, gt=0, description="steady: smoothed speed within this share of its plateau")
-    min_steady_share: float = Field(0.2, gt=0, lt=1, description="a steady window shorter than this share is too short")
+    speed_tolerance: float = Field(
+        0.1, gt=0, description="steady: smoothed speed within this share of its plateau"
+    )
+    min_steady_share: float = Field(
+        0.2, gt=0, lt=1, description="a steady window shorter than this share is too short"
+    )
     whole_file: bool = Field(False, description="every file is one steady stroke; no pre-sliding, no ramps")
 
 
@@ -217,15 +254,23 @@ class Bins(Strict):
 class Quality(Strict):
     """When a row, file or repeat is left out."""
 
-    max_bad_rows: float = Field(0.05, ge=0, le=1, description="share of rows a file may lose before it is left out")
+    max_bad_rows: float = Field(
+        0.05, ge=0, le=1, description="share of rows a file may lose before it is left out"
+    )
     outlier_p: float = Field(0.001, gt=0, lt=1, description="family-wise level at which a repeat is flagged")
     drop_outliers: bool = False
     max_gap_factor: float = Field(10.0, gt=1, description="a time step this many times the median is a gap")
-    max_gap_share: float = Field(0.2, gt=0, le=1, description="gaps that hide more of the time leave the stroke out")
+    max_gap_share: float = Field(
+        0.2, gt=0, le=1, description="gaps that hide more of the time leave the stroke out"
+    )
     saturated_share: float = Field(0.05, gt=0, le=1, description="share of samples at the very extreme")
     stuck_samples: int = Field(50, ge=3, description="this many equal force samples in a row are stuck")
-    spike_sigma: float = Field(12.0, gt=3, description="a sample this many robust SDs off its neighbours is a spike")
-    speed_disagreement: float = Field(0.2, gt=0, description="share by which speed x time may miss displacement")
+    spike_sigma: float = Field(
+        12.0, gt=3, description="a sample this many robust SDs off its neighbours is a spike"
+    )
+    speed_disagreement: float = Field(
+        0.2, gt=0, description="share by which speed x time may miss displacement"
+    )
 
 
 class Sensor(Strict):
@@ -248,7 +293,9 @@ class Loop(Strict):
     folds: int = Field(5, ge=2)
     seed: int = 1
     ignore_channels: list[str] = Field(default_factory=list)
-    effects_folder: str | None = Field(None, description="folder of the user's own effects; Python is run from it")
+    effects_folder: str | None = Field(
+        None, description="folder of the user's own effects; Python is run from it"
+    )
 
 
 class Config(Strict):
@@ -261,8 +308,12 @@ class Config(Strict):
     trace: TraceFormat = TraceFormat()
     files: Files = Files()
     runs: Runs = Runs()
-    quantities: dict[Literal["force", "displacement", "speed", "load", "time"], Quantity] = Field(default_factory=dict)
-    column_units: dict[str, str] = Field(default_factory=dict, description="units of the campaign's own channels")
+    quantities: dict[Literal["force", "displacement", "speed", "load", "time"], Quantity] = Field(
+        default_factory=dict
+    )
+    column_units: dict[str, str] = Field(
+        default_factory=dict, description="units of the campaign's own channels"
+    )
     strokes: Strokes = Strokes()
     bins: Bins = Bins()
     quality: Quality = Quality()
@@ -294,7 +345,8 @@ class Config(Strict):
 
     @model_validator(mode="after")
     def _expressions_are_safe(self) -> Config:
-        from sealfit.ingest.expression import parse  # here, so that commands that read no config start quickly
+        # Here, so that commands that read no config start quickly.
+        from sealfit.ingest.expression import parse
 
         rows = {f"trace.compute.{k}": (v, False) for k, v in self.trace.compute.items()}
         rows |= {f"files.compute.{k}": (v, False) for k, v in self.files.compute.items()}
@@ -312,7 +364,8 @@ class Config(Strict):
     def _units_convert(self) -> Config:
         units = self.units
         for table, place, name, unit in self._units_of_files():
-            # A channel of the campaign's own has no unit of ours: it keeps its numbers, and labels show its unit.
+            # A channel of the campaign's own has no unit of ours: it keeps its numbers, and labels show its
+            # unit.
             to = units.of(name) or self._kept_units.setdefault(name, unit)
             try:
                 self._conversions.setdefault(table, {})[name] = conversion(unit, to)
@@ -321,18 +374,24 @@ class Config(Strict):
         return self
 
     def _units_of_files(self) -> list[tuple[str, str, str, str]]:
-        """Return every column whose unit is given: its table, its place in the config, its name and the unit."""
+        """Return every column whose unit is given: its table, place in the config, name and unit."""
         parts, ours = self.files.units, self.units
         copies = {n: parts[p] for n, p in self.files.copies.items() if p in parts and not ours.of(p)}
         tables = (
             ("trace", "trace.columns", {name: column.unit for name, column in self.trace.columns.items()}),
-            ("runs", "files.runs_columns", {name: column.unit for name, column in self.files.runs_columns.items()}),
+            (
+                "runs",
+                "files.runs_columns",
+                {name: column.unit for name, column in self.files.runs_columns.items()},
+            ),
             ("names", "files.units", copies | parts),
         )
-        return [(table, place, n, unit) for table, place, units in tables for n, unit in units.items() if unit]
+        return [
+            (table, place, n, unit) for table, place, units in tables for n, unit in units.items() if unit
+        ]
 
     def conversions(self, table: Literal["trace", "runs", "names"]) -> dict[str, Conversion]:
-        """Return the conversion of every column of traces, runs.csv or file names whose unit the config gives."""
+        """Return the conversion per column of traces, runs.csv or file names whose unit the config gives."""
         return self._conversions.get(table, {})
 
     @property
@@ -402,7 +461,7 @@ def parse_config(text: str, name: str) -> Config:
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """Return one sentence per fault of a config or SPEC; one of `model`'s keys is named for an unknown key."""
+    """Return a sentence per fault of a config or SPEC; one of `model`'s keys is named for an unknown key."""
     lines = []
     for fault in error.errors():
         key, text = ".".join(str(part) for part in fault["loc"]), fault["msg"].removeprefix("Value error, ")
@@ -416,7 +475,7 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str
 
 
 def _nearest_key(place: tuple[int | str, ...], model: type[BaseModel]) -> str:
-    """Return the key that is most likely meant: one of the same table, else one of that name in another; "" if none."""
+    """Return the key most likely meant: one of the same table, else of that name in another; "" if none."""
     *above, wrong = place
     here = model
     for part in above:
@@ -430,7 +489,7 @@ def _nearest_key(place: tuple[int | str, ...], model: type[BaseModel]) -> str:
 
 
 def _table_of(annotation: object) -> type[BaseModel] | None:
-    """Return the model of a table of a config, or that of the tables that it holds; None where it holds none."""
+    """Return the model of a table of a config, or of the tables that it holds; None where it holds none."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((table for part in get_args(annotation) if (table := _table_of(part))), None)

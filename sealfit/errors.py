@@ -15,8 +15,9 @@ from typing import Literal
 class Fault:
     """One thing found wrong (or worth saying) in a campaign: where, what, what was done, how to fix it.
 
-    A `Fault` with `severity` "error" stops a run if it concerns the campaign; one that concerns a file or a cell
-    leaves that file or row out (`action`) and the run goes on (design: a fault of a file, a fault of a cell).
+    A `Fault` with `severity` "error" stops a run if it concerns the campaign; one that concerns a file or a
+    cell leaves that file or row out (`action`) and the run goes on (design: a fault of a file, a fault of a
+    cell).
     """
 
     check: str  # short name of the rule, e.g. "missing_column"
@@ -58,7 +59,7 @@ RUNS_TABLES = ("runs.csv", "runs.xlsx", "runs.parquet")  # their lines are trace
 
 
 def grouped(faults: Iterable[Fault]) -> list[list[Fault]]:
-    """Return the faults with those that more than `EXAMPLES` files share together, in the order of the first of each.
+    """Return the faults, grouped if more than `EXAMPLES` files share them, in the order of the first of each.
 
     Faults are shared that differ in the file, the line, the value and in numbers of their reason only.
     """
@@ -100,7 +101,7 @@ def how_many(group: Sequence[Fault]) -> str:
 
 
 def examples(group: Sequence[Fault]) -> list[str]:
-    """Return the places of a group, three at most, with value, and reason where it differs from file to file."""
+    """Return the places of a group, three at most, with value, and reason if it differs between files."""
     whole, places = one_reason(group), {}
     for fault in group:
         places.setdefault(_place(fault), fault)
@@ -141,7 +142,7 @@ def _shared(fault: Fault) -> tuple:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return the known name that `name` most likely means: the same in other case, or a close one; "" if none."""
+    """Return the known name that `name` most likely means: equal but for case, or a close one; "" if none."""
     known = [other for other in known if other]
     by_case = [other for other in known if other.lower() == name.lower()]
     folded = {other.lower(): other for other in known}
@@ -150,7 +151,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def did_you_mean(path: Path, fits: Callable[[Path], bool] = Path.is_dir) -> str:
-    """Return a fix for a path that is not there: the nearest name beside it, or beside its missing folder; "" if none.
+    """Return a fix for a missing path: the nearest name beside it, or beside its missing folder; "" if none.
 
     `fits` says which files or folders can be meant.
     """
@@ -160,12 +161,18 @@ def did_you_mean(path: Path, fits: Callable[[Path], bool] = Path.is_dir) -> str:
         missing, parent = parent, parent.parent
     try:
         there = sorted(
-            child.name for child in parent.iterdir() if not child.name.startswith(".") and (missing or fits(child))
+            child.name
+            for child in parent.iterdir()
+            if not child.name.startswith(".") and (missing or fits(child))
         )
     except OSError:
         return ""
     likely = nearest((missing or path.absolute()).name, there)
-    return f"Did you mean {quoted(path.parent / likely if missing is None else parent / likely)}?" if likely else ""
+    return (
+        f"Did you mean {quoted(path.parent / likely if missing is None else parent / likely)}?"
+        if likely
+        else ""
+    )
 
 
 def quoted(path: Path) -> str:
@@ -197,7 +204,7 @@ class SealfitError(Exception):
         super().__init__(" ".join(p for p in (f"{head}: {message}" if head else message, fix) if p))
 
     def _render_traceback_(self) -> list[str]:
-        """Return what a notebook shows in place of a traceback: the program is not at fault, and the fix is said."""
+        """Return what a notebook shows, not a traceback: the program is not at fault, and the fix is said."""
         return [f"{type(self).__name__}: {self}"]
 
     def as_dicts(self) -> list[dict]:
@@ -222,7 +229,7 @@ class CampaignError(SealfitError):
 
 
 class BadFile(SealfitError):
-    """A trace file that must be left out; the run goes on without it. `faults` says why, the deciding one last."""
+    """A trace file that is left out; the run goes on without it. `faults` says why, the deciding one last."""
 
     def __init__(self, *faults: Fault):
         self.faults = faults
@@ -251,7 +258,7 @@ class StaleError(SealfitError):
 
 
 class OutError(SealfitError):
-    """OUT cannot be written: it belongs to another campaign, another process writes it, or the disk is full."""
+    """OUT cannot be written: it is another campaign's, another process writes it, or the disk is full."""
 
 
 class ParameterError(SealfitError):

@@ -23,8 +23,8 @@ INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bin
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
 AFTER = (
     "steady_after", "steady_fit_after", "aging_fit_after", "aging_curves_after", "aging_laws_after",
-    "master_curve_after", "dynamic_fit_after", "dynamic_curves_after", "steady_covariance_after", "steady_shift_after",
-    "aging_covariance_after",
+    "master_curve_after", "dynamic_fit_after", "dynamic_curves_after", "steady_covariance_after",
+    "steady_shift_after", "aging_covariance_after",
 )  # fmt: skip
 FITS = {
     "fit-steady": ("steady_fit", "steady_covariance", "steady_shift"),
@@ -127,7 +127,10 @@ def single(step: str, out: Path, *, progress: Silent | None = None, **options) -
         If close-loop needs the user's own effects and no `effects_folder` is given.
     """
     chosen = Options(**options)
-    with Store.writing(existing_out(out), effects=chosen.effects_folder) as store, on_cluster(chosen.scheduler, out):
+    with (
+        Store.writing(existing_out(out), effects=chosen.effects_folder) as store,
+        on_cluster(chosen.scheduler, out),
+    ):
         store.require(STEPS[STEPS.index(step) - 1])
         return _do_steps(store, (step,), chosen, progress or Silent())
 
@@ -164,7 +167,10 @@ def faults_of(quality: pd.DataFrame) -> list[Fault]:
     return [Fault(**row) for row in rows.assign(**whole).to_dict("records")]
 
 
-# ---------------------------------------------------------------- the work of each step; how many rows of what it saw
+# ---------------------------------------------------------------- the work of each step
+# Each returns how many rows of what it saw.
+
+
 def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
     with timed("loading libraries"):
         from sealfit.ingest.campaign import Place, ingest_campaign
@@ -233,7 +239,9 @@ def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) ->
 
     store.require_effects()
     config = store.seen_config("close-loop")
-    closure = close_loop(store.read("bins"), store.traces(), config, workers=workers, on_progress=progress.say)
+    closure = close_loop(
+        store.read("bins"), store.traces(), config, workers=workers, on_progress=progress.say
+    )
     if closure.tables["effects"].size:
         progress.say("the fits with the effects taken out")
     after = after_fits(closure.after, store.read("steady"), store.traces(), config, workers=workers)
@@ -285,7 +293,7 @@ def report_tables(store: Store) -> dict[str, pd.DataFrame]:
 
 
 def _example_traces(store: Store, runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the averaged traces that the report draws; the table has hundreds of rows for each of all runs."""
+    """Return the averaged traces that the report draws; the table has hundreds of rows for every run."""
     from sealfit.report.figures.aging import example_runs
 
     names = ["run_id", "condition"]

@@ -53,7 +53,7 @@ class Lines(Silent):
         self.say(f"warning: {text}")
 
     def faults(self, faults: Iterable[Fault]) -> None:
-        """List the faults found in a campaign, those of all of it first; only the first of them if they are many.
+        """List the faults found in a campaign, those of all of it first; only the first if they are many.
 
         One that many files share is one line.
         """
@@ -110,7 +110,7 @@ def to_stderr() -> Lines:
 
 
 def for_notebook() -> Lines:
-    """Return the progress that fits a notebook: lines among its results, not in red; else that which fits stderr."""
+    """Return the progress that fits a notebook: lines among its results, not in red; else that for stderr."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython else None
     return Lines(sys.stdout) if hasattr(shell, "kernel") else to_stderr()
@@ -173,7 +173,7 @@ def timed(name: str, rows: int | None = None, of: str = "") -> Iterator[Part]:
 
 
 def as_dicts(parts: Sequence[Part]) -> list[dict]:
-    """Return the parts as plain values: step, part (null for the step itself), seconds, rows and what these are."""
+    """Return the parts as plain values: step, part (null for the step), seconds, rows and what these are."""
     found, step = [], ""
     for part in parts:
         step = part.name if part.depth == 0 else step

@@ -24,7 +24,7 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """One table: its fixed columns and, if `open_`, whatever condition columns and channels the campaign adds."""
+    """One table: its fixed columns and, if `open_`, the condition columns and channels the campaign adds."""
 
     name: str
     columns: tuple[Column, ...]
@@ -52,7 +52,9 @@ FORCE = Column("force_N", "N", FLOAT, "friction force, with the sign of the moti
 PRESLIDING = Column("presliding_N", "N", FLOAT, "what is left of the pre-sliding rise, taken out of force_N")
 DISPLACEMENT = Column("displacement_mm", "mm", FLOAT, "displacement in the rig's own coordinate")
 DISTANCE = Column("distance_mm", "mm", FLOAT, "distance slid since the stroke's start")
-TIME = Column("time_s", "s", FLOAT, "time in the file; from the stroke's first row in a file of several strokes")
+TIME = Column(
+    "time_s", "s", FLOAT, "time in the file; from the stroke's first row in a file of several strokes"
+)
 RUN_ORDER = Column("run_order", "", FLOAT, "place of the file in the order of started_at; null if not given")
 ELAPSED = Column("elapsed_h", "h", FLOAT, "time since the campaign's first file; null if not given")
 
@@ -80,7 +82,9 @@ RUNS = Schema(
         LOAD,
         RUN_ORDER,
         ELAPSED,
-        Column("started_at", "", TEXT, "start of the file, ISO 8601, as given where it is; null if not given"),
+        Column(
+            "started_at", "", TEXT, "start of the file, ISO 8601, as given where it is; null if not given"
+        ),
         Column("used", "", BOOL, "false where the stroke was left out; quality says why"),
     ),
     open_=True,
@@ -109,7 +113,12 @@ TRACES = Schema(
         TIME,
         DISPLACEMENT,
         FORCE,
-        Column("presliding_N", "N", FLOAT, "in the steady window, what is left in force_N of the pre-sliding rise"),
+        Column(
+            "presliding_N",
+            "N",
+            FLOAT,
+            "in the steady window, what is left in force_N of the pre-sliding rise",
+        ),
         Column("steady", "", BOOL, "true inside the steady window"),
     ),
     open_=True,  # channels measured along the trace
@@ -122,7 +131,9 @@ TRACES_MEAN = Schema(
         CONDITION,
         DISPLACEMENT,
         Column("force_N", "N", FLOAT, "mean force of the repeats at this displacement"),
-        Column("force_se_N", "N", FLOAT, "standard error of that mean, from the repeats; null for one repeat"),
+        Column(
+            "force_se_N", "N", FLOAT, "standard error of that mean, from the repeats; null for one repeat"
+        ),
         Column("n", "", INT, "strokes averaged"),
         Column("steady", "", BOOL, "true where every stroke averaged is in its steady window"),
     ),
@@ -157,7 +168,12 @@ BINS = Schema(
         *KEYS,
         Column("bin", "", INT, "number of the bin along its stroke, from 0"),
         SPEED,
-        Column("speed_bin_mm_s", "mm/s", FLOAT, "sliding speed in the bin; the stroke's where no difference is seen"),
+        Column(
+            "speed_bin_mm_s",
+            "mm/s",
+            FLOAT,
+            "sliding speed in the bin; the stroke's where no difference is seen",
+        ),
         SPEED_SET,
         LOAD,
         Column("force_N", "N", FLOAT, "friction force: mean in the bin, without presliding_N"),
@@ -174,8 +190,8 @@ BINS = Schema(
 )
 
 # ---------------------------------------------------------------- fits (long: one row per parameter)
-# The fits before the loop are without effects. If the loop added effects, the tables with the suffix `_after` have the
-# fits after their subtraction; otherwise these are empty. Column `model` is "before" or "after".
+# The fits before the loop are without effects. If the loop added effects, the tables with the suffix `_after`
+# have the fits after their subtraction; otherwise these are empty. Column `model` is "before" or "after".
 MODEL = Column("model", "", TEXT, "before: without effects | after: at the reference of the loop's effects")
 _FIT = (
     MODEL,
@@ -222,7 +238,12 @@ STEADY_SHIFT = Schema(
         SERIES,
         RUBBER,
         MODEL,
-        Column("source", "", TEXT, "sensor: it reads one standard uncertainty too high | 1, 2, ...: of the effects"),
+        Column(
+            "source",
+            "",
+            TEXT,
+            "sensor: it reads one standard uncertainty too high | 1, 2, ...: of the effects",
+        ),
         _PARAMETER,
         Column("value", "", FLOAT, "change of the parameter, common to all conditions in sign"),
         Column("unit", "", TEXT, "unit of value"),
@@ -235,7 +256,10 @@ DYNAMIC_FIT = Schema("dynamic_fit", (CONDITION, SERIES, RUBBER, DIRECTION, SPEED
 STEADY_AFTER = Schema(
     "steady_after",
     (
-        *(replace(c, meaning=f"{c.meaning}, less `effects_N`") if c.name == "force_N" else c for c in STEADY.columns),
+        *(
+            replace(c, meaning=f"{c.meaning}, less `effects_N`") if c.name == "force_N" else c
+            for c in STEADY.columns
+        ),
         Column("effects_N", "N", FLOAT, "mean force of the subtracted effects over the steady window"),
         Column("effects_start_N", "N", FLOAT, "force of these effects at the start of the stroke"),
     ),
@@ -341,7 +365,12 @@ AGING_LAWS = Schema(
         MODEL,
         Column("quantity", "", TEXT, "mu_s, mu_c, F_s or F_c"),
         Column("law", "", TEXT, "log | stretched | power | induction, for all series; or separate laws"),
-        Column("way", "", TEXT, "what temperature and compression change: rate | loss; empty where neither varies"),
+        Column(
+            "way",
+            "",
+            TEXT,
+            "what temperature and compression change: rate | loss; empty where neither varies",
+        ),
         Column("form", "", TEXT, "equation"),
         Column("rank", "", INT, "1: lowest BIC"),
         Column("rival", "", BOOL, "true where it is not distinguishable from the best law with these data"),
@@ -363,14 +392,21 @@ MASTER_CURVE = Schema(
         RUBBER,
         Column("quantity", "", TEXT, "mu_s, mu_c, F_s or F_c"),
         Column("kind", "", TEXT, "value | law"),
-        Column("scaled_days", "d", FLOAT, "aging time, by the rate where temperature and compression change that"),
         Column(
-            "value", "", FLOAT, "value of a condition, brought to the reference where that changes the loss; or law"
+            "scaled_days", "d", FLOAT, "aging time, by the rate where temperature and compression change that"
+        ),
+        Column(
+            "value",
+            "",
+            FLOAT,
+            "value of a condition, brought to the reference where that changes the loss; or law",
         ),
         Column("lo95", "", FLOAT, "lower end of the law's 95 % band"),
         Column("hi95", "", FLOAT, "upper end of the law's 95 % band"),
         Column("temperature_C", "°C", FLOAT, "aging temperature; null for unaged rubber and for the law"),
-        Column("compression_ratio_pct", "%", FLOAT, "height while aging; null for unaged rubber and for the law"),
+        Column(
+            "compression_ratio_pct", "%", FLOAT, "height while aging; null for unaged rubber and for the law"
+        ),
         Column("aging_days", "d", FLOAT, "aging time; null for the law"),
     ),
 )
@@ -384,7 +420,12 @@ DYNAMIC_CURVES = Schema(
         Column("force_N", "N", FLOAT, "mean force of the starts, in the direction of motion"),
         Column("force_se_N", "N", FLOAT, "standard error of that mean, from the starts; null for one start"),
         Column("n", "", INT, "starts averaged"),
-        Column("model_N", "N", FLOAT, "mean of the fitted dynamic model over the same samples; null without a fit"),
+        Column(
+            "model_N",
+            "N",
+            FLOAT,
+            "mean of the fitted dynamic model over the same samples; null without a fit",
+        ),
     ),
 )
 AGING_CURVES = Schema(

@@ -1,7 +1,8 @@
-"""The true unit of every column: what a slot such as `force_N` holds; a config may declare another quantity and unit.
+"""The true unit of every column: what a slot such as `force_N` holds.
 
-Column names are fixed (design: "Units"); `Units.of` gives the true unit, and that is what the Parquet metadata and
-every label show. Numbers of files that are in other units are converted by `conversion`, once, when they are read.
+A config may declare another quantity and unit. Column names are fixed (design: "Units"); `Units.of` gives
+the true unit, and that is what the Parquet metadata and every label show. Numbers of files that are in other
+units are converted by `conversion`, once, when they are read.
 """
 
 from __future__ import annotations
@@ -77,7 +78,16 @@ class Units:
         return f"{words} ({unit})" if unit else words
 
 
-_ENDINGS = {"_C": "°C", "_pct": "%", "_days": "d", "_h": "h", "_s": "s", "_mm": "mm", "_N": "N", "_bar": "bar"}
+_ENDINGS = {
+    "_C": "°C",
+    "_pct": "%",
+    "_days": "d",
+    "_h": "h",
+    "_s": "s",
+    "_mm": "mm",
+    "_N": "N",
+    "_bar": "bar",
+}
 _KNOWN = {"aging_days": "d", "temperature_C": "°C", "compression_ratio_pct": "%", "elapsed_h": "h"}
 _MEANING = {
     "distance_mm": "sliding distance",
@@ -156,9 +166,13 @@ def conversion(unit: str, to: str) -> Conversion:
     registry = _registry()
     ours, theirs = _dimension(to), _dimension(unit)
     if ours is None:
-        raise ConfigError(f"nothing can be converted to {to!r}, which is no known unit.", fix="Drop the unit.")
+        raise ConfigError(
+            f"nothing can be converted to {to!r}, which is no known unit.", fix="Drop the unit."
+        )
     if theirs is None:
-        raise ConfigError(f"{unit!r} is no known unit; {_name(ours)} ({to}) is expected.", fix=_nearest(unit, ours))
+        raise ConfigError(
+            f"{unit!r} is no known unit; {_name(ours)} ({to}) is expected.", fix=_nearest(unit, ours)
+        )
     if theirs != ours:
         reason = f"the unit {unit!r} is one of {_name(theirs)}; {_name(ours)} ({to}) is expected."
         raise ConfigError(reason, fix=_nearest(unit, ours))
@@ -167,7 +181,9 @@ def conversion(unit: str, to: str) -> Conversion:
         return float(registry.Quantity(value, registry.Unit(unit)).m_as(registry.Unit(to)))
 
     offset = converted(0.0)
-    return Conversion(converted(1.0)) if offset == 0 else Conversion((converted(_FAR) - offset) / _FAR, offset)
+    return (
+        Conversion(converted(1.0)) if offset == 0 else Conversion((converted(_FAR) - offset) / _FAR, offset)
+    )
 
 
 @cache

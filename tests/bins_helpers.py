@@ -45,7 +45,9 @@ def make_bins(
     files = 0
     for temperature, compression, day in conditions:
         piece = rng.normal(0, specimen)
-        series = "unaged" if day == 0 else f"temperature_C={temperature:g}, compression_ratio_pct={compression:g}"
+        series = (
+            "unaged" if day == 0 else f"temperature_C={temperature:g}, compression_ratio_pct={compression:g}"
+        )
         condition = "unaged" if day == 0 else f"{series}, aging_days={day:g}"
         mu_s = TRUE["mu_s0"] - TRUE["a_s"] * np.log1p(day / TRUE["b_s"])
         mu_c = TRUE["mu_c0"] - TRUE["a_c"] * np.log1p(day / TRUE["b_c"])
@@ -101,4 +103,6 @@ def warm(table: pd.DataFrame, force: np.ndarray) -> np.ndarray:
 
 def make_traces(bins: pd.DataFrame) -> pd.DataFrame:
     """Return the bins themselves as steady samples: what the ripple search sees."""
-    return bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(presliding_N=0.0, steady=True)
+    return bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(
+        presliding_N=0.0, steady=True
+    )

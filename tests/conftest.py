@@ -1,6 +1,7 @@
 """No test is judged by how long it takes: the first example of a process may load scipy on a busy machine.
 
-A shell starts what it puts in the background with Ctrl-C ignored; tests that send one need it heard, wherever they run.
+A shell starts what it puts in the background with Ctrl-C ignored; tests that send one need it heard, wherever
+they run.
 """
 
 import signal

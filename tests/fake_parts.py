@@ -11,7 +11,16 @@ from sealfit.store.manifest import fingerprint
 from sealfit.tables import AFTER
 
 FAULT = Fault(
-    "not_a_number", "is not a number.", "a.csv", None, 3, "force_N", "x", "warning", "row left out", "Fix the cell."
+    "not_a_number",
+    "is not a number.",
+    "a.csv",
+    None,
+    3,
+    "force_N",
+    "x",
+    "warning",
+    "row left out",
+    "Fix the cell.",
 )
 ERRORS = {
     "rmse_N": 0.4,
@@ -71,7 +80,9 @@ class Parts:
 
     def ingest_campaign(self, campaign, config, *, workers=1, on_file=None, place=None):
         self._called("ingest", config)
-        marks = {path.name: fingerprint(path) for path in sorted(campaign.glob("*.csv")) if path.name != "runs.csv"}
+        marks = {
+            path.name: fingerprint(path) for path in sorted(campaign.glob("*.csv")) if path.name != "runs.csv"
+        }
         on_file(len(marks), len(marks))
         tables = {name: small(name) for name in ("runs", "traces", "traces_mean", "steady", "bins")}
         tables["runs"] = tables["runs"].assign(started_at="2024-03-01T09:30:00")
@@ -89,7 +100,9 @@ class Parts:
 
     def fit_conditions(self, steady, config):
         self._called("fit-steady", config)
-        fit = small("steady_fit", 3).assign(condition=["a", "b", "c"], parameter="mu_s", value=[0.7, 0.8, 9.0], unit="")
+        fit = small("steady_fit", 3).assign(
+            condition=["a", "b", "c"], parameter="mu_s", value=[0.7, 0.8, 9.0], unit=""
+        )
         return fit.assign(identified=[True, True, False], reason=["", "", "Too few speeds."])
 
     def fit_series(self, steady_fit, config):
@@ -102,7 +115,11 @@ class Parts:
     def fit_dynamic(self, traces, steady, steady_fit, config, *, workers=1):
         self._called("fit-dynamic", config)
         fit = small("dynamic_fit", 2).assign(
-            quantity="dynamic", parameter=["sigma_0", "sigma_1"], value=[100.0, 0.5], unit=["N/mm", "N s/mm"], reason=""
+            quantity="dynamic",
+            parameter=["sigma_0", "sigma_1"],
+            value=[100.0, 0.5],
+            unit=["N/mm", "N s/mm"],
+            reason="",
         )
         return SimpleNamespace(fit=fit, curves=small("dynamic_curves"))
 
@@ -115,7 +132,10 @@ class Parts:
         on_progress("trying ripple along displacement_mm")
         names = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
         return SimpleNamespace(
-            document=self.closure, model={"ready": True}, tables={name: small(name) for name in names}, after=None
+            document=self.closure,
+            model={"ready": True},
+            tables={name: small(name) for name in names},
+            after=None,
         )
 
     def after_fits(self, after, steady, traces, config, *, workers=1):

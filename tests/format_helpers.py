@@ -48,7 +48,9 @@ def as_mat73(path, table, **scalars):
             group[name] = table[name].to_numpy()[None, :]
         for name, value in scalars.items():
             text = isinstance(value, str)
-            file[name] = np.array([[ord(c)] for c in value], np.uint16) if text else np.array([[value]], float)
+            file[name] = (
+                np.array([[ord(c)] for c in value], np.uint16) if text else np.array([[value]], float)
+            )
             file[name].attrs["MATLAB_class"] = np.bytes_("char" if text else "double")
         file.create_group("#refs#")["a"] = np.zeros((1, 5))
     with open(path, "r+b") as raw:

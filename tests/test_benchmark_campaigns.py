@@ -54,7 +54,10 @@ def test_the_papers_campaign_has_its_73_conditions_and_1752_files():
 def test_strengths_stand_in_their_proportion_to_the_scatter(name, tmp_path):
     rms = []
     for strength in ("weak", "strong"):
-        simulate(campaigns.campaign(name, strength=strength, rows=200 if name == "run_in" else 60), tmp_path / strength)
+        simulate(
+            campaigns.campaign(name, strength=strength, rows=200 if name == "run_in" else 60),
+            tmp_path / strength,
+        )
         truth = load_truth(truth_path(tmp_path / strength))
         rms.append([effect["rms_N"] for effect in truth["effects"]])
     mean = np.abs([row["mean_force_N"] for row in truth["files"]]).mean()
@@ -62,7 +65,9 @@ def test_strengths_stand_in_their_proportion_to_the_scatter(name, tmp_path):
     scatter = mean * np.sqrt(3) * 0.005
     rms = np.array(rms)
     assert ((rms[0] > 0.2 * scatter) & (rms[0] < 2 * scatter)).all()
-    np.testing.assert_allclose(rms[1] / rms[0], 10.0, rtol=0.14)  # factors multiply each other, shifts of v_s saturate
+    np.testing.assert_allclose(
+        rms[1] / rms[0], 10.0, rtol=0.14
+    )  # factors multiply each other, shifts of v_s saturate
 
 
 def test_the_strengths_are_one_three_and_ten_times_the_weak_one():
@@ -73,7 +78,9 @@ def test_the_strengths_are_one_three_and_ten_times_the_weak_one():
 
 def test_the_command_writes_one_and_refuses_an_unknown_name(tmp_path, capsys):
     out = tmp_path / "c"
-    assert campaigns.main(["null_specimen_with_columns", "--seed", "3", "--out", str(out), "--rows", "60"]) == 0
+    assert (
+        campaigns.main(["null_specimen_with_columns", "--seed", "3", "--out", str(out), "--rows", "60"]) == 0
+    )
     runs = pd.read_csv(out / "runs.csv")
     assert {"lab_temperature_C", "sheet"} <= set(runs.columns)
     assert load_truth(truth_path(out))["spec"]["seed"] == 3

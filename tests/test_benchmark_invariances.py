@@ -25,7 +25,12 @@ AS_IS = Change(lambda given, rng: given)
 
 
 def closure(*effects, verdict="closed", after=0.1):
-    return {"verdict": verdict, "effects": list(effects), "before": {"rmse_N": 0.5}, "after": {"rmse_N": after}}
+    return {
+        "verdict": verdict,
+        "effects": list(effects),
+        "before": {"rmse_N": 0.5},
+        "after": {"rmse_N": after},
+    }
 
 
 def with_values(**values):
@@ -36,7 +41,16 @@ def with_values(**values):
 # ---------------------------------------------------------------- the parts
 @pytest.mark.parametrize(
     ("unit", "value"),
-    [("", 1), ("N", 1), ("mN", 1e-3), ("N s/mm", 1e3), ("1/mm", 1e3), ("N/(mm/s)", 1e3), ("mm/ms", 1), ("rad", 1)],
+    [
+        ("", 1),
+        ("N", 1),
+        ("mN", 1e-3),
+        ("N s/mm", 1e3),
+        ("1/mm", 1e3),
+        ("N/(mm/s)", 1e3),
+        ("mm/ms", 1),
+        ("rad", 1),
+    ],
 )
 def test_units_by_hand(unit, value):
     assert factor(unit) == pytest.approx(value)
@@ -65,9 +79,13 @@ def test_numbers_are_compared_after_units_shifts_and_mirrors():
 
 
 def test_a_jitter_ten_times_as_large_moves_numbers_ten_times_as_far():
-    closures = [closure(with_values(A={"value": a}, phi={"value": phi})) for a, phi in ((0.5, 3.1), (0.51, -3.1))]
+    closures = [
+        closure(with_values(A={"value": a}, phi={"value": phi})) for a, phi in ((0.5, 3.1), (0.51, -3.1))
+    ]
     (moved,) = in_proportion(*closures)["effects"]
-    assert [p["value"] for p in moved["parameters"]] == pytest.approx([0.6, 5.0, 3.1 + 10 * (2 * np.pi - 6.2)])
+    assert [p["value"] for p in moved["parameters"]] == pytest.approx(
+        [0.6, 5.0, 3.1 + 10 * (2 * np.pi - 6.2)]
+    )
 
 
 def test_fewer_data_move_numbers_by_chance():
@@ -86,16 +104,27 @@ def test_a_copy_counts_as_the_column():
 @pytest.mark.parametrize("name", CHANGES)
 def test_every_change_leaves_a_campaign_that_its_config_reads(name):
     runs = pd.DataFrame(
-        {"file": [f"f{k}.csv" for k in range(4)], "speed_mm_s": 5.0, "load_N": 50.0, "oil_ppm": [1.0, 2.0, 3.0, 4.0]}
+        {
+            "file": [f"f{k}.csv" for k in range(4)],
+            "speed_mm_s": 5.0,
+            "load_N": 50.0,
+            "oil_ppm": [1.0, 2.0, 3.0, 4.0],
+        }
     )
     time = np.linspace(0.0, 2.0, 201)
     place = 11.0 - np.abs(10.0 * time - 10.0)  # there and back
-    trace = pd.DataFrame({"time_s": time, "displacement_mm": place, "force_N": np.where(time < 1.0, 20.0, -20.0)})
+    trace = pd.DataFrame(
+        {"time_s": time, "displacement_mm": place, "force_N": np.where(time < 1.0, 20.0, -20.0)}
+    )
     given = Campaign(runs, dict.fromkeys(runs["file"], trace), "")
     made = CHANGES[name].make(given, np.random.default_rng(0))
     assert set(made.runs["file"]) == set(made.traces)
     config = parse_config(made.config, name)
-    changed = not made.runs.equals(runs) or made.config != "" or any(not t.equals(trace) for t in made.traces.values())
+    changed = (
+        not made.runs.equals(runs)
+        or made.config != ""
+        or any(not t.equals(trace) for t in made.traces.values())
+    )
     assert changed
     assert (config.trace.compute != {}) == name.endswith("_turned")
     assert runs["speed_mm_s"].tolist() == [5.0] * 4  # the campaign as it was is let be
@@ -130,7 +159,9 @@ def test_a_build_is_its_commit_and_what_differs_from_it(tmp_path):
 
 def test_pairs_of_another_build_are_run_again(tmp_path, monkeypatch, capsys):
     ran = []
-    monkeypatch.setattr(invariances, "closed", lambda given: ran.append(given) or closure(verdict="nothing_missing"))
+    monkeypatch.setattr(
+        invariances, "closed", lambda given: ran.append(given) or closure(verdict="nothing_missing")
+    )
     out = tmp_path / "pairs.jsonl"
     asked = ["--campaigns", "short", "--changes", "renamed", "--out", str(out)]
     for own, runs in (("one", 2), ("one", 2), ("two", 4)):
@@ -151,7 +182,8 @@ SHORT = {
 
 
 @pytest.mark.parametrize(
-    ("name", "effect"), [("short", "ripple"), ("there_and_back", "zero_offset"), ("zero_offset", "zero_offset")]
+    ("name", "effect"),
+    [("short", "ripple"), ("there_and_back", "zero_offset"), ("zero_offset", "zero_offset")],
 )
 def test_claims_do_not_hang_on_what_does_not_matter(name, effect):
     given = campaign(name)

@@ -19,7 +19,9 @@ OIL = Target("linear", ("oil_ppm",), "run", "mu", "multiply")
 RIPPLE = Target("ripple", ("displacement_mm",), "trace", "force", "add")
 
 
-def claim(id="linear", channels=("oil_ppm",), level="run", acts_on="mu", operation="multiply", alternatives=()):
+def claim(
+    id="linear", channels=("oil_ppm",), level="run", acts_on="mu", operation="multiply", alternatives=()
+):
     return {
         "id": id,
         "channels": list(channels),
@@ -46,7 +48,9 @@ def test_a_claim_with_the_same_place_and_quantity_is_found_whatever_its_form():
         ),
         (claim(channels=("dust_mg",)), 0.99, NONE),  # another channel, and nothing said of the true one
         (
-            claim(channels=("dust_mg",), alternatives=[{"id": "log", "channels": ["oil_ppm"], "acts_on": "mu"}]),
+            claim(
+                channels=("dust_mg",), alternatives=[{"id": "log", "channels": ["oil_ppm"], "acts_on": "mu"}]
+            ),
             0.99,
             LENIENT,
         ),
@@ -135,7 +139,14 @@ def test_a_file_of_results_is_taken_up_and_failures_run_again(tmp_path):
 
 
 def test_a_summary_counts_what_the_records_say():
-    effect = {"z": 20.0, "grade": 2, "named": True, "named_leniently": True, "catalogued": True, "claimed_id": "ripple"}
+    effect = {
+        "z": 20.0,
+        "grade": 2,
+        "named": True,
+        "named_leniently": True,
+        "catalogued": True,
+        "claimed_id": "ripple",
+    }
     inside = {"parameters": [{"inside": True}, {"inside": False}]}
     base = {
         "seed": 1,
@@ -147,15 +158,20 @@ def test_a_summary_counts_what_the_records_say():
     }
     errors = {"after": 0.2, "plain": 0.5, "true_form": 0.1}
     one = {
-        **base, "kind": "ripple", "strength": "strong", "verdict": "closed", "before": 0.5, "after": 0.2, "inside": 190,
+        **base, "kind": "ripple", "strength": "strong", "verdict": "closed", "before": 0.5, "after": 0.2,
+        "inside": 190,
         "effects": [effect | inside], "claims": [{}], "extra": 0, "misplaced": 0, "errors": errors,
     }  # fmt: skip
     null = {
-        **one, "kind": "null_white", "strength": "-", "verdict": "nothing_missing", "before": 0.2, "claims": [],
+        **one, "kind": "null_white", "strength": "-", "verdict": "nothing_missing", "before": 0.2,
+        "claims": [],
         "effects": [], "errors": dict.fromkeys(errors, 0.1),
     }  # fmt: skip
     text = summarise([one, null])
-    assert "| clear effects found (channels, level, acts_on, operation) | 1 of 1, 100.0 % [2.5, 100.0] | 97 % |" in text
+    assert (
+        "| clear effects found (channels, level, acts_on, operation) | 1 of 1, 100.0 % [2.5, 100.0] | 97 % |"
+        in text
+    )
     assert "| nulls with an effect claimed | 0 of 1, 0.0 % [0.0, 97.5] |" in text
     assert "50.0 % ± nan (2 intervals, 1 campaigns)" in text
     assert "| ripple | strong | 0.200 | 0.100 | 2.00 ** | 0.500 |" in text
@@ -163,7 +179,7 @@ def test_a_summary_counts_what_the_records_say():
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A small campaign with a ripple and a column, and the rows that its bins would be, at the files' own samples."""
+    """A small campaign with a ripple and a column, and the rows its bins would be, at the files' samples."""
     folder = tmp_path_factory.mktemp("loop") / "c"
     spec = campaign("three_at_once", rows=60)
     simulate(spec, folder)
@@ -174,8 +190,9 @@ def made(tmp_path_factory):
     bins = bins.assign(
         condition=bins["specimen_id"], rubber="rubber", stroke=1, direction=1, bin=0, n=10, force_sd_N=0.1,
         series=np.where(bins["aging_days"] > 0, bins["temperature_C"].astype(str), "unaged"),
-        distance_mm=distance, displacement_mm=distance + rng.normal(size=len(bins)), speed_set_mm_s=bins["speed_mm_s"],
-        time_s=distance / bins["speed_mm_s"], run_order=1.0 + bins.index // 3, elapsed_h=24.0 * bins["aging_days"],
+        distance_mm=distance, displacement_mm=distance + rng.normal(size=len(bins)),
+        speed_set_mm_s=bins["speed_mm_s"], time_s=distance / bins["speed_mm_s"],
+        run_order=1.0 + bins.index // 3, elapsed_h=24.0 * bins["aging_days"],
     )  # fmt: skip
     truth = load_truth(truth_path(folder))
     return spec, truth, bins.assign(force_N=true_force(truth, bins))
@@ -210,7 +227,8 @@ def test_a_true_number_is_told_in_the_claims_reference_and_turn(made):
 def test_a_number_without_reference_is_told_as_it_is(made):
     _, _, bins = made
     bins = bins.assign(
-        direction=np.where(bins.index % 2, 1, -1), speed_mm_s=bins["speed_mm_s"] * np.where(bins.index % 2, 1, -1)
+        direction=np.where(bins.index % 2, 1, -1),
+        speed_mm_s=bins["speed_mm_s"] * np.where(bins.index % 2, 1, -1),
     )
     rows = make_rows(bins, has_aging=True)
     (offset,) = true_effects(campaign("zero_offset", strength="strong"), rows)

@@ -1,4 +1,4 @@
-"""What the source paper printed agrees with itself as far as it does, and is looked up where our tables have it."""
+"""What the paper printed agrees with itself as far as it does, and is looked up where our tables have it."""
 
 import pandas as pd
 import pytest

@@ -30,7 +30,9 @@ def test_short_traces_are_read_without_a_fault_and_fit_their_law(short):
     ingested = ingest_campaign(short, load_config())
     assert ingested.faults == []
     fits = fit_conditions(ingested.tables["steady"], load_config())
-    unaged = fits[(fits["condition"] == "unaged") & (fits["quantity"] == "steady")].set_index("parameter")["value"]
+    unaged = fits[(fits["condition"] == "unaged") & (fits["quantity"] == "steady")].set_index("parameter")[
+        "value"
+    ]
     wanted = {"mu_s": MU_S["mu_0"], "mu_c": MU_C["mu_0"], "v_s": V_S, "sigma_2": SIGMA_2}
     for name, value in wanted.items():  # specimen, set-up and repeat scatter by 0.5 % each
         assert unaged[name] == pytest.approx(value, rel=0.4 if name == "sigma_2" else 0.06)
@@ -73,7 +75,9 @@ def test_an_effect_is_in_the_files_and_nothing_else_is_changed(short, tmp_path, 
         wanted = 0.05 * (1 - np.exp(-slid / 10.0)) * force
     else:
         wanted = 0.5 * np.sin(2 * np.pi * place / 5.0 + 0.7)
-    npt.assert_allclose(added, wanted, atol=0.03)  # rounded to 0.01 N; noise of force and place is in what is compared
+    npt.assert_allclose(
+        added, wanted, atol=0.03
+    )  # rounded to 0.01 N; noise of force and place is in what is compared
 
 
 def test_added_files_are_a_new_run_of_a_condition_that_was_there(tmp_path):
@@ -109,7 +113,9 @@ def test_the_script_fits_the_aging_law():
 
 
 def test_a_watched_command_tells_its_memory_and_what_it_said():
-    cost = watched([sys.executable, "-c", "import time; a = b'x' * 80_000_000; time.sleep(0.5); print('said')"])
+    cost = watched(
+        [sys.executable, "-c", "import time; a = b'x' * 80_000_000; time.sleep(0.5); print('said')"]
+    )
     assert cost.output == "said\n"
     assert cost.seconds > 0.5
     assert cost.largest > 80_000_000
@@ -125,7 +131,11 @@ def test_a_watched_command_that_fails_says_so():
 def test_what_is_compared_is_measured_in_turns():
     order = []
     found = in_turns(
-        {"a": lambda: order.append("a") or {"": 1.0, "part": 0.5}, "b": lambda: order.append("b") or {"": 2.0}}, 2
+        {
+            "a": lambda: order.append("a") or {"": 1.0, "part": 0.5},
+            "b": lambda: order.append("b") or {"": 2.0},
+        },
+        2,
     )
     assert order == ["a", "b", "a", "b"]
     assert found == {"a": [1.0, 1.0], "a, part": [0.5, 0.5], "b": [2.0, 2.0]}

@@ -13,7 +13,17 @@ from worlds.motion import batches, force_at, integrate
 from worlds.parameters import EXCLUDES_SCATTER, HOLDS_FOR_TESTED, aged_series, laws_inside
 from worlds.priors import PRIORS
 from worlds.run import command, copies, read_closure, true_effects
-from worlds.score import NONE, RIGHT, SAME_AT_DESIGN, Target, explained_by, grade, named_rightly, on_variables, scored
+from worlds.score import (
+    NONE,
+    RIGHT,
+    SAME_AT_DESIGN,
+    Target,
+    explained_by,
+    grade,
+    named_rightly,
+    on_variables,
+    scored,
+)
 from worlds.summary import alarmed, summarise
 from worlds.true_form import candidates, make_rows, p_units, z_values
 from worlds.world import draw_world
@@ -29,7 +39,9 @@ WARM_HOT = Target(
 OFFSET_IN_WEEK = Target((), ("elapsed_h",), ("repeat",), ("step",), True)
 
 
-def claim(id="ripple", channels=("displacement_mm",), level="trace", named=True, alternatives=(), acts_on="force"):
+def claim(
+    id="ripple", channels=("displacement_mm",), level="trace", named=True, alternatives=(), acts_on="force"
+):
     return {"id": id, "channels": list(channels), "level": level, "named": named, "acts_on": acts_on,
             "operation": "add", "alternatives": list(alternatives)}  # fmt: skip
 
@@ -81,7 +93,9 @@ def test_far_from_the_start_the_integrated_force_is_eq_14(index):
     world = quiet(index, stroke_bristles=300.0)
     world.rig["sigma_0"] *= 300.0 / draw_world(SEED, index).rig["stroke_bristles"]
     for batch in batches(world):
-        last = batch.plateau.shape[1] - 1 - batch.plateau[:, ::-1].argmax(axis=1)  # last sample at the set speed
+        last = (
+            batch.plateau.shape[1] - 1 - batch.plateau[:, ::-1].argmax(axis=1)
+        )  # last sample at the set speed
         for k, row in enumerate(batch.files):
             speed = abs(batch.speed_mm_s[k, last[k]])
             wanted = steady_N(world, world.files.iloc[row], speed)
@@ -96,7 +110,10 @@ def test_bristles_rise_by_their_length():
         own |= {"v_s": 1e-6, "sigma_2": 0.0}
     group = world.files.index[world.files["speed_mm_s"] == world.speeds_mm_s[0]].to_numpy()[:1]
     batch = integrate(world, group)
-    first = int(world.rig["strokes"] > 1 and batch.force_N.shape[1] // world.rig["strokes"]) or batch.force_N.shape[1]
+    first = (
+        int(world.rig["strokes"] > 1 and batch.force_N.shape[1] // world.rig["strokes"])
+        or batch.force_N.shape[1]
+    )
     F_c = steady_N(world, world.files.iloc[group[0]], 1e3)
     distance = batch.channels["distance_mm"][0, :first]
     wanted = F_c * (1 - np.exp(-world.rig["sigma_0"] * distance / F_c))
@@ -106,7 +123,8 @@ def test_bristles_rise_by_their_length():
 def test_the_truth_at_new_points_is_the_traces_force():
     world = quiet(4, speed_error=0.0)
     world.files["_speed_error"] = 0.0
-    world.effects = [Effect("ripple", (), ("displacement_mm",), "force", "add", "sine", {"period": 3.0, "phase": 1.0},
+    world.effects = [Effect("ripple", (), ("displacement_mm",), "force", "add", "sine",
+                            {"period": 3.0, "phase": 1.0},
                             amplitude=0.1 * world.rig["mean_N"])]  # fmt: skip
     world.rig["sigma_0"] *= 300.0 / world.rig["stroke_bristles"]  # settled soon
     batch = batches(world)[0]
@@ -114,7 +132,9 @@ def test_the_truth_at_new_points_is_the_traces_force():
     row = world.files.iloc[[batch.files[0]]]
     here = {name: [values[0, at]] for name, values in batch.channels.items()}
     point = pd.DataFrame({**{n: row[n].tolist() for n in row if not n.startswith("_")}, **here})
-    point = point.assign(speed_mm_s=[batch.speed_mm_s[0, at]], aging_days=row["aging_days"].fillna(0.0).tolist())
+    point = point.assign(
+        speed_mm_s=[batch.speed_mm_s[0, at]], aging_days=row["aging_days"].fillna(0.0).tolist()
+    )
     npt.assert_allclose(force_at(world, point), batch.force_N[0, at], rtol=1e-3)
 
 
@@ -156,7 +176,9 @@ def test_a_strong_ripple_is_seen_and_an_absent_one_is_not():
 
 def test_what_can_be_told_is_counted_by_units_and_by_candidates():
     z = {"z": 9.0, "z_specimens": 2.0}
-    npt.assert_allclose([p_units(z, scatters=True), p_units(z, scatters=False)], [0.0455, 2.257e-19], rtol=1e-3)
+    npt.assert_allclose(
+        [p_units(z, scatters=True), p_units(z, scatters=False)], [0.0455, 2.257e-19], rtol=1e-3
+    )
     world = quiet(5)
     variables = len(world.ranges) + (world.rig["directions"] != "one") + ("batch" in world.files)
     aged = 9 if (world.days > 0).any() else 7
@@ -185,7 +207,9 @@ def test_grades_and_names():
     assert grade(RIPPLE, claim(), 0.0) == RIGHT
     assert grade(RIPPLE, claim(level="run"), 0.0) == NONE
     assert grade(RIPPLE, claim(channels=("time_s",)), 0.99) == SAME_AT_DESIGN
-    by_power = Target(("distance_mm", "speed_mm_s"), (), ("trace",), ("warming_conduction", "warming_power"), False)
+    by_power = Target(
+        ("distance_mm", "speed_mm_s"), (), ("trace",), ("warming_conduction", "warming_power"), False
+    )
     assert grade(by_power, claim("warming_power", ("time_s", "speed_mm_s", "load_N")), 0.0) == RIGHT
     listed = [{"id": "ripple", "channels": ["displacement_mm"], "acts_on": "force"}]
     assert grade(RIPPLE, claim(channels=("time_s",), alternatives=listed), 0.0) == SAME_AT_DESIGN
@@ -222,7 +246,9 @@ def test_a_closure_is_read_with_and_without_the_statement_of_power(coming):
     world = quiet(5)
     wave = {"period": world.rig["stroke_mm"] / 5, "phase": 0.3}
     size = 0.2 * world.rig["mean_N"]
-    world.effects = [Effect("ripple", ("ripple",), ("displacement_mm",), "force", "add", "sine", wave, amplitude=size)]
+    world.effects = [
+        Effect("ripple", ("ripple",), ("displacement_mm",), "force", "add", "sine", wave, amplitude=size)
+    ]
     rows, errors = make_rows(world), {"heldout_rmse_N": 1.0, "rmse_N": 1.0}
     verdict = "cannot_tell" if coming else "closed"
     closure = {"verdict": verdict, "effects": [claim()], "before": errors, "after": errors}
@@ -240,8 +266,9 @@ def test_a_closure_is_read_with_and_without_the_statement_of_power(coming):
 
 def record(index=0, effects=(), verdict="nothing_missing", extra=0, **more):
     return {
-        "seed_text": "s", "index": index, "size": "small", "features": ["small"], "files": 9, "effects": list(effects),
-        "verdict": verdict, "claims": [], "extra": extra, "extra_on_true_variable": 0, "exit": 0, "traceback": None,
+        "seed_text": "s", "index": index, "size": "small", "features": ["small"], "files": 9,
+        "effects": list(effects), "verdict": verdict, "claims": [], "extra": extra,
+        "extra_on_true_variable": 0, "exit": 0, "traceback": None,
         "seconds": 5.0, "peak_MB": 200.0, "predict_exit": 0, "points": 100, "inside": 95, "fit_quality": None,
         "refused": None, "errors": {"before": 1.0, "after": 1.0, "true_form": 0.5},
         "of_tested_specimens": {"points": 40, "inside": 38}, **more,
@@ -249,8 +276,9 @@ def record(index=0, effects=(), verdict="nothing_missing", extra=0, **more):
 
 
 def effect(grade=RIGHT, z=20.0):
-    return {"family": "ripple", "acts_on": "force", "strength_pct": 3.0, "z": z, "clear": z >= 8, "grade": grade,
-            "claimed_id": "ripple" if grade else None, "named_rightly": bool(grade), "smallest_N": 0.1,
+    return {"family": "ripple", "acts_on": "force", "strength_pct": 3.0, "z": z, "clear": z >= 8,
+            "grade": grade, "claimed_id": "ripple" if grade else None, "named_rightly": bool(grade),
+            "smallest_N": 0.1,
             "own_rms_N": 0.1}  # fmt: skip
 
 
@@ -276,7 +304,9 @@ def test_the_summary_counts_what_the_records_say(tmp_path):
     assert not alarmed(records[0])
     path = tmp_path / "r.jsonl"
     path.write_text(
-        "\n".join(json.dumps(r) for r in [*records, {"seed_text": "s", "index": 9, "size": "small", "error": "x"}])
+        "\n".join(
+            json.dumps(r) for r in [*records, {"seed_text": "s", "index": 9, "size": "small", "error": "x"}]
+        )
     )
     assert [r["index"] for r in read(path)] == [0, 1, 2, 3, 4, 5]
 

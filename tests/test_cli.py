@@ -100,7 +100,8 @@ def test_processes_here_and_a_cluster_exclude_each_other(sealfit, campaign, out)
 
 # ---------------------------------------------------------------- exit codes
 @pytest.mark.parametrize(
-    "arguments", [[], ["rum"], ["run"], ["run", "c"], ["ingest", "c", "--out", "o", "--workers", "0"], ["run", "--bad"]]
+    "arguments",
+    [[], ["rum"], ["run"], ["run", "c"], ["ingest", "c", "--out", "o", "--workers", "0"], ["run", "--bad"]],
 )
 def test_wrong_usage_is_2(sealfit, arguments):
     ended = sealfit(*arguments)
@@ -114,7 +115,9 @@ def test_wrong_usage_is_2(sealfit, arguments):
 
 
 def test_a_campaign_at_fault_is_1_and_leaves_no_out(sealfit, parts, campaign, out):
-    parts.raises["ingest"] = CampaignError([Fault("twice", "is listed twice.", "runs.csv", None, 3, fix="Drop one.")])
+    parts.raises["ingest"] = CampaignError(
+        [Fault("twice", "is listed twice.", "runs.csv", None, 3, fix="Drop one.")]
+    )
     ended = sealfit("run", campaign, "--out", out)
     assert (ended.code, ended.stdout) == (1, "")
     assert "sealfit: runs.csv:3: is listed twice. Drop one.\n" in ended.stderr
@@ -177,7 +180,9 @@ def test_a_bug_under_json_leaves_one_object(sealfit, monkeypatch, arguments, at)
 
 def test_a_reader_that_leaves_early_is_no_fault():
     program = "import sys; sys.argv = ['sealfit', '--help']; from sealfit.cli import main; main()"
-    read = subprocess.run(["bash", "-c", f'{sys.executable} -c "{program}" | true'], capture_output=True, text=True)
+    read = subprocess.run(
+        ["bash", "-c", f'{sys.executable} -c "{program}" | true'], capture_output=True, text=True
+    )
     assert "Traceback" not in read.stderr
 
 
@@ -196,7 +201,10 @@ def test_run_does_every_step_and_says_so_in_a_few_lines(sealfit, parts, campaign
     assert f"verdict     closed: {sentence} of repeats" in lines
     assert "            + lead-screw ripple: A 0.25 N, n unknown" in lines
     assert "              reference state of the coefficients: mean over a wavelength" in lines
-    assert "error (N)   rmse 0.4 -> 0.2; held out 0.5 -> unknown; run means 0.3 -> 0.3; largest 1.5 -> 1.5" in lines
+    assert (
+        "error (N)   rmse 0.4 -> 0.2; held out 0.5 -> unknown; run means 0.3 -> 0.3; largest 1.5 -> 1.5"
+        in lines
+    )
     assert f"report      {out / 'report.html'}" in lines
     assert "reading trace files: 1 of 1" in ended.stderr
     assert "trying ripple" in ended.stderr
@@ -277,7 +285,10 @@ def test_faults_are_said_and_counted_and_strict_stops(sealfit, parts, campaign, 
     parts.faults = [fake_parts.FAULT]
     ended = sealfit("run", campaign, "--out", out)
     assert ended.code == 0
-    assert "warning: a.csv:3: column 'force_N': 'x': is not a number. Fix the cell. [row left out]" in ended.stderr
+    assert (
+        "warning: a.csv:3: column 'force_N': 'x': is not a number. Fix the cell. [row left out]"
+        in ended.stderr
+    )
     assert "faults      0 errors, 1 warning; left out: 1 row (table quality)" in ended.stdout
     parts.calls.clear()
     for arguments in (["--strict"], ["--strict", "--force"]):
@@ -366,7 +377,9 @@ def test_wrong_places_come_with_the_likeliest_right_one(sealfit, parts, campaign
     assert f"Did you mean {campaign}?" in fault("run", tmp_path / "campain" / "deeper", "--out", out)
     assert f"Give its folder: {campaign}" in fault("run", campaign / "runs.csv", "--out", out)
     assert f"has no runs.csv. Did you mean {campaign}?" in fault("run", tmp_path, "--out", out)
-    assert "rig.toml: cannot be read" in fault("run", campaign, "--out", out, "--config", tmp_path / "rig.toml")
+    assert "rig.toml: cannot be read" in fault(
+        "run", campaign, "--out", out, "--config", tmp_path / "rig.toml"
+    )
     assert not out.exists()
     sealfit("run", campaign, "--out", out)
     assert f"Did you mean {out}?" in fault("fit-steady", tmp_path / "oot")
@@ -446,7 +459,10 @@ def test_predict_never_overwrites_the_points(sealfit, done, tmp_path):
     ended = sealfit("predict", done, "--points", points, "--output", points)
     assert ended.code == 1
     assert points.read_text() == "a\n1\n"
-    assert "there is no folder" in sealfit("predict", done, "--points", points, "--output", tmp_path / "n/q.csv").stderr
+    assert (
+        "there is no folder"
+        in sealfit("predict", done, "--points", points, "--output", tmp_path / "n/q.csv").stderr
+    )
     assert "is a folder" in sealfit("predict", done, "--points", points, "--output", tmp_path).stderr
 
 
@@ -458,7 +474,10 @@ def test_simulate_names_campaign_and_truth_and_replaces_only_when_told(sealfit, 
     assert ended.code == 0
     assert ended.stdout == f"1 trace files in {made}\ntruth: {made}.truth.json\n"
     spec.write_text("two")
-    assert "is there already. Choose another --out, or replace it" in sealfit("simulate", spec, "--out", made).stderr
+    assert (
+        "is there already. Choose another --out, or replace it"
+        in sealfit("simulate", spec, "--out", made).stderr
+    )
     assert (made / "a.csv").read_text() == "one\n"
     assert sealfit("simulate", spec, "--out", made, "--force").code == 0
     assert (made / "a.csv").read_text() == "two\n"

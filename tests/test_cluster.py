@@ -1,4 +1,4 @@
-"""A real Dask scheduler and two workers of this computer: the same results as here, also where a worker is killed."""
+"""A real Dask scheduler and two local workers: the same results as here, also where a worker is killed."""
 
 import json
 import os
@@ -183,7 +183,9 @@ def campaign(tmp_path_factory):
     return folder / "c", results(folder / "here")
 
 
-def test_files_read_on_a_cluster_give_the_same_although_a_worker_is_killed(campaign, tmp_path, dask, monkeypatch):
+def test_files_read_on_a_cluster_give_the_same_although_a_worker_is_killed(
+    campaign, tmp_path, dask, monkeypatch
+):
     folder, (here, _) = campaign
     monkeypatch.setattr(partitions, "PART_FILES", 12)
     kills = KillsAt(dask.workers[1], "reading trace files")
@@ -194,7 +196,9 @@ def test_files_read_on_a_cluster_give_the_same_although_a_worker_is_killed(campa
         pdt.assert_frame_equal(there.read(name), here[name], check_exact=True, obj=name)
 
 
-def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(campaign, tmp_path, dask, monkeypatch):
+def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
+    campaign, tmp_path, dask, monkeypatch
+):
     folder, (here, closure) = campaign
     monkeypatch.setattr(partitions, "PART_FILES", 12)
     monkeypatch.setattr(loop, "JACKKNIFE_UNITS", 6)
@@ -204,7 +208,9 @@ def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(ca
     assert_same_results(tmp_path / "there", here, closure)
 
 
-def test_the_search_on_a_cluster_gives_the_same_although_a_worker_is_killed(campaign, tmp_path, dask, monkeypatch):
+def test_the_search_on_a_cluster_gives_the_same_although_a_worker_is_killed(
+    campaign, tmp_path, dask, monkeypatch
+):
     folder, (here, closure) = campaign
     monkeypatch.setattr(partitions, "PART_FILES", 12)
     monkeypatch.setattr(spectrum, "WORTHWHILE", 0)

@@ -18,7 +18,9 @@ def test_condition_and_series_are_spelled_from_the_columns_in_the_config_s_order
 
 
 def test_day_zero_is_one_condition_whatever_stands_in_its_other_cells():
-    made = keys({"temperature_C": [20, None, 80], "compression_ratio_pct": [None, 100, 90], "aging_days": [0, 0.0, 2]})
+    made = keys(
+        {"temperature_C": [20, None, 80], "compression_ratio_pct": [None, 100, 90], "aging_days": [0, 0.0, 2]}
+    )
     assert made["condition"].tolist()[:2] == ["unaged", "unaged"]
     assert made["series"].tolist() == ["unaged", "unaged", "temperature_C=80, compression_ratio_pct=90"]
 
@@ -26,7 +28,11 @@ def test_day_zero_is_one_condition_whatever_stands_in_its_other_cells():
 def test_each_rubber_has_its_own_unaged_condition_and_its_own_aged_ones():
     config = Config(condition=["aging_days"], rubber=["compound", "batch"])
     made = keys({"aging_days": [0, 0, 2], "compound": ["NBR", "FKM", "FKM"], "batch": [1, 1, 2]}, config)
-    assert made["condition"].tolist() == ["unaged, NBR, 1", "unaged, FKM, 1", "aging_days=2, compound=FKM, batch=2"]
+    assert made["condition"].tolist() == [
+        "unaged, NBR, 1",
+        "unaged, FKM, 1",
+        "aging_days=2, compound=FKM, batch=2",
+    ]
     assert made["series"].tolist()[2] == "compound=FKM, batch=2"
     assert made["rubber"].tolist() == ["NBR, 1", "FKM, 1", "FKM, 2"]
     assert condition_columns(config) == ["aging_days", "compound", "batch"]

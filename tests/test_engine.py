@@ -154,7 +154,11 @@ def test_no_worker_outlives_its_parent(tmp_path, how):
     program = tmp_path / "program.py"
     program.write_text(PROGRAM.format(tests=str(HERE), work=WORK))
     with subprocess.Popen(
-        [sys.executable, program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        [sys.executable, program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     ) as run:
         assert run.stdout.readline() == "begun\n"
         until = time.monotonic() + 20

@@ -42,11 +42,15 @@ def test_three_files_and_the_lines_of_one_file_are_named_one_by_one():
 def test_lines_of_runs_csv_are_files():
     faults = [Fault("not_a_time", "is no time.", file="runs.csv", line=n, value="x") for n in range(2, 8)]
     (group,) = grouped(faults)
-    assert told(group) == "6 files: is no time. For example runs.csv:2: 'x'; runs.csv:3: 'x'; runs.csv:4: 'x'."
+    assert (
+        told(group) == "6 files: is no time. For example runs.csv:2: 'x'; runs.csv:3: 'x'; runs.csv:4: 'x'."
+    )
 
 
 def test_reasons_that_differ_in_numbers_stand_with_the_examples():
-    faults = [Fault("too_many", f"{i} of 600 rows are bad.", file=f"{i}.csv", value=float(i)) for i in range(5)]
+    faults = [
+        Fault("too_many", f"{i} of 600 rows are bad.", file=f"{i}.csv", value=float(i)) for i in range(5)
+    ]
     (group,) = grouped(faults)
     examples = "; ".join(f"{i}.csv: {i} of 600 rows are bad" for i in range(3))
     assert told(group) == f"5 files: for example {examples}."
@@ -80,11 +84,15 @@ def test_the_terminal_and_the_report_list_it_once_and_quality_has_every_row(caps
 def test_a_campaign_of_which_nothing_can_be_used_says_so_in_two_lines(tmp_path):
     names = [f"{i}.csv" for i in range(30)]
     folder = campaign(tmp_path, "file,aging_days\n" + "".join(f"{name},4\n" for name in names), names)
-    rig = config(DAYS + '[trace]\ncolumns = {time_s = "t", displacement_mm = "displacement_mm", force_N = "force_N"}')
+    rig = config(
+        DAYS + '[trace]\ncolumns = {time_s = "t", displacement_mm = "displacement_mm", force_N = "force_N"}'
+    )
     with pytest.raises(CampaignError) as caught:
         ingest_campaign(folder, rig)
     shared, last = str(caught.value).splitlines()
-    assert shared.startswith("30 files: column 't': there is no such column. For example 0.csv:1; 1.csv:1; 2.csv:1. ")
+    assert shared.startswith(
+        "30 files: column 't': there is no such column. For example 0.csv:1; 1.csv:1; 2.csv:1. "
+    )
     assert last.startswith("none of 30 trace files can be used.")
 
 

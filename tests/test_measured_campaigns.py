@@ -9,7 +9,9 @@ from measured import emps_plateaus, kidney, kidney_plain, measured
 from sealfit.pipeline import run
 from sealfit.store.out_folder import Store
 
-pytestmark = pytest.mark.skipif(measured() is None, reason="SEALFIT_MEASURED names no folder of measured data")
+pytestmark = pytest.mark.skipif(
+    measured() is None, reason="SEALFIT_MEASURED names no folder of measured data"
+)
 PRESSURE = '- pressure_bar * 1e5 * pi * (bore_m / 2) ** 2"'
 
 
@@ -48,12 +50,15 @@ def test_emps_plateaus_go_through(tmp_path):
     assert sliding(tmp_path / "out")["value"].item() == pytest.approx(21.8, abs=1.5)
     assert np.isfinite(sliding(tmp_path / "out")["se"].item())
     loop = json.loads((tmp_path / "out" / "closure.json").read_text())
-    # Over the six means of speed and direction the sum of squares is 67 N^2; with an offset 9.0, with an asymmetry of
-    # sigma_2 0.39, with both 0.36: what looks like an offset is the asymmetry, 154 forward and 229 N s/m backward.
+    # Over the six means of speed and direction the sum of squares is 67 N^2; with an offset 9.0, with an
+    # asymmetry of sigma_2 0.39, with both 0.36: what looks like an offset is the asymmetry, 154 forward and
+    # 229 N s/m backward.
     (asymmetry,) = [e for e in loop["effects"] if e["channels"] == ["direction"]]
     assert (asymmetry["id"], asymmetry["acts_on"]) == ("asymmetry", "sigma_2")
     assert asymmetry["parameters"][0]["value"] == pytest.approx(-0.0744, abs=0.01)
-    ripples = [{p["name"]: p["value"] for p in e["parameters"]} for e in loop["effects"] if e["id"] == "ripple"]
+    ripples = [
+        {p["name"]: p["value"] for p in e["parameters"]} for e in loop["effects"] if e["id"] == "ripple"
+    ]
     strongest = max(ripples, key=lambda values: values["A"])
     assert strongest["lambda"] == pytest.approx(2.50, abs=0.005)
     assert strongest["A"] == pytest.approx(0.97, abs=0.1)

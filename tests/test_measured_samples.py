@@ -1,4 +1,4 @@
-"""The measured campaigns in sample_data: before and after, with tolerances (their READMEs say what is in them)."""
+"""The measured campaigns in sample_data: before and after, with tolerances (their READMEs describe them)."""
 
 from pathlib import Path
 
@@ -69,7 +69,8 @@ def test_pneumatic_seal_lacks_an_offset_run_in_and_ripples(pneuseal):
     effects = {e["id"]: e for e in reversed(document["effects"])}
     offset = effects["zero_offset"]["parameters"][0]
     assert offset["value"] == pytest.approx(3.1, abs=0.5)  # 1.2 to 4.4 N, by pressure and set-up
-    # Friction grows over ten cycles in 18 of 20 files, by a size that differs: between 12 runs p is near 0.005.
+    # Friction grows over ten cycles in 18 of 20 files, by a size that differs: between 12 runs p is near
+    # 0.005.
     assert all(e["parameters"][0]["value"] > 0 for e in document["effects"] if e["channels"] == ["stroke"])
     ripples = [{p["name"]: p for p in e["parameters"]} for e in document["effects"] if e["id"] == "ripple"]
     for length in (3.0, 1.5):
@@ -93,4 +94,6 @@ def test_pneumatic_seal_has_no_stribeck_speed_and_no_effect_of_scatter_between_f
     closure = pneuseal[1]
     assert set(closure.model["declared"]["stribeck"].values()) == {"constant"}
     for effect in closure.document["effects"]:
-        assert not {"mounting", "setup", "repeat"} & set(effect["channels"]) or "direction" in effect["channels"]
+        assert (
+            not {"mounting", "setup", "repeat"} & set(effect["channels"]) or "direction" in effect["channels"]
+        )

@@ -1,4 +1,4 @@
-"""Python is run only from a folder that the command line names, never from what a campaign or OUT brings along."""
+"""Python is run only from a folder that the command line names, never from what a campaign or OUT brings."""
 
 import json
 import shutil
@@ -43,9 +43,9 @@ def made(tmp_path_factory):
     (home / "rig.toml").write_text("[loop]\neffects_folder = 'mine'\nmax_rounds = 1\n")
     run(home / "campaign", home / "out", home / "rig.toml")
     points = pd.read_csv(home / "campaign" / "runs.csv").iloc[[0]].assign(displacement_mm=20.0)
-    points[["temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s", "displacement_mm"]].to_csv(
-        home / "points.csv", index=False
-    )
+    points[
+        ["temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s", "displacement_mm"]
+    ].to_csv(home / "points.csv", index=False)
     return home
 
 
@@ -94,7 +94,9 @@ def predicted(home: Path, **options) -> pd.Series:
 
 # ---------------------------------------------------------------- what OUT brings along is not run
 def test_a_folder_named_in_the_model_or_the_state_of_out_is_never_run(home, monkeypatch):
-    monkeypatch.setattr("sealfit.report.style._saved", lambda *given: b"<svg/>")  # four reports that nobody looks at
+    monkeypatch.setattr(
+        "sealfit.report.style._saved", lambda *given: b"<svg/>"
+    )  # four reports that nobody looks at
     out = home / "out"
     marks = [evil(out / "evil"), evil(home / "elsewhere")]
     for folder in (out / "evil", home / "elsewhere"):
@@ -102,7 +104,10 @@ def test_a_folder_named_in_the_model_or_the_state_of_out_is_never_run(home, monk
         model["config"]["loop"]["effects_folder"] = str(folder)
         text = f"[loop]\neffects_folder = '{folder}'\nmax_rounds = 1\n"
         (out / "rig.toml").write_text(text)
-        for path in (str(out / "rig.toml"), "/nowhere/rig.toml"):  # read again where it lies, or as the state keeps it
+        for path in (
+            str(out / "rig.toml"),
+            "/nowhere/rig.toml",
+        ):  # read again where it lies, or as the state keeps it
             keep(out, model=model, state={"config": {"path": path, "text": text}})
             for doing in (
                 lambda: predicted(home),
@@ -132,7 +137,9 @@ def test_a_model_without_own_effects_predicts_without_their_folder(home):
 
 def test_a_model_with_own_effects_says_which_option_it_needs(home):
     with_own_effect(home / "out")
-    with pytest.raises(RequestError, match=r"your own effects \(worn_patch\).* Add --effects-folder FOLDER\.$"):
+    with pytest.raises(
+        RequestError, match=r"your own effects \(worn_patch\).* Add --effects-folder FOLDER\.$"
+    ):
         predicted(home)
     answer = predicted(home, effects_folder=home / "mine")
     # The patch takes half of the friction coefficient away at its middle; the viscous part is small.
@@ -145,11 +152,15 @@ def test_other_files_than_the_model_was_made_with_are_said(home):
     words = r"close-loop is stale: your own effects are not those it was made with \(patch\.py\)"
     with pytest.raises(StaleError, match=words + ".*Run: sealfit close-loop .*--effects-folder"):
         predicted(home, effects_folder=home / "mine")
-    assert "are not those it was made with (patch.py)" in commands.effects(home / "out", home / "mine")["note"]
+    assert (
+        "are not those it was made with (patch.py)" in commands.effects(home / "out", home / "mine")["note"]
+    )
 
 
 def test_the_loop_is_closed_again_only_with_a_folder_that_is_named(home):
-    with pytest.raises(RequestError, match=r"closed with your own effects \(patch\.py\).*Add --effects-folder FOLDER"):
+    with pytest.raises(
+        RequestError, match=r"closed with your own effects \(patch\.py\).*Add --effects-folder FOLDER"
+    ):
         single("close-loop", home / "out", force=True)
     single("close-loop", home / "out", force=True, effects_folder=home / "mine")
     assert predicted(home)["force_after_N"] > 0
@@ -205,7 +216,9 @@ def test_a_folder_in_the_campaign_or_in_out_is_refused(home, place, way):
 def test_a_config_that_came_with_the_data_cannot_name_a_folder(home):
     config = home / "campaign" / "rig.toml"
     config.write_text("[loop]\neffects_folder = '../mine'\n")
-    with pytest.raises(ConfigError, match=r"the config lies in .*campaign.*Name the folder by --effects-folder"):
+    with pytest.raises(
+        ConfigError, match=r"the config lies in .*campaign.*Name the folder by --effects-folder"
+    ):
         run(home / "campaign", home / "out", config)
 
 

@@ -86,7 +86,9 @@ def test_defaults_in_the_readme_are_those_of_the_config():
 def test_every_dependency_has_its_reason_in_the_readme():
     names = {re.match(r"[a-z0-9]+", need.lower())[0] for need in requires("sealfit")}
     table = README.split("## Dependencies")[1].split("##")[0]
-    rows = set(re.findall(r"[a-z0-9]+", " ".join(line.split("|")[1] for line in table.splitlines() if "|" in line)))
+    rows = set(
+        re.findall(r"[a-z0-9]+", " ".join(line.split("|")[1] for line in table.splitlines() if "|" in line))
+    )
     assert names <= rows
 
 
@@ -100,7 +102,10 @@ def test_the_two_commands_of_the_readme_are_targets():
 @pytest.mark.parametrize(
     ("script", "expected"),
     [
-        ('[ "$1" = --version ] && echo Python 3.9.2; exit 1', "needs Python 3.11 or newer, and here is Python 3.9.2"),
+        (
+            '[ "$1" = --version ] && echo Python 3.9.2; exit 1',
+            "needs Python 3.11 or newer, and here is Python 3.9.2",
+        ),
         ('case "$2" in *ensurepip*) exit 1;; esac', "apt install python3-venv"),
     ],
     ids=["too old", "no venv"],
@@ -127,7 +132,11 @@ def test_make_says_what_is_missing(tmp_path, script, expected):
 
 def test_python_dash_m_works_from_anywhere(tmp_path):
     run = subprocess.run(
-        [sys.executable, "-m", "sealfit", "--version"], cwd=tmp_path, capture_output=True, text=True, check=True
+        [sys.executable, "-m", "sealfit", "--version"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert run.stdout == f"sealfit {__version__}\n"
 

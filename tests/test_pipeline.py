@@ -1,4 +1,4 @@
-"""The whole chain for real: a simulated campaign from CSV files to report and predictions, and what interrupts it."""
+"""The whole chain for real: a simulated campaign from CSV to report and predictions, and interruptions."""
 
 import json
 import os
@@ -41,7 +41,8 @@ ERROR_KEYS = {
     "lack_of_fit_p",
 }  # fmt: skip
 KEYS = {
-    "schema", "verdict", "units", "noise_floor_N", "before", "after", "heldout_unit", "effects", "scatter", "left",
+    "schema", "verdict", "units", "noise_floor_N", "before", "after", "heldout_unit", "effects", "scatter",
+    "left",
     "next_runs", "fit_quality", "sensitivity", "refused", "incomplete_channels",
 }  # fmt: skip
 TIMES = ("provenance.json", "state.json", "report.html")  # hold times of day
@@ -116,7 +117,9 @@ def test_where_nothing_is_missing_after_is_before(first):
     assert after == before
     said = sealfit(*asked[:-1]).stdout
     assert said.startswith("model       after: no effect was added, so this is the declared model\n")
-    assert sealfit(*asked[:-1], "--model", "both", code=1).stderr.startswith("sealfit: there is no model 'both'.")
+    assert sealfit(*asked[:-1], "--model", "both", code=1).stderr.startswith(
+        "sealfit: there is no model 'both'."
+    )
 
 
 def test_a_run_ends_with_a_short_summary(first):
@@ -182,7 +185,9 @@ def test_a_changed_file_is_found_and_everything_after_it_redone(first, campaign,
     trace = sorted((copy / "traces").iterdir())[0]
     trace.write_text(trace.read_text().replace("time_s,", "time_s,", 1) + "oops,1,1\n")
     for command in (["fit-steady", out], ["report", out]):
-        assert f"inputs changed (traces/{trace.name}). Run: sealfit ingest" in sealfit(*command, code=1).stderr
+        assert (
+            f"inputs changed (traces/{trace.name}). Run: sealfit ingest" in sealfit(*command, code=1).stderr
+        )
     run = sealfit("run", copy, "--out", out, "--json")
     assert json.loads(run.stdout)["done"] == list(STEPS)
     assert f"traces/{trace.name}:" in run.stderr
@@ -203,13 +208,21 @@ def test_kills_lose_nothing_and_the_next_run_goes_on(first, campaign, tmp_path):
     whole, _ = first
     out = tmp_path / "out"
     killed = 0
-    for said in (None, "fitting 5", "fitting the pre", "round 1", "drawing"):  # each goes on where the last one ended
+    for said in (
+        None,
+        "fitting 5",
+        "fitting the pre",
+        "round 1",
+        "drawing",
+    ):  # each goes on where the last one ended
         run = started("run", campaign, "--out", out)
         if said is None:
             locked(out)
             killed += 1
         else:
-            killed += any(line.startswith(said) for line in run.stderr)  # on a busy machine a kill may come a step late
+            killed += any(
+                line.startswith(said) for line in run.stderr
+            )  # on a busy machine a kill may come a step late
         with suppress(ProcessLookupError):
             os.killpg(run.pid, signal.SIGKILL)
         run.communicate()

@@ -25,7 +25,9 @@ def test_the_same_spec_gives_the_same_bytes_and_another_seed_others(tmp_path):
 
 def test_a_simulated_folder_is_replaced_whole(tmp_path):
     simulate(SMALL, tmp_path / "a")
-    simulate(SMALL.model_copy(update={"design": SMALL.design.model_copy(update={"repeats": 1})}), tmp_path / "a")
+    simulate(
+        SMALL.model_copy(update={"design": SMALL.design.model_copy(update={"repeats": 1})}), tmp_path / "a"
+    )
     assert len(list((tmp_path / "a" / "traces").iterdir())) == 3
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "a.truth.json"]
 
@@ -120,7 +122,10 @@ def test_an_effect_that_gives_no_number_is_said_and_nothing_written(tmp_path):
         ('[[effects]]\nid = "no_such_effect"', "there is no such effect"),
         ('[[channels]]\nkind = "constant"\nname = "load_N"\nvalue = 1', "'load_N' is taken"),
         ('[[channels]]\nkind = "category"\nname = "batch"', "give labels"),
-        ('[design]\norder = "undated"\n[[channels]]\nkind = "slow"\nname = "lab_C"', "drifts with the calendar"),
+        (
+            '[design]\norder = "undated"\n[[channels]]\nkind = "slow"\nname = "lab_C"',
+            "drifts with the calendar",
+        ),
     ],
 )
 def test_a_wrong_spec_is_refused_with_its_fix(tmp_path, text, words):

@@ -89,7 +89,9 @@ numbers = st.one_of(st.none(), st.floats(allow_nan=False))
 words = st.one_of(st.none(), st.text(st.characters(codec="utf-8"), max_size=8))
 
 
-@given(st.lists(st.tuples(words, st.one_of(st.none(), st.integers(-(2**53), 2**53)), numbers, words), max_size=6))
+@given(
+    st.lists(st.tuples(words, st.one_of(st.none(), st.integers(-(2**53), 2**53)), numbers, words), max_size=6)
+)
 def test_a_table_survives_parquet(tmp_path_factory, rows):
     path = tmp_path_factory.mktemp("t") / "quality.parquet"
     frame = small("quality", len(rows))
@@ -192,8 +194,15 @@ def test_a_frame_that_is_not_its_table_is_refused(frame, words):
 
 
 def test_json_has_neither_nan_nor_infinity_nor_numpy():
-    text = to_json({"a": math.nan, "b": [np.float64("inf"), np.int64(3)], "c": np.array([1.5, np.nan]), "d": pd.NA})
-    assert json.loads(text, parse_constant=pytest.fail) == {"a": None, "b": [None, 3], "c": [1.5, None], "d": None}
+    text = to_json(
+        {"a": math.nan, "b": [np.float64("inf"), np.int64(3)], "c": np.array([1.5, np.nan]), "d": pd.NA}
+    )
+    assert json.loads(text, parse_constant=pytest.fail) == {
+        "a": None,
+        "b": [None, 3],
+        "c": [1.5, None],
+        "d": None,
+    }
 
 
 # ---------------------------------------------------------------- current and stale
@@ -303,10 +312,14 @@ def test_a_table_that_is_missing_or_was_cut_makes_its_step_stale(out, campaign):
 def test_a_missing_predecessor_names_the_command_to_run(out, campaign):
     with Store.writing(out, campaign, rig(campaign.parent, "")) as store:
         do(store, "ingest")
-        with pytest.raises(StaleError, match=r"fit-steady has not been done\. Run: sealfit fit-steady .*out$"):
+        with pytest.raises(
+            StaleError, match=r"fit-steady has not been done\. Run: sealfit fit-steady .*out$"
+        ):
             store.require("close-loop")
     (campaign / "a.csv").write_text("new")
-    with pytest.raises(StaleError, match=r"Run: sealfit ingest \S*campaign --out \S*out --config \S*rig.toml$"):
+    with pytest.raises(
+        StaleError, match=r"Run: sealfit ingest \S*campaign --out \S*out --config \S*rig.toml$"
+    ):
         Store.open(out).require("close-loop")
 
 
@@ -381,7 +394,9 @@ def test_a_state_that_cannot_be_read_is_refused(out, campaign):
 def test_results_of_an_earlier_format_are_made_again(out, campaign):
     do_all(out, campaign)
     state = json.loads((out / "state.json").read_text())
-    (out / "state.json").write_text(json.dumps({**state, "format": state["format"] - 1, "inputs": "written otherwise"}))
+    (out / "state.json").write_text(
+        json.dumps({**state, "format": state["format"] - 1, "inputs": "written otherwise"})
+    )
     assert Store.open(out).why_stale("ingest") == "ingest has not been done"
     do_all(out, campaign, rows=5)
     assert stale(out) == []

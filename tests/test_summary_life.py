@@ -35,7 +35,8 @@ def test_days_have_their_intervals_and_the_rivals_answer(laws):
 
 
 @pytest.mark.parametrize(
-    ("value", "words"), [(-1.0, "-1 is not reached within 1e9 d"), (0.99, "unaged rubber is already beyond 0.99")]
+    ("value", "words"),
+    [(-1.0, "-1 is not reached within 1e9 d"), (0.99, "unaged rubber is already beyond 0.99")],
 )
 def test_what_is_never_or_already_reached_is_said(laws, value, words):
     text = said(laws, Goal(value), temperature_C=20.0)

@@ -21,13 +21,15 @@ WITHOUT_AGING = 'condition = ["temperature_C", "compression_ratio_pct"]\n'
 
 
 def write_campaign(world: World, folder: Path) -> Path | None:
-    """Write runs.csv, the traces and, where the default does not fit, a config; return the config's path or None."""
+    """Write runs.csv, the traces and, where the default does not fit, a config; return its path or None."""
     (folder / "traces").mkdir(parents=True)
     runs_table(world).to_csv(folder / "runs.csv", index=False)
     for batch in batches(world, scattered=True):
         force = measured_N(world, batch)
         place = measured_mm(world, batch)
-        clock = batch.channels["_clock_s"] * (1 + world.files["_clock_error"].to_numpy()[batch.files][:, None])
+        clock = batch.channels["_clock_s"] * (
+            1 + world.files["_clock_error"].to_numpy()[batch.files][:, None]
+        )
         for k, row in enumerate(batch.files):
             table = {"time_s": clock[k], "displacement_mm": place[k], "force_N": force[k]}
             table |= {name: batch.channels[name][k] for name in trace_names(world)}
@@ -109,7 +111,8 @@ def truth_record(world: World) -> dict:
         "seed_text": world.seed_text, "index": world.index, "size": world.size, "features": world.features,
         "rig": world.rig, "series": world.series, "noise": world.noise, "scatter": world.scatter,
         "columns": world.columns, "effects": [asdict(e) | {"place": e.place} for e in world.effects],
-        "speeds_mm_s": world.speeds_mm_s.tolist(), "days": world.days.tolist(), "loads_N": world.loads_N.tolist(),
+        "speeds_mm_s": world.speeds_mm_s.tolist(), "days": world.days.tolist(),
+        "loads_N": world.loads_N.tolist(),
     }  # fmt: skip
     return json.loads(json.dumps(record, default=float))
 
@@ -117,9 +120,10 @@ def truth_record(world: World) -> dict:
 def draw_points(world: World, count: int = POINTS) -> pd.DataFrame:
     """Return new points inside what was tested, with every channel, `series` too.
 
-    Each starts from a file and a stroke of the campaign, so that condition, calendar and columns go together. Speed is
-    drawn anew, log-uniform, and time goes with it; loads lie between the tested ones; a half of the aged points lies
-    at days between the tested ones of a series with a law (three or more days) where tests do not follow the rubber.
+    Each starts from a file and a stroke of the campaign, so that condition, calendar and columns go together.
+    Speed is drawn anew, log-uniform, and time goes with it; loads lie between the tested ones; a half of the
+    aged points lies at days between the tested ones of a series with a law (three or more days) where tests
+    do not follow the rubber.
     """
     rng, rig = world.streams("points"), world.rig
     table = world.files.iloc[rng.integers(len(world.files), size=count)].reset_index(drop=True)
@@ -131,7 +135,9 @@ def draw_points(world: World, count: int = POINTS) -> pd.DataFrame:
     direction = table["direction"] * (-1.0) ** stroke
     keys = ["series", "direction"]  # points keep to the speeds tested there
     tested = world.files.groupby(keys)["speed_mm_s"].agg(["min", "max"])
-    low, high = (tested[end].reindex(pd.MultiIndex.from_frame(table[keys])).to_numpy() for end in ("min", "max"))
+    low, high = (
+        tested[end].reindex(pd.MultiIndex.from_frame(table[keys])).to_numpy() for end in ("min", "max")
+    )
     speed = np.exp(rng.uniform(np.log(low), np.log(high)))
     distance = rig["stroke_mm"] * rng.uniform(EDGE, 1 - EDGE, count)
     begin = table["start_mm"] + np.where(direction < 0, rig["stroke_mm"], 0.0)

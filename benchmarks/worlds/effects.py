@@ -1,8 +1,8 @@
 """Hidden effects: shapes, families of the catalogue, local ones, and smooth random functions.
 
-An effect is `amplitude x shape(variables)`, zero outside `where`; it is added to, or one plus it multiplies, the
-quantity it acts on. `names` are the ids under which a claim names it rightly; a closed form of the right variable
-(linear, log, bump, ...) describes it and is right, too.
+An effect is `amplitude x shape(variables)`, zero outside `where`; it is added to, or one plus it multiplies,
+the quantity it acts on. `names` are the ids under which a claim names it rightly; a closed form of the right
+variable (linear, log, bump, ...) describes it and is right, too.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ SHAPES: dict[str, Callable] = {
 }
 
 
-# ---------------------------------------------------------------- families: each returns an effect of amplitude +-1
+# ---------------------------------------------------------- families: each returns an effect of amplitude +-1
 def _warming_distance(w: World, rng) -> Effect:
     scale = w.rig["stroke_mm"] * 10 ** rng.uniform(-1, 0.3)
     return Effect("warming_distance", ("warming_distance",), ("distance_mm",), "mu", "multiply", "approach",
@@ -123,7 +123,9 @@ def _sensor_drift(w: World, rng) -> Effect:
 
 
 def _zero_offset(w: World, rng) -> Effect:
-    return Effect("zero_offset", ("zero_offset",), ("direction",), "force", "add", "constant", amplitude=_sign(rng))
+    return Effect(
+        "zero_offset", ("zero_offset",), ("direction",), "force", "add", "constant", amplitude=_sign(rng)
+    )
 
 
 def _asymmetry(w: World, rng) -> Effect:
@@ -188,17 +190,19 @@ def _aging_floor(w: World, rng) -> Effect:
 def _aging_induction(w: World, rng) -> Effect:
     aged = w.days[w.days > 0]
     day = float(np.exp(rng.uniform(np.log(aged[0]), np.log(aged[-2]))))
-    return Effect("aging_induction", ("aging_induction",), ("aging_days",), "mu", "multiply", "induction", {"day": day})
+    return Effect(
+        "aging_induction", ("aging_induction",), ("aging_days",), "mu", "multiply", "induction", {"day": day}
+    )
 
 
 def _stribeck_aging(w: World, rng) -> Effect:
-    return Effect("stribeck_speed_aging", ("stribeck_speed_aging",), ("aging_days",), "v_s", "multiply", "log_growth",
-                  {"scale": rng.uniform(0.3, 3.0)}, amplitude=_sign(rng))  # fmt: skip
+    return Effect("stribeck_speed_aging", ("stribeck_speed_aging",), ("aging_days",), "v_s", "multiply",
+                  "log_growth", {"scale": rng.uniform(0.3, 3.0)}, amplitude=_sign(rng))  # fmt: skip
 
 
 def _viscosity_aging(w: World, rng) -> Effect:
-    return Effect("viscosity_aging", ("viscosity_aging",), ("aging_days",), "sigma_2", "multiply", "log_growth",
-                  {"scale": rng.uniform(0.3, 3.0)})  # fmt: skip
+    return Effect("viscosity_aging", ("viscosity_aging",), ("aging_days",), "sigma_2", "multiply",
+                  "log_growth", {"scale": rng.uniform(0.3, 3.0)})  # fmt: skip
 
 
 def _of_column(family: str, name: str, target: tuple[str, str]) -> Callable:
@@ -220,7 +224,9 @@ def _batch(w: World, rng) -> Effect:
 def _step_in_time(w: World, rng) -> Effect:
     target = (("force", "multiply"), ("force", "add"))[rng.integers(2)]
     place = float(np.quantile(w.files["elapsed_h"], rng.uniform(0.25, 0.75)))
-    return Effect("step_in_time", ("step",), ("elapsed_h",), *target, "step", {"place": place}, amplitude=_sign(rng))
+    return Effect(
+        "step_in_time", ("step",), ("elapsed_h",), *target, "step", {"place": place}, amplitude=_sign(rng)
+    )
 
 
 def _day_and_night(w: World, rng) -> Effect:
@@ -276,7 +282,8 @@ def smooth_random(w: World, rng) -> Effect:
     count = min(len(names), 1 + int(rng.random() < 0.35))
     chosen = tuple(names[k] for k in rng.permutation(len(names))[:count])
     targets = [("force", "add"), ("force", "multiply"), ("mu", "multiply"), ("mu", "multiply"),
-               ("mu_s", "multiply"), ("mu_c", "multiply"), ("v_s", "multiply"), ("sigma_2", "multiply")]  # fmt: skip
+               ("mu_s", "multiply"), ("mu_c", "multiply"), ("v_s", "multiply"),
+               ("sigma_2", "multiply")]  # fmt: skip
     length = rng.uniform(0.2, 0.8)  # correlation length, share of the range
     return Effect(
         f"smooth_{count}", (), chosen, *targets[rng.integers(len(targets))], "fourier",
@@ -318,7 +325,10 @@ FAMILIES: dict[str, tuple[Callable, Callable]] = {
         _of_column("lab_temperature", "lab_temperature_C", ("mu", "multiply")),
         lambda w: "lab_temperature_C" in w.ranges,
     ),
-    "humidity": (_of_column("humidity", "humidity_pct", ("mu", "multiply")), lambda w: "humidity_pct" in w.ranges),
+    "humidity": (
+        _of_column("humidity", "humidity_pct", ("mu", "multiply")),
+        lambda w: "humidity_pct" in w.ranges,
+    ),
     "batch": (_batch, lambda w: "batch" in w.files),
     "channel_offset": (
         _of_column("channel_offset", "pressure_bar", ("force", "add")),

@@ -1,4 +1,4 @@
-"""The friction law of a world: the declared coefficients of a condition, and what the hidden effects make of them."""
+"""The friction law of a world: a condition's declared coefficients, and what hidden effects make of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from worlds.effects import change
 if TYPE_CHECKING:
     from worlds.world import World
 
-SLOWEST_SHARE = 0.01  # effects of the logarithm of speed stop changing below this share of the slowest tested speed
+SLOWEST_SHARE = (
+    0.01  # effects of the logarithm of speed stop changing below this share of the slowest tested speed
+)
 QUANTITIES = ("mu_0s", "mu_0c", "a_s", "a_c", "b_s", "b_c", "v_s", "sigma_2")
 
 
@@ -23,15 +25,15 @@ def parameters(
     without: Collection[int] = (),
     nudge: Mapping[str, float] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return mu_s, mu_c, v_s, sigma_2, the factor on the whole force and the added force at given channel values.
+    """Return mu_s, mu_c, v_s, sigma_2, the factor on the whole force and the added force at given channels.
 
     Parameters
     ----------
     world : World
         Its series and effects.
     channels : mapping of str to ndarray
-        `series` (number of the series), `aging_days`, `speed_mm_s` (magnitude), `direction`, and whatever the effects
-        read; arrays that broadcast.
+        `series` (number of the series), `aging_days`, `speed_mm_s` (magnitude), `direction`, and whatever the
+        effects read; arrays that broadcast.
     without : collection of int
         Numbers of effects left out.
     nudge : mapping of str to float, optional
@@ -68,8 +70,10 @@ def parameters(
 
 
 def quasi_steady_N(world: World, channels: Mapping[str, np.ndarray], **more) -> np.ndarray:
-    """Return the signed force where bristles have settled: only to scale effects, never a campaign's force."""
+    """Return the signed force of settled bristles: only to scale effects, never a campaign's force."""
     p = parameters(world, channels, **more)
     speed = np.abs(channels["speed_mm_s"])
     mu = p["mu_c"] + (p["mu_s"] - p["mu_c"]) * np.exp(-((speed / p["v_s"]) ** 2))
-    return channels["direction"] * (mu * channels["load_N"] + p["sigma_2"] * speed) * p["factor"] + p["added_N"]
+    return (
+        channels["direction"] * (mu * channels["load_N"] + p["sigma_2"] * speed) * p["factor"] + p["added_N"]
+    )

@@ -23,11 +23,19 @@ def guarded(task: Task) -> dict:
     try:
         return run_world(task)
     except Exception:
-        return {"seed_text": task.seed_text, "index": task.index, "size": task.size, "error": traceback.format_exc()}
+        return {
+            "seed_text": task.seed_text,
+            "index": task.index,
+            "size": task.size,
+            "error": traceback.format_exc(),
+        }
 
 
 def read(path: Path) -> list[dict]:
-    """Return the records of a file, the last of each world; the benchmark's own failures are left out and run again."""
+    """Return the records of a file, the last of each world.
+
+    The benchmark's own failures are left out and run again.
+    """
     if not path.exists():
         return []
     records = [json.loads(text) for text in path.read_text("utf-8").splitlines() if text.strip()]
@@ -35,7 +43,7 @@ def read(path: Path) -> list[dict]:
 
 
 def run(tasks: list[Task], out: Path, jobs: int, *, limit_s: float) -> None:
-    """Run what `out` does not hold yet, appending each result as it comes; no new ones after `limit_s` seconds."""
+    """Run what `out` does not hold, appending results as they come; no new ones after `limit_s` seconds."""
     done = {(r["seed_text"], r["index"], r["size"]) for r in read(out)}
     waiting = iter(todo := [t for t in tasks if t.key not in done])
     print(f"{len(todo)} of {len(tasks)} worlds to run", file=sys.stderr)
@@ -58,8 +66,12 @@ def run(tasks: list[Task], out: Path, jobs: int, *, limit_s: float) -> None:
 
 def main(arguments: list[str] | None = None, *, description: str | None = None) -> int:
     """Run worlds, then summarise; the exit code."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, metavar="FILE", help="JSON lines, one a world; taken up where it ends")
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="JSON lines, one a world; taken up where it ends"
+    )
     parser.add_argument("--summary", type=Path, metavar="FILE", help="only summarise")
     parser.add_argument("--show", type=int, metavar="INDEX", help="run one world and print its record")
     parser.add_argument("--keep", metavar="DIR", help="keep campaigns and results there")

@@ -1,9 +1,9 @@
 """Noise-free traces: the motion of the rig, and the bristles of Eqs. 1 to 7 integrated along it.
 
 Within a step the speed is constant, so dz/dt = v - |v| z / g has the exact solution
-z(t + h) = g s + (z(t) - g s) exp(-|v| h / g), s = sgn v. Steps are short enough for the ramps and for 400 steps a
-stroke. All files of one speed are integrated together; strokes of a file follow one another with the bristles as they
-were left.
+z(t + h) = g s + (z(t) - g s) exp(-|v| h / g), s = sgn v. Steps are short enough for the ramps and for 400
+steps a stroke. All files of one speed are integrated together; strokes of a file follow one another with the
+bristles as they were left.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ REVERSED = -0.9  # deflection left by a move back, share of the steady one
 
 @dataclass(frozen=True)
 class Batch:
-    """Files of one set speed: sample times, positions and the noise-free force, each of shape (files, samples)."""
+    """Files of one set speed: sample times, positions and noise-free force, all of shape (files, samples)."""
 
     files: np.ndarray  # (files,) rows of world.files
     channels: dict[str, np.ndarray]  # every channel at the samples
@@ -50,7 +50,7 @@ def groups(world: World, most: int = 400_000) -> list[np.ndarray]:
 
 
 def distance_mm(t: np.ndarray, speed: np.ndarray, world: World) -> np.ndarray:
-    """Return the distance slid `t` seconds after the start of a stroke: dwell, ramp up, set speed, ramp down."""
+    """Return the distance slid `t` seconds after a stroke's start: dwell, ramp up, set speed, ramp down."""
     stroke, dwell, ramp, moving = _times(speed, world)
     x = np.clip(t - dwell, 0.0, moving)
     acceleration = speed / ramp
@@ -102,7 +102,11 @@ def integrate(
     _, dwell, ramp, moving = _times(speed, world)
     count = int(np.ceil(float((dwell + moving).max()) / dt))
     sub = int(
-        np.clip(np.ceil(max(LEAST_STEPS / count, RAMP_STEPS * dt / float(ramp.max()))), 1, max(1, MOST_STEPS // count))
+        np.clip(
+            np.ceil(max(LEAST_STEPS / count, RAMP_STEPS * dt / float(ramp.max()))),
+            1,
+            max(1, MOST_STEPS // count),
+        )
     )
     fine = np.arange(count * sub + 1) * (dt / sub)
     middle = 0.5 * (fine[1:] + fine[:-1])
@@ -139,7 +143,8 @@ def integrate(
         flat = (t >= dwell + ramp) & (t <= dwell + moving - ramp)
         found = {
             **{k: np.broadcast_to(shared[k], at.shape) for k in ("direction", "stroke")}, **padded,
-            "distance_mm": at, "displacement_mm": begin + direction * at, "time_s": np.broadcast_to(t, at.shape),
+            "distance_mm": at, "displacement_mm": begin + direction * at,
+            "time_s": np.broadcast_to(t, at.shape),
             "_clock_s": np.broadcast_to(t + stroke * count * dt, at.shape),
             "_force": np.broadcast_to(force, at.shape), "_flat": flat, "_speed": direction * v_at,
         }  # fmt: skip
@@ -151,7 +156,7 @@ def integrate(
 
 
 def _followed(z: np.ndarray, target: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return the deflection at every step's ends: from z (files,), targets and steps over g (files, steps)."""
+    """Return the deflection at all steps' ends: from z (files,), targets and steps over g (files, steps)."""
     keep = np.ascontiguousarray(np.exp(-steps).T)
     pulled = np.ascontiguousarray((-np.expm1(-steps) * target).T)
     bent = np.empty((len(keep) + 1, z.size))
@@ -168,7 +173,7 @@ def _speed(t, speed, world: World) -> np.ndarray:
 
 
 def _deflection(world, shared, begin, distance, t, speed, own, sigma_0, without, nudge):
-    """Return the settled deflection g and the law's numbers at places along a stroke, shape (files, places)."""
+    """Return the settled deflection g and the law's numbers at places along a stroke: (files, places)."""
     given = {**shared, "distance_mm": distance, "displacement_mm": begin + shared["direction"] * distance,
              "time_s": np.broadcast_to(t, distance.shape), "speed_mm_s": speed}  # fmt: skip
     p = parameters(world, given, without=without, nudge=nudge)
@@ -206,9 +211,9 @@ def force_at(
 ) -> np.ndarray:
     """Return the noise-free mean force at points, bristles settled where each stroke began: shape (points,).
 
-    Each point is reached by sliding at its speed from its stroke's start; the force is integrated along the way, so
-    what lags behind a place by a bristle length lags here, too. The rise from rest is left out. With `tested` the mean
-    is that of the tested specimens of each condition, otherwise that of the population.
+    Each point is reached by sliding at its speed from its stroke's start; the force is integrated along the
+    way, so what lags behind a place by a bristle length lags here, too. The rise from rest is left out. With
+    `tested` the mean is that of the tested specimens of each condition, otherwise that of the population.
     """
     steps, nudge = LEAST_STEPS, dict(nudge or {})
     sigma_0 = world.rig["sigma_0"] * (1 + nudge.pop("sigma_0", 0.0))
@@ -218,7 +223,9 @@ def force_at(
     begin = column["displacement_mm"] - direction * distance
     dwell = column["time_s"] - distance / speed
     shared = {**{k: x for k, x in column.items() if not k.startswith("_")}, "direction": direction}
-    own = {k: column[f"_specimen_{k}"] if tested else 0.0 for k in ("gain", "level", "slope", "v_s", "sigma_2")}
+    own = {
+        k: column[f"_specimen_{k}"] if tested else 0.0 for k in ("gain", "level", "slope", "v_s", "sigma_2")
+    }
     places = distance * (np.arange(steps) + 0.5) / steps
     g, _ = _deflection(
         world, shared, begin, places, dwell + places / speed, speed + 0 * places, own, sigma_0, without, nudge
@@ -227,4 +234,6 @@ def force_at(
     _, p = _deflection(world, shared, begin, distance, column["time_s"], speed, own, sigma_0, without, nudge)
     along = 1 + own["gain"] + own["slope"] * (distance / world.rig["stroke_mm"] - 0.5)
     friction = sigma_0 * bent[:, None] + p["sigma_2"] * (1 + own["sigma_2"]) * speed * along
-    return (direction * friction * p["factor"] + p["added_N"] + direction * own["level"] * world.rig["mean_N"])[:, 0]
+    return (
+        direction * friction * p["factor"] + p["added_N"] + direction * own["level"] * world.rig["mean_N"]
+    )[:, 0]

@@ -1,6 +1,7 @@
 """Parameters and lifetimes of a world without effects: whether their 95 % intervals hold the truth.
 
-Only without effects: what a hidden effect leaves of mu_0 or a depends on the reference state at which it is taken out.
+Only without effects: what a hidden effect leaves of mu_0 or a depends on the reference state at which it is
+taken out.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ def laws_inside(world: World, out: Path) -> dict[str, list[int]]:
     """
     counts = {name: [0, 0] for name in LAW}
     steady = pd.read_parquet(out / "steady_fit.parquet")
-    flat = steady[steady["parameter"].isin(("mu_s", "F_s")) & ~steady["identified"]]  # mu_c is then no mu_c of Eq. 14
+    flat = steady[
+        steady["parameter"].isin(("mu_s", "F_s")) & ~steady["identified"]
+    ]  # mu_c is then no mu_c of Eq. 14
     table = pd.read_parquet(out / "aging_fit.parquet")
     table = table[table["identified"] & table["lo95"].notna() & table["parameter"].isin(LAW)]
     table = table[~table["reason"].fillna("").str.contains(EXCLUDES_SCATTER)]
@@ -65,7 +68,12 @@ def lifetime_question(world: World) -> tuple[list[str], float] | None:
         quantity, threshold = "F_s", threshold * float(world.loads_N[0])
     words = ["--quantity", quantity, "--threshold", f"{threshold:.8g}", "--json"]
     if len(aged_series(world)) > 1:
-        words += ["--temperature", f"{own['temperature_C']:g}", "--compression", f"{own['compression_ratio_pct']:g}"]
+        words += [
+            "--temperature",
+            f"{own['temperature_C']:g}",
+            "--compression",
+            f"{own['compression_ratio_pct']:g}",
+        ]
     return words, true
 
 

@@ -1,4 +1,4 @@
-"""One world from its draw to its scored record: written, given to sealfit as a command, read back, compared."""
+"""One world from its draw to its scored record: written, given to sealfit's command, read back, compared."""
 
 from __future__ import annotations
 
@@ -62,7 +62,9 @@ class Ended:
     def traceback(self) -> str | None:
         """Last line of a traceback, or None."""
         return (
-            self.output.strip().splitlines()[-1][:300] if "Traceback (most recent call last)" in self.output else None
+            self.output.strip().splitlines()[-1][:300]
+            if "Traceback (most recent call last)" in self.output
+            else None
         )
 
 
@@ -80,7 +82,9 @@ def command(words: list[str], limit_s: float) -> Ended:
             peak = max(peak, memory(tree(process.pid), proportional=False)[0])
             time.sleep(LOOK_EVERY_S)
         said.seek(0)
-        return Ended(process.returncode, time.monotonic() - started, _cpu_seconds() - spent, peak, said.read())
+        return Ended(
+            process.returncode, time.monotonic() - started, _cpu_seconds() - spent, peak, said.read()
+        )
 
 
 def _cpu_seconds() -> float:
@@ -101,7 +105,8 @@ def run_world(task: Task) -> dict:
         rows = make_rows(world)
         record = {
             "seed_text": task.seed_text, "index": task.index, "size": task.size, "features": world.features,
-            "files": len(world.files), "series": int(world.files["series"].nunique()), "days": int(world.days.size),
+            "files": len(world.files), "series": int(world.files["series"].nunique()),
+            "days": int(world.days.size),
             "speeds": int(world.speeds_mm_s.size), "mean_N": world.rig["mean_N"],
             "stroke_bristles": world.rig["stroke_bristles"],
             "effects": true_effects(world, rows), "simulated_s": time.monotonic() - started,
@@ -158,7 +163,7 @@ def true_effects(world: World, rows: Rows) -> list[dict]:
 
 
 def targets(effects: list[dict], rows: Rows) -> list[Target]:
-    """Return what each effect must be found as; with a place, the level of the variables alone is right, too."""
+    """Return what each effect must be found as; with a place, the level of variables alone is right, too."""
     units, found = codes(rows), []
     order = list(CLAIM_LEVEL)
     both_ways = bool(rows.table.groupby("file")["direction"].nunique().max() > 1)
@@ -200,8 +205,20 @@ def read_closure(world: World, rows: Rows, closure: dict, effects: list[dict]) -
     same = copies(
         table, {n for t in aims for n in (*t.variables, *t.place)}, {n for c in claims for n in c["channels"]}
     )
-    result = scored(aims, [c | {"channels": [same.get(n, n) for n in c["channels"]]} for c in claims], explained)
-    slim = ("id", "channels", "level", "acts_on", "operation", "named", "p_value", "heldout_gain_N", "candidate")
+    result = scored(
+        aims, [c | {"channels": [same.get(n, n) for n in c["channels"]]} for c in claims], explained
+    )
+    slim = (
+        "id",
+        "channels",
+        "level",
+        "acts_on",
+        "operation",
+        "named",
+        "p_value",
+        "heldout_gain_N",
+        "candidate",
+    )
     stated = closure.get("sensitivity")
     merged = []
     for effect, aim, came in zip(effects, aims, result.pop("effects"), strict=True):
@@ -218,10 +235,12 @@ def read_closure(world: World, rows: Rows, closure: dict, effects: list[dict]) -
 
 
 def copies(table: pd.DataFrame, true: set[str], claimed: set[str]) -> dict[str, str]:
-    """Return for claimed channels that order the rows as a true variable does (the calendar's do) that variable."""
+    """Return the true variable of claimed channels that order the rows as it does (the calendar's do)."""
     numeric = [n for n in sorted(true) if n in table and table[n].dtype.kind in "fi"]
     others = [n for n in sorted(claimed - true) if n in table and table[n].dtype.kind in "fi"]
-    return {o: n for n in numeric for o in others if abs(table[n].corr(table[o], method="spearman")) > SAME_ORDER}
+    return {
+        o: n for n in numeric for o in others if abs(table[n].corr(table[o], method="spearman")) > SAME_ORDER
+    }
 
 
 def _names(variable) -> list[str]:
@@ -229,14 +248,18 @@ def _names(variable) -> list[str]:
 
 
 def predicted(task: Task, world: World, rows: Rows, home: Path) -> dict:
-    """Return how `predict` compares with the noise-free truth at new points, and with the fitted true form."""
+    """Return how `predict` compares with the noise-free truth at new points and with the fitted true form."""
     points = draw_points(world)
     exact = force_at(world, points)
     points_csv(world, points).to_csv(home / "points.csv", index=False)
     words = [task.python, "-m", "sealfit", "predict", str(home / "out"), "--points", str(home / "points.csv")]
     ended = command([*words, "--output", str(home / "predicted.csv")], task.limit_s)
     if ended.code != 0:
-        return {"predict_exit": ended.code, "predict_traceback": ended.traceback, "predict_said": ended.output[-3000:]}
+        return {
+            "predict_exit": ended.code,
+            "predict_traceback": ended.traceback,
+            "predict_said": ended.output[-3000:],
+        }
     answer = pd.read_csv(home / "predicted.csv")
     before, after = (answer[f"force_{name}_N"].to_numpy(float) for name in ("before", "after"))
     low, high = (answer[f"force_after_{end}95_N"].to_numpy(float) for end in ("lo", "hi"))
@@ -244,7 +267,9 @@ def predicted(task: Task, world: World, rows: Rows, home: Path) -> dict:
     good = np.isfinite(after) & np.isfinite(before) & ~outside
     oracle = error_at(world, rows, points)
     own_only = answer["note"].astype(str).str.contains(HOLDS_FOR_TESTED).to_numpy()
-    meant = np.where(own_only, force_at(world, points, tested=True), exact)  # what each interval says it is of
+    meant = np.where(
+        own_only, force_at(world, points, tested=True), exact
+    )  # what each interval says it is of
     inside = (low <= meant) & (meant <= high) & good
     given = np.isfinite(low) & np.isfinite(high) & good
 
@@ -258,7 +283,10 @@ def predicted(task: Task, world: World, rows: Rows, home: Path) -> dict:
         "extrapolated": int(outside.sum()),
         "errors": {"before": rms(before - exact), "after": rms(after - exact), "true_form": rms(oracle)},
         "inside": int(inside.sum()),
-        "of_tested_specimens": {"points": int((given & own_only).sum()), "inside": int((inside & own_only).sum())},
+        "of_tested_specimens": {
+            "points": int((given & own_only).sum()),
+            "inside": int((inside & own_only).sum()),
+        },
         "with_interval": int(given.sum()),
         "half_width_N": float(np.median((high - low)[given] / 2)) if given.any() else None,
     }

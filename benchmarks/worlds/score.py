@@ -2,15 +2,17 @@
 
 An effect is found where a claim that is no candidate
 
-- stands on the effect's variables, with or without the channels that say where it sits (the direction is free for an
+- stands on the effect's variables, with or without the channels that say where it sits (the direction is free
+  for an
   added force), or is its mechanism of several variables, at the effect's level; or
-- cannot be told from it with these files: the claim lists the effect's variables among its `alternatives`, or a
-  smooth function of the claim's channels explains 96 % (correlation 0.98) of what the effect adds beyond the declared
-  quantities.
+- cannot be told from it with these files: the claim lists the effect's variables among its `alternatives`, or
+  a
+  smooth function of the claim's channels explains 96 % (correlation 0.98) of what the effect adds beyond the
+  declared quantities.
 
-It is named rightly, or honestly left without a name, where the claim says `named: false`, carries one of the effect's
-names, or is a closed form (linear, log, bump, ...) of the variable. A claim stands for one effect at most; claims left
-over are extra, and are counted apart where they stand on the variable of a true effect.
+It is named rightly, or honestly left without a name, where the claim says `named: false`, carries one of the
+effect's names, or is a closed form (linear, log, bump, ...) of the variable. A claim stands for one effect at
+most; claims left over are extra, and are counted apart where they stand on the variable of a true effect.
 """
 
 from __future__ import annotations
@@ -73,8 +75,13 @@ def on_variables(target: Target, channels: Sequence[str]) -> bool:
 
 
 def grade(target: Target, claim: Mapping, explained: float) -> int:
-    """Return RIGHT, SAME_AT_DESIGN or NONE; `explained`: correlation of a smooth function of the claim's channels."""
-    several = len(claim["channels"]) > 1  # then the mechanism's variables are fixed: power is v x load, at a time
+    """Return RIGHT, SAME_AT_DESIGN or NONE.
+
+    `explained` is the correlation of a smooth function of the claim's channels.
+    """
+    several = (
+        len(claim["channels"]) > 1
+    )  # then the mechanism's variables are fixed: power is v x load, at a time
     own_mechanism = several and claim["id"] in target.names and claim["id"] not in CLOSED_FORMS
     if (own_mechanism or on_variables(target, claim["channels"])) and claim["level"] in target.levels:
         return RIGHT
@@ -87,11 +94,15 @@ def named_rightly(target: Target, claim: Mapping) -> bool:
     return not claim["named"] or claim["id"] in target.names or claim["id"] in CLOSED_FORMS
 
 
-def match(targets: Sequence[Target], claims: Sequence[Mapping], explained: np.ndarray) -> list[tuple[int | None, int]]:
-    """Return for each effect the number of its claim (None where not found) and the grade: the best pairing."""
+def match(
+    targets: Sequence[Target], claims: Sequence[Mapping], explained: np.ndarray
+) -> list[tuple[int | None, int]]:
+    """Return for each effect the number of its claim (None if not found) and the grade: the best pairing."""
     if not targets or not claims:
         return [(None, NONE)] * len(targets)
-    grades = np.array([[grade(t, c, explained[j, k]) for k, c in enumerate(claims)] for j, t in enumerate(targets)])
+    grades = np.array(
+        [[grade(t, c, explained[j, k]) for k, c in enumerate(claims)] for j, t in enumerate(targets)]
+    )
     names = np.array([[named_rightly(t, c) for c in claims] for t in targets])
     chosen = dict(zip(*linear_sum_assignment(-(grades + 0.1 * names * (grades > 0))), strict=True))
     pairs = [(chosen.get(j), int(grades[j, chosen[j]]) if j in chosen else NONE) for j in range(len(targets))]
@@ -117,7 +128,9 @@ def scored(targets: Sequence[Target], claims: Sequence[Mapping], explained: np.n
     return {"effects": found, "extra": len(left), "extra_on_true_variable": int(near)}
 
 
-def explained_by(values: Mapping[str, np.ndarray], y: np.ndarray, others: np.ndarray, scale: np.ndarray) -> float:
+def explained_by(
+    values: Mapping[str, np.ndarray], y: np.ndarray, others: np.ndarray, scale: np.ndarray
+) -> float:
     """Return the correlation of `y` with the best smooth function of some channels, beyond `others`.
 
     Parameters
@@ -129,7 +142,8 @@ def explained_by(values: Mapping[str, np.ndarray], y: np.ndarray, others: np.nda
     others : ndarray, shape (n, k)
         What else may explain it (the declared quantities, the other effects), weighted.
     scale : ndarray, shape (n, m)
-        What the smooth function is multiplied with: the weights for an added force, weights times the force for a gain.
+        What the smooth function is multiplied with: the weights for an added force, weights times the force
+        for a gain.
     """
     basis = np.ones((y.size, 1))
     for value in values.values():

@@ -51,7 +51,9 @@ def clear_effects(records: Iterable[dict]) -> list[dict]:
 
 def ratios(records: Iterable[dict], over: str) -> np.ndarray:
     """Return the error after over another error (`before` or `true_form`), for every world with points."""
-    pairs = [(r["errors"]["after"], r["errors"][over]) for r in records if (r.get("errors") or {}).get("after")]
+    pairs = [
+        (r["errors"]["after"], r["errors"][over]) for r in records if (r.get("errors") or {}).get("after")
+    ]
     return np.array([a / b for a, b in pairs if b])
 
 
@@ -81,7 +83,8 @@ def line(record: dict) -> str:
     errors = " ".join(f"{k} {v:.3g}" for k, v in (record.get("errors") or {}).items() if v is not None)
     inside = f"{record.get('inside', 0)}/{record.get('with_interval', 0)}"
     return (
-        f"{head} {record['verdict']:15s} {hidden or 'null'} | {claims or '-'} | extra {record['extra']} | {errors} | "
+        f"{head} {record['verdict']:15s} {hidden or 'null'} | {claims or '-'} | "
+        f"extra {record['extra']} | {errors} | "
         f"inside {inside} | {record['seconds']:.0f} s {record['peak_MB']:.0f} MB{' | ' + why if why else ''}"
     )
 
@@ -102,10 +105,18 @@ def figures(records: list[dict], fine: list[dict]) -> str:
     pooled = sum(r.get("inside", 0) for r in fine), sum(r.get("with_interval", 0) for r in fine)
     noted = [r["of_tested_specimens"] for r in fine if r.get("of_tested_specimens")]
     own = sum(n["inside"] for n in noted), sum(n["points"] for n in noted)
-    stated = [(e["own_rms_N"] / e["smallest_N"], e["grade"] > 0) for r in fine for e in r["effects"] if e["smallest_N"]]
+    stated = [
+        (e["own_rms_N"] / e["smallest_N"], e["grade"] > 0)
+        for r in fine
+        for e in r["effects"]
+        if e["smallest_N"]
+    ]
     near = [found for ratio, found in stated if NEAR_STATED[0] <= ratio <= NEAR_STATED[1]]
     spent = np.array([r["cpu_s"] for r in fine if "cpu_s" in r] or [0.0])
-    seconds, memory = np.array([r["seconds"] for r in fine] or [0.0]), np.array([r["peak_MB"] for r in fine] or [0.0])
+    seconds, memory = (
+        np.array([r["seconds"] for r in fine] or [0.0]),
+        np.array([r["peak_MB"] for r in fine] or [0.0]),
+    )
     rows = [
         ("worlds", f"{len(records)} ({len(fine)} answered, {len(nulls)} of them hide nothing)"),
         ("seeds", ", ".join(sorted({r["seed_text"][:12] for r in records}))),
@@ -115,7 +126,10 @@ def figures(records: list[dict], fine: list[dict]) -> str:
         ),
         ("nothing hidden: claimed or unexplained", share(sum(map(alarmed, nulls)), len(nulls))),
         ("worlds with an effect beyond the true ones", share(sum(r["extra"] > 0 for r in fine), len(fine))),
-        ("... on a variable of a true effect", share(sum(r["extra_on_true_variable"] > 0 for r in fine), len(fine))),
+        (
+            "... on a variable of a true effect",
+            share(sum(r["extra_on_true_variable"] > 0 for r in fine), len(fine)),
+        ),
         ("clear effects found", share(sum(e["grade"] > 0 for e in clear), len(clear))),
         (
             f"... of those with z by specimens >= {BY_SPECIMENS:g}",
@@ -126,13 +140,22 @@ def figures(records: list[dict], fine: list[dict]) -> str:
             share(len(told), sum("told" in e for e in clear)),
         ),
         ("... of these found", share(sum(e["grade"] > 0 for e in told), len(told))),
-        ("clear effects named or honestly unnamed", share(sum(e["named_rightly"] for e in clear), len(clear))),
-        ("predict: error after above before by more than 5 %", share(int((before > WORSE).sum()), before.size)),
+        (
+            "clear effects named or honestly unnamed",
+            share(sum(e["named_rightly"] for e in clear), len(clear)),
+        ),
+        (
+            "predict: error after above before by more than 5 %",
+            share(int((before > WORSE).sum()), before.size),
+        ),
         ("predict: after over the true form, median, 95th percentile", _quantiles(true_form)),
         ("points inside the 95 % interval of the mean", share(*pooled)),
         ("... that says it is the tested specimens' only", share(*own)),
         ("... and the other points", share(pooled[0] - own[0], pooled[1] - own[1])),
-        *((f"intervals of {name} of Eq. 15, nothing hidden", share(*_laws(fine, name))) for name in ("mu_0", "a", "b")),
+        *(
+            (f"intervals of {name} of Eq. 15, nothing hidden", share(*_laws(fine, name)))
+            for name in ("mu_0", "a", "b")
+        ),
         ("intervals of lifetimes, nothing hidden", share(*_lifetimes(fine))),
         ("effects of about the size that `sensitivity` states: found", share(sum(near), len(near))),
         ("seconds of `run`: median, 95th percentile, most", _quantiles(seconds, last=True)),
@@ -151,7 +174,9 @@ def _laws(fine: list[dict], name: str) -> tuple[int, int]:
 
 
 def _lifetimes(fine: list[dict]) -> tuple[int, int]:
-    told = [r["lifetime"]["inside"] for r in fine if r.get("lifetime") and r["lifetime"].get("inside") is not None]
+    told = [
+        r["lifetime"]["inside"] for r in fine if r.get("lifetime") and r["lifetime"].get("inside") is not None
+    ]
     return sum(told), len(told)
 
 
@@ -212,7 +237,9 @@ def by_family(fine: list[dict]) -> str:
                 ", ".join(f"{k} {n}" for k, n in said.most_common(4)),
             )
         )
-    return _table(("family", "found of all", "clear (z >= 8) found", "rightly named or unnamed", "claimed as"), rows)
+    return _table(
+        ("family", "found of all", "clear (z >= 8) found", "rightly named or unnamed", "claimed as"), rows
+    )
 
 
 def family_of(effect: dict) -> str:
@@ -223,20 +250,28 @@ def family_of(effect: dict) -> str:
 def failures(records: list[dict]) -> str:
     """Return the worlds that were not answered, or whose points were not."""
     rows = [(name(r), str(r["files"]), why) for r in records if (why := failed(r))]
-    return _table(("world", "files", "what happened"), rows) if rows else "No world was left without an answer."
+    return (
+        _table(("world", "files", "what happened"), rows) if rows else "No world was left without an answer."
+    )
 
 
 def worst(fine: list[dict], most: int = 15) -> str:
-    """Return the worlds that hide nothing and gave alarm, those made worse most, and the clearest effects missed."""
+    """Return the worlds with false alarms, those made worse most, and the clearest effects missed."""
     rows = [(name(r), "alarm, nothing hidden", line(r)) for r in fine if is_null(r) and alarmed(r)]
-    made = [(r["errors"]["after"] / r["errors"]["before"], r) for r in fine if (r.get("errors") or {}).get("before")]
+    made = [
+        (r["errors"]["after"] / r["errors"]["before"], r)
+        for r in fine
+        if (r.get("errors") or {}).get("before")
+    ]
     made = sorted((x for x in made if x[0] > WORSE), key=lambda x: -x[0])[:most]
     rows += [(name(r), f"error {ratio:.2f} times before", line(r)) for ratio, r in made]
     missed = [(e["z"], r, e) for r in fine for e in r["effects"] if e["clear"] and not e["grade"]]
     missed = sorted(missed, key=lambda x: -x[0])[:most]
     rows += [(name(r), f"missed {e['family']}, z {z:.0f}", line(r)) for z, r, e in missed]
     return (
-        _table(("world", "what", "in a line"), rows) if rows else "No alarm, nothing made worse, nothing clear missed."
+        _table(("world", "what", "in a line"), rows)
+        if rows
+        else "No alarm, nothing made worse, nothing clear missed."
     )
 
 

@@ -1,27 +1,29 @@
 """What somebody who knows the truth could see in a world: z of every effect, and the error of the true form.
 
-The rows are bin means of the plateaus. The declared quantities and the effects are linearised at the truth: the force
-is integrated again with each quantity moved by a little, and without each effect. So y = X d + e, y the measured force
-less the true mean, X the derivatives by every declared quantity (of every series) and sigma_0 and each effect's own
-noise-free part; d = 0 is the truth, and an effect's amplitude is 1 + d.
+The rows are bin means of the plateaus. The declared quantities and the effects are linearised at the truth:
+the force is integrated again with each quantity moved by a little, and without each effect. So y = X d + e, y
+the measured force less the true mean, X the derivatives by every declared quantity (of every series) and
+sigma_0 and each effect's own noise-free part; d = 0 is the truth, and an effect's amplitude is 1 + d.
 
-z of an effect: weighted least squares within the groups above its unit of evidence (groups are demeaned, so that
-their scatter has no part): an effect inside files within files, one between repeats within runs, one between runs
-within specimens, one between specimens as it is. The covariance is robust for clusters (CR1) of that unit, for an
-effect inside files runs where there are twelve, else files. The t value has as many degrees of freedom as clusters
-beyond the rank of their means, and is given as the normal z of the same p, at the true amplitude and at the measured
-one; the smaller counts. So z is conservative: what demeaning takes away is not used.
+z of an effect: weighted least squares within the groups above its unit of evidence (groups are demeaned, so
+that their scatter has no part): an effect inside files within files, one between repeats within runs, one
+between runs within specimens, one between specimens as it is. The covariance is robust for clusters (CR1) of
+that unit, for an effect inside files runs where there are twelve, else files. The t value has as many degrees
+of freedom as clusters beyond the rank of their means, and is given as the normal z of the same p, at the true
+amplitude and at the measured one; the smaller counts. So z is conservative: what demeaning takes away is not
+used.
 
-z by specimens: the same with specimens as the clusters, and one degree of freedom less than specimens. Nobody who does
-not know whether specimens differ in their slope along a channel can claim more from them than this.
+z by specimens: the same with specimens as the clusters, and one degree of freedom less than specimens. Nobody
+who does not know whether specimens differ in their slope along a channel can claim more from them than this.
 
-p by units: the two-sided p of z by the units that may scatter without any effect: specimens where the effect varies
-inside strokes, with the speed or with the direction, else the clusters of z. A tester who knows the form and the
-quantity, but not where to look, must hold it against as many tests as the campaign has candidates (`candidates`):
-every quantity along every variable, and friction and force along every pair. The effect can be told where p by units
-times their number is at most 0.005.
+p by units: the two-sided p of z by the units that may scatter without any effect: specimens where the effect
+varies inside strokes, with the speed or with the direction, else the clusters of z. A tester who knows the
+form and the quantity, but not where to look, must hold it against as many tests as the campaign has
+candidates (`candidates`): every quantity along every variable, and friction and force along every pair. The
+effect can be told where p by units times their number is at most 0.005.
 
-The true form's error at new points: d of the same generalised least squares, and the derivatives at the points.
+The true form's error at new points: d of the same generalised least squares, and the derivatives at the
+points.
 """
 
 from __future__ import annotations
@@ -48,17 +50,25 @@ LEAST_RUNS = 12  # with fewer, files are the clusters of an effect inside files
 MOST_ROWS = 1200  # of a specimen whose scatter is taken as one block: more are cut between files, for time
 WRONG_GAIN = 0.15  # of files that went wrong, about
 TOLD = 0.005  # family error of a search
-QUANTITIES_TRIED = 7  # force added and by a factor, mu, mu_s, mu_c, v_s, sigma_2; a and b where rubber is aged
+QUANTITIES_TRIED = (
+    7  # force added and by a factor, mu, mu_s, mu_c, v_s, sigma_2; a and b where rubber is aged
+)
 TRIED_OF_PAIRS = 2
 GAIN = ("mu_0s", "mu_0c", "a_s", "a_c", "sigma_2")  # quantities that a gain of the whole friction multiplies
 UNIT = {"repeat": "file", "run": "run_id", "specimen": "specimen_id"}
 LEVELS = ("stroke", "file", "run_id", "specimen_id")  # nesting, fine to coarse
-CLAIM_LEVEL = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run_id": "run", "specimen_id": "condition"}
+CLAIM_LEVEL = {
+    "sample": "trace",
+    "stroke": "stroke",
+    "file": "repeat",
+    "run_id": "run",
+    "specimen_id": "condition",
+}
 
 
 @dataclass
 class Rows:
-    """Bin means: every channel, `y` measured less true mean, `mean` the true mean force, and the columns X."""
+    """Bin means: every channel, `y` measured less true mean, `mean` the true mean force, and columns X."""
 
     table: pd.DataFrame
     columns: np.ndarray  # (n, k) nuisance first, then effects
@@ -111,7 +121,9 @@ def _moved(world: World, group: np.ndarray, truth: Batch):
         yield k, integrate(world, group, without={k}).force_N
 
 
-def _columns(world: World, table: pd.DataFrame, moved: list[str], truth: str, names: list[tuple]) -> np.ndarray:
+def _columns(
+    world: World, table: pd.DataFrame, moved: list[str], truth: str, names: list[tuple]
+) -> np.ndarray:
     """Return X from the table's moved forces: derivatives by relative changes, and each effect's own part."""
     order = [*QUANTITIES, "sigma_0", *range(len(world.effects))]
     by = dict(zip(order, moved, strict=True))
@@ -127,11 +139,16 @@ def _columns(world: World, table: pd.DataFrame, moved: list[str], truth: str, na
 
 
 def _binned(world: World, truth: Batch, forces: list[np.ndarray]) -> tuple[pd.DataFrame, np.ndarray]:
-    """Return the plateau's bin means of channels and forces (`_f0`, `_f1`, ...), and the variance of a mean's noise."""
+    """Return the plateau's bin means of channels and forces, and the variance of a mean's noise.
+
+    The means of forces are `_f0`, `_f1` and so on.
+    """
     n, _samples = truth.force_N.shape
     flat = truth.plateau
     share = np.clip(truth.channels["distance_mm"] / world.rig["stroke_mm"], 0, 1 - 1e-9)
-    key = ((np.arange(n)[:, None] * 64 + truth.channels["stroke"]) * BINS + np.floor(share * BINS)).astype(int)[flat]
+    key = ((np.arange(n)[:, None] * 64 + truth.channels["stroke"]) * BINS + np.floor(share * BINS)).astype(
+        int
+    )[flat]
     order = np.unique(key, return_inverse=True)[1]
     count = np.bincount(order)
 
@@ -178,7 +195,7 @@ def unit_of(values: np.ndarray, units: dict[str, np.ndarray]) -> str:
 
 
 def z_values(rows: Rows, world: World) -> list[dict]:
-    """Return for each effect its unit, z at the true amplitude and as measured, and how much of it is its own."""
+    """Return each effect's unit, z at the true amplitude and as measured, and how much of it is its own."""
     units = codes(rows)
     found = []
     if not rows.effects:
@@ -202,13 +219,16 @@ def z_values(rows: Rows, world: World) -> list[dict]:
 
 
 def p_units(z: dict, *, scatters: bool) -> float:
-    """Return the p of an effect by the units whose slopes `scatters` says may differ without it: specimens, or runs."""
+    """Return the p of an effect by the units whose slopes may differ without it.
+
+    `scatters` says which these are: specimens, or runs.
+    """
     size = min(abs(z["z"]), abs(z["z_specimens"])) if scatters else abs(z["z"])
     return float(2 * stats.norm.sf(size))
 
 
 def candidates(world: World) -> int:
-    """Return how many tests of an unknown effect a campaign has: quantities along variables, and pairs of these."""
+    """Count a campaign's tests of an unknown effect: quantities along variables, and pairs of these."""
     variables = len(world.ranges) + (world.rig["directions"] != "one") + ("batch" in world.files)
     quantities = QUANTITIES_TRIED + 2 * (np.count_nonzero(world.days > 0) > 0)
     return variables * quantities + TRIED_OF_PAIRS * variables * (variables - 1) // 2
@@ -228,7 +248,9 @@ def _z(rows: Rows, units: dict, unit: str, place: int, world: World) -> dict:
     mean = friction_N(rows, world)
     mean = np.sign(rows.table["direction"].to_numpy()) * np.maximum(np.abs(mean), 0.05 * world.rig["mean_N"])
     absorbed = ABOVE[unit]
-    gains = sum(s["sd"] ** 2 for s in world.scatter if s["kind"] in ("gain", "level") and s["level"] in BELOW[unit])
+    gains = sum(
+        s["sd"] ** 2 for s in world.scatter if s["kind"] in ("gain", "level") and s["level"] in BELOW[unit]
+    )
     weight = 1 / (rows.variance / mean**2 + gains + 1e-8)
     # Relative to the true friction: then a gain is a constant, and demeaning takes it away whole.
     y, x = rows.table["y"].to_numpy() / mean, rows.columns / mean[:, None]
@@ -309,7 +331,10 @@ def error_at(world: World, rows: Rows, points: pd.DataFrame) -> np.ndarray:
 
 
 def fitted(world: World, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Return d of the true form and its covariance, by generalised least squares: scatter correlates a unit's rows."""
+    """Return d of the true form and its covariance, by generalised least squares.
+
+    Scatter correlates the rows of a unit.
+    """
     if rows.fit is None:
         rows.fit = _fitted(world, rows)
     return rows.fit
@@ -319,9 +344,17 @@ def _fitted(world: World, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     table, units, mean = rows.table, codes(rows), friction_N(rows, world)
     along = (table["distance_mm"] / world.rig["stroke_mm"] - 0.5).to_numpy()
     moved = {q: sum(rows.columns[:, k] for k, n in enumerate(rows.names) if n[0] == q) for q in QUANTITIES}
-    gain = sum(moved[q] for q in GAIN)  # not the force itself: a larger friction bends the bristles further first
+    gain = sum(
+        moved[q] for q in GAIN
+    )  # not the force itself: a larger friction bends the bristles further first
     level = world.rig["mean_N"] * table["direction"].to_numpy()
-    bases = {"gain": gain, "level": level, "slope": gain * along, "v_s": moved["v_s"], "sigma_2": moved["sigma_2"]}
+    bases = {
+        "gain": gain,
+        "level": level,
+        "slope": gain * along,
+        "v_s": moved["v_s"],
+        "sigma_2": moved["sigma_2"],
+    }
     terms = [(s["sd"] ** 2, bases[s["kind"]], units[UNIT[s["level"]]]) for s in world.scatter]
     wrong = world.files["_wrong"].to_numpy()[world.files["file"].searchsorted(table["file"])]
     terms.append((WRONG_GAIN**2, np.where(wrong, gain, 0.0), units["file"]))
@@ -340,7 +373,7 @@ def _fitted(world: World, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def blocks(specimen: np.ndarray, file: np.ndarray) -> list[np.ndarray]:
-    """Return the rows of each specimen; of one with many, in parts of whole files, as if of several specimens."""
+    """Return each specimen's rows; of one with many, in parts of whole files, as if of several specimens."""
     found = []
     for s in range(int(specimen.max()) + 1):
         rows = np.flatnonzero(specimen == s)

@@ -25,7 +25,7 @@ KINDS = ("gain", "level", "slope", "v_s", "sigma_2")
 
 @dataclass
 class World:
-    """Everything drawn. `files` has a row per file; names that begin with _ are scatter that no column shows."""
+    """Everything drawn. `files` has a row per file; names that begin with _ are scatter no column shows."""
 
     seed_text: str
     index: int
@@ -140,9 +140,11 @@ def _design(rng, size: str) -> dict:
                     for d in both:
                         run = f"{name}_s{piece + 1}_{load_N:g}N_{speed:g}{'n' if d < 0 else ''}"
                         for repeat in range(count["repeats"]):
-                            rows.append((run, repeat + 1, f"{name}_s{piece + 1}", k, t, c, day, load_N, speed, d))
-    names = ("run_id", "repeat", "specimen_id", "series", "temperature_C", "compression_ratio_pct", "aging_days",
-             "load_N", "speed_mm_s", "direction")  # fmt: skip
+                            rows.append(
+                                (run, repeat + 1, f"{name}_s{piece + 1}", k, t, c, day, load_N, speed, d)
+                            )
+    names = ("run_id", "repeat", "specimen_id", "series", "temperature_C", "compression_ratio_pct",
+             "aging_days", "load_N", "speed_mm_s", "direction")  # fmt: skip
     table = pd.DataFrame(rows, columns=names)
     if rig["holes"] and len(table) > 12:
         share = draw("holes_share", rng)
@@ -153,7 +155,14 @@ def _design(rng, size: str) -> dict:
     series = [{"temperature_C": t, "compression_ratio_pct": c} for t, c in chosen]
     if len(chosen) > 1 and days.size and days[0] == 0:
         series.append({"temperature_C": 23.0, "compression_ratio_pct": 100.0})
-    return {"rig": rig, "speeds_mm_s": speeds, "days": days, "loads_N": loads, "series": series, "files": table}
+    return {
+        "rig": rig,
+        "speeds_mm_s": speeds,
+        "days": days,
+        "loads_N": loads,
+        "series": series,
+        "files": table,
+    }
 
 
 def _sharp(values: np.ndarray, digits: int) -> np.ndarray:
@@ -173,9 +182,17 @@ def _friction(world: World, rng) -> None:
     last = world.days.max() if aging else 1.0
     loss, b = {e: draw("aging_loss", rng) for e in "sc"}, {e: draw("aging_b_days", rng) for e in "sc"}
     for own in world.series:
-        r = {name: float(1 + spread * rng.uniform(-1, 1)) for name in ("mu", "a_s", "a_c", "b_s", "b_c", "v", "s2")}
+        r = {
+            name: float(1 + spread * rng.uniform(-1, 1))
+            for name in ("mu", "a_s", "a_c", "b_s", "b_c", "v", "s2")
+        }
         scale = 1.0 if aging else r["mu"]
-        own |= {"mu_0c": mu_c * scale, "mu_0s": mu_c * over * scale, "v_s": v_s * r["v"], "sigma_2": sigma_2 * r["s2"]}
+        own |= {
+            "mu_0c": mu_c * scale,
+            "mu_0s": mu_c * over * scale,
+            "v_s": v_s * r["v"],
+            "sigma_2": sigma_2 * r["s2"],
+        }
         for end in "sc":
             own[f"b_{end}"] = b[end] * r[f"b_{end}"]
             lost = loss[end] * r[f"a_{end}"] * own[f"mu_0{end}"] if aging else 0.0
@@ -191,7 +208,9 @@ def _calendar(world: World, rng) -> pd.DataFrame:
         rig["order"] = "blocked"
     runs = files["run_id"].unique()
     shuffled = dict(zip(rng.permutation(runs), range(runs.size), strict=True))
-    condition = files.groupby(["specimen_id"], sort=False).ngroup().map(dict(enumerate(rng.permutation(10_000))))
+    condition = (
+        files.groupby(["specimen_id"], sort=False).ngroup().map(dict(enumerate(rng.permutation(10_000))))
+    )
     keys = {
         "blocked": [condition, files["run_id"].map(shuffled)],
         "shuffled": [files["run_id"].map(shuffled)],
@@ -231,7 +250,9 @@ def _sampling(world: World, rng) -> None:
     rig, stroke = world.rig, world.rig["stroke_mm"]
     fastest = stroke / world.speeds_mm_s[-1]
     rate = float(
-        np.clip(draw("rate_Hz", rng), LEAST_SAMPLES / fastest, 1e4 if fastest > 0.006 else LEAST_SAMPLES / fastest)
+        np.clip(
+            draw("rate_Hz", rng), LEAST_SAMPLES / fastest, 1e4 if fastest > 0.006 else LEAST_SAMPLES / fastest
+        )
     )
     share = MOST_TOTAL[world.size] / (len(world.files) * rig["strokes"])
     most = max(100, min(draw("samples_per_file", rng), int(share)))
@@ -242,8 +263,8 @@ def _columns(world: World, rng) -> None:
     """Put columns into the log: idle, correlated with the design, and some that an effect may use."""
     files = world.files
     n, hours = len(files), files["elapsed_h"].to_numpy()
-    pool = ["lab_temperature_C", "humidity_pct", "batch", "pressure_bar", "motor_current_A", "operator", "dust_mg",
-            "oil_age_h", "oven_position"]  # fmt: skip
+    pool = ["lab_temperature_C", "humidity_pct", "batch", "pressure_bar", "motor_current_A", "operator",
+            "dust_mg", "oil_age_h", "oven_position"]  # fmt: skip
     for k in rng.permutation(len(pool))[: draw("idle_columns", rng) + int(rng.random() < 0.4)]:
         name = pool[k]
         column = {"name": name, "missing": 0.0}
@@ -256,10 +277,14 @@ def _columns(world: World, rng) -> None:
             labels = [f"B{j + 1}" for j in range(int(rng.integers(2, 5)))]
             if pieces.size < 2 * len(labels):
                 continue
-            files[name] = files["specimen_id"].map(dict(zip(pieces, rng.choice(labels, pieces.size), strict=True)))
+            files[name] = files["specimen_id"].map(
+                dict(zip(pieces, rng.choice(labels, pieces.size), strict=True))
+            )
         elif name == "pressure_bar":
             runs = files["run_id"].unique()
-            files[name] = files["run_id"].map(dict(zip(runs, np.round(rng.uniform(1, 8, runs.size), 1), strict=True)))
+            files[name] = files["run_id"].map(
+                dict(zip(runs, np.round(rng.uniform(1, 8, runs.size), 1), strict=True))
+            )
         elif name == "motor_current_A":  # a column of the traces; its mean here
             column |= {"mean": 2.0, "sd": 0.2, "samples": float(np.exp(rng.uniform(0, 4)))}
         elif name == "operator":
@@ -369,7 +394,9 @@ def scale_points(world: World) -> dict[str, np.ndarray]:
     }  # fmt: skip
     for column in world.columns:
         if column["name"] == "motor_current_A":
-            given[column["name"]] = column["mean"] + column["sd"] * np.sin(7.0 * np.arange(PLACES))[None, :] + 0 * begin
+            given[column["name"]] = (
+                column["mean"] + column["sd"] * np.sin(7.0 * np.arange(PLACES))[None, :] + 0 * begin
+            )
     return given
 
 
@@ -389,11 +416,13 @@ def _effects(world: World, rng) -> None:
         world.effects.append(effect)
         points = scale_points(world)
         world.effects[-1] = _scaled(world, effect, wanted, points)
-    world.effects = [e for e in world.effects if e.strength_pct > 1e-3]  # one outside its place changes nothing
+    world.effects = [
+        e for e in world.effects if e.strength_pct > 1e-3
+    ]  # one outside its place changes nothing
 
 
 def _scaled(world: World, effect: Effect, wanted_pct: float, points: dict) -> Effect:
-    """Return an effect with the amplitude that gives it its strength, within what keeps every quantity positive."""
+    """Return an effect with the amplitude for its strength, within what keeps every quantity positive."""
     number = len(world.effects) - 1
     size = float(np.abs(change(effect, points)).max())
     if size == 0:
@@ -407,7 +436,9 @@ def _scaled(world: World, effect: Effect, wanted_pct: float, points: dict) -> Ef
 
     def strength(amplitude: float) -> float:
         world.effects[number] = replace(effect, amplitude=effect.amplitude * amplitude)
-        return 100 * float(np.sqrt(np.mean((quasi_steady_N(world, points) - bare) ** 2))) / world.rig["mean_N"]
+        return (
+            100 * float(np.sqrt(np.mean((quasi_steady_N(world, points) - bare) ** 2))) / world.rig["mean_N"]
+        )
 
     amplitude = min(most, 1.0)
     for _ in range(4):  # nearly proportional

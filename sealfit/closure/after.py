@@ -28,10 +28,12 @@ from sealfit.progress import timed
 from sealfit.tables import AFTER, AGING_CURVES, AGING_FIT, SCHEMAS
 
 # ---------------------------------------------------------------- reference
-# The reference state of the after-model, in which its effects are zero, and the effects' share of the measured forces.
+# The reference state of the after-model, in which its effects are zero, and the effects' share of the
+# measured forces.
 #
-# The coefficients of the after-model are those at the reference: the contact cold, the offset removed, a column at its
-# reference value. An effect of condition columns only (such as days) is part of the condition and is not removed.
+# The coefficients of the after-model are those at the reference: the contact cold, the offset removed, a
+# column at its reference value. An effect of condition columns only (such as days) is part of the condition
+# and is not removed.
 
 KEPT = "not removed: part of the aging condition"
 SMALL = 1e-4  # Share of the effects' variance in principal directions that are dropped.
@@ -58,7 +60,9 @@ def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str
         return KEPT
     labels = {name: config.units.label(name) for name in term.channels}
     known = {"x": labels[term.channels[0]], "z": labels[term.channels[-1]], **labels}
-    known |= {name: f"{value:.4g}" for name, value in (*term.fixed.items(), *values.items()) if np.isscalar(value)}
+    known |= {
+        name: f"{value:.4g}" for name, value in (*term.fixed.items(), *values.items()) if np.isscalar(value)
+    }
     words = term.effect.reference or f"where {term.effect.form} = 0"
     return re.sub(r"\{(\w+)\}", lambda found: str(known.get(found[1], found[1])), words)
 
@@ -66,7 +70,9 @@ def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str
 def at_reference(model: Model, config: Config) -> Model:
     """Return the model at the reference: only effects that are part of a condition are kept."""
     kept = [k for k, term in enumerate(model.terms) if is_kept(term, config)]
-    return replace(model, terms=tuple(model.terms[k] for k in kept), values=tuple(model.values[k] for k in kept))
+    return replace(
+        model, terms=tuple(model.terms[k] for k in kept), values=tuple(model.values[k] for k in kept)
+    )
 
 
 def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.DataFrame:
@@ -84,16 +90,16 @@ def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.D
     Returns
     -------
     DataFrame
-        `steady` with `force_N` less `effects_N`, the effects' mean over the steady window; `effects_start_N`, their
-        force at the start of the stroke; and columns `effects_u1_N`, ...: the change of the force in the direction of
-        motion for one standard error along each principal direction of the effects' covariance. A stroke without bins
-        is not used.
+        `steady` with `force_N` less `effects_N`, the effects' mean over the steady window; `effects_start_N`,
+        their force at the start of the stroke; and columns `effects_u1_N`, ...: the change of the force in
+        the direction of motion for one standard error along each principal direction of the effects'
+        covariance. A stroke without bins is not used.
 
     Notes
     -----
-    The effects' covariance is that of the joint fit. In a linear model, a fit to the corrected forces, with this
-    covariance propagated through it, gives the estimate and the covariance of the joint fit (Frisch & Waugh 1933,
-    Econometrica 1(4), 387-401, doi:10.2307/1907330).
+    The effects' covariance is that of the joint fit. In a linear model, a fit to the corrected forces, with
+    this covariance propagated through it, gives the estimate and the covariance of the joint fit (Frisch &
+    Waugh 1933, Econometrica 1(4), 387-401, doi:10.2307/1907330).
     """
     model, rows = after.model, after.rows
     force, tangent = evaluate(model, rows)
@@ -107,24 +113,31 @@ def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.D
     columns |= {f"{SHIFT}{k + 1}_N": principal[:, k] * np.sign(rows.speed) for k in range(principal.shape[1])}
     keys = [rows.table["file"], rows.table["stroke"]]
     weight = rows.table["n"].astype(float)
-    means = pd.DataFrame(columns).mul(weight, axis=0).groupby(keys).sum().div(weight.groupby(keys).sum(), axis=0)
+    means = (
+        pd.DataFrame(columns).mul(weight, axis=0).groupby(keys).sum().div(weight.groupby(keys).sum(), axis=0)
+    )
     found = means.reindex(pd.MultiIndex.from_frame(steady[["file", "stroke"]])).reset_index(drop=True)
     known = found["effects_N"].notna()
     table = steady.reset_index(drop=True).join(found.fillna(0.0))
-    return table.assign(force_N=table["force_N"] - table["effects_N"], used=table["used"].astype(bool) & known)
+    return table.assign(
+        force_N=table["force_N"] - table["effects_N"], used=table["used"].astype(bool) & known
+    )
 
 
 def _principal(columns: np.ndarray, covariance: np.ndarray, rows: Rows) -> np.ndarray:
-    """Return L with L L' = J C J' for derivatives J, shape (n, p), and a covariance C, shape (p, p); few columns.
+    """Return L with L L' = J C J' for derivatives J, shape (n, p), and a covariance C, shape (p, p).
 
-    Directions whose mean over the strokes is small are dropped: they do not change a fit to the strokes.
+    L has few columns: directions whose mean over the strokes is small are dropped, because they do not change
+    a fit to the strokes.
     """
     if not columns.size:
         return columns
     size, axes = np.linalg.eigh(covariance)
     spread = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))
     stroke = rows.codes("stroke")
-    means = np.column_stack([np.bincount(stroke, column) for column in spread.T]) / np.bincount(stroke)[:, None]
+    means = (
+        np.column_stack([np.bincount(stroke, column) for column in spread.T]) / np.bincount(stroke)[:, None]
+    )
     _, singular, turned = np.linalg.svd(means, full_matrices=False)
     share = np.cumsum(singular[::-1] ** 2)[::-1]
     kept = share > SMALL * share[0]
@@ -141,7 +154,8 @@ def _at_start(model: Model, reference: Model, rows: Rows) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- after law
-# The aging law of every series in the after-model: Eq. 15 from the joint fit, with effects at their reference.
+# The aging law of every series in the after-model: Eq. 15 from the joint fit, with effects at their
+# reference.
 
 SLOW, FAST = 1e-6, 12.0  # Multiples of v_s at which the force is mu_s N, and mu_c N without the viscous term.
 WIDEST = 700.0  # Largest logarithm.
@@ -161,9 +175,9 @@ def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple
 
     Notes
     -----
-    mu_0, a and b and their standard errors are those of the joint fit. Their intervals use Student's t with the number
-    of specimens less the parameters of one coefficient; that of b is symmetric in its logarithm. Effects that are part
-    of the condition (such as days) multiply or change the law; the curves include them.
+    mu_0, a and b and their standard errors are those of the joint fit. Their intervals use Student's t with
+    the number of specimens less the parameters of one coefficient; that of b is symmetric in its logarithm.
+    Effects that are part of the condition (such as days) multiply or change the law; the curves include them.
     """
     rows, curves = [], []
     open_columns = [name for name in config.series_columns if name in steady_fit.columns]
@@ -183,7 +197,8 @@ def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple
 def law_df(after: Fitted) -> float:
     """Return the degrees of freedom of the laws' intervals: specimens less the parameters of one coefficient.
 
-    With few specimens their variance is often estimated as zero, and the runs would give too many degrees of freedom.
+    With few specimens their variance is often estimated as zero, and the runs would give too many degrees of
+    freedom.
     """
     left = after.rows.groups.starts["specimen"].size - after.model.declared.mu_parameter_count
     return min(degrees_of_freedom(after), float(max(left, 1)))
@@ -218,7 +233,9 @@ class _Law:
         names = (f"mu_0{end}", f"a_{end}", f"b_{end}")
         number = [int(declared.index[name][self.conditions[0]]) for name in names]
         self.place = number if min(number) >= 0 else None
-        self.curve_of = Curve(series, self.quantity, 0, np.unique(days[self.conditions]), self.unaged, self.unit)
+        self.curve_of = Curve(
+            series, self.quantity, 0, np.unique(days[self.conditions]), self.unaged, self.unit
+        )
         self.df = law_df(after)
 
     def rows(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
@@ -244,7 +261,10 @@ class _Law:
         t, error = t_quantile(self.df), np.sqrt(np.diag(found.covariance))
         low, high = (found.x[2] + s * t * error[2] for s in (-1, 1))
         first, last = search_limits(self.curve_of.days)
-        b = (float(np.exp(low)) if low > first else 0.0, float(np.exp(min(high, WIDEST))) if high < last else np.inf)
+        b = (
+            float(np.exp(low)) if low > first else 0.0,
+            float(np.exp(min(high, WIDEST))) if high < last else np.inf,
+        )
         c, half = -found.x[1] * found.x[2], t * found.error_of_c()
         return CurveInterval((found.x[1] - t * error[1], found.x[1] + t * error[1]), b, (c - half, c + half))
 
@@ -274,7 +294,9 @@ class _Law:
             ("last_day", self.curve_of.days[-1], "d"),
         ):
             parameter = f"{self.quantity}:{name}"
-            row = table_row(quantity="statistics", parameter=parameter, value=value, unit=unit, identified=True)
+            row = table_row(
+                quantity="statistics", parameter=parameter, value=value, unit=unit, identified=True
+            )
             yield {**row, "series": self.series}
 
     def curve(self) -> pd.DataFrame:
@@ -283,13 +305,17 @@ class _Law:
         value, error = self._values(days)
         half = t_quantile(self.df) * error
         columns = {"aging_days": days, "value": value, "lo95": value - half, "hi95": value + half}
-        return pd.DataFrame({"series": self.series, "quantity": self.quantity, **columns})[AGING_CURVES.names()]
+        return pd.DataFrame({"series": self.series, "quantity": self.quantity, **columns})[
+            AGING_CURVES.names()
+        ]
 
     def _values(self, days: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the coefficient at days of aging, and its standard error, shape (n,) each."""
         after, config, rows = self.after, self.config, self.after.rows
         model = at_reference(after.model, config)
-        for number in reversed([k for k, term in enumerate(model.terms) if term.acts_on in ("v_s", "sigma_2")]):
+        for number in reversed(
+            [k for k, term in enumerate(model.terms) if term.acts_on in ("v_s", "sigma_2")]
+        ):
             model = model.without_term(number)  # they change no coefficient
         declared = model.declared
         condition = int(self.conditions[0])
@@ -301,7 +327,9 @@ class _Law:
         load = float(rows.load.mean())
         first = rows.table[rows.condition == condition].iloc[[0]]
         table = pd.concat([first] * days.size, ignore_index=True)
-        table = table.assign(aging_days=days, speed_mm_s=v_s * (SLOW if self.end == "s" else FAST), load_N=load)
+        table = table.assign(
+            aging_days=days, speed_mm_s=v_s * (SLOW if self.end == "s" else FAST), load_N=load
+        )
         code = np.full(days.size, condition)
         at = point_rows(
             table.drop(columns=[POWER], errors="ignore"),
@@ -349,9 +377,9 @@ def after_fits(
 
     Notes
     -----
-    The laws of single series are those of the joint fit. Single conditions are fitted to the strokes' forces without
-    the effects, and the effects' covariance is propagated through these fits. The laws for all series, the pre-sliding
-    fits and the break-away forces follow from them.
+    The laws of single series are those of the joint fit. Single conditions are fitted to the strokes' forces
+    without the effects, and the effects' covariance is propagated through these fits. The laws for all
+    series, the pre-sliding fits and the break-away forces follow from them.
     """
     if not after.model.terms:
         return {schema.name: pd.DataFrame(columns=schema.names()) for schema in AFTER}
@@ -373,4 +401,6 @@ def after_fits(
         "dynamic_fit_after": dynamic.fit,
         "dynamic_curves_after": dynamic.curves,
     }
-    return {name: t.assign(model="after") if "model" in SCHEMAS[name].names() else t for name, t in found.items()}
+    return {
+        name: t.assign(model="after") if "model" in SCHEMAS[name].names() else t for name, t in found.items()
+    }

@@ -1,8 +1,8 @@
 """Channels that may explain a residual, and the level at which each varies.
 
-A channel varies at the coarsest level within whose groups it is nearly constant. Measured numbers scatter, so exact
-equality is not required. A category with each of its levels in one group only (a serial number) is a grouping and never
-an effect.
+A channel varies at the coarsest level within whose groups it is nearly constant. Measured numbers scatter, so
+exact equality is not required. A category with each of its levels in one group only (a serial number) is a
+grouping and never an effect.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def find_channels(
 ) -> list[Channel]:
     """Return every channel of the rows that varies and is not a grouping or a text with hundreds of values.
 
-    Columns of the condition are kept even if they are groupings: an offset between directions may differ between
-    conditions.
+    Columns of the condition are kept even if they are groupings: an offset between directions may differ
+    between conditions.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def varies(values: np.ndarray) -> bool:
 
 
 def incomplete_channels(rows: Rows) -> list[dict]:
-    """Return the campaign's own channels that some files lack, their numbers, and whether they are searched."""
+    """Return the campaign's own channels that some files lack, their numbers and whether each is searched."""
     found = []
     for name in open_columns(rows.table):
         known = rows.table[name].notna().groupby(rows.codes("file")).any()
@@ -123,7 +123,7 @@ def incomplete_channels(rows: Rows) -> list[dict]:
 
 
 def unit_of(values: np.ndarray, rows: Rows) -> str:
-    """Return the coarsest level within whose groups `values` are nearly constant; "sample" if there is none."""
+    """Return the coarsest level in whose groups `values` are nearly constant; "sample" if there is none."""
     numeric = values.dtype.kind == "f"
     least = CONSTANT_SHARE * float(np.var(values)) if numeric else 0.0
     for level in reversed(LEVELS):
@@ -132,7 +132,9 @@ def unit_of(values: np.ndarray, rows: Rows) -> str:
             constant = (values == values[start][code]).all()
         else:
             rounding = ROUNDING * float(np.abs(values).max())
-            constant = np.mean((values - rows.groups.means(values, level)[code]) ** 2) <= max(least, rounding**2)
+            constant = np.mean((values - rows.groups.means(values, level)[code]) ** 2) <= max(
+                least, rounding**2
+            )
         if constant:
             return level
     return "sample"
@@ -162,16 +164,19 @@ def settings(values: np.ndarray) -> np.ndarray:
 def scatter_level(channels: Iterable[Channel], rows: Rows) -> str:
     """Return the level of the units between which a contrast of some channels is tested.
 
-    It is the coarsest level at which the slope along the channels may scatter without any effect. The dependence of
-    friction on the place in a stroke, on speed and on direction differs between specimens, so these are tested between
-    specimens; what else varies between runs is tested between runs. A product has the units of its coarser channel,
-    because each of them may have a slope of its own along the finer one. With few units the next finer level is used.
+    It is the coarsest level at which the slope along the channels may scatter without any effect. The
+    dependence of friction on the place in a stroke, on speed and on direction differs between specimens, so
+    these are tested between specimens; what else varies between runs is tested between runs. A product has
+    the units of its coarser channel, because each of them may have a slope of its own along the finer one.
+    With few units the next finer level is used.
     """
     channels = list(channels)
     unit = max((c.unit for c in channels), key=FINER.get)
     coarsest = "specimen" if unit == "specimen" or any(c.scatters for c in channels) else "run"
     levels = LEVELS[max(FINER[unit], 1) - 1 : FINER[coarsest]]
-    return next((level for level in reversed(levels) if rows.groups.starts[level].size >= LEAST_SLOPES), levels[0])
+    return next(
+        (level for level in reversed(levels) if rows.groups.starts[level].size >= LEAST_SLOPES), levels[0]
+    )
 
 
 def flip_level(unit: str, rows: Rows) -> str:
@@ -201,8 +206,8 @@ def _is_grouping(channel: Channel, rows: Rows) -> bool:
 def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
     """Return the columns of a free shape, first a straight line: shape (n, k), each centred and scaled.
 
-    A cubic B-spline with knots at quantiles (of the logarithm if a positive channel spans a factor of 20), a quadratic
-    for few units; for categories, one column per level except the first.
+    A cubic B-spline with knots at quantiles (of the logarithm if a positive channel spans a factor of 20), a
+    quadratic for few units; for categories, one column per level except the first.
     """
     if not channel.numeric:
         levels = np.unique(channel.values)
@@ -226,7 +231,7 @@ def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
 
 
 def kinks(channel: Channel) -> np.ndarray:
-    """Return centred columns that are linear up to an inner value of the channel and constant beyond it, (n, k)."""
+    """Return centred columns that are linear up to an inner channel value and constant beyond it, (n, k)."""
     x = scaled(channel.values)
     columns = np.minimum(x[:, None], np.unique(x)[1:-1])
     return columns - columns.mean(axis=0)
@@ -240,7 +245,7 @@ def even_knots(values: np.ndarray) -> tuple[float, ...]:
 
 
 def shifted_from_zero(values: np.ndarray) -> np.ndarray:
-    """Return values; those that start at 0 are shifted by the smallest positive one, so that they have logarithms."""
+    """Return values, shifted by the smallest positive one if they start at 0, so that logarithms exist."""
     return values + values[values > 0].min() if values.min() == 0 < values.max() else values
 
 

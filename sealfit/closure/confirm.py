@@ -33,7 +33,7 @@ from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.whitening import Whitening
 
 LEAST_SETTINGS, MOST_SETTINGS = 3, 15
-"""Numbers of settings for which interpolation is tested: with fewer there is no inner one, with more they are dense."""
+"""Least and most settings for which interpolation is tested: fewer have no inner one, and more are dense."""
 
 WHOLE = ("mu", "force")
 """Targets that are the whole friction."""
@@ -60,14 +60,19 @@ class Gain:
 
 
 def heldout_gain(
-    before: Fitted, proposal: Proposal, count: int, seed: int, samples: pd.DataFrame, known: dict[tuple, np.ndarray]
+    before: Fitted,
+    proposal: Proposal,
+    count: int,
+    seed: int,
+    samples: pd.DataFrame,
+    known: dict[tuple, np.ndarray],
 ) -> Gain:
     """Return the gain of a proposal on held-out groups of its own unit.
 
-    If files scatter by newtons, the RMSE hardly changes with a ripple of 0.1 N. The whitened sum of squares does,
-    because the offset and gain of a whole file or run have little weight in it. For the same reason both are taken
-    about the means of the groups within which the effect varies. `known` caches the residual of the model without the
-    proposal in each fold.
+    If files scatter by newtons, the RMSE hardly changes with a ripple of 0.1 N. The whitened sum of squares
+    does, because the offset and gain of a whole file or run have little weight in it. For the same reason
+    both are taken about the means of the groups within which the effect varies. `known` caches the residual
+    of the model without the proposal in each fold.
     """
     if "shift" in proposal.term.fixed:
         return _gain_within_files(before, proposal, samples)
@@ -79,10 +84,13 @@ def heldout_gain(
     return _gain(before, proposal, masks, around, (level, *calendar[:1]), known)
 
 
-def gain_between_settings(before: Fitted, proposal: Proposal, known: dict[tuple, np.ndarray]) -> Iterator[Gain]:
+def gain_between_settings(
+    before: Fitted, proposal: Proposal, known: dict[tuple, np.ndarray]
+) -> Iterator[Gain]:
     """Yield the gain of a proposal if all files at an inner setting of one of its channels are held out.
 
-    Forms of one parameter are not tested: they cannot follow single settings, and a line is nearly zero at inner ones.
+    Forms of one parameter are not tested: they cannot follow single settings, and a line is nearly zero at
+    inner ones.
     """
     rows = before.rows
     if len(proposal.term.effect.parameters) == 1:
@@ -104,10 +112,10 @@ def _gain(
     key: tuple,
     known: dict[tuple, np.ndarray],
 ) -> Gain:
-    """Return the gain on rows held out by `masks`, about the means of the groups of level `around` if it is given.
+    """Return the gain on rows held out by `masks`, about the means of the groups of level `around` if given.
 
-    Both residuals are whitened by the scatter estimated with the proposal. Without it the effect is part of the
-    scatter, and a specimen has almost no weight.
+    Both residuals are whitened by the scatter estimated with the proposal. Without it the effect is part of
+    the scatter, and a specimen has almost no weight.
     """
     rows, after = before.rows, proposal.fitted
     squares, total, falls = np.zeros(2), 0.0, []
@@ -145,10 +153,10 @@ def _heldout_residual(before: Fitted, model: Model, out: np.ndarray, test: Rows)
 
 
 def varies_within(proposal: Proposal, share: float = MOST_WITHIN) -> str | None:
-    """Return the finest level within whose groups a share of the variance of the effect's shape lies, or None.
+    """Return the finest level in whose groups a share of the variance of the effect's shape lies, or None.
 
-    The shape is used, not the added force. The force of a relative loss of friction along each stroke differs between
-    runs as friction does, and the declared model explains that part.
+    The shape is used, not the added force. The force of a relative loss of friction along each stroke differs
+    between runs as friction does, and the declared model explains that part.
     """
     rows, term, model = proposal.fitted.rows, proposal.term, proposal.fitted.model
     if term.channels == ("direction",):
@@ -169,7 +177,8 @@ def about_means(values: np.ndarray, rows: Rows, level: str | None) -> np.ndarray
 def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame) -> Gain:
     """Return the gain on one half of every file, with the phase of each pass estimated from the other half.
 
-    Halves are alternate pairs of forward and backward strokes, or halves of the stroke in a file with one or two.
+    Halves are alternate pairs of forward and backward strokes, or halves of the stroke in a file with one or
+    two.
     """
     rows, after, axis = before.rows, proposal.fitted, proposal.term.channels[0]
     in_turn = rows.table["stroke"].max() >= 4
@@ -181,10 +190,13 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
         shift = pass_shifts(samples[seen], rows, length, axis)
         term = replace(proposal.term, fixed={**proposal.term.fixed, "shift": shift})
         model = replace(after.model, terms=(*after.model.terms[:-1], term))
-        old, new = (_within_strokes(test, evaluate(m, test, jacobian=False)[0]) for m in (before.model, model))
+        old, new = (
+            _within_strokes(test, evaluate(m, test, jacobian=False)[0]) for m in (before.model, model)
+        )
         weight = rows.weight[out]
         squares += weight @ old**2, weight @ new**2
-    # The amplitude of a ripple differs between files, so each file is tested for the same wave in both halves.
+    # The amplitude of a ripple differs between files, so each file is tested for the same wave in both
+    # halves.
     from scipy.stats import wilcoxon  # imported here: scipy.stats takes half a second to load
 
     both = agreement(samples, sample_first, length, axis)
@@ -211,10 +223,10 @@ def _within_strokes(rows: Rows, force: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class AcceptedEffect:
-    """An accepted effect: the proposal, its gain on held-out data and the rivals that these data do not exclude.
+    """An accepted effect: the proposal, its gain on held-out data and the rivals these data do not exclude.
 
-    `left_N` is the RMSE on the held-out data with it, and `rivals_rmse_N` with each rival instead; NaN if not computed.
-    If the effect varies within files, runs or specimens, it is the RMSE about their means.
+    `left_N` is the RMSE on the held-out data with it, and `rivals_rmse_N` with each rival instead; NaN if not
+    computed. If the effect varies within files, runs or specimens, it is the RMSE about their means.
     """
 
     proposal: Proposal
@@ -308,7 +320,11 @@ def confirmed(
         context.say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
             others = rivals(proposal, proposals)
-            rmse = [heldout_gain(fitted, o, *folds_of).left_N for o in others[:MOST_RIVALS]] if context.compare else []
+            rmse = (
+                [heldout_gain(fitted, o, *folds_of).left_N for o in others[:MOST_RIVALS]]
+                if context.compare
+                else []
+            )
             rmse += [np.nan] * (len(others) - len(rmse))
             return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
         if proposal.p_value <= config.loop.family_error:
@@ -317,14 +333,18 @@ def confirmed(
     return None
 
 
-def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame, known: dict) -> str | None:
+def _reason_refused(
+    fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame, known: dict
+) -> str | None:
     """Return the reason why a proposal is refused; None if it is confirmed."""
     if not gain.real:
         return "it does not lower the error on held-out data"
     if proposal.p_value > CURVE_P and _changes_the_curve(proposal):
         return f"its p-value is above {CURVE_P:g}, and the scatter of such a coefficient is not known"
     if proposal.p_value > WEAK_P and gain.share < LEAST_FALL:
-        return f"its p-value is above {WEAK_P:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
+        return (
+            f"its p-value is above {WEAK_P:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
+        )
     least = max(rounding_error_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
     if np.sqrt(np.mean(added_force(proposal) ** 2)) <= least:
         return "it is smaller than the resolution of the recorded force"
@@ -334,7 +354,7 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
 
 
 def _changes_the_curve(proposal: Proposal) -> bool:
-    """Whether a proposal is a free shape within specimens, of one coefficient or of speed and another variable."""
+    """Whether it is a free shape within specimens, of one coefficient or of speed and another variable."""
     term = proposal.term
     by_speed = len(term.channels) > 1 and "speed_mm_s" in term.channels
     free = not term.effect.physical and proposal.unit != "specimen"

@@ -2,7 +2,7 @@
 
 # ---------------------------------------------------------------- evidence: how many units a test needs
 MANY_RUNS = 20
-"""Number of runs from which a contrast within files is tested between runs, because repeats share a set-up."""
+"""Number of runs from which a contrast within files is tested between runs because repeats share a set-up."""
 
 LEAST_GROUPS_HELD_OUT = 6
 """With fewer runs whole files are held out; with fewer files, strokes."""
@@ -23,7 +23,7 @@ FINE_UNITS = 50
 """Number of units from which the finer shape is tested."""
 
 CONSTANT_SHARE = 1e-4
-"""A channel is constant within groups if less than this share of its variance (1 % of its SD) lies within them.
+"""A channel is constant within groups if less than this share of its variance (1 % of its SD) lies in them.
 
 Measured speeds of one setting differ by 1e-5 to 1e-3 of their value; settings differ by 10 % and more.
 """
@@ -41,7 +41,7 @@ PROMISING = 1e-3
 """The jackknife is computed if the unadjusted p-value of what the columns explain is below this."""
 
 TESTED_AGAINST_RUNS = 0.05
-"""Columns constant in runs are tested against the scatter of runs if their unadjusted p-value is below this."""
+"""Columns constant in runs are tested against the scatter of runs if the unadjusted p-value is below this."""
 
 CONSTANT_IN_RUNS = 0.9
 """Columns are constant in runs if at least this share of their variance is one number per run."""
@@ -53,19 +53,19 @@ SEARCHES = 2
 """Number of searches that share the family-wise error rate: single channels, and pairs of channels."""
 
 LOGARITHMIC_SPAN = 5.0
-"""Ratio of the largest to the smallest value of a positive channel from which pairs also use its logarithm."""
+"""Ratio of the largest to the smallest value of a positive channel from which pairs use its logarithm too."""
 
 PAIR_FACTOR = 2.0
-"""Factor on the p-values of pairs, which are many and seldom true: they get half of their share of the error rate."""
+"""Factor on p-values of pairs. They are many and seldom true, and get half their share of the error rate."""
 
 MOST_CATEGORIES = 12
 """Largest number of levels of a category for which a slope per level is tested."""
 
 PAIRS_FROM_P = 1e-4
-"""Pairs are searched too if the smallest p-value of a single channel is above this: theirs may be far smaller."""
+"""Pairs are searched too if the least p-value of single channels is above this: theirs may be far smaller."""
 
 
-# ---------------------------------------------------------------- few units: slopes and means between specimens or runs
+# ---------------------------------------------------------------- slopes and means of few specimens or runs
 LEAST_UNITS_OF_SLOPES = 5
 """Least number of units between which slopes are compared."""
 
@@ -79,7 +79,7 @@ LEAST_LEVERAGE = 0.05
 """Least share of the leverage with which a specimen has a slope of its own in a contrast."""
 
 CONSISTENT_P = 0.1
-"""The slopes of two to four specimens are consistent if the p-value of Student's t over them is below this."""
+"""Slopes of two to four specimens are consistent if the p-value of Student's t over them is below this."""
 
 CONSISTENT_P_IF_DIFFERENT = 0.005
 """The same where the slopes differ by more than noise, so that they may be consistent by chance."""
@@ -124,7 +124,7 @@ ABOVE_BACKGROUND = 4.0
 """Least ratio of the power of a peak to the median of its neighbours. A smooth trend has no such peak."""
 
 LEAST_FILES_OF_RIPPLE = 9
-"""Fewest files of a sign test at 0.5 %: eight equal signs have p = 0.004, and one file may have a weak ripple."""
+"""Fewest files of a sign test at 0.5 %: eight equal signs have p = 0.004; one file may have a weak ripple."""
 
 LEAST_SAMPLES_OF_STROKE = 16
 """Fewest steady samples of a stroke that is used in the search for ripples."""
@@ -139,7 +139,7 @@ REACHED = 0.25
 """Least share of the strokes that must reach a frequency for it to be searched."""
 
 
-# ---------------------------------------------------------------- forms: which are tried, and which is reported
+# ---------------------------------------------------------------- forms: which are tried, which is reported
 MOST_KNOTS = 24
 """Most knots of a penalised spline, whose smoothness is estimated from the data."""
 
@@ -153,13 +153,13 @@ SPANS = 4.0
 """Largest width or time constant of a form, as a multiple of the channel's range."""
 
 PAIR_PENALTY = 10.0
-"""Deviance added for a form of two channels, a likelihood ratio of exp(5): there are many more pairs to choose from."""
+"""Deviance added for a form of two channels, a likelihood ratio of exp(5): there are many more pairs."""
 
 CONTENDER_SHARE = 0.6
-"""Forms are fitted for a channel that explains at least this share of the largest explained sum of squares."""
+"""Forms are fitted for channels that explain at least this share of the largest explained sum of squares."""
 
 SCATTER_FALL = 20.0
-"""Fall of the deviance, with the scatter re-estimated, from which all proposals are refitted under the new scatter.
+"""Fall of the deviance, with re-estimated scatter, from which all proposals are refitted under the new one.
 
 Most of the estimated scatter was then the missing effect.
 """
@@ -168,10 +168,10 @@ HALF_OF_CALENDAR = 0.5
 """A channel is preferred to the calendar if it explains at least this share of what the calendar explains."""
 
 REFIT_MARGIN = 60.0
-"""Variance components are re-estimated for proposals whose BIC, under the best one's scatter, is within this of it."""
+"""The scatter is re-estimated for proposals whose BIC, under the best one's scatter, is within this of it."""
 
 EQUAL_BIC = 3.0
-"""Two forms are equal if they differ by less than this in BIC: the simpler or more physical one is reported."""
+"""Forms are equal if their BIC differs by less than this: the simpler or more physical one is reported."""
 
 RIVAL_BIC = 10.0
 """A form is a rival if its BIC is larger by less than this, a likelihood ratio of exp(5)."""
@@ -194,7 +194,7 @@ LEAST_HELD_OUT = 0.5
 """Least share of the rows that blocks of the calendar must hold out."""
 
 BLOCKS_OF_A_FOLD = (1, 2, 4)
-"""Numbers of calendar blocks per fold, tried in this order until `LEAST_HELD_OUT` of the rows are held out."""
+"""Numbers of calendar blocks per fold, tried in order until `LEAST_HELD_OUT` of the rows are held out."""
 
 OUTSIDE = 0.02
 """Share of the range of the other rows by which a held-out row may lie outside without being extrapolated."""
@@ -203,16 +203,16 @@ SAME_SETTING = 0.01
 """Relative difference of measured values of one setting."""
 
 RIPPLE_CONFIRMED_P = 0.005
-"""A ripple with a phase per stroke is confirmed if the p-value of Wilcoxon's test over files is below this."""
+"""A ripple with a phase per stroke is confirmed if Wilcoxon's test over files has a p-value below this."""
 
 MOST_RIVALS = 4
 """Number of rivals, best first, whose held-out error is computed too."""
 
 MOST_PROPOSALS = 3
-"""Number of proposals of a round that are tested on held-out data before the residual counts as unexplained."""
+"""Number of proposals of a round tested on held-out data before the residual counts as unexplained."""
 
 MOST_WITHIN = 0.5
-"""The gain is computed about group means if at least this share of the effect's variance lies within the groups."""
+"""The gain is about group means if at least this share of the effect's variance lies within the groups."""
 
 PART_WITHIN = 0.1
 """The same share for the comparison of errors at the end of the loop.
@@ -226,9 +226,9 @@ SAMPLES_PER_VALUE = 10.0
 WEAK_P = 1e-6
 """An effect with a larger p-value must also lower the held-out error by `LEAST_FALL`.
 
-P-values from a few specimens or runs depend on assumptions about their scatter; held-out data do not. Of 28 claims
-with p above 1e-5 in worlds drawn at random, 9 of the 11 true ones lower the error by more, and 13 of the 17 false ones
-by less. Two false claims had a p-value between 1e-6 and 1e-5.
+P-values from a few specimens or runs depend on assumptions about their scatter; held-out data do not. Of 28
+claims with p above 1e-5 in worlds drawn at random, 9 of the 11 true ones lower the error by more, and 13 of
+the 17 false ones by less. Two false claims had a p-value between 1e-6 and 1e-5.
 """
 
 LEAST_FALL = 0.05
@@ -237,13 +237,13 @@ LEAST_FALL = 0.05
 CURVE_P = 1e-5
 """Largest p-value of an accepted free shape that changes the Stribeck curve or the aging law.
 
-These are shapes that act on one coefficient, or on the speed together with another variable. The scatter of the whole
-friction between runs is estimated; that of the single coefficients is not. In 354 worlds drawn at random 11 of 13 false
-claims of this kind had larger p-values.
+These are shapes that act on one coefficient, or on the speed together with another variable. The scatter of
+the whole friction between runs is estimated; that of the single coefficients is not. In 354 worlds drawn at
+random 11 of 13 false claims of this kind had larger p-values.
 """
 
 LEAST_SIZE = 2e-4
-"""Smallest effect that is reported, as a share of the RMS force. The sensor's nonlinearity may be as large."""
+"""Smallest reported effect, as a share of the RMS force. The sensor's nonlinearity may be as large."""
 
 
 # ---------------------------------------------------------------- the verdict, and what could have been seen
@@ -278,7 +278,7 @@ REAL_SHARE = 0.1
 """Least share of a variable's variance at a level at which it varies."""
 
 REAL_RATIO = 3.0
-"""Least ratio of the mean square of a variable at a level to that of finer levels: less is variation within groups."""
+"""Least ratio of a variable's mean square at a level to that of finer levels: less is variation in groups."""
 
 MATERIAL_SCATTER = 0.02
 """Scatter between units, as a share of the force, that would matter if it were an effect."""

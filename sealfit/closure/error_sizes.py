@@ -19,7 +19,10 @@ RANK = 1e-9  # Relative singular value below which a direction of a tangent is z
 
 
 def errors(rows: Rows, residual: np.ndarray) -> dict[str, float]:
-    """Return rmse_N, rmse_runs_N, max_abs_N and mean_abs_pct of a residual, shape (n,), with equal weight per file."""
+    """Return rmse_N, rmse_runs_N, max_abs_N and mean_abs_pct of a residual, shape (n,).
+
+    Every file has the same weight.
+    """
     weight = rows.weight
     run = pd.factorize(rows.table["run_id"])[0]
     per_run = np.bincount(run, weight)
@@ -31,7 +34,9 @@ def errors(rows: Rows, residual: np.ndarray) -> dict[str, float]:
         "rmse_N": float(np.sqrt(weight @ residual**2)),
         "rmse_runs_N": float(np.sqrt(np.mean(means**2))),
         "max_abs_N": float(np.abs(residual).max()),
-        "mean_abs_pct": float(100 * (weight[known] @ relative[known]) / weight[known].sum()) if known.any() else None,
+        "mean_abs_pct": float(100 * (weight[known] @ relative[known]) / weight[known].sum())
+        if known.any()
+        else None,
     }
 
 
@@ -50,7 +55,8 @@ def without_repeat_pattern(rows: Rows, residual: np.ndarray) -> np.ndarray:
 def pure_error(rows: Rows, residual: np.ndarray) -> tuple[float, float] | None:
     """Return (variance, df) of a bin about its run's mean over repeats; None without repeats.
 
-    The mean shape over the repeats of a run and the mean pattern from one repeat to the next are not part of it.
+    The mean shape over the repeats of a run and the mean pattern from one repeat to the next are not part of
+    it.
     """
     table = rows.table
     clean = without_repeat_pattern(rows, residual)
@@ -67,16 +73,17 @@ def pure_error(rows: Rows, residual: np.ndarray) -> tuple[float, float] | None:
 def noise_floor(fitted: Fitted) -> float | None:
     """Return the RMSE of the true mean on these bins, from the repeats of runs; None without repeats.
 
-    It does not contain the scatter of set-ups, which cannot be distinguished from lack of fit without replicated runs.
+    It does not contain the scatter of set-ups, which cannot be distinguished from lack of fit without
+    replicated runs.
     """
     pure = pure_error(fitted.rows, fitted.residual)
     return None if pure is None else float(np.sqrt(pure[0]))
 
 
 def lack_of_fit(fitted: Fitted) -> float | None:
-    """Return the p-value of the residual's means and shapes in runs against repeats (F tests); None without repeats.
+    """Return the p-value of the residual's means and shapes in runs against repeats (F tests).
 
-    The smallest p-value is multiplied by the number of tests (Bonferroni).
+    This is the smallest one times the number of tests (Bonferroni); None without repeats.
     """
     means = _p_of_run_means(fitted)
     tests = [p for p in (means, *_p_of_shapes(fitted)) if p is not None]
@@ -86,8 +93,8 @@ def lack_of_fit(fitted: Fitted) -> float | None:
 def _p_of_shapes(fitted: Fitted) -> list[float]:
     """Return the p-values of shapes along strokes that the repeats of a run have in common.
 
-    Each is one number per stroke, the coefficient of a Legendre polynomial, so that noise may be correlated within
-    strokes.
+    Each is one number per stroke, the coefficient of a Legendre polynomial, so that noise may be correlated
+    within strokes.
     """
     rows = fitted.rows
     stroke, start = rows.codes("stroke"), rows.groups.starts["stroke"]
@@ -113,7 +120,7 @@ def _p_of_shapes(fitted: Fitted) -> list[float]:
 
 
 def _p_of_run_means(fitted: Fitted) -> float | None:
-    """Return the p-value of run means against the scatter of files within runs (F test); None without repeats.
+    """Return the p-value of run means against the scatter of files in runs (F test); None without repeats.
 
     The scatter of specimens is not lack of fit and is removed with the model.
     """
@@ -136,7 +143,9 @@ def _p_of_run_means(fitted: Fitted) -> float | None:
     first = ~files["run_id"].duplicated().to_numpy()
     root = np.sqrt(count[first])
     size = mean[first] * root
-    left, rank = _residual_of_model(fitted, files["force"].to_numpy(), size, np.flatnonzero(first), root / scale[first])
+    left, rank = _residual_of_model(
+        fitted, files["force"].to_numpy(), size, np.flatnonzero(first), root / scale[first]
+    )
     df_fit = float(runs - rank)
     if df_pure < 1 or df_fit < 1:
         return None

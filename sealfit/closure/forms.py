@@ -1,4 +1,4 @@
-"""The forms that are fitted for a candidate, richer aging laws among them, and the grids of their parameters."""
+"""The forms fitted for a candidate, richer aging laws among them, and the grids of their parameters."""
 
 from __future__ import annotations
 
@@ -10,7 +10,15 @@ import pandas as pd
 from scipy.special import fdtrc
 
 from sealfit.closure.channels import CALENDAR, FINER, Channel, even_knots, scaled
-from sealfit.closure.criteria import FREE_DF, JACKKNIFE_UNITS, KNOTS_APART, MOST_KNOTS, SEARCHES, SPANS, UNITS_PER_KNOT
+from sealfit.closure.criteria import (
+    FREE_DF,
+    JACKKNIFE_UNITS,
+    KNOTS_APART,
+    MOST_KNOTS,
+    SEARCHES,
+    SPANS,
+    UNITS_PER_KNOT,
+)
 from sealfit.closure.intervals import t_quantile
 from sealfit.closure.linearised import Proposal, middles
 from sealfit.closure.ripples import Peak, common_wavelength, pass_shifts
@@ -62,14 +70,16 @@ def terms_of(
     knots = min(MOST_KNOTS, candidate.test_result.units // UNITS_PER_KNOT)
     for term, grid in _terms_of_single(channel, target, channels, fitted, effects, knots):
         fits = len(term.effect.parameters) <= room_along(channel, fitted)
-        if fits or len(term.channels) > 1 or term.smoothness is not None:  # a smoothing spline has fewer effective df
+        # a smoothing spline has fewer effective degrees of freedom
+        if fits or len(term.channels) > 1 or term.smoothness is not None:
             yield term, grid
 
 
 def room_along(channel: Channel, fitted: Fitted) -> int:
-    """Return how many parameters of an effect the settings of a channel determine beside those of the declared model.
+    """Return how many parameters of an effect a channel's settings determine beside the declared model's.
 
-    Eq. 14 has up to four parameters along speed and Eq. 15 three along days; along other channels there is a constant.
+    Eq. 14 has up to four parameters along speed and Eq. 15 three along days; along other channels there is a
+    constant.
     """
     declared = fitted.model.declared
     own = 1
@@ -105,7 +115,8 @@ def _terms_of_single(
             fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
             grids = grid_of(effect, np.abs(channel.values))
             yield Term(effect, effect.reads, *target, fixed=fixed), grids
-            if target == ("mu", "multiply") and ("mu", "add") in effect.acts_on:  # the search tests the factor only
+            # the search tests the factor only
+            if target == ("mu", "multiply") and ("mu", "add") in effect.acts_on:
                 yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids
     if name != "direction":
         yield free_term(channel, *target, knots=knots), {}
@@ -121,10 +132,13 @@ def _may_follow(effect: Effect, channel: Channel, fitted: Fitted) -> bool:
     return channel.name not in CALENDAR or effect.along_calendar
 
 
-def _all_read(effect: Effect, channels: Mapping[str, Channel], rows: Rows, effects: Mapping[str, Effect]) -> bool:
+def _all_read(
+    effect: Effect, channels: Mapping[str, Channel], rows: Rows, effects: Mapping[str, Effect]
+) -> bool:
     """Whether the campaign has the channels that an effect reads.
 
-    Some of them may be constant (the one load of a campaign), unless the effect is then the same as another one.
+    Some of them may be constant (the one load of a campaign), unless the effect is then the same as another
+    one.
     """
     varying = {name for name in effect.reads if name in channels or name == CHANNEL}
     still = set(effect.reads) - varying
@@ -139,8 +153,8 @@ def _terms_of_pair(
 ) -> Iterator[tuple[Term, dict]]:
     """Yield the forms of a pair of channels: products, or a slope for each category.
 
-    Forms with main effects need `alone`. They would otherwise explain the specimens' scatter if that is not known, or
-    the Stribeck curve if there are few speeds.
+    Forms with main effects need `alone`. They would otherwise explain the specimens' scatter if that is not
+    known, or the Stribeck curve if there are few speeds.
     """
     if not (one.numeric and other.numeric):
         number, category = (one, other) if one.numeric else (other, one)
@@ -170,7 +184,8 @@ def _terms_of_pair(
 def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = FREE_DF + 1) -> Term:
     """Return the free shape of a channel: one level per category, or a spline.
 
-    A spline of up to five knots has them at quantiles and no penalty; one of more has even knots and a penalty.
+    A spline of up to five knots has them at quantiles and no penalty; one of more has even knots and a
+    penalty.
 
     Parameters
     ----------
@@ -237,13 +252,16 @@ def periodic_terms(
         fixed["held"] = {"lambda_": (length - reach, length + reach), "phi": (-np.pi, np.pi)}
         lengths, phases = (length,), (0.0,)
     names = {
-        p.name: (lengths if p.name == "lambda_" or p.name.startswith("lambda") else phases) for p in effect.nonlinear
+        p.name: (lengths if p.name == "lambda_" or p.name.startswith("lambda") else phases)
+        for p in effect.nonlinear
     }
     units = rows.groups.starts["file"].size
     for target in targets:
         if target in effect.acts_on:
             test_result = ScoreTestResult(0.0, 2, units, 0.0)
-            candidate = Candidate((peak.axis,), *target, "file", np.empty((0, 0)), test_result, p_value=peak.p_value)
+            candidate = Candidate(
+                (peak.axis,), *target, "file", np.empty((0, 0)), test_result, p_value=peak.p_value
+            )
             yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
 
 
@@ -257,7 +275,9 @@ def _in_domain(effect: Effect, values: np.ndarray) -> bool:
     """Whether a form is finite at every value of the channel."""
     sample = np.unique(values)[:: max(1, np.unique(values).size // 50)]
     with np.errstate(all="ignore"):
-        result = effect.shape({CHANNEL: sample, "direction": 1.0, "x_ref": reference(values)}, **effect.start())
+        result = effect.shape(
+            {CHANNEL: sample, "direction": 1.0, "x_ref": reference(values)}, **effect.start()
+        )
     return bool(np.isfinite(result).all())
 
 
@@ -307,14 +327,15 @@ def describe(term: Term) -> str:
 # ---------------------------------------------------------------- richer laws
 # Richer aging laws: each of the catalogue is fitted jointly and tested against the declared one.
 #
-# The declared law is flexible: with a and b free it explains most of the effect of a floor or an induction time. The
-# part orthogonal to its tangent space is small, and a dozen specimens give little evidence of it. Each richer law is
-# therefore fitted jointly from several starts, with its own estimate of the specimens' scatter. With n specimens, p
-# parameters of the declared law and q more, the restricted deviances D give the ratio of the residual variances between
-# specimens,
+# The declared law is flexible: with a and b free it explains most of the effect of a floor or an induction
+# time. The part orthogonal to its tangent space is small, and a dozen specimens give little evidence of it.
+# Each richer law is therefore fitted jointly from several starts, with its own estimate of the specimens'
+# scatter. With n specimens, p parameters of the declared law and q more, the restricted deviances D give the
+# ratio of the residual variances between specimens,
 #
-# .. math:: \log \frac{S_0}{S_1} = \frac{1}{n} \Big(D_0 - D_1 + n \log \frac{n - p}{n - p - q} - q \Big), \qquad
-#           F = \Big(\frac{S_0}{S_1} - 1\Big) \frac{n - p - q}{q}
+# .. math::
+#     \log \frac{S_0}{S_1} = \frac{1}{n} \Big(D_0 - D_1 + n \log \frac{n - p}{n - p - q} - q \Big), \qquad
+#     F = \Big(\frac{S_0}{S_1} - 1\Big) \frac{n - p - q}{q}
 #
 # or, if that is smaller, F = t^2 / q of its amplitude: near a bound either alone may be too large.
 
@@ -341,7 +362,12 @@ def richer_laws(
     """
     specimens = fitted.rows.groups.starts["specimen"].size
     lawful = any(fitted.model.declared.law.values())
-    if AGING not in channels or channels[AGING].unit != "specimen" or not lawful or specimens >= JACKKNIFE_UNITS:
+    if (
+        AGING not in channels
+        or channels[AGING].unit != "specimen"
+        or not lawful
+        or specimens >= JACKKNIFE_UNITS
+    ):
         return []
     known = {t.effect.id for t in fitted.model.terms}
     laws = [e for e in effects.values() if e.physical and e.reads == (AGING,) and TARGET in e.acts_on]
@@ -380,7 +406,9 @@ def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tupl
     shape = shape_of(term, values, fitted.rows)
     column = project(fitted, (fitted.slope(*TARGET) * shape)[:, None])[:, 0]
     adjusted = float(min(1.0, (SEARCHES + 1) * laws * p_value))
-    test = SmallSampleTest(TARGET, np.empty((0, q)), 0.0, gain, float(np.log(max(p_value, 1e-300))), 1.0, error)
+    test = SmallSampleTest(
+        TARGET, np.empty((0, q)), 0.0, gain, float(np.log(max(p_value, 1e-300))), 1.0, error
+    )
     test_result = ScoreTestResult(gain, q, units, test.log_p, small_sample=test)
     candidate = Candidate((AGING,), *TARGET, "specimen", shape[:, None], test_result, adjusted)
     return candidate, Proposal(term, values, "specimen", units, gain, adjusted, column, candidate.key)

@@ -6,7 +6,13 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from sealfit.closure.criteria import BLOCKS_OF_A_FOLD, LEAST_GROUPS_HELD_OUT, LEAST_HELD_OUT, OUTSIDE, SAME_SETTING
+from sealfit.closure.criteria import (
+    BLOCKS_OF_A_FOLD,
+    LEAST_GROUPS_HELD_OUT,
+    LEAST_HELD_OUT,
+    OUTSIDE,
+    SAME_SETTING,
+)
 from sealfit.fit.joint.rows import LEVELS, Rows
 
 
@@ -21,8 +27,8 @@ def heldout_level(rows: Rows) -> str:
 def foldable(rows: Rows, level: str) -> str:
     """Return a level, or the next finer one at which conditions keep some groups while others are held out.
 
-    A condition with one file and no aging law cannot be predicted without that file. Its strokes are held out then, and
-    the error is that of predicting the same files.
+    A condition with one file and no aging law cannot be predicted without that file. Its strokes are held out
+    then, and the error is that of predicting the same files.
     """
     for finer in reversed(LEVELS[: LEVELS.index(level) + 1]):
         start = rows.groups.starts[finer]
@@ -34,9 +40,10 @@ def foldable(rows: Rows, level: str) -> str:
 
 
 def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,): whole groups, spread so that each condition keeps most of its own.
+    """Yield masks of the rows held out, shape (n,), in whole groups.
 
-    Day 0 and the last day always keep a group, so that the aging law does not have to extrapolate.
+    The groups are spread so that each condition keeps most of its own. Day 0 and the last day always keep a
+    group, so that the aging law does not have to extrapolate.
     """
     start = rows.groups.starts[level]
     count = min(count, start.size)
@@ -52,9 +59,9 @@ def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]
 def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]:
     """Return masks of the rows held out, shape (n,): blocks of groups that are consecutive in the calendar.
 
-    Neighbours in time are correlated, and so are conditions tested one after the other. With single groups held out,
-    any smooth curve through the calendar would be confirmed. If a block contains a whole condition that cannot be
-    predicted without it, blocks are shortened, and a fold has several of them that are apart.
+    Neighbours in time are correlated, and so are conditions tested one after the other. With single groups
+    held out, any smooth curve through the calendar would be confirmed. If a block contains a whole condition
+    that cannot be predicted without it, blocks are shortened, and a fold has several of them that are apart.
     """
     start = rows.groups.starts[level]
     count = min(count, start.size)
@@ -69,7 +76,7 @@ def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]
 
 
 def _masks(rows: Rows, level: str, number: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,), from the fold of each group; edge conditions keep a group."""
+    """Yield masks of the rows held out, shape (n,), from each group's fold; edge conditions keep a group."""
     start, code = rows.groups.starts[level], rows.codes(level)
     condition = rows.condition[start]
     for k in range(number.max() + 1):
@@ -140,7 +147,7 @@ def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def whole_settings(rows: Rows, values: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,): all rows at one inner setting of a channel, one setting at a time.
+    """Yield masks of the rows held out, shape (n,): all rows at each inner setting of a channel in turn.
 
     A free shape may fit every setting it has seen and still not predict those between them.
     """

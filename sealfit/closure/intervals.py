@@ -28,13 +28,14 @@ class Sandwich(NamedTuple):
 
     covariance: np.ndarray  # (p, p)
     information: Sequence[tuple[np.ndarray, np.ndarray]]
-    """Per group the parameters it depends on, shape (k,), and their information, (k, k); empty with many groups."""
+    """Parameters each group depends on, shape (k,), and their information, (k, k); empty with many groups."""
 
 
 def degrees_of_freedom(fitted: Fitted) -> float:
-    """Return the degrees of freedom of the coarsest level that scatters: its units less the parameters they estimate.
+    """Return the degrees of freedom of the coarsest level that scatters.
 
-    0 if the model has as many parameters as there are runs: the scatter of runs is then not estimable.
+    This is the number of its units less the parameters they estimate; 0 if the model has as many parameters
+    as there are runs, because the scatter of runs is then not estimable.
     """
     groups = fitted.rows.groups
     white = fitted.whitening(fitted.friction[:, None])[:, 0]
@@ -45,7 +46,9 @@ def degrees_of_freedom(fitted: Fitted) -> float:
     active = [c.level for c in fitted.scatter.components if c.variance > 0]
     level = active[-1] if active else "file"
     units = fitted.rows.groups.starts[LEVELS[max(LEVELS.index(level), 1)]].size
-    between = len({(p.quantity, p.owner) for p in fitted.model.declared.parameters if p.quantity in ("mu_0c", "a_c")})
+    between = len(
+        {(p.quantity, p.owner) for p in fitted.model.declared.parameters if p.quantity in ("mu_0c", "a_c")}
+    )
     return float(max(units - (between if level == "specimen" else fitted.basis.shape[1]), 1))
 
 
@@ -86,8 +89,8 @@ def sandwiches(fitted: Fitted) -> list[Sandwich]:
 def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Interval]:
     """Return {parameter: (value, lo95, hi95)} of one effect.
 
-    The larger of two standard errors is used: by the variance components, and by the sandwich of the units of the
-    effect's level. An effect that scatters between units would otherwise get too short an interval.
+    The larger of two standard errors is used: by the variance components, and by the sandwich of the units of
+    the effect's level. An effect that scatters between units would otherwise get too short an interval.
     """
     term = fitted.model.terms[number]
     held = term.fixed.get("held", {})
@@ -125,15 +128,17 @@ def normalised_waves(intervals: dict[str, Interval]) -> dict[str, Interval]:
 
 
 def mean_se(tangent: Tangent, covariance: np.ndarray) -> np.ndarray:
-    """Return the standard error of the model's force from its tangent, of shape (n, p), and covariance -> (n,)."""
+    """Return the standard error of the model's force from its tangent, (n, p), and covariance -> (n,)."""
     return np.sqrt(np.maximum(tangent.squares(covariance), 0.0))
 
 
-def mean_half_width(tangent: Tangent, covariance: np.ndarray, df: float, others: Sequence[Sandwich]) -> np.ndarray:
+def mean_half_width(
+    tangent: Tangent, covariance: np.ndarray, df: float, others: Sequence[Sandwich]
+) -> np.ndarray:
     """Return half the 95 % interval of the model's force, shape (n,): the largest of several.
 
-    One uses the variance components. The others are sandwiches of whole groups, each with Satterthwaite's degrees of
-    freedom at this point. They are not used where one group alone determines the force.
+    One uses the variance components. The others are sandwiches of whole groups, each with Satterthwaite's
+    degrees of freedom at this point. They are not used where one group alone determines the force.
 
     Parameters
     ----------
@@ -150,8 +155,12 @@ def mean_half_width(tangent: Tangent, covariance: np.ndarray, df: float, others:
     for covariance_of_groups, information in others:
         reach = np.full(half.shape, t_quantile(df))
         if len(information):
-            share = np.stack([tangent.squares(covariance[:, k] @ own @ covariance[k]) for k, own in information])
+            share = np.stack(
+                [tangent.squares(covariance[:, k] @ own @ covariance[k]) for k, own in information]
+            )
             share /= np.maximum(share.sum(axis=0), 1e-300)
-            reach = np.where(share.max(axis=0) > LARGEST_LEVERAGE, 0.0, stdtrit(satterthwaite_df(share), 0.975))
+            reach = np.where(
+                share.max(axis=0) > LARGEST_LEVERAGE, 0.0, stdtrit(satterthwaite_df(share), 0.975)
+            )
         half = np.maximum(half, reach * mean_se(tangent, covariance_of_groups))
     return half

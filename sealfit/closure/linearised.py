@@ -1,4 +1,4 @@
-"""Forms fitted to the residual in the tangent space of the model: amplitudes exactly, other parameters on a grid."""
+"""Forms fitted to the residual in the tangent space: amplitudes exactly, other parameters on a grid."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ class Proposal:
     p_value: float
     column: np.ndarray  # (n,) what it adds to the force, whitened and projected
     source: tuple  # key of its candidate
-    linear_size: float | None = None  # effective degrees of freedom of a penalised shape before it is refitted
+    # effective degrees of freedom of a penalised shape before it is refitted
+    linear_size: float | None = None
     fitted: Fitted | None = None
 
     @cached_property
@@ -44,7 +45,11 @@ class Proposal:
         """Effective degrees of freedom: its number of parameters, or fewer for a penalised free shape."""
         if self.linear_size is None:
             return float(len(self.term.effect.parameters))
-        return self.linear_size if self.fitted is None else effective_df(self.fitted, len(self.fitted.model.terms) - 1)
+        return (
+            self.linear_size
+            if self.fitted is None
+            else effective_df(self.fitted, len(self.fitted.model.terms) - 1)
+        )
 
     @property
     def bic_penalty(self) -> float:
@@ -64,7 +69,7 @@ class Proposal:
 
     @property
     def rank(self) -> tuple:
-        """Sort key among equals: physical effect, closed form, free shape; then fewer parameters; then the target.
+        """Sort key of equals: physical effect, closed form, free shape; then fewer parameters; then target.
 
         A physical effect lists its usual target first.
         """
@@ -77,7 +82,9 @@ class Proposal:
 
 
 class Linearised:
-    """Fits terms to the residual in the tangent space of a model: amplitudes exactly, other parameters on a grid.
+    """Fits terms to the residual in the tangent space of a model.
+
+    Amplitudes are fitted exactly, other parameters on a grid.
 
     Parameters
     ----------
@@ -110,12 +117,16 @@ class Linearised:
         values = {p.name: chosen[p.name] for p in effect.parameters}
         found = float(2 * column @ fitted.white_residual - column @ column)
         units = candidate.test_result.units
-        return [Proposal(term, values, candidate.unit, units, found, candidate.p_value, column, candidate.key, size)]
+        return [
+            Proposal(
+                term, values, candidate.unit, units, found, candidate.p_value, column, candidate.key, size
+            )
+        ]
 
     def _best(
         self, term: Term, points: list[dict[str, float]], shapes: np.ndarray
     ) -> tuple[dict[str, float], float, np.ndarray]:
-        """Return the best point of a grid, the sum of squares explained there, and its shapes, (n, amplitudes)."""
+        """Return the best point of a grid, the sum of squares it explains and its shapes, (n, amplitudes)."""
         slope, count = self.fitted.slope(term.acts_on, term.operation), len(term.effect.linear)
         parts = range(0, shapes.shape[1], PART * count)
         chi2 = np.concatenate(
@@ -125,7 +136,7 @@ class Linearised:
         return points[best], float(chi2[best]), shapes[:, best * count : (best + 1) * count]
 
     def _shapes(self, term: Term, points: list[dict[str, float]]) -> np.ndarray:
-        """Return the shapes per unit amplitude at every point, shape (n, points * amplitudes), from a cache."""
+        """Return the shapes per unit amplitude at every point, (n, points * amplitudes), from a cache."""
         key = (term.effect.id, term.channels, points, term.fixed)
         if self._kept is None or self._kept[0] != key:
             self._kept = (key, self._made(term, points))
@@ -138,7 +149,9 @@ class Linearised:
         return np.column_stack([column for columns in made for column in columns])
 
 
-def _between(term: Term, point: Mapping[str, float], search: Mapping[str, tuple], rows: Rows) -> list[dict[str, float]]:
+def _between(
+    term: Term, point: Mapping[str, float], search: Mapping[str, tuple], rows: Rows
+) -> list[dict[str, float]]:
     """Return the places of a jump between the best grid point's neighbours that the grid left out."""
     jump = next((p.name for p in term.effect.nonlinear if p.search == "between"), None)
     if jump is None:

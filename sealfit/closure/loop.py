@@ -1,4 +1,4 @@
-"""Close the loop: the models before and after, the effects added, and what is left, as closure.json and tables."""
+"""Close the loop: models before and after, effects added, and what is left, as closure.json and tables."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from sealfit.progress import timed
 
 @dataclass(frozen=True)
 class Closure:
-    """closure.json as a dict, the model record for `predict`, the tables, and the after-model fitted to all bins."""
+    """closure.json, the model record for `predict`, the tables, and the after-model fitted to all bins."""
 
     document: dict
     model: dict
@@ -92,7 +92,10 @@ def close_loop(
         if not part.whole and (more := missed_by_subsample(on_all_strokes, selection, config)):
             say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
             continue
-        say(f"held out by {heldout.level}" + (": the search repeated without each fold" if heldout.repeats else ""))
+        say(
+            f"held out by {heldout.level}"
+            + (": the search repeated without each fold" if heldout.repeats else "")
+        )
         with timed("held out", rows=len(heldout.masks), of="folds"):
             held_before, held_after, found = heldout.forces(selection, say)
             if found is not None and not _found_in_folds(selection, found):
@@ -100,7 +103,12 @@ def close_loop(
             models = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
             selection, models = _only_gains(selection, models, heldout, say)
         break
-    before, after, held_before, held_after = models.before, models.after, models.held_before, models.held_after
+    before, after, held_before, held_after = (
+        models.before,
+        models.after,
+        models.held_before,
+        models.held_after,
+    )
     drawn = _drawn_tables(selection, before, after, config)
     document = closure_document(selection, models, heldout.level, config, effects)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their original order
@@ -113,9 +121,14 @@ def close_loop(
     return Closure(document, to_record(before, after, config), tables, after)
 
 
-def _drawn_tables(selection: Selection, before: Fitted, after: Fitted, config: Config) -> dict[str, pd.DataFrame]:
+def _drawn_tables(
+    selection: Selection, before: Fitted, after: Fitted, config: Config
+) -> dict[str, pd.DataFrame]:
     """Return the tables that do not depend on the folds."""
-    levels = [level_table("before", before, list(selection.first)), level_table("after", after, list(selection.last))]
+    levels = [
+        level_table("before", before, list(selection.first)),
+        level_table("after", after, list(selection.last)),
+    ]
     return {
         "levels": pd.concat(levels, ignore_index=True),
         "channels": channel_table(selection, before, after),
@@ -125,7 +138,7 @@ def _drawn_tables(selection: Selection, before: Fitted, after: Fitted, config: C
 
 
 def _on_all(rows: Rows, selection: Selection) -> tuple[Fitted, Fitted]:
-    """Return before and after, refitted to all rows with ripples free; twice the same if nothing was added."""
+    """Return before and after refitted to all rows with ripples free; twice the same if nothing was added."""
     if selection.before.rows is rows:
         return selection.before, selection.after
     before = fit(selection.before.model, rows, selection.before.scatter, turns=2)
@@ -148,18 +161,19 @@ class _HeldOut:
     def repeats(self) -> bool:
         """Whether the search is repeated in each fold.
 
-        With few runs a fold has too little power; the effects of the full campaign are then refitted in each fold.
+        With few runs a fold has too little power; the effects of the full campaign are then refitted in each
+        fold.
         """
         return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
 
     def forces(
         self, selection: Selection, say: Callable[[str], None]
     ) -> tuple[np.ndarray, np.ndarray, Sequence[Model] | None]:
-        """Return each row's force before and after, by fits without its group (NaN if never held out), and the models.
+        """Return each row's force before and after, by fits without its group, and the models.
 
-        The models are those of the repeated searches; None if the search is not repeated. A repeated search has as many
-        rounds as the full campaign needed for its last effect: with less power it would go on for many rounds with
-        small effects that it refuses.
+        A force is NaN if its row was never held out. The models are those of the repeated searches; None if
+        the search is not repeated. A repeated search has as many rounds as the full campaign needed for its
+        last effect: with less power it would go on for many rounds with small effects that it refuses.
         """
         if not (selection.added and self.repeats):
             before = self.refitted(selection.before)
@@ -236,7 +250,9 @@ class _Folds(Sequence):
 def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
     """Return the forces before and after at a fold's rows (equal without a search), and the model after."""
     if fold.rounds:
-        part = select_effects(fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds)
+        part = select_effects(
+            fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds
+        )
         before, after = part.before, part.after
     else:
         before = after = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
@@ -260,13 +276,18 @@ def _found_in_folds(selection: Selection, found: Sequence[Model]) -> bool:
     known = [pair for model in found for pair in zip(model.terms, model.values, strict=True)]
     shapes = [shape_of(term, values, rows) for term, values in known if "shift" not in term.fixed]
     terms = [item.proposal.term for item in selection.added]
-    own = [shape_of(term, values, rows) for term, values in zip(terms, selection.after.model.values, strict=True)]
+    own = [
+        shape_of(term, values, rows) for term, values in zip(terms, selection.after.model.values, strict=True)
+    ]
     return any(_same_shape(one, other) for one in own for other in shapes)
 
 
 def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:
-    """Return a selection without its effects, which are refused: their evidence is weak and no fold found them."""
-    say("removed, because no fold found them again: " + "; ".join(describe(a.proposal.term) for a in selection.added))
+    """Return a selection with all effects refused: their evidence is weak and no fold found them."""
+    say(
+        "removed, because no fold found them again: "
+        + "; ".join(describe(a.proposal.term) for a in selection.added)
+    )
     reason = "its evidence is weak, and the repeated search finds it in no fold"
     refused = [RefusedEffect(a.proposal.term, a.proposal.p_value, reason) for a in selection.added]
     return replace(selection, after=selection.before, added=(), refused=(*selection.refused, *refused))
@@ -284,23 +305,31 @@ def _only_gains(
 ) -> tuple[Selection, BeforeAfter]:
     """Return the result without the last effects that do not lower the error in sample and held out.
 
-    A removed effect was significant. It is recorded as refused; the verdict is `unexplained` or, if its evidence is
-    weak, `cannot_tell`.
+    A removed effect was significant. It is recorded as refused; the verdict is `unexplained` or, if its
+    evidence is weak, `cannot_tell`.
     """
     refused = []
-    while selection.added and not models.gains(_level_of(selection.added), weak=any(a.weak for a in selection.added)):
+    while selection.added and not models.gains(
+        _level_of(selection.added), weak=any(a.weak for a in selection.added)
+    ):
         last = selection.added[-1].proposal
         say(f"removed, because it does not lower the error: {describe(last.term)}")
         reason = "it does not lower the error, in sample or on held-out data"
         refused.append(RefusedEffect(last.term, last.p_value, reason))
         model = selection.after.model.without_term(len(selection.added) - 1)
-        own = fit(model, selection.after.rows, selection.after.scatter, turns=2) if model.terms else selection.before
+        own = (
+            fit(model, selection.after.rows, selection.after.scatter, turns=2)
+            if model.terms
+            else selection.before
+        )
         selection = replace(selection, after=own, added=selection.added[:-1])
         _, after = _on_all(models.before.rows, selection)
         if not selection.added:
             models = replace(models, after=models.before, held_after=models.held_before)
         else:
-            models = replace(models, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model))
+            models = replace(
+                models, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model)
+            )
     strong = tuple(r for r in refused if not r.weak)
     return replace(selection, refused=(*selection.refused, *refused), worse=strong), models
 
@@ -315,7 +344,7 @@ def _level_of(added: Sequence[AcceptedEffect]) -> str | None:
 
 
 def _residual_table(bins: pd.DataFrame, fitted: Fitted, held: np.ndarray) -> pd.DataFrame:
-    """Return `bins`, in its order, with the model, the residual, their held-out counterparts and the weight."""
+    """Return `bins` in its order with the model, the residual, their held-out counterparts and the weight."""
     rows, own = fitted.rows, np.argsort(fitted.rows.order)
     return bins.assign(
         model_N=fitted.force[own],

@@ -14,22 +14,26 @@ from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, l
 from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest, slope_log_p
 from sealfit.fit.joint.estimate import Fitted
 
-# The signs of whole units are flipped at random many times. The largest T over all candidates gives the p-value
-# adjusted for the search (Westfall & Young 1993; sign flips of score contributions: Hemerik, Goeman & Finos 2020,
-# doi:10.1111/rssb.12369). P-values by the jackknife are adjusted for the number of candidates (Bonferroni); each of the
-# two tests has half of the error rate. Tests on few specimens are adjusted by random draws (`small_sample`), contrasts
-# in few units by their number (`slopes`).
+# The signs of whole units are flipped at random many times. The largest T over all candidates gives the
+# p-value adjusted for the search (Westfall & Young 1993; sign flips of score contributions: Hemerik, Goeman &
+# Finos 2020, doi:10.1111/rssb.12369). P-values by the jackknife are adjusted for the number of candidates
+# (Bonferroni); each of the two tests has half of the error rate. Tests on few specimens are adjusted by
+# random draws (`small_sample`), contrasts in few units by their number (`slopes`).
 #
-# Draws continue until the smallest p-value is known well enough for the decision not to depend on them (sequential
-# Monte Carlo p-values: Besag & Clifford 1991, Biometrika 78(2), 301-304, doi:10.1093/biomet/78.2.301).
+# Draws continue until the smallest p-value is known well enough for the decision not to depend on them
+# (sequential Monte Carlo p-values: Besag & Clifford 1991, Biometrika 78(2), 301-304,
+# doi:10.1093/biomet/78.2.301).
 
 FLIPS = 1999  # Number of random sign flips, or draws, that are made at a time.
-MOST_FLIPS = 25 * FLIPS  # Their largest number: a p-value of 0.00125, four times which is 0.005, has an error of 13 %.
+# Their largest number: a p-value of 0.00125, four times which is 0.005, has an error of 13 %.
+MOST_FLIPS = 25 * FLIPS
 ENOUGH = 50  # Number of draws below the smallest p-value that determine it well enough.
 MOST_SIGNS = 1 << 22  # Signs of all units that are drawn at once (34 MB), or beyond `FLIPS`.
 
 
-def adjust_all(tests: ScoreTests, candidates: Sequence[Candidate], rng: np.random.Generator) -> list[Candidate]:
+def adjust_all(
+    tests: ScoreTests, candidates: Sequence[Candidate], rng: np.random.Generator
+) -> list[Candidate]:
     """Return candidates with p-values adjusted over all of them, strongest evidence first."""
     results = [c.test_result for c in candidates]
     p_values = np.ones(len(candidates))
@@ -39,10 +43,14 @@ def adjust_all(tests: ScoreTests, candidates: Sequence[Candidate], rng: np.rando
     for k in many:
         if results[k].scores.shape[0] >= JACKKNIFE_UNITS:  # two tests, each with half of the error rate
             p_values[k] = 2 * min(p_values[k], len(many) * np.exp(results[k].log_p_jackknife))
-    small = np.min([adjust_small_sample(units, results, rng) for units in tests.cluster_tests.values()], axis=0)
+    small = np.min(
+        [adjust_small_sample(units, results, rng) for units in tests.cluster_tests.values()], axis=0
+    )
     p_values = np.minimum(p_values, np.minimum(small, adjust_slopes(results)))
     p_values[[r.small_sample is not None and bool(r.slopes) for r in results]] *= 2  # two tests here as well
-    found = [replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)]
+    found = [
+        replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)
+    ]
     return sorted(found, key=lambda c: -c.evidence)
 
 
@@ -52,11 +60,13 @@ def adjust(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: 
     Results with the same number of units are flipped with the same signs, so that their correlation is used.
     """
     own = [j.log_p for j in results]
-    return _adjusted(own, _drawn(lambda: _least(results, rng, flips), min(own), max(j.units for j in results)))
+    return _adjusted(
+        own, _drawn(lambda: _least(results, rng, flips), min(own), max(j.units for j in results))
+    )
 
 
 def _drawn(draw: Callable[[], np.ndarray], smallest: float, units: int) -> np.ndarray:
-    """Return draws of the smallest log p-value until `ENOUGH` are below the smallest observed one, or no more fit."""
+    """Return draws of the smallest log p-value until `ENOUGH` are below the observed one, or no more fit."""
     least = draw()
     most = min(MOST_FLIPS, MOST_SIGNS // units)
     while np.count_nonzero(least <= smallest) < ENOUGH and least.size < most:
@@ -98,7 +108,7 @@ def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: 
 
 
 def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the sums of scores, shape (units, m), under random signs -> (flips, m); a few flips at a time."""
+    """Return sums of scores, shape (units, m), under random signs -> (flips, m); a few flips at a time."""
     part = max(1, MOST_SIGNS // scores.shape[0])
     return np.concatenate(
         [
@@ -111,9 +121,11 @@ def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.nda
 def adjust_small_sample(
     units: ClusterTests, results: Sequence[ScoreTestResult], rng: np.random.Generator, draws: int = FLIPS
 ) -> np.ndarray:
-    """Return the p-values of the small-sample tests of a level, adjusted over all, shape (m,); 1 if not tested."""
+    """Return the p-values of the small-sample tests of a level, adjusted over all, (m,); 1 if not tested."""
     p_values = np.ones(len(results))
-    tried = [k for k, j in enumerate(results) if j.small_sample is not None and j.small_sample.level == units.level]
+    tried = [
+        k for k, j in enumerate(results) if j.small_sample is not None and j.small_sample.level == units.level
+    ]
     if tried:
         tests = [results[k].small_sample for k in tried]
         logs = np.array([test.log_p for test in tests])
@@ -129,7 +141,9 @@ def _least_small_sample(
 ) -> np.ndarray:
     """Return the smallest log p-value of all small-sample tests of one level in each of many draws."""
     drawn = units.draws(draws, rng)
-    return np.min([small_sample_test.log_p_of(drawn[test.target], test.basis, test.known) for test in tests], axis=0)
+    return np.min(
+        [small_sample_test.log_p_of(drawn[test.target], test.basis, test.known) for test in tests], axis=0
+    )
 
 
 def adjust_slopes(results: Sequence[ScoreTestResult]) -> np.ndarray:

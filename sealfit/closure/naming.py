@@ -1,8 +1,8 @@
 """From a channel that explains the residual to an effect: physical effects, closed forms, free shapes.
 
-Every form is fitted to the residual in the tangent space, exactly in its amplitudes and on a grid in its nonlinear
-parameters. The best few are refitted jointly with the model, and the BIC decides. Of equal forms a physical effect is
-preferred to a closed form, and a closed form to a free shape.
+Every form is fitted to the residual in the tangent space, exactly in its amplitudes and on a grid in its
+nonlinear parameters. The best few are refitted jointly with the model, and the BIC decides. Of equal forms a
+physical effect is preferred to a closed form, and a closed form to a free shape.
 """
 
 from __future__ import annotations
@@ -66,19 +66,32 @@ def propose(
         Further proposals.
     """
     linearised = Linearised(fitted)
-    forms = [(t, search, c) for c in _contenders(significant) for t, search in terms_of(c, channels, fitted, effects)]
+    forms = [
+        (t, search, c)
+        for c in _contenders(significant)
+        for t, search in terms_of(c, channels, fitted, effects)
+    ]
     forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # all quantities share a shape
     found = [*also, *(p for form in forms for p in linearised(*form))]
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
     others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
-    if not (calendar and others and max(p.chi2 for p in others) >= HALF_OF_CALENDAR * max(p.chi2 for p in calendar)):
+    if not (
+        calendar
+        and others
+        and max(p.chi2 for p in others) >= HALF_OF_CALENDAR * max(p.chi2 for p in calendar)
+    ):
         return named_among(fitted, _best_few(found))
-    # Conditions are tested one after the other, so the calendar is correlated with them: other channels come first.
-    others, calendar = (_refitted(fitted, part) for part in (_best_few(others), _best_few(calendar)[:CALENDAR_RIVALS]))
+    # Conditions are tested one after the other, so the calendar is correlated with them: other channels come
+    # first.
+    others, calendar = (
+        _refitted(fitted, part) for part in (_best_few(others), _best_few(calendar)[:CALENDAR_RIVALS])
+    )
     return _ordered(fitted, others) + sorted(calendar, key=lambda p: p.bic)
 
 
-def propose_ripples(fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]) -> list[Proposal]:
+def propose_ripples(
+    fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
+) -> list[Proposal]:
     """Return jointly refitted proposals for a periodic component, best first.
 
     Parameters
@@ -123,8 +136,9 @@ def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
 def _best_few(found: list[Proposal]) -> list[Proposal]:
     """Return the few best proposals to refit, the best free shape among them.
 
-    Each effect is kept at most once per target and on at most two. A grid is coarse, so physical effects get a margin.
-    Every further quantity that explains nearly as much is kept: the missing effect biases the model it is tested on.
+    Each effect is kept at most once per target and on at most two. A grid is coarse, so physical effects get
+    a margin. Every further quantity that explains nearly as much is kept: the missing effect biases the model
+    it is tested on.
     """
     kept: list[Proposal] = []
     ranked = sorted(found, key=lambda p: p.bic - EQUAL_BIC * p.term.effect.physical)
@@ -152,7 +166,10 @@ def _kind(proposal: Proposal) -> tuple[str, int]:
 
 
 def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
-    """Return proposals best first; among equals, first those that leave earlier effects unchanged, then by rank."""
+    """Return proposals best first.
+
+    Among equals, those that leave earlier effects unchanged are first; then they are sorted by rank.
+    """
     if not found:
         return []
     found = sorted(found, key=lambda p: p.bic)
@@ -186,7 +203,9 @@ def _changes_earlier(fitted: Fitted, proposal: Proposal) -> bool:
     """
     return any(
         abs(now[p.name] - then[p.name]) > LARGE_CHANGE * abs(then[p.name])
-        for term, then, now in zip(fitted.model.terms, fitted.model.values, proposal.fitted.model.values, strict=False)
+        for term, then, now in zip(
+            fitted.model.terms, fitted.model.values, proposal.fitted.model.values, strict=False
+        )
         for p in term.effect.parameters
         if p.linear
     )
@@ -214,7 +233,10 @@ def _simpler(proposal: Proposal, best: Proposal) -> bool:
 
     A quantity of the declared model is preferred to a factor on the whole force.
     """
-    gain = (best.term.acts_on, best.term.operation) == ("force", "multiply") and proposal.term.acts_on != "force"
+    gain = (best.term.acts_on, best.term.operation) == (
+        "force",
+        "multiply",
+    ) and proposal.term.acts_on != "force"
     plain = proposal.rank[:2] < best.rank[:2] or proposal.source == ZERO_OFFSET or gain
     return plain and correlation(proposal, best) > SAME_EFFECT and proposal.bic - best.bic < 2 * EQUAL_BIC
 
@@ -226,13 +248,15 @@ def correlation(one: Proposal, other: Proposal) -> float:
 
 
 def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
-    """Return the proposals that these data cannot distinguish from the chosen one: they add nearly the same force."""
+    """Return proposals these data cannot distinguish from the chosen one: they add nearly the same force."""
     return [p for p in found if p is not chosen and not _identical(p, chosen) and _rival(p, chosen)]
 
 
 def _rival(proposal: Proposal, chosen: Proposal) -> bool:
     similarity = correlation(proposal, chosen)
-    return similarity > SAME_EFFECT or (similarity > RIVAL_CORRELATION and proposal.bic - chosen.bic < RIVAL_BIC)
+    return similarity > SAME_EFFECT or (
+        similarity > RIVAL_CORRELATION and proposal.bic - chosen.bic < RIVAL_BIC
+    )
 
 
 def _identical(one: Proposal, other: Proposal) -> bool:
@@ -241,10 +265,11 @@ def _identical(one: Proposal, other: Proposal) -> bool:
 
 
 def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
-    """Return proposals fitted jointly with the model, best first; scatter is re-estimated for those near the best.
+    """Return proposals fitted jointly with the model, best first.
 
-    Nearness is the BIC under the scatter of the best. If most of the former scatter was the missing effect, as the few
-    likeliest proposals show, all are fitted under the re-estimated one.
+    The scatter is re-estimated for those near the best. Nearness is the BIC under the scatter of the best. If
+    most of the former scatter was the missing effect, as the few likeliest proposals show, all are fitted
+    under the re-estimated one.
     """
     if not found:
         return []
@@ -255,7 +280,9 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
         refitted = sorted(_refitted_under(fitted, likeliest, alone.fitted.scatter), key=lambda p: p.bic)
         best = _reestimated(refitted[0])
     elif len(found) > LIKELIEST:
-        refitted = sorted([*refitted, *(_joint(fitted, p) for p in likeliest[LIKELIEST:])], key=lambda p: p.bic)
+        refitted = sorted(
+            [*refitted, *(_joint(fitted, p) for p in likeliest[LIKELIEST:])], key=lambda p: p.bic
+        )
         best = best if refitted[0].term is best.term else _reestimated(refitted[0])
     least = min(best.bic, refitted[0].bic)
     scatter = best.fitted.scatter
@@ -269,7 +296,9 @@ def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:
     """Return a proposal fitted jointly with the model, under the current scatter."""
     model = fitted.model.with_term(proposal.term, proposal.values)
     model = solve_linear(model, fitted.rows, fitted.scatter, fitted.friction)
-    return replace(proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction))
+    return replace(
+        proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
+    )
 
 
 def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
@@ -277,9 +306,10 @@ def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
 
 
 def _refitted_under(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
-    """Yield proposals fitted under another scatter, with a new search for v_s and b, which may have been biased.
+    """Yield proposals fitted under another scatter, with a new search for v_s and b.
 
-    The search is made with the likeliest effect on each quantity; further effects on it start from its result.
+    They may have been biased. The search is made with the likeliest effect on each quantity; further effects
+    on it start from its result.
     """
     rows, friction = fitted.rows, fitted.friction
     begun: dict[tuple[str, str], np.ndarray] = {}

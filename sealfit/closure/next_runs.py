@@ -22,9 +22,10 @@ from sealfit.fit.joint.search import bounds_of
 # ---------------------------------------------------------------- aliases
 # Effects that are not distinguishable from the model with these runs.
 #
-# A sensor offset in a campaign with one direction is the same as friction; a drift over time, with one specimen tested
-# after the other, is the same as aging. The residual does not contain them, so the design is searched for them: of an
-# alias, less than 1 % is left after projection off the tangent space of the model, for all its parameters and targets.
+# A sensor offset in a campaign with one direction is the same as friction; a drift over time, with one
+# specimen tested after the other, is the same as aging. The residual does not contain them, so the design is
+# searched for them: of an alias, less than 1 % is left after projection off the tangent space of the model,
+# for all its parameters and targets.
 
 SIZE = 0.01  # Assumed size of an alias, as a share of the RMS force.
 NEGLIGIBLE = 1e-6  # A shape of amplitude 1 with a smaller RMS has no effect here.
@@ -69,7 +70,7 @@ def find_aliases(fitted: Fitted, effects: Mapping[str, Effect], taken: tuple[str
 def _at_grid(
     fitted: Fitted, effect: Effect, target: tuple[str, str]
 ) -> Iterator[tuple[Term, dict[str, float], np.ndarray, float]]:
-    """Yield a form at each grid point of its nonlinear parameters: term, values, column, and share that is left."""
+    """Yield a form at each grid point of its nonlinear parameters: term, values, column and share left."""
     rows = fitted.rows
     values = {name: rows.values(name) for name in effect.reads}
     if any(v.dtype.kind != "f" or (np.ptp(v) == 0 and name != "direction") for name, v in values.items()):
@@ -82,7 +83,9 @@ def _at_grid(
     searched = grid_of(effect, np.abs(values[effect.reads[0]]))
     for point in itertools.product(*searched.values()):
         at = {**effect.start(), **dict(zip(searched, point, strict=True))}
-        for name, shape in zip(effect.linear, mean_derivatives(term, at, rows, only_linear=True), strict=True):
+        for name, shape in zip(
+            effect.linear, mean_derivatives(term, at, rows, only_linear=True), strict=True
+        ):
             column = slope * shape
             if np.isfinite(shape).all() and (column**2).mean() > NEGLIGIBLE**2 * (slope**2).mean():
                 white = fitted.whitening(column[:, None])[:, 0]
@@ -113,8 +116,10 @@ ROWS = 4  # Rows per stroke at which forces are compared.
 
 
 def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect]) -> list[dict]:
-    """Return for each effect the run that would distinguish it from its nearest rival, and for each alias the run that
-    would show it.
+    """Return the runs that would distinguish effects from rivals, and those that would show aliases.
+
+    There is a run for each effect, which would distinguish it from its nearest rival, and a run for each
+    alias, which would show it.
 
     Parameters
     ----------
@@ -135,11 +140,14 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
         for rival in item.rivals[:1]:
             chosen = item.proposal
             channels = (*chosen.term.channels, *rival.term.channels)
-            found = largest_difference(chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, config)
+            found = largest_difference(
+                chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, config
+            )
             if found is not None:
                 wanted.append(
                     {
-                        "why": f"would distinguish {describe(item.proposal.term)} from {describe(rival.term)}: "
+                        "why": f"would distinguish {describe(item.proposal.term)} "
+                        f"from {describe(rival.term)}: "
                         f"they differ there by {found[1]:.3g} {config.units.unit('force')}",
                         "conditions": found[0],
                     }
@@ -152,7 +160,7 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
 
 
 def _second_specimen(rows: Rows, config: Config) -> dict:
-    """Return the condition (the last one) to test on a second specimen if the scatter of specimens is not known."""
+    """Return the last condition, for a test on a second specimen if the scatter of specimens is not known."""
     k = int(np.argmax(rows.days))
     return {
         "why": "would show the scatter of specimens, which is unknown in this campaign and in no interval: "
@@ -179,7 +187,7 @@ def _runs_for_aliases(fitted: Fitted, config: Config, effects: Mapping[str, Effe
 
 
 def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
-    """Return the condition to repeat on a new specimen: where an effect shown by too few specimens is largest."""
+    """Return the condition to repeat on a new specimen: where an effect in too few specimens is largest."""
     fitted = item.proposal.fitted
     k = int(np.argmax(np.abs(added_force(item.proposal))))
     count = fitted.rows.groups.starts["specimen"].size
@@ -187,17 +195,20 @@ def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
     return {
         "why": f"{few} too few to distinguish {describe(item.proposal.term)} from the scatter of specimens: "
         "test a second specimen of the same conditions, here first",
-        "conditions": {name: _plain(fitted.rows.table[name].iloc[k]) for name in (*config.condition, "speed_mm_s")},
+        "conditions": {
+            name: _plain(fitted.rows.table[name].iloc[k]) for name in (*config.condition, "speed_mm_s")
+        },
     }
 
 
 def largest_difference(
     chosen: Model, rival: Model, rows: Rows, channels: Sequence[str], config: Config
 ) -> tuple[dict, float] | None:
-    """Return the run at which two models differ most, and the difference (force unit); None if they do not differ.
+    """Return the run at which two models differ most, and the difference (force unit); None if there is none.
 
-    Every tested run is tried with each combination of low, median and high values of the channels of their effects, so
-    that channels which were confounded in the campaign (a condition and the calendar) are separated.
+    Every tested run is tried with each combination of low, median and high values of the channels of their
+    effects, so that channels which were confounded in the campaign (a condition and the calendar) are
+    separated.
     """
     rows = rows.sparse(ROWS)
     channels = tuple(dict.fromkeys(channels))

@@ -67,7 +67,8 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
             "alike": float(after.scatter.design_effect),
             "shape": float(after.scatter.shape),
             "components": [
-                {"level": c.level, "kind": c.kind, "variance": float(c.variance)} for c in after.scatter.components
+                {"level": c.level, "kind": c.kind, "variance": float(c.variance)}
+                for c in after.scatter.components
             ],
         },
         "ranges": _ranges(rows),
@@ -207,10 +208,14 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
     reach = t_quantile(degrees_of_freedom(after))
     for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True)):
         place = after.model.term_slice(number)
-        covariance = (robust_covariance(after, "file") if "held" in term.fixed else after.covariance)[place, place]
+        covariance = (robust_covariance(after, "file") if "held" in term.fixed else after.covariance)[
+            place, place
+        ]
         inputs, x, labels = _along(term, after)
         value = np.asarray(term.effect.shape(inputs, **values), dtype=float)
-        tangent = np.column_stack([np.broadcast_to(d, value.shape) for d in term_derivatives(term, values, inputs)])
+        tangent = np.column_stack(
+            [np.broadcast_to(d, value.shape) for d in term_derivatives(term, values, inputs)]
+        )
         se = mean_se(Tangent.dense(tangent), covariance)
         free = _free_shape(after, number, x)
         unit = parameter_unit("{y}", term, config.units)
@@ -233,7 +238,7 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
 
 
 def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
-    """Return inputs along a term's first channel, others at their means; and the channel's values or categories."""
+    """Return inputs along a term's first channel, others at their means, and its values or categories."""
     rows = after.rows
     first = term.channels[0]
     values = rows.values(first)
@@ -245,16 +250,22 @@ def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
     if "lambda_" in after.model.values[after.model.terms.index(term)]:
         high = min(high, low + 4 * after.model.values[after.model.terms.index(term)]["lambda_"])
     distinct = np.unique(values)
-    x = distinct if distinct.size <= 12 else np.linspace(low, high, 4 * POINTS if high < values.max() else POINTS)
+    x = (
+        distinct
+        if distinct.size <= 12
+        else np.linspace(low, high, 4 * POINTS if high < values.max() else POINTS)
+    )
     inputs = {}
     for name, channel in zip(term.effect.reads, term.channels, strict=True):
-        inputs[name] = x if channel == first else np.full(x.size, _usual(rows.values(channel), pair=name == SECOND))
+        inputs[name] = (
+            x if channel == first else np.full(x.size, _usual(rows.values(channel), pair=name == SECOND))
+        )
     fixed = {key: value for key, value in term.fixed.items() if key != "shift"}
     return {**inputs, **fixed}, x, None
 
 
 def _usual(values: np.ndarray, *, pair: bool) -> float | str:
-    """Return the value of a second channel in a plot: its mean, the 90 % quantile for a pair, or a category."""
+    """Return a second channel's value in a plot: its mean, the 90 % quantile for a pair, or a category."""
     if values.dtype.kind != "f":
         return str(np.unique(values)[0])
     size = np.abs(values)
@@ -262,9 +273,14 @@ def _usual(values: np.ndarray, *, pair: bool) -> float | str:
 
 
 def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
-    """Return the free shape fitted instead of an effect, with the same mean; None for periodic effects and levels."""
+    """Return the free shape fitted instead of an effect, with its mean; None for periodic ones and levels."""
     term = after.model.terms[number]
-    if len(term.channels) != 1 or term.effect.periodic or term.effect.id in (SMOOTH, LEVELS) or np.isnan(x).any():
+    if (
+        len(term.channels) != 1
+        or term.effect.periodic
+        or term.effect.id in (SMOOTH, LEVELS)
+        or np.isnan(x).any()
+    ):
         return None
     if term.channels[0] == "direction":
         return None
@@ -292,7 +308,9 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     speeds = [np.abs(rows.speed[chosen]) for chosen in np.split(order, cuts)]
     counts = [POINTS if own.max() > 1.02 * own.min() else 1 for own in speeds]
     first = order[np.r_[0, cuts]]
-    points = pd.DataFrame({**columns, "direction": direction[first]}).loc[np.repeat(np.arange(first.size), counts)]
+    points = pd.DataFrame({**columns, "direction": direction[first]}).loc[
+        np.repeat(np.arange(first.size), counts)
+    ]
     along = [np.geomspace(own.min(), own.max(), count) for own, count in zip(speeds, counts, strict=True)]
     points = points.assign(speed_mm_s=points["direction"].to_numpy() * np.concatenate(along), file="")
     points = points.reset_index(drop=True)

@@ -1,8 +1,9 @@
 """Force at new points, before and after, with 95 % intervals of the mean and of one new measurement.
 
-The mean is that of the population, with all random effects (specimen, set-up, repeat) at zero. Its interval has the
-uncertainty of the parameters, which includes the scatter of specimens, runs and files. The interval of a measurement
-adds one draw of each level and the noise of a bin. The sensor's accuracy is not included (GUM, type B).
+The mean is that of the population, with all random effects (specimen, set-up, repeat) at zero. Its interval
+has the uncertainty of the parameters, which includes the scatter of specimens, runs and files. The interval
+of a measurement adds one draw of each level and the noise of a bin. The sensor's accuracy is not included
+(GUM, type B).
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from sealfit.ingest.quality import NO_VALUE
 
 BEYOND = 1e-6  # Relative tolerance of the tested range.
 ANSWERS = (
-    "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N", "meas_lo95_N", "meas_hi95_N",
+    "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N",
+    "meas_lo95_N", "meas_hi95_N",
 )  # fmt: skip
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
 
@@ -41,16 +43,16 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     model : dict
         The model record (OUT/model.json).
     points : DataFrame
-        Condition columns, signed `speed_mm_s`, and every channel that the after-model reads; grouping columns such as
-        `specimen_id` are ignored.
+        Condition columns, signed `speed_mm_s`, and every channel that the after-model reads; grouping columns
+        such as `specimen_id` are ignored.
     own : mapping of str to Effect, optional
         The user's own effects, by id.
 
     Raises
     ------
     RequestError
-        If a condition column, the speed or a channel of the after-model is missing, or the model has a user effect that
-        is not in `own`.
+        If a condition column, the speed or a channel of the after-model is missing, or the model has a user
+        effect that is not in `own`.
     """
     before, after, conditions = from_record(model, own)
     config = Config.model_validate(model["config"])
@@ -65,7 +67,9 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
             notes[k].append(TESTED_ONLY)
     if model["df"] == 0:
         for k in np.flatnonzero(good):
-            notes[k].append("no interval: as many parameters in the model as runs; test repeats or more speeds")
+            notes[k].append(
+                "no interval: as many parameters in the model as runs; test repeats or more speeds"
+            )
     extrapolated = _outside(table, conditions, code, model, notes, after)
     if good.any():
         at = point_rows(
@@ -78,14 +82,24 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         mean, tangent = evaluate(after, at)
         reach = t_quantile(model["df"])
         others = [
-            Sandwich(np.array(own["covariance"]), [(np.array(k), np.array(block)) for k, block in own["information"]])
+            Sandwich(
+                np.array(own["covariance"]),
+                [(np.array(k), np.array(block)) for k, block in own["information"]],
+            )
             for own in model["sandwiches"]
         ]
         half = mean_half_width(tangent, np.array(model["covariance"]), model["df"], others)
         half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, mean))
         spread = reach * np.sqrt((half / reach) ** 2 + _one_measurement(model["scatter"], mean))
         answer.loc[good, list(ANSWERS)] = np.column_stack(
-            [evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half, mean - spread, mean + spread]
+            [
+                evaluate(before, at, jacobian=False)[0],
+                mean,
+                mean - half,
+                mean + half,
+                mean - spread,
+                mean + spread,
+            ]
         )
     bad = answer["force_after_N"].isna().to_numpy()
     return points.reset_index(drop=True).assign(
@@ -109,7 +123,12 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
         if name in table:
             continue
         tested = ranges.get(name)
-        if tested is not None and len(tested) == 2 and tested[0] == tested[1] and name not in config.condition:
+        if (
+            tested is not None
+            and len(tested) == 2
+            and tested[0] == tested[1]
+            and name not in config.condition
+        ):
             table[name] = tested[0]
             continue
         unit = config.units.of(name)
@@ -147,9 +166,11 @@ def _is_range(tested: object) -> bool:
 def _conditions(
     before: Model, after: Model, conditions: pd.DataFrame, table: pd.DataFrame, notes: list, config: Config
 ) -> tuple[Model, Model, pd.DataFrame, np.ndarray]:
-    """Return the models with the conditions of the points added, and each point's condition; -1 if it has none."""
+    """Return the models with the points' conditions added, and each point's condition; -1 if it has none."""
     keys = add_keys(table, config)
-    days = pd.to_numeric(table["aging_days"], errors="coerce") if config.aging else pd.Series(0.0, table.index)
+    days = (
+        pd.to_numeric(table["aging_days"], errors="coerce") if config.aging else pd.Series(0.0, table.index)
+    )
     known = {name: k for k, name in enumerate(conditions["condition"])}
     declared = after.declared
     names, index = list(conditions["condition"]), {q: list(v) for q, v in declared.index.items()}
@@ -171,7 +192,9 @@ def _conditions(
                 continue
             known[name] = len(names)
             names.append(name)
-            added.append({"condition": name, "series": series, "rubber": rubber, "aging_days": float(days.iloc[k])})
+            added.append(
+                {"condition": name, "series": series, "rubber": rubber, "aging_days": float(days.iloc[k])}
+            )
             for quantity in index:
                 index[quantity].append(int(declared.index[quantity][lawful[0]]))
         code[k] = known[name]

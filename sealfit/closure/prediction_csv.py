@@ -74,7 +74,9 @@ def _names_of_points(names: list[str], path: Path) -> list[str]:
     if not any(names):
         raise RequestError("is empty.", file=path, fix="Give a line of column names, then one row per point.")
     if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
-        raise RequestError("is not separated by commas.", file=path, line=1, fix="Save it with commas and points.")
+        raise RequestError(
+            "is not separated by commas.", file=path, line=1, fix="Save it with commas and points."
+        )
     _refuse_names(names, file=path, line=1)
     return names
 
@@ -145,7 +147,9 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
         table.to_csv(staged, index=False, encoding="utf-8", lineterminator="\n")
         os.replace(staged, output)
     except OSError as error:
-        raise RequestError(f"{output} cannot be written ({error.strerror}).", fix="Choose another --output.") from error
+        raise RequestError(
+            f"{output} cannot be written ({error.strerror}).", fix="Choose another --output."
+        ) from error
     finally:
         staged.unlink(missing_ok=True)
     answered = answers["force_after_N"].notna()

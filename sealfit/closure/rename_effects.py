@@ -1,8 +1,8 @@
 """Renaming of effects that were named while others were still missing.
 
-A missing effect is part of the scatter, so an effect named then is not well distinguished from its rivals: a factor
-from an added force, a line from a logarithm. If a second effect of one channel is found, the first was not its whole
-shape: one effect that fits as well replaces the two.
+A missing effect is part of the scatter, so an effect named then is not well distinguished from its rivals: a
+factor from an added force, a line from a logarithm. If a second effect of one channel is found, the first was
+not its whole shape: one effect that fits as well replaces the two.
 """
 
 from __future__ import annotations
@@ -44,11 +44,13 @@ class Renaming:
     samples: pd.DataFrame
     context: Context
 
-    def earlier_renamed(self, fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
+    def earlier_renamed(
+        self, fitted: Fitted, added: list[AcceptedEffect]
+    ) -> tuple[Fitted, list[AcceptedEffect]]:
         """Return a fit and its effects, each but the last renamed given all others.
 
-        An effect that keeps its name was confirmed while others were missing. It is removed if it has no gain on
-        held-out data given the others.
+        An effect that keeps its name was confirmed while others were missing. It is removed if it has no gain
+        on held-out data given the others.
         """
         for item in added[:-1]:
             number = next(k for k, a in enumerate(added) if a is item)
@@ -70,8 +72,10 @@ class Renaming:
                 added = [*others, better]
         return fitted, added
 
-    def _unchanged(self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect) -> AcceptedEffect | None:
-        """Return an effect of a fit with its own name, confirmed given the others; None if it is not confirmed."""
+    def _unchanged(
+        self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect
+    ) -> AcceptedEffect | None:
+        """Return an effect of a fit with its own name, confirmed given the others; None if not confirmed."""
         model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
         own = fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
         return self._confirmed(without, [replace(item.proposal, fitted=own)], item.round)
@@ -79,11 +83,11 @@ class Renaming:
     def merged_with_earlier(
         self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect, *, pending: bool = False
     ) -> tuple[list[AcceptedEffect], AcceptedEffect]:
-        """Return the earlier effects and a new one that is not in `fitted` yet, merged with an earlier one if possible.
+        """Return the earlier effects and a new one, merged with an earlier one if possible.
 
-        Two effects are merged if a single one fits as well: a shape of the same channel or of a proportional one, or a
-        product of two channels. While the other effect of a masked pair is `pending`, only effects of the new one's own
-        channel are merged with it.
+        The new one is not in `fitted` yet. Two effects are merged if a single one fits as well: a shape of
+        the same channel or of a proportional one, or a product of two channels. While the other effect of a
+        masked pair is `pending`, only effects of the new one's own channel are merged with it.
         """
         for number, earlier in enumerate(added):
             if pending and self._channel(earlier) != self._channel(new):
@@ -98,8 +102,8 @@ class Renaming:
     ) -> AcceptedEffect | None:
         """Return one effect that fits as well as an earlier and a new one; None if there is none.
 
-        Two forms of one channel that are no physical effects are one shape: then the single effect only has to fit as
-        well, whatever its number of parameters.
+        Two forms of one channel that are no physical effects are one shape: then the single effect only has
+        to fit as well, whatever its number of parameters.
         """
         names = self._channel(earlier), self._channel(new)
         if None in names:
@@ -149,11 +153,15 @@ class Renaming:
         found = sorted(finest.values(), key=lambda c: -c.chi2)
         own, values = fitted.model.terms[number], fitted.model.values[number]
         at_own_values = {p.name: (values[p.name],) for p in own.effect.nonlinear}
-        same_target = next((c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None)
+        same_target = next(
+            (c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None
+        )
         own_form = Linearised(without)(own, at_own_values, same_target) if same_target is not None else ()
         return propose(without, found, self.channels, self.context.effects, own_form)
 
-    def _confirmed(self, without: Fitted, proposals: Sequence[Proposal], number: int) -> AcceptedEffect | None:
+    def _confirmed(
+        self, without: Fitted, proposals: Sequence[Proposal], number: int
+    ) -> AcceptedEffect | None:
         self.context.say(f"  round {number} again:")
         return confirmed(without, proposals, self.samples, self.context, number, [])
 

@@ -11,7 +11,15 @@ import pandas as pd
 from sealfit.closure.after import reference_of
 from sealfit.closure.channels import FINER, Channel, incomplete_channels, unit_of
 from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, about_means
-from sealfit.closure.criteria import CHANCE_P, HALVED, HARMLESS, LACK_OF_FIT, NOT_ADJUSTED, SAME_ERROR, UNSTEADY
+from sealfit.closure.criteria import (
+    CHANCE_P,
+    HALVED,
+    HARMLESS,
+    LACK_OF_FIT,
+    NOT_ADJUSTED,
+    SAME_ERROR,
+    UNSTEADY,
+)
 from sealfit.closure.error_sizes import errors, lack_of_fit, noise_floor, scatter_list
 from sealfit.closure.forms import describe, free_term
 from sealfit.closure.intervals import effect_intervals
@@ -54,9 +62,9 @@ class BeforeAfter:
     def gains(self, around: str | None, *, weak: bool) -> bool:
         """Whether the model after has no larger errors than that before, in sample and held out.
 
-        With weak evidence the held-out error must be lower. If a level is given, the errors about the means of its
-        groups are compared, and the whole errors may be larger by `HARMLESS`. This needs evidence that is not
-        weak, or a held-out error about the means that is halved.
+        With weak evidence the held-out error must be lower. If a level is given, the errors about the means
+        of its groups are compared, and the whole errors may be larger by `HARMLESS`. This needs evidence that
+        is not weak, or a held-out error about the means that is halved.
         """
         whole = self._ratios(None)
         inside = whole if around is None else self._ratios(around)
@@ -66,26 +74,37 @@ class BeforeAfter:
         return max(whole) <= (HARMLESS if strong else SAME_ERROR)
 
     def _ratios(self, around: str | None) -> tuple[float, float]:
-        """Return the ratio of the errors after and before, in sample and held out (1 if nothing was held out)."""
+        """Return the ratio of errors after and before, in sample and held out (1 if nothing was held out)."""
         rows, weight = self.before.rows, self.before.rows.weight
         inside = [weight @ about_means(f.residual, rows, around) ** 2 for f in (self.before, self.after)]
         known = np.isfinite(self.held_before) & np.isfinite(self.held_after) & self.covered
         held = [1.0, 1.0]
         if known.any():
             test = rows.subset(known)
-            left = [about_means(test.force - h[known], test, around) for h in (self.held_before, self.held_after)]
+            left = [
+                about_means(test.force - h[known], test, around) for h in (self.held_before, self.held_after)
+            ]
             held = [test.weight @ own**2 for own in left]
-        in_sample, held_out = (float(np.sqrt(after / max(before, 1e-300))) for before, after in (inside, held))
+        in_sample, held_out = (
+            float(np.sqrt(after / max(before, 1e-300))) for before, after in (inside, held)
+        )
         return in_sample, held_out
 
 
 def closure_document(
-    selection: Selection, models: BeforeAfter, heldout_unit: str, config: Config, effects: Mapping[str, Effect]
+    selection: Selection,
+    models: BeforeAfter,
+    heldout_unit: str,
+    config: Config,
+    effects: Mapping[str, Effect],
 ) -> dict:
     """Return closure.json."""
     after, units = models.after, config.units
     numbers = {}
-    for name, fitted, held in (("before", models.before, models.held_before), ("after", after, models.held_after)):
+    for name, fitted, held in (
+        ("before", models.before, models.held_before),
+        ("after", after, models.held_after),
+    ):
         found = errors(fitted.rows, fitted.residual)
         numbers[name] = {
             "rmse_N": found["rmse_N"],
@@ -130,7 +149,7 @@ def closure_document(
 
 
 def fit_quality(errors_after: Mapping, floor_N: float | None) -> dict:
-    """Return closure.json's `fit_quality`: whether the error exceeds the scatter of repeats, and their ratio."""
+    """Return closure.json's `fit_quality`: whether the error exceeds the repeats' scatter, and the ratio."""
     p_value = errors_after["lack_of_fit_p"]
     if floor_N is None or p_value is None:
         return {"state": "unknown", "ratio": None, "p_value": None}
@@ -155,7 +174,9 @@ def effect_entries(after: Fitted, selection: Selection, config: Config) -> list[
     entries = [_entry(after, number, item, config) for number, item in enumerate(selection.added)]
     if selection.inconclusive is not None:
         alone = selection.inconclusive.proposal.fitted
-        entries.append({**_entry(alone, len(alone.model.terms) - 1, selection.inconclusive, config), "candidate": True})
+        entries.append(
+            {**_entry(alone, len(alone.model.terms) - 1, selection.inconclusive, config), "candidate": True}
+        )
     return entries
 
 
@@ -205,11 +226,16 @@ def _number(value: float) -> float | None:
 
 
 def channels_of(term: Term, rows: Rows) -> list[str]:
-    """Return the channels of an effect; an unsigned force along a channel of whole files has direction too."""
+    """Return an effect's channels; an unsigned force along a channel of whole files has direction too."""
     names = list(term.channels)
     both_ways = rows.speed.min() < 0 < rows.speed.max()
     coarse = all(FINER[unit_of(rows.values(name), rows)] > FINER["stroke"] for name in names)
-    if both_ways and coarse and (term.acts_on, term.operation) == ("force", "add") and "direction" not in names:
+    if (
+        both_ways
+        and coarse
+        and (term.acts_on, term.operation) == ("force", "add")
+        and "direction" not in names
+    ):
         names.insert(0, "direction")
     return names
 
@@ -261,7 +287,9 @@ def effect_table(entries: Sequence[dict], added: Sequence[AcceptedEffect]) -> pd
     records = [
         {
             "round": item.round,
-            **{key: entry[key] for key in ("id", "label", "acts_on", "operation", "form", "named", "p_value")},
+            **{
+                key: entry[key] for key in ("id", "label", "acts_on", "operation", "form", "named", "p_value")
+            },
             "channels": " ".join(entry["channels"]),
             "parameter": p["name"],
             "value": p["value"],
@@ -276,19 +304,27 @@ def effect_table(entries: Sequence[dict], added: Sequence[AcceptedEffect]) -> pd
 
 
 def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> dict:
-    """Return closure.json's `left`: the error above the noise floor, and the strongest structure in the residual.
+    """Return closure.json's `left`: the error above the noise floor and the residual's strongest structure.
 
-    This is what is still significant, or an effect that was removed because it lowered no error. If there is neither
-    but effects were added, it is the channel that explains most of the residual, which is not significant.
+    This is what is still significant, or an effect that was removed because it lowered no error. If there is
+    neither but effects were added, it is the channel that explains most of the residual, which is not
+    significant.
     """
     above = float(np.sqrt(max(rmse_N**2 - floor_N**2, 0.0))) if floor_N is not None else None
     left = selection.left
     if left is None and selection.worse:
         item, rows = selection.worse[-1], selection.after.rows
         names = " ".join(channels_of(item.term, rows))
-        return {"rmse_N": above, "level": effect_level(item.term, rows), "channel": names, "p_value": item.p_value}
+        return {
+            "rmse_N": above,
+            "level": effect_level(item.term, rows),
+            "channel": names,
+            "p_value": item.p_value,
+        }
     if left is None and selection.added:
-        last = [c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < CHANCE_P]
+        last = [
+            c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < CHANCE_P
+        ]
         left = _unsteady_offset(selection) or _largest(selection.after, last)
     if isinstance(left, Peak):
         return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
@@ -303,15 +339,19 @@ def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> di
 
 
 def _unsteady_offset(selection: Selection) -> Candidate | None:
-    """Return the category that explains most of an offset between directions that differs between runs, or None.
+    """Return the category that explains most of an unsteady offset between directions, or None.
 
-    An offset per condition is fitted first, because it would mask the influence of a set-up. The p-value is adjusted
-    over the categories.
+    An unsteady offset differs between runs. An offset per condition is fitted first, because it would mask
+    the influence of a set-up. The p-value is adjusted over the categories.
     """
     fitted = selection.after
     rows = fitted.rows
     amplitude = max(
-        (abs(v["A"]) for t, v in zip(fitted.model.terms, fitted.model.values, strict=True) if t.effect.id == OFFSET),
+        (
+            abs(v["A"])
+            for t, v in zip(fitted.model.terms, fitted.model.values, strict=True)
+            if t.effect.id == OFFSET
+        ),
         default=0.0,
     )
     variance = sum(c.variance for c in fitted.scatter.components if c.kind == "offset" and c.level == "run")

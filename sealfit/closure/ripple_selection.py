@@ -1,4 +1,4 @@
-"""Selection of ripples, which comes first: they are found and confirmed on the raw samples, without slow effects."""
+"""Ripples are selected first: they are found and confirmed on the raw samples, without slow effects."""
 
 from __future__ import annotations
 
@@ -65,7 +65,8 @@ class Ripples:
                 self.found = None
                 break
             self.added.append(accepted)
-            found = accepted.proposal.fitted  # under its own scatter: the former one contains the missing effect
+            # under its own scatter: the former one contains the missing effect
+            found = accepted.proposal.fitted
             own = fit(found.model, own.rows, found.scatter, turns=2)
             self.samples = without_ripples(self.samples, own)
             self.found = self._find(own.model)
@@ -76,7 +77,11 @@ class Ripples:
         return fit(_held(own.model), fitted.rows, own.scatter, turns=2)
 
     def _find(self, model: Model | None = None) -> Peak | None:
-        known = [(t.channels[0], v["lambda_"]) for t, v in zip(model.terms, model.values, strict=True)] if model else []
+        known = (
+            [(t.channels[0], v["lambda_"]) for t, v in zip(model.terms, model.values, strict=True)]
+            if model
+            else []
+        )
         common_phase = self.context.config.position_origin == "rig"
         peak = find_ripple(self.samples, common_phase=common_phase, known=known, workers=self.context.workers)
         return peak if peak is not None and peak.p_value <= self.context.config.loop.family_error else None

@@ -1,4 +1,4 @@
-"""Search for ripples, periodic forces along displacement or time, in the raw samples of the steady windows."""
+"""Search for ripples, periodic forces along displacement or time, in the raw samples of steady windows."""
 
 from __future__ import annotations
 
@@ -10,17 +10,27 @@ import pandas as pd
 from scipy.special import betaincc, gammaincc
 
 from sealfit.closure.criteria import ABOVE_BACKGROUND, LEAST_FILES_OF_RIPPLE, LOBE, SHARED_PHASE
-from sealfit.closure.spectrum import Spectrum, Strokes, background, effective_count, smooth_background, spectra_of, tops
+from sealfit.closure.spectrum import (
+    Spectrum,
+    Strokes,
+    background,
+    effective_count,
+    smooth_background,
+    spectra_of,
+    tops,
+)
 from sealfit.fit.joint.model import passes
 from sealfit.fit.joint.rows import Rows
 
 # ---------------------------------------------------------------- ripple
-# Ripples are periodic forces along displacement or time. They are searched in the samples of the steady windows.
+# Ripples are periodic forces along displacement or time. They are searched in the samples of the steady
+# windows.
 #
-# Bins are too coarse for short waves, so the samples of every stroke are transformed: :math:`Z_u(f)` is the complex
-# amplitude of unit u (a file) at frequency f. A ripple of the rig has the same phase in all files, so
-# :math:`R = |\sum_u Z_u|^2 / \sum_u |Z_u|^2` is large; with random phases R is exponential with mean 1. If each file
-# has an origin of its own, only the power is common, and it is tested against the local background of the spectrum.
+# Bins are too coarse for short waves, so the samples of every stroke are transformed: :math:`Z_u(f)` is the
+# complex amplitude of unit u (a file) at frequency f. A ripple of the rig has the same phase in all files, so
+# :math:`R = |\sum_u Z_u|^2 / \sum_u |Z_u|^2` is large; with random phases R is exponential with mean 1. If
+# each file has an origin of its own, only the power is common, and it is tested against the local background
+# of the spectrum.
 
 
 @dataclass(frozen=True)
@@ -65,20 +75,24 @@ def find_ripple(
         peaks.append(_incoherent(spectrum))
     if not peaks:
         return None
-    # A wave in time is also seen along displacement, at each speed, and vice versa. If both are significant, the axis
-    # along which it is the same wave in all files has more energy.
+    # A wave in time is also seen along displacement, at each speed, and vice versa. If both are significant,
+    # the axis along which it is the same wave in all files has more energy.
     significant = [peak for peak in peaks if peak.p_value < SHARED_PHASE]
     best = (
-        max(significant, key=lambda p: p.energy) if significant else min(peaks, key=lambda p: (p.p_value, -p.statistic))
+        max(significant, key=lambda p: p.energy)
+        if significant
+        else min(peaks, key=lambda p: (p.p_value, -p.statistic))
     )
     # A common phase is stronger evidence than power.
-    shared = [p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED_PHASE]
+    shared = [
+        p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED_PHASE
+    ]
     best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
 
 
 def _coherent(spectrum: Spectrum) -> list[Peak]:
-    """Return the best peak of each mode: the same force in both directions, or with the sign of the direction."""
+    """Return the best peak per mode: the same force in both directions, or with the sign of the direction."""
     peaks = []
     for common in spectrum.common:
         total = np.abs(common.total) ** 2
@@ -90,7 +104,9 @@ def _coherent(spectrum: Spectrum) -> list[Peak]:
         p = _coherence_p(statistic[k], common.units) * spectrum.frequency.size * len(spectrum.common)
         wavelength, amplitude = _refined(total, spectrum.frequency, k), float(np.abs(common.amplitude[k]))
         energy = amplitude**2 * float(spectrum.count[k])
-        peaks.append(Peak(spectrum.axis, wavelength, common.symmetric, True, float(statistic[k]), p, amplitude, energy))
+        peaks.append(
+            Peak(spectrum.axis, wavelength, common.symmetric, True, float(statistic[k]), p, amplitude, energy)
+        )
     return peaks
 
 
@@ -102,8 +118,8 @@ def _coherence_p(statistic: float, units: int) -> float:
 def _incoherent(spectrum: Spectrum) -> Peak:
     """Return the best peak of the mean power of all units, whatever their phases.
 
-    The mean of U units' powers, each on its own scale, is Gamma(U) about the background. If units share a texture of
-    the track, their effective number is smaller.
+    The mean of U units' powers, each on its own scale, is Gamma(U) about the background. If units share a
+    texture of the track, their effective number is smaller.
     """
     open_power = np.where(spectrum.taken, np.nan, spectrum.power)
     ratio = spectrum.power / smooth_background(open_power, spectrum.frequency, spectrum.count)
@@ -143,12 +159,13 @@ def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
 
 
 # ---------------------------------------------------------------- stroke phases
-# The wave of each pass at one wavelength, from the raw samples: the exact wavelength, and the phases of the passes.
+# The wave of each pass at one wavelength, from the raw samples: the exact wavelength, and the phases of the
+# passes.
 #
-# A pass is a file in one direction. A parabola, a sine and a cosine of the place are fitted to a stroke's residual by
-# least squares weighted with a Hann window, which gives the ends of the stroke little weight. The strokes of a pass
-# share the sine and the cosine. The resolution is not limited by bins or frequencies, and a wave of a few periods is
-# separated from the trend.
+# A pass is a file in one direction. A parabola, a sine and a cosine of the place are fitted to a stroke's
+# residual by least squares weighted with a Hann window, which gives the ends of the stroke little weight. The
+# strokes of a pass share the sine and the cosine. The resolution is not limited by bins or frequencies, and a
+# wave of a few periods is separated from the trend.
 
 MOST_NUMBERS = 1 << 14  # Samples times wavelengths that are computed at once.
 AROUND = np.linspace(-0.5, 0.5, 101)  # Periods per stroke on each side of a peak that are refined.
@@ -156,7 +173,7 @@ AROUND = np.linspace(-0.5, 0.5, 101)  # Periods per stroke on each side of a pea
 
 @dataclass(frozen=True)
 class Waves:
-    """Normal equations of a sine and a cosine at each of m wavelengths, for p passes in order of file and direction."""
+    """Normal equations of sine and cosine at m wavelengths, for p passes in order of file and direction."""
 
     unit: np.ndarray  # (p,) number of the file
     direction: np.ndarray  # (p,)
@@ -173,7 +190,9 @@ class Waves:
     @property
     def share(self) -> np.ndarray:
         """Share of the sum of squares that the wave explains, shape (p, m)."""
-        return np.einsum("pmi,pmi->pm", self.amplitudes, self.product) / np.maximum(self.total, 1e-300)[:, None]
+        return (
+            np.einsum("pmi,pmi->pm", self.amplitudes, self.product) / np.maximum(self.total, 1e-300)[:, None]
+        )
 
 
 def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
@@ -192,7 +211,10 @@ def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
 
 
 def _waves(strokes: Strokes, lengths: np.ndarray) -> Waves:
-    square, product = np.zeros((strokes.size.size, lengths.size, 2, 2)), np.zeros((strokes.size.size, lengths.size, 2))
+    square, product = (
+        np.zeros((strokes.size.size, lengths.size, 2, 2)),
+        np.zeros((strokes.size.size, lengths.size, 2)),
+    )
     total, middle = np.zeros((2, strokes.size.size))
     for size in np.unique(strokes.size).tolist():  # strokes of one size together, in parts that fit the cache
         same_size = np.flatnonzero(strokes.size == size)
@@ -206,9 +228,12 @@ def _waves(strokes: Strokes, lengths: np.ndarray) -> Waves:
     unit, direction = strokes.unit[order], strokes.direction[order]
     first = np.flatnonzero(np.r_[True, (np.diff(unit) != 0) | (np.diff(direction) != 0)][: order.size])
     square, product, total, middle = (
-        np.add.reduceat(part[order], first, axis=0) if first.size else part for part in (square, product, total, middle)
+        np.add.reduceat(part[order], first, axis=0) if first.size else part
+        for part in (square, product, total, middle)
     )
-    return Waves(unit[first], direction[first], square, product, total, middle / np.diff(np.r_[first, order.size]))
+    return Waves(
+        unit[first], direction[first], square, product, total, middle / np.diff(np.r_[first, order.size])
+    )
 
 
 def _normal_equations(
@@ -258,8 +283,8 @@ def _top(lengths: np.ndarray, power: np.ndarray) -> float:
 def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis: str) -> np.ndarray:
     """Return per file the scalar product of the amplitudes of its two halves, shape (files,).
 
-    Without a wave the phases of the halves are independent, and both signs are equally likely. With too few files for a
-    sign test the products are per pass (a file in one direction).
+    Without a wave the phases of the halves are independent, and both signs are equally likely. With too few
+    files for a sign test the products are per pass (a file in one direction).
 
     Parameters
     ----------
@@ -283,8 +308,8 @@ def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis:
 def pass_shifts(samples: pd.DataFrame, rows: Rows, wavelength: float, axis: str) -> dict[str, float]:
     """Return per pass the shift of its origin from that of the wave, in the unit of the axis.
 
-    Of the possible origins the one nearest to the middle of the pass is taken. A change of the wavelength then does not
-    change the phase there.
+    Of the possible origins the one nearest to the middle of the pass is taken. A change of the wavelength
+    then does not change the phase there.
     """
     strokes = rows.table.iloc[rows.groups.starts["stroke"]]
     names = dict(zip(strokes["stroke_id"], passes(strokes), strict=True))

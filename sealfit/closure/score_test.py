@@ -32,23 +32,25 @@ from sealfit.fit.joint.estimate import Fitted
 from sealfit.fit.joint.rows import LEVELS
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 
-# A candidate is a free shape of one channel acting on one quantity: columns c of the force. After whitening and after
-# projection on the tangent space of the current model, the score of unit u is :math:`s_u = c_u^T r_u`, and
+# A candidate is a free shape of one channel acting on one quantity: columns c of the force. After whitening
+# and after projection on the tangent space of the current model, the score of unit u is
+# :math:`s_u = c_u^T r_u`, and
 #
 # .. math:: T = S^T V^{-1} S, \quad S = \sum_u s_u, \quad V = \sum_u s_u s_u^T .
 #
-# The r_u in V are enlarged for what the fit has removed from each unit (CR2, Bell & McCaffrey 2002), because residuals
-# are smaller than errors and V would be too small with few units. V does not change when the sign of a unit is flipped,
-# so random flips give the null distribution of T.
+# The r_u in V are enlarged for what the fit has removed from each unit (CR2, Bell & McCaffrey 2002), because
+# residuals are smaller than errors and V would be too small with few units. V does not change when the sign
+# of a unit is flipped, so random flips give the null distribution of T.
 #
-# Sign flips are valid for any scatter of the units, but a strong effect is part of V itself: T never exceeds the number
-# of units over the kurtosis of c, and a few runs in extreme places may mask the others. From thirty units on the
-# estimate is therefore also tested against its jackknife over whole units (CV3; MacKinnon, Nielsen & Webb 2023,
-# doi:10.1016/j.jeconom.2022.04.001). A few runs may have nearly all of the leverage and agree by chance, so what the
-# columns explain must be significant too: by chi-squared, or by F against the scatter of runs if they are one number
-# per run. With fewer than thirty specimens, what is constant in them is tested against their own scatter
-# (`small_sample`), and what varies within them against the scatter of their slopes (`slopes`). With fewer than twenty
-# runs, what is constant in runs is tested against their scatter (`small_sample`).
+# Sign flips are valid for any scatter of the units, but a strong effect is part of V itself: T never exceeds
+# the number of units over the kurtosis of c, and a few runs in extreme places may mask the others. From
+# thirty units on the estimate is therefore also tested against its jackknife over whole units (CV3;
+# MacKinnon, Nielsen & Webb 2023, doi:10.1016/j.jeconom.2022.04.001). A few runs may have nearly all of the
+# leverage and agree by chance, so what the columns explain must be significant too: by chi-squared, or by F
+# against the scatter of runs if they are one number per run. With fewer than thirty specimens, what is
+# constant in them is tested against their own scatter (`small_sample`), and what varies within them against
+# the scatter of their slopes (`slopes`). With fewer than twenty runs, what is constant in runs is tested
+# against their scatter (`small_sample`).
 
 # A unit alone determines a direction if the eigenvalue of what is left without the unit is smaller.
 OWN = 1e-6
@@ -97,7 +99,9 @@ class Candidate:
     @property
     def claimable(self) -> bool:
         """Whether it may be claimed: there are enough units, and two to four specimens are consistent."""
-        return self.consistent and (self.test_result.small_sample is None or self.test_result.small_sample.enough_df)
+        return self.consistent and (
+            self.test_result.small_sample is None or self.test_result.small_sample.enough_df
+        )
 
     @property
     def chi2(self) -> float:
@@ -111,7 +115,7 @@ class Candidate:
 
 
 def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
-    """Return columns of the force, whitened and projected off the tangent space of the model, shape (n, k)."""
+    """Return columns of the force, whitened and projected off the model's tangent space, shape (n, k)."""
     white = fitted.whitening(columns)
     return _distinct(fitted.basis.project_out(white), white)
 
@@ -143,9 +147,10 @@ class ScoreTests:
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
         """Return the columns of a channel, shape (n, k), in each variant in which they must be significant.
 
-        The first variant is projected. If the scatter of specimens is not known, the second is also projected off the
-        specimens' own columns. With about as many specimens as conditions their scatter is confounded with the
-        conditions, and a channel that varies between runs, such as the time since the start, would explain it.
+        The first variant is projected. If the scatter of specimens is not known, the second is also projected
+        off the specimens' own columns. With about as many specimens as conditions their scatter is confounded
+        with the conditions, and a channel that varies between runs, such as the time since the start, would
+        explain it.
         """
         left = project(self.fitted, columns)
         if self._specimens is None or FINER[unit] >= FINER["specimen"]:
@@ -206,10 +211,12 @@ class ScoreTests:
         tests = tuple(contrast_test(self.fitted, left, between) for left in variants)
         if any(test is None for test in tests):
             return None
-        return weakest._replace(slopes=tests, small_sample=self._test_of_runs(variants, between, level, target))
+        return weakest._replace(
+            slopes=tests, small_sample=self._test_of_runs(variants, between, level, target)
+        )
 
     def _specimens_agree(self, left: np.ndarray) -> bool:
-        """Return whether two to four specimens are consistent in what columns along strokes explain together."""
+        """Return whether two to four specimens agree in what columns along strokes explain together."""
         fitted = self.fitted
         if not few_specimens(fitted):
             return True
@@ -256,17 +263,20 @@ class ScoreTests:
         return ScoreTestResult(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
 
     def _jackknife(self, left: np.ndarray, level: str) -> float:
-        """Return the log p-value of the coefficients of orthonormal columns by their jackknife over whole units.
+        """Return the log p-value of orthonormal columns' coefficients by their jackknife over whole units.
 
-        All parameters, also those of the model, are re-estimated without each unit u in the tangent space, from the
-        normal equations less those of u: [[1 - B'B, -B'L], [-L'B, 1 - L'L]] with B, L its rows of basis and columns.
+        All parameters, also those of the model, are re-estimated without each unit u in the tangent space,
+        from the normal equations less those of u: [[1 - B'B, -B'L], [-L'B, 1 - L'L]] with B, L its rows of
+        basis and columns.
         """
         fitted, start = self.fitted, self.fitted.rows.groups.starts[level]
         units, k = start.size, left.shape[1]
         parts = np.split(left, start[1:])
         inverse, product = self._without(level)
         own = np.add.reduceat(left * fitted.white_residual[:, None], start)
-        mixed = np.stack([b.T @ c for b, c in zip(np.split(fitted.basis.values, start[1:]), parts, strict=True)])
+        mixed = np.stack(
+            [b.T @ c for b, c in zip(np.split(fitted.basis.values, start[1:]), parts, strict=True)]
+        )
         through = mixed.transpose(0, 2, 1) @ inverse
         square = np.eye(k) - np.stack([c.T @ c for c in parts]) - through @ mixed
         total = left.T @ fitted.white_residual
@@ -277,7 +287,7 @@ class ScoreTests:
         return _log(fdtrc(k, units - k, t * (units - k) / (k * (units - 1))))
 
     def _without(self, level: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return per unit the inverse of 1 - B'B, shape (units, k, k), and B'r, shape (units, k), in its block."""
+        """Return per unit the inverse of 1 - B'B, shape (units, k, k), and B'r, (units, k), in its block."""
         if level not in self._kept:
             fitted = self.fitted
             share, axes = fitted.unit_shares(level)

@@ -1,4 +1,4 @@
-"""Search for channels that explain the residual: free shapes of channels and pairs, acting on every quantity."""
+"""Search for channels that explain the residual: free shapes of channels and pairs, on every quantity."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from sealfit.fit.joint.rows import POWER, Rows
 from sealfit.fit.joint.variance_components import orthonormal
 
 # ---------------------------------------------------------------- search
-# Does any channel explain the residual? A free shape of every channel is tested on every quantity it may act on.
+# Does a channel explain the residual? A free shape of each is tested on every quantity it may act on.
 
 TARGETS = (
     ("mu", "multiply"),
@@ -83,7 +83,8 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
     if channel.name == "direction":
         yield from _shape_candidates(tests, channel, np.ones((rows.force.size, 1)), TARGETS)
         return
-    few_units = channel.numeric and channel.unit == "specimen" and rows.groups.starts["specimen"].size < JACKKNIFE_UNITS
+    specimens = rows.groups.starts["specimen"].size
+    few_units = channel.numeric and channel.unit == "specimen" and specimens < JACKKNIFE_UNITS
     shapes = free_columns(channel, FEW_DF if few_units else FREE_DF)
     widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
     yield from _shape_candidates(tests, channel, shapes, TARGETS, widths)
@@ -103,7 +104,7 @@ def _shape_candidates(
     targets: Sequence[tuple[str, str]],
     widths: Sequence[int] = (),
 ) -> Iterator[Candidate]:
-    """Yield the candidates of a channel's columns on every target, one for each number of columns in `widths`."""
+    """Yield candidates of a channel's columns on every target, one for each number of columns in `widths`."""
     fitted, rows = tests.fitted, tests.fitted.rows
     if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
         return  # with few speeds a dependence on speed may be the Stribeck curve
@@ -114,7 +115,8 @@ def _shape_candidates(
             continue
         slope = fitted.slope(acts_on, operation)
         if np.abs(slope).max() > 0:
-            own = channel.values[:, None] / 2 if channel.name == "direction" and acts_on != "force" else shapes
+            halved = channel.name == "direction" and acts_on != "force"
+            own = channel.values[:, None] / 2 if halved else shapes
             slopes.append(own * slope[:, None])
             places.append((acts_on, operation, own))
     together = max(1, MOST_NUMBERS // shapes.size)
@@ -126,13 +128,15 @@ def _shape_candidates(
         unit = channel.unit
         names = (channel.name,)
         unsigned = both_ways and (acts_on, operation) == ("force", "add") and channel.name != "direction"
-        if unsigned and FINER[channel.unit] > FINER["stroke"]:  # it is seen only as a difference between directions
+        # it is seen only as a difference between directions
+        if unsigned and FINER[channel.unit] > FINER["stroke"]:
             names = ("direction", channel.name)
             unit = min(unit, _direction_unit(rows), key=FINER.get)
         level = flip_level(unit, rows)
         between = level if channel.grouping else scatter_level([channel], rows)
         for width in dict.fromkeys(widths or (own.shape[1],)):
-            test_result = tests([v[:, first : first + width] for v in variants], between, level, (acts_on, operation))
+            parts = [v[:, first : first + width] for v in variants]
+            test_result = tests(parts, between, level, (acts_on, operation))
             if test_result is not None:
                 yield Candidate(names, acts_on, operation, level, own[:, :width], test_result)
 
@@ -143,8 +147,8 @@ def _direction_unit(rows: Rows) -> str:
 
 def _declared(fitted: Fitted, acts_on: str) -> bool:
     """Whether the declared model has the quantity; without a Stribeck curve, mu_c is mu."""
-    needs = {"mu_s": "v_s", "mu_c": "v_s", "v_s": "v_s", "sigma_2": "sigma_2", "a": "a_c", "b": "b_c"}.get(acts_on)
-    return needs is None or bool((fitted.model.declared.index[needs] >= 0).any())
+    needs = {"mu_s": "v_s", "mu_c": "v_s", "v_s": "v_s", "sigma_2": "sigma_2", "a": "a_c", "b": "b_c"}
+    return acts_on not in needs or bool((fitted.model.declared.index[needs[acts_on]] >= 0).any())
 
 
 def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool) -> bool:
@@ -160,8 +164,8 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool) ->
 # ---------------------------------------------------------------- pairs
 # Pairs of channels, for effects that are interactions.
 #
-# They are searched where no single channel explains the residual. The columns of a pair are interaction terms only:
-# the main effects of both channels have been tested before.
+# They are searched where no single channel explains the residual. The columns of a pair are interaction terms
+# only: the main effects of both channels have been tested before.
 
 # The variable whose influence each coefficient describes.
 VARIABLE_OF = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
@@ -172,7 +176,7 @@ NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}
 def search_pairs(
     tests: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
 ) -> list[Candidate]:
-    """Return candidates of two channels, with p-values adjusted over single channels and pairs, strongest first.
+    """Return candidates of pairs, with p-values adjusted over single channels and pairs, strongest first.
 
     Parameters
     ----------
@@ -185,7 +189,8 @@ def search_pairs(
     rng : Generator
         For the sign flips.
     """
-    found = [c for pair in itertools.combinations(_usable(channels), 2) for c in _pair_candidates(tests, *pair)]
+    combined = itertools.combinations(_usable(channels), 2)
+    found = [c for pair in combined for c in _pair_candidates(tests, *pair)]
     if not found:
         return []
     pairs = [c for c in adjust_all(tests, [*found, *singles], rng) if c.pair]
@@ -197,8 +202,8 @@ def equivalent_pairs(
 ) -> list[Candidate]:
     """Return the pairs that are equivalent to a single channel acting on a, b, v_s or sigma_2.
 
-    a describes how mu changes with days, v_s how it changes with speed. The pair explains the same structure, so it is
-    fitted as well as the single channel, whatever its own p-value. The fits decide.
+    a describes how mu changes with days, v_s how it changes with speed. The pair explains the same structure,
+    so it is fitted as well as the single channel, whatever its own p-value. The fits decide.
 
     Parameters
     ----------
@@ -216,9 +221,13 @@ def equivalent_pairs(
             continue
         members = _usable([channels[name] for name in sorted(pair)])
         found = _pair_candidates(tests, *members) if len(members) == 2 else []
-        strongest = [max(own, key=lambda c: c.chi2) for t in MAIN_TARGETS if (own := [c for c in found if _on(c, t)])]
+        strongest = [
+            max(own, key=lambda c: c.chi2) for t in MAIN_TARGETS if (own := [c for c in found if _on(c, t)])
+        ]
         best[pair] = [
-            replace(c, test_result=c.test_result._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value)
+            replace(
+                c, test_result=c.test_result._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value
+            )
             for c in strongest
         ]
     return list(itertools.chain.from_iterable(best.values()))
@@ -232,7 +241,8 @@ def _usable(channels: Sequence[Channel]) -> list[Channel]:
     return [
         c
         for c in channels
-        if not (c.grouping or c.name in NOT_IN_PAIRS) and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
+        if not (c.grouping or c.name in NOT_IN_PAIRS)
+        and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
     ]
 
 
@@ -261,8 +271,9 @@ def _pair_candidates(tests: ScoreTests, one: Channel, other: Channel) -> list[Ca
 def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
     """Return the interaction terms of two channels, blocks of shape (n, k) that are tested one by one.
 
-    The first are products, also of logarithms for channels with a wide range: main effects explain most of a product,
-    and the rest depends on its exact shape. The last is a block of nonlinear terms. Two categories have none.
+    The first are products, also of logarithms for channels with a wide range: main effects explain most of a
+    product, and the rest depends on its exact shape. The last is a block of nonlinear terms. Two categories
+    have none.
     """
     if not (one.numeric or other.numeric):
         return []
@@ -276,12 +287,14 @@ def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
         levels = np.unique(category.values)
         blocks = [(category.values[:, None] == levels[None, 1:]) * u[:, None]]
     sizes = [np.sqrt((columns**2).mean(axis=0)) for columns in blocks]
-    blocks = [columns[:, size > 1e-9] / size[size > 1e-9] for columns, size in zip(blocks, sizes, strict=True)]
+    blocks = [
+        columns[:, size > 1e-9] / size[size > 1e-9] for columns, size in zip(blocks, sizes, strict=True)
+    ]
     return [columns for columns in blocks if columns.shape[1]]
 
 
 def _scales(channel: Channel) -> list[np.ndarray]:
-    """Return a channel, centred, and its logarithm if the range is wide (values from 0 on are shifted first)."""
+    """Return a channel, centred, and its logarithm if the range is wide (values from 0 are shifted first)."""
     x = channel.values
     scales = [x]
     if x.min() >= 0 and x.max() > LOGARITHMIC_SPAN * x[x > 0].min(initial=np.inf):
@@ -300,16 +313,16 @@ def _centred(values: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------- masked pairs
 # Two effects that mask each other: each is part of the other's error, and neither is significant alone.
 #
-# They are searched in few units, where nothing else is significant. Only simple pairs are tested: two straight lines
-# (an offset, for the direction) that share a channel or of which one is of the direction, and a line along strokes with
-# its change along a coarser channel. Both columns must change each unit along one direction, so that a unit is one
-# number; then
+# They are searched in few units, where nothing else is significant. Only simple pairs are tested: two
+# straight lines (an offset, for the direction) that share a channel or of which one is of the direction, and
+# a line along strokes with its change along a coarser channel. Both columns must change each unit along one
+# direction, so that a unit is one number; then
 #
 # .. math:: F = \frac{(RSS_0 - RSS_{12}) / 2}{RSS_{12} / (d - 2)}
 #
-# tests both against the residual scatter of the units. The test is exact if that scatter is normal with one variance.
-# P-values are adjusted for the number of pairs (Bonferroni). In a significant pair each of the two is significant given
-# the other.
+# tests both against the residual scatter of the units. The test is exact if that scatter is normal with one
+# variance. P-values are adjusted for the number of pairs (Bonferroni). In a significant pair each of the two
+# is significant given the other.
 
 OF_DIRECTION = (("force", "add"), ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
 LEAST_SINGULAR = 1e-3  # Two unit columns with a smaller singular value are collinear.
@@ -378,7 +391,10 @@ def _is_simple_pair(line: Candidate, other: Candidate, channels: Mapping[str, Ch
         return name == other.channels[-1] or ("direction",) in (line.channels, other.channels)
     inside = [channels[n].unit == "sample" for n in other.channels]
     return (
-        name in other.channels and channels[name].unit == "sample" and not all(inside) and line.acts_on == other.acts_on
+        name in other.channels
+        and channels[name].unit == "sample"
+        and not all(inside)
+        and line.acts_on == other.acts_on
     )
 
 
@@ -386,7 +402,9 @@ def _targets(candidate: Candidate) -> Sequence[tuple[str, str]]:
     return OF_DIRECTION if candidate.channels == ("direction",) else MAIN_TARGETS
 
 
-def _joint_test(tests: ScoreTests, two: tuple[Candidate, Candidate], level: str) -> tuple[float, float, float] | None:
+def _joint_test(
+    tests: ScoreTests, two: tuple[Candidate, Candidate], level: str
+) -> tuple[float, float, float] | None:
     """Return log p of two candidates jointly, the larger log p of one given the other, and their chi-squared.
 
     Of several variants the weakest result counts. None if they are no pair.
@@ -399,7 +417,8 @@ def _joint_test(tests: ScoreTests, two: tuple[Candidate, Candidate], level: str)
     found = []
     for left in tests.variants(columns, unit):
         own = fitted.rows.groups.sums(numbers.direction[:, None] * left, level)
-        if ((own**2).sum(axis=0) <= CONSTANT_IN_RUNS * (left**2).sum(axis=0)).any() or not left.any(axis=0).all():
+        varies = (own**2).sum(axis=0) <= CONSTANT_IN_RUNS * (left**2).sum(axis=0)
+        if varies.any() or not left.any(axis=0).all():
             return None
         made = numbers.root @ own
         made = made / np.sqrt((made**2).sum(axis=0))
@@ -407,20 +426,23 @@ def _joint_test(tests: ScoreTests, two: tuple[Candidate, Candidate], level: str)
         if basis.shape[1] < 2 or numbers.df - 2 < LEAST_ERROR_DF_OF_RUNS:
             return None
         joint = log_p_of(numbers.values[None, :], basis, 0.0, numbers.df)[0]
-        given = max(_conditional_log_p(numbers.values, *made.T[order], numbers.df) for order in ([0, 1], [1, 0]))
-        found.append((joint, given, -float(((orthonormal(left, LEAST_SINGULAR).T @ fitted.white_residual) ** 2).sum())))
+        given = max(
+            _conditional_log_p(numbers.values, *made.T[order], numbers.df) for order in ([0, 1], [1, 0])
+        )
+        explained = orthonormal(left, LEAST_SINGULAR).T @ fitted.white_residual
+        found.append((joint, given, -float((explained**2).sum())))
     joint, given, chi2 = np.max(found, axis=0).tolist()
     return joint, given, -chi2
 
 
 def _conditional_log_p(values: np.ndarray, one: np.ndarray, other: np.ndarray, df: int) -> float:
-    """Return log p of one column of independent numbers given another, all of shape (d,), the columns of length 1."""
+    """Return log p of a unit column of independent numbers given another unit column, all of shape (d,)."""
     rest = one - (one @ other) * other
     left = values - (values @ other) * other
     return float(log_p_of(left[None, :], rest[:, None] / np.linalg.norm(rest), 0.0, df - 1)[0])
 
 
 def _larger_column(white: np.ndarray, groups, level: str) -> np.ndarray:
-    """Return the larger of two columns in each unit, shape (n,): the direction along which both may change it."""
+    """Return the larger of two columns in each unit, (n,): the direction along which both may change it."""
     size = groups.sums(white**2, level)
     return white[np.arange(len(white)), size.argmax(axis=1)[groups.codes[level]]]

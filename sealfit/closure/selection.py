@@ -1,4 +1,4 @@
-"""The rounds of the loop: search, name, confirm, add, refit and remove effects until nothing significant is left."""
+"""Rounds of the loop: search, name, confirm, add, refit and remove effects until nothing is significant."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Start(NamedTuple):
 
 @dataclass(frozen=True)
 class Selection:
-    """The result of the loop on some rows: both fits, the added effects, and the candidates of the searches."""
+    """Result of the loop on some rows: both fits, the added effects, and the candidates of the searches."""
 
     before: Fitted
     after: Fitted
@@ -168,19 +168,27 @@ class _Loop:
     def search_model(self, number: int) -> _SearchResult:
         """Return the result of all searches on the current model."""
         found = _search_all(self.tests, self.last, self.channels, self.context.effects, self.alpha, self.rng)
-        tried = f"{len(self.last)} candidates on {len(self.channels)} channels, {len(found.pairs)} on pairs of them"
+        tried = (
+            f"{len(self.last)} candidates on {len(self.channels)} channels, "
+            f"{len(found.pairs)} on pairs of them"
+        )
         self.context.say(
-            f"round {number}: {tried}; {len(found.significant)} significant, {len(found.masked)} mask each other"
+            f"round {number}: {tried}; {len(found.significant)} significant, "
+            f"{len(found.masked)} mask each other"
         )
         return found
 
     def add_pair_of_direction(self, number: int) -> bool:
         """Add two effects of the direction that mask each other; return whether that was done."""
-        two = next((pair for pair in self.found.masked if {key[0] for key in pair.keys} == {("direction",)}), None)
+        two = next(
+            (pair for pair in self.found.masked if {key[0] for key in pair.keys} == {("direction",)}), None
+        )
         if self.masked or two is None:
             return False
         pending = _pending_candidates([two], self.found.claimable)
-        both = _confirmed_pair(self.fitted, pending, self.channels, self.context.effects, self.confirm, number)
+        both = _confirmed_pair(
+            self.fitted, pending, self.channels, self.context.effects, self.confirm, number
+        )
         if both:
             later, earlier = both
             own = earlier.proposal.fitted
@@ -191,11 +199,13 @@ class _Loop:
         return bool(both)
 
     def open_candidates(self) -> list[Candidate]:
-        """Return the significant candidates that are not refused; if there are none, those of masked pairs."""
+        """Return the significant candidates not refused; if there are none, those of masked pairs."""
         found = self.found
         if not (self.masked or found.significant):
             self.masked = [pair for pair in found.masked if self.refused.isdisjoint(pair.keys)]
-        significant = _pending_candidates(self.masked, (*found.claimable, *found.pairs)) or list(found.significant)
+        significant = _pending_candidates(self.masked, (*found.claimable, *found.pairs)) or list(
+            found.significant
+        )
         significant += [c for c, _ in found.laws if c.p_value <= self.alpha and c.claimable]
         self.left = significant[0] if significant else self.ripple
         significant += equivalent_pairs(self.tests, significant, self.channels)
@@ -219,7 +229,9 @@ class _Loop:
         source = accepted.proposal.source
         self.masked = [pair.without(source) for pair in self.masked if source in pair.keys]
         pending = any(pair.keys for pair in self.masked)
-        earlier, accepted = self.renaming.merged_with_earlier(self.fitted, self.added, accepted, pending=pending)
+        earlier, accepted = self.renaming.merged_with_earlier(
+            self.fitted, self.added, accepted, pending=pending
+        )
         added = [*earlier, accepted]
         own = accepted.proposal.fitted  # under its own scatter: the former one contains the missing effect
         self.fitted, self.added = _remove_redundant(fit(own.model, self.rows, own.scatter, turns=2), added)
@@ -240,10 +252,14 @@ class _Loop:
         tested = (*self.last, *(c for c, _ in laws))
         unclaimable = [c for c in tested if c.p_value <= self.alpha and not c.claimable]
         if left is None and unclaimable:
-            proposals = propose(self.fitted, unclaimable, self.channels, self.context.effects, [p for _, p in laws])
+            proposals = propose(
+                self.fitted, unclaimable, self.channels, self.context.effects, [p for _, p in laws]
+            )
             others = tuple(rivals(proposals[0], proposals))
             left = unclaimable[0]
-            inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1)
+            inconclusive = AcceptedEffect(
+                proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1
+            )
         return replace(found, left=left, inconclusive=inconclusive, refused=tuple(self.unconfirmed))
 
 
@@ -296,7 +312,8 @@ def _confirmed_pair(
 def _inconsistent_channels(candidates: Sequence[Candidate], alpha: float) -> set[str]:
     """Return the significant channels whose slopes are not consistent between two to four specimens.
 
-    Their strongest candidate on mu or the force decides: on a wrong quantity the same effect differs by specimen.
+    Their strongest candidate on mu or the force decides: on a wrong quantity the same effect differs by
+    specimen.
     """
     strongest: dict[str, Candidate] = {}
     for c in candidates:  # strongest evidence first
@@ -311,7 +328,7 @@ def _claimable(candidates: Sequence[Candidate], inconsistent: set[str]) -> list[
 
 
 def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return the linear candidates of masked pairs that are not in the model yet, with the p-value of the pair."""
+    """Return the linear candidates of masked pairs that are not in the model yet, with the pair's p-value."""
     pairs = {key: pair for pair in reversed(masked) for key in pair.keys}
     found = []
     for c in candidates:
@@ -326,9 +343,9 @@ def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candi
 def _related_candidates(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
     """Return further candidates that may explain the same structure as the significant ones.
 
-    The same channel on other quantities is one: the fits decide on which it acts. Conditions that explain half of what
-    the calendar does on the same quantity are others: they are tested one after the other, so the calendar is
-    correlated with them, and a dozen specimens may give too little evidence.
+    The same channel on other quantities is one: the fits decide on which it acts. Conditions that explain
+    half of what the calendar does on the same quantity are others: they are tested one after the other, so
+    the calendar is correlated with them, and a dozen specimens may give too little evidence.
     """
     found = []
     keys = {c.key for c in significant}
@@ -337,7 +354,9 @@ def _related_candidates(significant: list[Candidate], candidates: list[Candidate
             same_target = (c.acts_on, c.operation) == (strong.acts_on, strong.operation)
             condition = strong.channels[0] in CALENDAR and c.unit == "specimen" and same_target
             same_channel = (
-                c.channels[-1:] == strong.channels[-1:] and not strong.pair and c.columns.shape == strong.columns.shape
+                c.channels[-1:] == strong.channels[-1:]
+                and not strong.pair
+                and c.columns.shape == strong.columns.shape
             )
             if (condition or same_channel) and c.key not in keys and c.chi2 >= HALF_OF_CALENDAR * strong.chi2:
                 found.append(replace(c, p_value=strong.p_value))
@@ -346,9 +365,10 @@ def _related_candidates(significant: list[Candidate], candidates: list[Candidate
 
 
 def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-    """Return the fit without effects that a later one has made redundant by the BIC; the weakest is removed first.
+    """Return the fit without effects that a later one has made redundant by the BIC.
 
-    After a removal all are tested again. Ripples are kept: they were tested on the raw samples.
+    The weakest is removed first, and after a removal all are tested again. Ripples are kept: they were tested
+    on the raw samples.
     """
     kept: set[int] = set()
     while True:
@@ -361,7 +381,9 @@ def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitt
         k = min((k for k in size if size[k] <= 0 and k not in kept), key=size.__getitem__, default=None)
         if k is None:
             return fitted, added
-        without = fit(fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
+        without = fit(
+            fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction
+        )
         if without.deviance - fitted.deviance < added[k].proposal.bic_penalty:
             fitted = fit(without.model, fitted.rows, fitted.scatter, turns=1)
             added, kept = [*added[:k], *added[k + 1 :]], set()
@@ -411,7 +433,9 @@ def steady_samples(traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows) ->
         place = np.repeat(own, np.diff(edges))
         known = place >= 0
         parts.append((place[known].astype(np.int32), *(steady[name].to_numpy()[known] for name in SAMPLED)))
-    place, *values = map(np.concatenate, zip(*parts, strict=True)) if parts else [np.zeros(0, int)] * (1 + len(SAMPLED))
+    place, *values = (
+        map(np.concatenate, zip(*parts, strict=True)) if parts else [np.zeros(0, int)] * (1 + len(SAMPLED))
+    )
     about = {name: own.astype(np.int32)[place] for name, own in about.items()}
     return pd.DataFrame({**about, **dict(zip(SAMPLED, values, strict=True))})
 

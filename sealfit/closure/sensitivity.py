@@ -1,9 +1,10 @@
 """Sensitivity of a campaign: the smallest effect of each variable that it would have found.
 
-The effect is a factor on mu, linear in the variable at one of the levels at which it varies, or an offset force for the
-direction. It is added to the residual, and the scatter is re-estimated, because part of the effect is taken for
-scatter. The smallest effect exceeds the critical value of the whole search with a power of 80 % (noncentral F). It must
-also have the least size that is reported and, with weak evidence, lower the held-out error. Naming is not considered.
+The effect is a factor on mu, linear in the variable at one of the levels at which it varies, or an offset
+force for the direction. It is added to the residual, and the scatter is re-estimated, because part of the
+effect is taken for scatter. The smallest effect exceeds the critical value of the whole search with a power
+of 80 % (noncentral F). It must also have the least size that is reported and, with weak evidence, lower the
+held-out error. Naming is not considered.
 """
 
 from __future__ import annotations
@@ -72,9 +73,10 @@ LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "
 
 
 def sensitivity(selection: Selection, alpha: float) -> list[dict]:
-    """Return an entry per variable and level: variable, level, acts_on, smallest_N, smallest_pct, files_needed.
+    """Return an entry per variable and level.
 
-    A variable that varies at several levels has an entry for each, for an effect at that level only.
+    Its keys are variable, level, acts_on, smallest_N, smallest_pct and files_needed. A variable that varies
+    at several levels has an entry for each, for an effect at that level only.
 
     Parameters
     ----------
@@ -86,9 +88,10 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     Returns
     -------
     list of dict
-        `smallest_N` is the RMS over all rows of the smallest effect that is found with a power of 80 %, `smallest_pct`
-        the same in percent of the RMS force; None if the variable cannot be tested in this campaign. `files_needed` is
-        the number of files, made like these, that would show an effect of 1 % of the force.
+        `smallest_N` is the RMS over all rows of the smallest effect that is found with a power of 80 %,
+        `smallest_pct` the same in percent of the RMS force; None if the variable cannot be tested in this
+        campaign. `files_needed` is the number of files, made like these, that would show an effect of 1 % of
+        the force.
     """
     fitted = selection.after
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))
@@ -97,7 +100,11 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     entries = []
     for name, channel in selection.channels.items():
         target = ("force", "add") if name == "direction" or channel.grouping else FRICTION
-        own = [c for c in selection.last if (c.channels[-1], c.acts_on, c.operation) == (name, *target) and not c.pair]
+        own = [
+            c
+            for c in selection.last
+            if (c.channels[-1], c.acts_on, c.operation) == (name, *target) and not c.pair
+        ]
         own = sorted(own, key=lambda c: c.columns.shape[1])[:1]  # a straight line
         for level, part in _parts(selection, channel, own):
             smallest = None
@@ -111,7 +118,11 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 units = rows.groups.starts[scatter_level([channel], rows)].size
                 if channel.unit == "sample" and specimens > 1:
                     units = min(units, specimens)
-                needed = int(np.ceil(files * LEAST_UNITS_OF_SLOPES / units)) if units < LEAST_UNITS_OF_SLOPES else None
+                needed = (
+                    int(np.ceil(files * LEAST_UNITS_OF_SLOPES / units))
+                    if units < LEAST_UNITS_OF_SLOPES
+                    else None
+                )
             else:
                 needed = int(np.ceil(files * (100 * smallest / force / WANTED_PCT) ** 2))
             entries.append(
@@ -134,17 +145,21 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
 def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
     """Return the factor on an effect at a level, shape (n,), with which it lowers the error by `LEAST_FALL`.
 
-    Only the part that the declared model does not explain lowers the error. Effect and error are taken about the means
-    of the groups within which the effect varies.
+    Only the part that the declared model does not explain lowers the error. Effect and error are taken about
+    the means of the groups within which the effect varies.
     """
     rows = fitted.rows
     around = dict(zip(LEVEL_NAMES, (*LEVELS, None), strict=True))[level]
     own = project(fitted, effect[:, None])[:, 0] / fitted.whitening.unit
-    size, left = (float(np.sqrt(rows.weight @ about_means(x, rows, around) ** 2)) for x in (own, fitted.residual))
+    size, left = (
+        float(np.sqrt(rows.weight @ about_means(x, rows, around) ** 2)) for x in (own, fitted.residual)
+    )
     return SIZE_MARGIN * left * float(np.sqrt(1 / (1 - LEAST_FALL) ** 2 - 1)) / size if size > 0 else np.inf
 
 
-def _parts(selection: Selection, channel: Channel, own: Sequence[Candidate]) -> Iterator[tuple[str, np.ndarray | None]]:
+def _parts(
+    selection: Selection, channel: Channel, own: Sequence[Candidate]
+) -> Iterator[tuple[str, np.ndarray | None]]:
     """Yield each level at which a channel varies, and the part of its first column at that level."""
     groups, weight = selection.after.rows.groups, selection.after.rows.weight
     if not own or not channel.numeric or channel.name == "direction":
@@ -170,9 +185,9 @@ def _parts(selection: Selection, channel: Channel, own: Sequence[Candidate]) -> 
 class _Search:
     """The tests of the last search, applied to an effect that is added to the residual.
 
-    The effect raises the estimated scatter, and its differences between units raise the variance that it is tested
-    against. Variances are treated as in the search: those of contrasts in few units are moderated, and those of the
-    scores of many units are 1 or more.
+    The effect raises the estimated scatter, and its differences between units raise the variance that it is
+    tested against. Variances are treated as in the search: those of contrasts in few units are moderated, and
+    those of the scores of many units are 1 or more.
     """
 
     def __init__(self, selection: Selection, alpha: float) -> None:
@@ -186,7 +201,9 @@ class _Search:
         tests = [test for own in slopes for test in own]
         self.moderated = {id(t): m for t, m in zip(tests, moderated(tests), strict=True)}
         lines = [c for c in selection.last if c.test_result.slopes and c.key[1:] == FRICTION and not c.pair]
-        self.lines = np.column_stack([c.columns[:, 0] for c in lines] or [np.ones(selection.after.force.size)])
+        self.lines = np.column_stack(
+            [c.columns[:, 0] for c in lines] or [np.ones(selection.after.force.size)]
+        )
         self.lines = self.lines * selection.after.slope(*FRICTION)[:, None]
         self.many = len(many)
         self.critical_many = critical_many(many, self.level / 2, np.random.default_rng(0)) if many else 0.0
@@ -213,11 +230,13 @@ class _Search:
         """
         if candidate.test_result.units < JACKKNIFE_UNITS:
             return np.inf
-        found, strong = (-ndtri(p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK_P))
+        found, strong = (
+            -ndtri(p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK_P)
+        )
         return times * float((strong + ndtri(TARGET_POWER)) / (found + ndtri(TARGET_POWER)))
 
     def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
-        """Return the factor on an effect, shape (n,), that gives it `TARGET_POWER`; infinite if there is none."""
+        """Return the factor on an effect, shape (n,), that gives it `TARGET_POWER`; infinite if none does."""
         size, margin, before = TINY, self.margin(candidate, TINY * effect, self.fitted), None
         for _ in range(STEPS):
             if not 0 < margin < np.inf:
@@ -247,11 +266,15 @@ class _Search:
         large = min(float(least_share(effect, left).max()) for left in variants) / LARGE_SHARE
         return min(large, self._by_units(candidate, noise, effect, variants))
 
-    def _by_units(self, candidate: Candidate, noise: Fitted, effect: Fitted, variants: Sequence[np.ndarray]) -> float:
+    def _by_units(
+        self, candidate: Candidate, noise: Fitted, effect: Fitted, variants: Sequence[np.ndarray]
+    ) -> float:
         """Return the margin by the tests against the units' scatter."""
         channel, test_result = self.channels[candidate.channels[-1]], candidate.test_result
         known = test_result.small_sample
-        by_test = 0.0 if known is None else min(self._by_one_test(noise, effect, left, known) for left in variants)
+        by_test = (
+            0.0 if known is None else min(self._by_one_test(noise, effect, left, known) for left in variants)
+        )
         if test_result.slopes:
             tail = self.level / self.contrasts / (1 if known is None else N_VARIANCES)
             pairs = zip(variants, test_result.slopes, strict=True)
@@ -261,7 +284,9 @@ class _Search:
         level = candidate.unit if channel.grouping else scatter_level([channel], noise.rows)
         return min(self._by_many(noise, effect, left, level, candidate) for left in variants)
 
-    def _by_slopes(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: ContrastTest, tail: float) -> float:
+    def _by_slopes(
+        self, noise: Fitted, effect: Fitted, left: np.ndarray, known: ContrastTest, tail: float
+    ) -> float:
         test, added = (contrast_test(one, left, known.level) for one in (noise, effect))
         if test is None or test.slope.size != known.slope.size:
             return 0.0
@@ -271,7 +296,9 @@ class _Search:
         others = contrast_test(effect, project(effect, self.lines), known.level)
         for along in (False, True) if others is not None else ():
             others_variance = others.variance[others.along == along]  # the effect enlarges it
-            prior[known.along == along] *= np.exp(np.mean(np.log1p(others_variance))) if others_variance.size else 1.0
+            prior[known.along == along] *= (
+                np.exp(np.mean(np.log1p(others_variance))) if others_variance.size else 1.0
+            )
         own = variance * test.variance / known.variance
         share = test.df / (prior_df + test.df)
         both = (1 - share) * prior + share * own
@@ -290,7 +317,9 @@ class _Search:
         units = (ClusterTests(one, known.level) for one in (noise, effect))
         return _by_numbers(*units, left, known.target, np.exp(self.critical_small_sample[known.level]))
 
-    def _by_many(self, noise: Fitted, effect: Fitted, left: np.ndarray, level: str, candidate: Candidate) -> float:
+    def _by_many(
+        self, noise: Fitted, effect: Fitted, left: np.ndarray, level: str, candidate: Candidate
+    ) -> float:
         basis = orthonormal(left)
         seen = basis @ (basis.T @ effect.white_residual)
         length = float(np.linalg.norm(seen))
@@ -299,7 +328,9 @@ class _Search:
         scores = candidate.test_result.scores
         units, k = scores.shape
         sums = noise.rows.groups.sums
-        own, added = (float((sums(seen / length * f.unit_residual(level), level) ** 2).sum()) for f in (noise, effect))
+        own, added = (
+            float((sums(seen / length * f.unit_residual(level), level) ** 2).sum()) for f in (noise, effect)
+        )
         own *= max(1.0, k / float((scores**2).sum()))  # not smaller than the noise is on average
         beyond = ndtri(TARGET_POWER) * np.sqrt(own)
         share = 1 - betaincinv((units - k) / 2, k / 2, np.exp(self.critical_many))
@@ -342,7 +373,9 @@ def _margin(length: np.ndarray, quiet: np.ndarray, differs: np.ndarray, k: int, 
     It is tested against a variance: `quiet` without the effect, plus `differs`, which the effect adds itself.
     """
     critical = fdtri(k, df, 1 - tail)
-    return np.abs(length) / np.sqrt(quiet * ncfdtrinc(k, df, 1 - TARGET_POWER, critical) + k * critical * differs)
+    return np.abs(length) / np.sqrt(
+        quiet * ncfdtrinc(k, df, 1 - TARGET_POWER, critical) + k * critical * differs
+    )
 
 
 def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
@@ -353,12 +386,14 @@ def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
     return replace(fitted, scatter=scatter, whitening=whitening, white_jacobian=whitening.of(fitted.jacobian))
 
 
-def undetectable_variables(selection: Selection, entries: Sequence[dict], scatter: Sequence[dict]) -> list[str]:
+def undetectable_variables(
+    selection: Selection, entries: Sequence[dict], scatter: Sequence[dict]
+) -> list[str]:
     """Return the variables whose effects are not detectable in this campaign.
 
-    An effect is not detectable if it cannot reach the required p-value, and the variable varies along strokes, is the
-    direction, or varies between fewer than five specimens; or if the units between which it varies scatter strongly,
-    and an effect that explains all of that scatter would not have been found.
+    An effect is not detectable if it cannot reach the required p-value, and the variable varies along
+    strokes, is the direction, or varies between fewer than five specimens; or if the units between which it
+    varies scatter strongly, and an effect that explains all of that scatter would not have been found.
 
     Parameters
     ----------
@@ -379,7 +414,11 @@ def undetectable_variables(selection: Selection, entries: Sequence[dict], scatte
         if channel.grouping or channel.name in ASIDE or entry["level"] != LEVEL_NAMES[channel.unit]:
             continue
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
-        own = [s for s in scatter if channel.unit != "sample" and starts[s["level"]].size == starts[channel.unit].size]
+        own = [
+            s
+            for s in scatter
+            if channel.unit != "sample" and starts[s["level"]].size == starts[channel.unit].size
+        ]
         much = any(s["sd_rel"] > MATERIAL_SCATTER and s["sd_N"] < smallest for s in own)
         few_specimens = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS_OF_SLOPES
         decisive = channel.unit == "sample" or channel.name == "direction" or few_specimens

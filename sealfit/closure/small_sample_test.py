@@ -1,4 +1,4 @@
-"""Tests in few units: a slope in each, or one number per specimen or run, against the scatter between units."""
+"""Tests in few units: a slope in each, or a number per specimen or run, against the scatter between units."""
 
 from __future__ import annotations
 
@@ -35,25 +35,26 @@ from sealfit.fit.joint.whitening import Whitening
 # ---------------------------------------------------------------- contrasts
 # Contrasts in few units: the mean slope is tested against the scatter of the units' own slopes.
 #
-# A contrast is one column L of the force, whitened, projected off the tangent space of the model, and of length 1.
-# Unit u (a specimen, or a run or file where there are few specimens) gives the score :math:`s_u = L_u^T r_u`, and
-# :math:`\hat\beta = \sum_u s_u`. Units may have slopes of their own, so that their scores scatter more than by
-# noise. The variance of :math:`\hat\beta` is therefore estimated from the units,
+# A contrast is one column L of the force, whitened, projected off the tangent space of the model, and of
+# length 1. Unit u (a specimen, or a run or file where there are few specimens) gives the score
+# :math:`s_u = L_u^T r_u`, and :math:`\hat\beta = \sum_u s_u`. Units may have slopes of their own, so that
+# their scores scatter more than by noise. The variance of :math:`\hat\beta` is therefore estimated from the
+# units,
 #
 # .. math:: V = \sum_u \frac{(s_u - h_u \hat\beta)^2}{1 - h_u}, \quad h_u = L_u^T L_u ,
 #
-# (CR2; Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181) with Satterthwaite's degrees of freedom. With a dozen
-# units V is uncertain. All contrasts of one kind give a prior for it: moderated t (Smyth 2004,
-# doi:10.2202/1544-6115.1027). Contrasts are correlated, so the degrees of freedom of the prior are limited by the
-# number of independent directions of their scores. An effect is part of the scatter of all other contrasts, so V alone
-# is used as well: the p-value is twice the smaller of the two. P-values are adjusted for the number of contrasts
-# (Bonferroni).
+# (CR2; Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181) with Satterthwaite's degrees of freedom.
+# With a dozen units V is uncertain. All contrasts of one kind give a prior for it: moderated t (Smyth 2004,
+# doi:10.2202/1544-6115.1027). Contrasts are correlated, so the degrees of freedom of the prior are limited by
+# the number of independent directions of their scores. An effect is part of the scatter of all other
+# contrasts, so V alone is used as well: the p-value is twice the smaller of the two. P-values are adjusted
+# for the number of contrasts (Bonferroni).
 
 MOST_DF = 1e4
 """Largest degrees of freedom of a prior. With more, the variance counts as known."""
 
 N_VARIANCES = 2
-"""Number of variances that a contrast is tested against: moderated, and its own. Each has half of the error rate."""
+"""Number of variances a contrast is tested against: moderated, and its own. Each has half the error rate."""
 
 
 class ContrastTest(NamedTuple):
@@ -103,11 +104,12 @@ def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest 
     if not known.any():
         return None
     parts = (slope, (deviations**2).sum(axis=0), df, along_strokes(fitted, left))
-    return ContrastTest(level, *(p[known] for p in parts), deviations[:, known], specimens_agree(fitted, left)[known])
+    agree = specimens_agree(fitted, left)[known]
+    return ContrastTest(level, *(p[known] for p in parts), deviations[:, known], agree)
 
 
 def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
-    """Return the degrees of freedom of CR2 variances of contrasts, shape (m,), from leverages, shape (units, m).
+    """Return the degrees of freedom of CR2 variances of contrasts, shape (m,), from leverages, (units, m).
 
     The leverages of a contrast add up to 1.
     """
@@ -116,11 +118,11 @@ def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
 
 
 def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return whether up to four specimens have the same slope along each whitened column, shape (n, m) -> (m,).
+    """Return whether up to four specimens have equal slopes along each whitened column, shape (n, m) -> (m,).
 
-    From `LEAST_UNITS_OF_SLOPES` specimens on they are the units of the test. Along strokes each specimen has a slope of
-    its own. There must be enough specimens there, and slopes that differ by more than noise must meet a stricter
-    level; or all slopes must be larger than the scatter of specimens can be.
+    From `LEAST_UNITS_OF_SLOPES` specimens on they are the units of the test. Along strokes each specimen has
+    a slope of its own. There must be enough specimens there, and slopes that differ by more than noise must
+    meet a stricter level; or all slopes must be larger than the scatter of specimens can be.
     """
     found = enough_specimens(fitted, left)
     if not few_specimens(fitted):
@@ -134,8 +136,10 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
             continue
         t = slopes.mean() / max(np.std(slopes) / np.sqrt(slopes.size - 1), 1e-300)
         log_p = log_p_of_t(t, np.array(slopes.size - 1.0))
-        equal_slopes = chdtrc(slopes.size - 1, own @ (slopes - np.average(slopes, weights=own)) ** 2) > DIFFERENT_P
-        found[k] = log_p < np.log(CONSISTENT_P if equal_slopes or not inside[k] else CONSISTENT_P_IF_DIFFERENT)
+        chi2 = own @ (slopes - np.average(slopes, weights=own)) ** 2
+        equal_slopes = chdtrc(slopes.size - 1, chi2) > DIFFERENT_P
+        most = CONSISTENT_P if equal_slopes or not inside[k] else CONSISTENT_P_IF_DIFFERENT
+        found[k] = log_p < np.log(most)
     return found | (inside & (least_share(fitted, left) > LARGE_SHARE))
 
 
@@ -162,7 +166,7 @@ def least_share(fitted: Fitted, left: np.ndarray) -> np.ndarray:
 
 
 def enough_specimens(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return whether up to four specimens are enough to be consistent on each whitened column, shape (n, m) -> (m,).
+    """Return whether up to four specimens are enough to agree on each whitened column, shape (n, m) -> (m,).
 
     Their effective number follows from their leverages. They are always enough for columns not along strokes.
     """
@@ -186,7 +190,7 @@ def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:
 
 
 def slope_log_p(tests: Sequence[ContrastTest]) -> list[np.ndarray]:
-    """Return the log p-values of the contrasts of several candidates, two-sided, not adjusted for their number."""
+    """Return two-sided log p-values of several candidates' contrasts, not adjusted for their number."""
     found = []
     for test, (variance, df) in zip(tests, moderated(tests), strict=True):
         logs = [log_p_of_t(test.slope / np.sqrt(v), d) for v, d in ((variance, df), (test.variance, test.df))]
@@ -195,7 +199,7 @@ def slope_log_p(tests: Sequence[ContrastTest]) -> list[np.ndarray]:
 
 
 def moderated(tests: Sequence[ContrastTest]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return per test the variances of its contrasts, moderated by all of one kind, and their degrees of freedom."""
+    """Return the variances of each test's contrasts, moderated by all of one kind, and degrees of freedom."""
     priors = {kind: _prior(tests, *kind) for kind in {(t.level, bool(a)) for t in tests for a in t.along}}
     found = []
     for test in tests:
@@ -213,9 +217,10 @@ def log_p_of_t(t: np.ndarray, df: np.ndarray) -> np.ndarray:
 
 
 def _prior(tests: Sequence[ContrastTest], level: str, along: bool) -> Prior:
-    """Return the prior of the variances of one kind of contrast, by moments of their logarithms (Smyth 2004, 6.2)."""
+    """Return the prior for contrasts of one kind, by moments of their log variances (Smyth 2004, 6.2)."""
     chosen = [(t, t.along == along) for t in tests if t.level == level]
-    variance, df = (np.concatenate([getattr(t, name)[own] for t, own in chosen]) for name in ("variance", "df"))
+    variance = np.concatenate([t.variance[own] for t, own in chosen])
+    df = np.concatenate([t.df[own] for t, own in chosen])
     deviations = np.concatenate([t.deviations[:, own] for t, own in chosen], axis=1)
     mean, spread = _log_moments(variance, df)
     known = _degrees_of_freedom(spread)
@@ -238,7 +243,8 @@ def _degrees_of_freedom(spread: float) -> float:
         return MOST_DF
     if spread >= polygamma(1, 1e-3):
         return 0.0
-    return float(2 * np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - spread, np.log(1e-3), np.log(MOST_DF / 2))))
+    root = brentq(lambda x: polygamma(1, np.exp(x)) - spread, np.log(1e-3), np.log(MOST_DF / 2))
+    return float(2 * np.exp(root))
 
 
 def _independent_directions(deviations: np.ndarray) -> float:
@@ -254,19 +260,20 @@ def _independent_directions(deviations: np.ndarray) -> float:
 # ---------------------------------------------------------------- small sample test
 # One number per specimen, or per run, is tested against the scatter between these units.
 #
-# An effect on a quantity that is constant within specimens shifts each specimen along one direction, the slope of that
-# quantity. With g_u that direction in specimen u (whitened, of length 1), :math:`\rho_u = g_u^T r_u` is one number per
-# specimen. What the model has removed from these numbers is known. Without it they are independent, with one variance
-# if all specimens scatter equally, and a channel's columns are tested against their residual by F. The variance of a
-# few numbers is uncertain. If runs and files explain it, it gets eight prior degrees of freedom (moderated F: Smyth
-# 2004, doi:10.2202/1544-6115.1027); if specimens scatter themselves, it has no prior.
+# An effect on a quantity that is constant within specimens shifts each specimen along one direction, the
+# slope of that quantity. With g_u that direction in specimen u (whitened, of length 1), :math:`\rho_u = g_u^T
+# r_u` is one number per specimen. What the model has removed from these numbers is known. Without it they are
+# independent, with one variance if all specimens scatter equally, and a channel's columns are tested against
+# their residual by F. The variance of a few numbers is uncertain. If runs and files explain it, it gets eight
+# prior degrees of freedom (moderated F: Smyth 2004, doi:10.2202/1544-6115.1027); if specimens scatter
+# themselves, it has no prior.
 #
 # The same test is used for what is constant in runs, with few runs.
 #
-# A dozen specimens have too few sign flips for a search of hundreds of candidates, and a strong effect is part of its
-# own denominator there. The F test assumes normal scatter instead. Its p-values are adjusted by the smallest over all
-# candidates in draws of normal numbers with the same covariance (a rotation test: Langsrud 2005,
-# doi:10.1007/s11222-005-4789-5).
+# A dozen specimens have too few sign flips for a search of hundreds of candidates, and a strong effect is
+# part of its own denominator there. The F test assumes normal scatter instead. Its p-values are adjusted by
+# the smallest over all candidates in draws of normal numbers with the same covariance (a rotation test:
+# Langsrud 2005, doi:10.1007/s11222-005-4789-5).
 
 MANY = 100  # Number of units from which their covariance is not computed as a matrix.
 
@@ -328,7 +335,7 @@ class Root:
 
 
 def small_root(taken: Tangent, moved: np.ndarray) -> np.ndarray:
-    """Return the same for few units as a matrix, in the principal axes of the covariance, shape (d, units)."""
+    """Return the same for few units as a matrix in the principal axes of the covariance, shape (d, units)."""
     dense = taken.toarray()
     share, axes = np.linalg.eigh(np.diag(moved.astype(float)) - dense @ dense.T)
     kept = share > LEAST_OWN_VARIANCE
@@ -352,7 +359,7 @@ class ClusterTests:
 
     @cached_property
     def _residual(self) -> np.ndarray:
-        """Whitened residual, projected off the tangent space (priors and bounds may leave a part there), shape (n,)."""
+        """Whitened residual off the tangent space, where priors and bounds may leave a part; shape (n,)."""
         return self.fitted.basis.project_out(self.fitted.white_residual)
 
     @cached_property
@@ -370,18 +377,21 @@ class ClusterTests:
             slope = fitted.slope(*target)[:, None]
             white = fitted.whitening(slope)[:, 0]
             size, finer = (groups.sums(w**2, self.level) for w in (white, self._finer(slope)[:, 0]))
-            self._numbers[target] = self.along(white)._replace(known=KNOWN_DF * min(mean_ratio(size, finer), 1.0))
+            known = KNOWN_DF * min(mean_ratio(size, finer), 1.0)
+            self._numbers[target] = self.along(white)._replace(known=known)
         return self._numbers[target]
 
     def along(self, white: np.ndarray) -> Numbers:
         """Return the units' numbers along a whitened column, shape (n,), without prior degrees of freedom."""
         groups = self.fitted.rows.groups
         size = np.sqrt(groups.sums(white**2, self.level))
-        direction = white * np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)[groups.codes[self.level]]
+        inverse = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+        direction = white * inverse[groups.codes[self.level]]
         taken = self.fitted.basis.sums(groups, self.level, direction)
         root = (Root if size.size > MANY else small_root)(taken, size > 0)
         values = root @ groups.sums(direction * self._residual, self.level)
-        return Numbers(direction, taken, root, values, root.df if isinstance(root, Root) else values.size, 0.0)
+        df = root.df if isinstance(root, Root) else values.size
+        return Numbers(direction, taken, root, values, df, 0.0)
 
     def test(self, left: np.ndarray, target: tuple[str, str]) -> SmallSampleTest | None:
         """Return the F test of projected columns, shape (n, k), on a quantity; None with too few units."""
@@ -417,17 +427,17 @@ class ClusterTests:
 
 
 def mean_ratio(squares: np.ndarray, finer: np.ndarray) -> float:
-    """Return the mean of squares / finer, shape (units,) each, over units where `finer` is not rounding; 1 if none.
+    """Return the mean of squares / finer, shape (units,) each, over units where `finer` is not rounding.
 
-    Rounding is below 1e-30 of the largest. A derivative far from its Stribeck velocity may underflow in a unit, and the
-    ratio then overflows.
+    It is 1 if there are none. Rounding is below 1e-30 of the largest. A derivative far from its Stribeck
+    velocity may underflow in a unit, and the ratio then overflows.
     """
     known = finer > 1e-30 * finer.max(initial=0.0)
     return float(np.mean(squares[known] / finer[known])) if known.any() else 1.0
 
 
 def log_p_of(values: np.ndarray, basis: np.ndarray, known: float, d: int | None = None) -> np.ndarray:
-    """Return the log p-value of F for rows of d independent numbers, shape (m, d), and columns (d, k) -> (m,).
+    """Return log p-values of F for rows of d independent numbers, shape (m, d), and columns (d, k) -> (m,).
 
     Both may be padded with zeros to more than d.
     """

@@ -39,7 +39,9 @@ class Strokes:
         stroke = samples["stroke_id"].to_numpy()
         start = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]][: stroke.size])
         size = np.diff(np.r_[start, stroke.size])
-        low, high = (part.reduceat(place, start) if start.size else place for part in (np.minimum, np.maximum))
+        low, high = (
+            part.reduceat(place, start) if start.size else place for part in (np.minimum, np.maximum)
+        )
         good = (size >= LEAST_SAMPLES_OF_STROKE) & (high > low)
         unit, direction = (samples[name].to_numpy()[start[good]] for name in ("unit", "direction"))
         return cls(place, residual, start[good], size[good], low[good], (high - low)[good], unit, direction)
@@ -53,7 +55,7 @@ class Strokes:
         return Strokes(self.place[own], self.residual[own], start, size, *others)
 
     def on_grids(self, chosen: np.ndarray, step: float, size: int) -> np.ndarray:
-        """Return residuals of chosen strokes on even grids of `size` places from their start, (strokes, size)."""
+        """Return residuals of chosen strokes on even grids from their start, shape (strokes, size)."""
         grid = step * np.arange(size)
         found = np.empty((chosen.size, size))
         for row, k in zip(found, chosen, strict=True):
@@ -67,7 +69,7 @@ class Strokes:
         return self.place[own][order], self.residual[own][order]
 
     def together(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return places and residuals of strokes with n samples each, sorted by place, both of shape (strokes, n)."""
+        """Return places and residuals of strokes of n samples each, sorted by place, both (strokes, n)."""
         own = self.start[chosen, None] + np.arange(self.size[chosen[0]])
         order = np.argsort(self.place[own], axis=1, kind="stable")
         return np.take_along_axis(self.place[own], order, 1), np.take_along_axis(self.residual[own], order, 1)
@@ -80,8 +82,8 @@ class Strokes:
 def effective_count(ratio: np.ndarray) -> np.ndarray:
     """Return the effective number of independent powers in the mean at each frequency, shape (f,).
 
-    The logarithm of a mean of c powers has the variance trigamma(c). It is estimated from the quartiles of the
-    neighbours, which are robust to a few peaks.
+    The logarithm of a mean of c powers has the variance trigamma(c). It is estimated from the quartiles of
+    the neighbours, which are robust to a few peaks.
     """
     low, high = _quantiles(_neighbours(np.log(np.maximum(ratio, 1e-300))), (0.25, 0.75))
     spread = ((high - low) / 1.349) ** 2
@@ -107,7 +109,7 @@ def _quantiles(windows: np.ndarray, levels: Sequence[float]) -> list[np.ndarray]
 
 
 def _neighbours(value: np.ndarray) -> np.ndarray:
-    """Return the neighbours of each frequency, shape (f, window); NaN in its main lobe and beyond the ends."""
+    """Return the neighbours of each frequency, (f, window); NaN in its main lobe and beyond the ends."""
     padded = np.pad(value, NEIGHBOURS, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1).copy()
     windows[:, np.abs(np.arange(-NEIGHBOURS, NEIGHBOURS + 1)) <= LOBE] = np.nan
@@ -117,8 +119,8 @@ def _neighbours(value: np.ndarray) -> np.ndarray:
 def tops(power: np.ndarray) -> np.ndarray:
     """Return where a spectrum has its maximum within a main lobe on each side, without both ends, shape (f,).
 
-    The low end contains the smooth shapes of a stroke (warming, drift), which are no ripple. Only the most finely
-    sampled strokes reach the high end, and their noise is not typical.
+    The low end contains the smooth shapes of a stroke (warming, drift), which are no ripple. Only the most
+    finely sampled strokes reach the high end, and their noise is not typical.
     """
     padded = np.pad(power, LOBE, constant_values=np.inf)
     highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * LOBE + 1).max(axis=1)
@@ -126,10 +128,10 @@ def tops(power: np.ndarray) -> np.ndarray:
 
 
 def smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return the background of a mean of `count` powers: a line in log-log coordinates through the neighbours.
+    """Return the background of means of `count` powers: a line in log-log coordinates through the neighbours.
 
-    The spectrum of correlated noise falls steeply, so a median of neighbours would give a false peak at the low end.
-    Outlying neighbours are clipped, and the main lobe of the peak is excluded.
+    The spectrum of correlated noise falls steeply, so a median of neighbours would give a false peak at the
+    low end. Outlying neighbours are clipped, and the main lobe of the peak is excluded.
     """
     value = np.log(np.maximum(power, 1e-300))
     place = np.log(frequency)
@@ -157,8 +159,8 @@ def background(power: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------- spectrum
 # The spectrum of strokes along an axis, summed over units. Amplitudes of single units are not kept.
 #
-# Strokes that share a grid are transformed together, and units are added block by block, so that memory does not grow
-# with the campaign. Blocks and sums do not depend on the number of workers.
+# Strokes that share a grid are transformed together, and units are added block by block, so that memory does
+# not grow with the campaign. Blocks and sums do not depend on the number of workers.
 
 MOST_NUMBERS = 1 << 19  # Grid points of a block: 4 MB.
 WORTHWHILE = 400_000  # Samples from which the transforms take longer than the start of worker processes.
@@ -196,8 +198,9 @@ def spectra_of(
 ) -> Iterator[Spectrum]:
     """Return the spectra along some axes, without those with too few strokes or frequencies.
 
-    A parabola is subtracted from each stroke, which is then tapered (Hann) and transformed on a grid that divides twice
-    the longest stroke. All strokes have the same frequencies then. The longest wavelength is half the median stroke.
+    A parabola is subtracted from each stroke, which is then tapered (Hann) and transformed on a grid that
+    divides twice the longest stroke. All strokes have the same frequencies then. The longest wavelength is
+    half the median stroke.
 
     Parameters
     ----------
@@ -251,7 +254,8 @@ def _survey(samples: pd.DataFrame, axis: str) -> _Survey | None:
     points = np.array([next_fast_len(int(n), real=True) for n in distinct])[number]
     frequency = np.arange(min(2**15, int(np.ceil(longest / np.quantile(step, 0.1)))) // 2 + 1) / longest
     reach = np.minimum(points // 2 + 1, np.searchsorted(frequency, 0.5 / step, side="right"))
-    reaching = np.bincount(reach, minlength=frequency.size + 1)[::-1].cumsum()[::-1][1:]  # strokes, at each frequency
+    # strokes, at each frequency
+    reaching = np.bincount(reach, minlength=frequency.size + 1)[::-1].cumsum()[::-1][1:]
     use = (frequency >= 2 / np.median(strokes.span)) & (reaching[: frequency.size] >= REACHED * reach.size)
     if use.sum() < LEAST_FREQUENCIES:
         return None
@@ -341,7 +345,7 @@ def _sums_of(block: _Block) -> _Sums:
 
 
 def _transformed(block: _Block) -> np.ndarray:
-    """Return complex amplitudes of strokes with phases from place 0; 0 beyond their reach, (strokes, most)."""
+    """Return complex amplitudes of strokes with phases from place 0, (strokes, most); 0 beyond reach."""
     strokes, points, reach = block.strokes, block.points, block.reach
     found = np.zeros((reach.size, int(reach.max())), dtype=complex)
     size = np.ceil(strokes.span * points / block.longest).astype(int)
@@ -361,7 +365,7 @@ def _transformed(block: _Block) -> np.ndarray:
 
 @lru_cache(maxsize=512)  # strokes of one speed share their grid
 def _on_grid(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return an orthonormal basis of parabolas on an even grid, shape (size, 3), and the Hann taper, shape (size,)."""
+    """Return an orthonormal basis of parabolas on an even grid, (size, 3), and the Hann taper, (size,)."""
     trend, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, size), 3))
     taper = np.hanning(size + 2)[1:-1]
     return trend, taper * (2 / taper.sum())

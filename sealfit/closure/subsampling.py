@@ -1,4 +1,4 @@
-"""Subsampling of large campaigns: choice of the runs and rows searched, and check of the result on all of them."""
+"""Subsampling of large campaigns: choice of the runs and rows searched, and check of the result on all."""
 
 from __future__ import annotations
 
@@ -65,9 +65,9 @@ class Subsample:
 
 
 def subsamples(rows: Rows, seed: int) -> Iterator[Subsample]:
-    """Yield larger and larger subsets of a campaign's runs, drawn evenly over its conditions; the last has all runs.
+    """Yield larger and larger subsets of a campaign's runs, drawn evenly over its conditions.
 
-    The cost of the first search depends on the model, not on the number of files.
+    The last has all runs. The cost of the first search depends on the model, not on the number of files.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def subsamples(rows: Rows, seed: int) -> Iterator[Subsample]:
 
 
 def _merged(part: Rows, campaign: Rows, seed: int) -> Rows:
-    """Return rows merged along their strokes, with the conditions and the declared model of the full campaign."""
+    """Return rows merged along their strokes, with the full campaign's conditions and declared model."""
     merged = merged_bins(part.table.drop(columns=POWER, errors="ignore"), seed)
     if len(merged) == part.force.size:
         return part
@@ -126,8 +126,8 @@ def _fill(drawn: np.ndarray, number: np.ndarray, least: int, rng: np.random.Gene
 def merged_bins(bins: pd.DataFrame, seed: int) -> pd.DataFrame:
     """Return the bins for the search: neighbours within a stroke are merged if there are many.
 
-    With very many strokes, some files drawn evenly over the campaign keep several rows per stroke, in `MOST_ROWS` rows
-    together. The others keep their mean only.
+    With very many strokes, some files drawn evenly over the campaign keep several rows per stroke, in
+    `MOST_ROWS` rows together. The others keep their mean only.
 
     Parameters
     ----------
@@ -167,11 +167,11 @@ Target = tuple[str, str]  # (acts_on, operation)
 def reselect_on_all(
     selection: Selection, every: Rows, samples: pd.DataFrame, config: Config, say: Callable[[str], None]
 ) -> tuple[Selection, Fitted]:
-    """Re-select the form and target of each effect on all strokes; return the result and the model fitted to them.
+    """Re-select the form and target of each effect on all strokes; return the result and the fitted model.
 
-    An effect is compared with its first rivals, and the best of them with itself on the targets of its rivals, each
-    time on all strokes. Rivals on targets that are excluded by this are removed. Ripples were tested on the samples and
-    are kept.
+    An effect is compared with its first rivals, and the best of them with itself on the targets of its
+    rivals, each time on all strokes. Rivals on targets that are excluded by this are removed. Ripples were
+    tested on the samples and are kept.
 
     Parameters
     ----------
@@ -217,7 +217,9 @@ def _first_rivals(item: AcceptedEffect) -> list[Proposal]:
 def _on_other_quantities(item: AcceptedEffect) -> list[Proposal]:
     """Return an effect on the targets of its rivals, with its own values as start."""
     term = item.proposal.term
-    targets = (target for target in dict.fromkeys(map(_target, item.rivals)) if target != _target(item.proposal))
+    targets = (
+        target for target in dict.fromkeys(map(_target, item.rivals)) if target != _target(item.proposal)
+    )
     return [
         replace(item.proposal, term=replace(term, acts_on=target[0], operation=target[1]))
         for target in targets
@@ -256,7 +258,9 @@ def _with_rivals(item: AcceptedEffect, rivals: list[tuple[Proposal, float]]) -> 
 
 def _on_full_campaign(proposal: Proposal, every: Rows) -> Proposal:
     """Return a proposal of a part as one for all strokes, not fitted yet."""
-    return replace(proposal, units=every.groups.starts[proposal.unit].size, values=_values(proposal), fitted=None)
+    return replace(
+        proposal, units=every.groups.starts[proposal.unit].size, values=_values(proposal), fitted=None
+    )
 
 
 def _target(proposal: Proposal) -> Target:
@@ -283,7 +287,9 @@ def missed_by_subsample(fitted: Fitted, selection: Selection, config: Config) ->
         Error rate, channels.
     """
     alpha = config.loop.family_error
-    found = search(ScoreTests(fitted), channels_of(fitted.rows, config), np.random.default_rng(config.loop.seed))
+    found = search(
+        ScoreTests(fitted), channels_of(fitted.rows, config), np.random.default_rng(config.loop.seed)
+    )
     known = {c.channels for c in selection.last if c.p_value <= alpha}
     new = (c for c in found if c.p_value <= alpha and c.claimable and c.channels not in known)
     return ", ".join(next((c.channels for c in new), ()))

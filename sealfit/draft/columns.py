@@ -1,4 +1,4 @@
-"""Which column of the trace files is time, displacement, force and load: by name, by unit and by behaviour."""
+"""Which column of the trace files is time, displacement, force and load: by name, unit and behaviour."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ BY_BEHAVIOUR = 0.5  # how well a column must behave to be taken without a name o
 class Column:
     """A column of the trace files, and what each of some files holds in it.
 
-    `position` counts from 1; `label` is what the files call it, "" if nothing; `role` is what its name says, with
-    `sure` 3 for a word, 1 for a letter, 0 for nothing. `copy_of` is the position of another column that is the same
-    signal.
+    `position` counts from 1; `label` is what the files call it, "" if nothing; `role` is what its name says,
+    with `sure` 3 for a word, 1 for a letter, 0 for nothing. `copy_of` is the position of another column that
+    is the same signal.
     """
 
     position: int
@@ -44,11 +44,13 @@ class Column:
     def place(self) -> str:
         """The column in words: "column 4 'Weg [mm]'"."""
         unit = f" [{self.unit.name}]" if self.unit is not None and self.unit.name not in self.label else ""
-        return f"column {self.position} '{self.label}'{unit}" if self.label else f"column {self.position}{unit}"
+        return (
+            f"column {self.position} '{self.label}'{unit}" if self.label else f"column {self.position}{unit}"
+        )
 
     @property
     def key(self) -> str | int:
-        """How a config names it: by its name, or by its position where the name is missing or stands twice."""
+        """How a config names it: by name, or by position where the name is missing or stands twice."""
         return self.label if self.by_name else self.position
 
     def may_be(self, role: str) -> bool:
@@ -100,7 +102,7 @@ def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
 
 
 def _copies_marked(columns: list[Column]) -> list[Column]:
-    """Return the columns, of each pair that is the same signal the earlier marked: loggers write the raw one first."""
+    """Return the columns, the earlier of two with the same signal marked: loggers write the raw one first."""
     marked = []
     for i, column in enumerate(columns):
         later = next((other for other in columns[i + 1 :] if _same_signal(column, other)), None)
@@ -120,7 +122,9 @@ def find_roles(columns: Sequence[Column]) -> Roles:
     time = _best(columns, "time", _as_time)
     counters = [c for c in columns if c.role != "displacement" and all(map(motion.is_counter, c.values))]
     rest = [column for column in columns if column is not time and column not in counters]
-    speed_named = [c for c in rest if c.role == "speed" or (c.unit and c.unit.dimension in DIMENSION["speed"])]
+    speed_named = [
+        c for c in rest if c.role == "speed" or (c.unit and c.unit.dimension in DIMENSION["speed"])
+    ]
     speed = speed_named[0] if speed_named else None
     rest = [column for column in rest if column not in speed_named]
     displacement = _best(rest, "displacement", _as_displacement)
@@ -181,7 +185,9 @@ def _load(rest: Sequence[Column]) -> Column | None:
     named = [c for c in rest if c.role == "load" and c.may_be("load")]
     if named:
         return named[0]
-    forces = [c for c in rest if c.unit is not None and c.unit.dimension == "force" and c.role in ("force", "")]
+    forces = [
+        c for c in rest if c.unit is not None and c.unit.dimension == "force" and c.role in ("force", "")
+    ]
     steady = [c for c in forces if all(abs(np.mean(v)) > 5.0 * np.std(v) > 0.0 for v in c.values)]
     return steady[0] if len(steady) == 1 else None
 

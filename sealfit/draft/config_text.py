@@ -79,13 +79,16 @@ class Notes:
 
 
 # ---------------------------------------------------------------- lines for a column
-# The one place where a unit or a sign that is not the default, or a date that is not ISO 8601, becomes config lines.
+# The one place where a unit or a sign that is not the default, or a date that is not ISO 8601, becomes config
+# lines.
 
 DEFAULT_UNIT = {"time_s": "s", "displacement_mm": "mm", "force_N": "N", "load_N": "N"}
 
 
-def column_guesses(slot: str, column: Column, unit: Unit | None, sign: int, evidence: str) -> tuple[list[Guess], str]:
-    """Return the config lines that bring a column into a slot, and the helper column that they need, "" for none.
+def column_guesses(
+    slot: str, column: Column, unit: Unit | None, sign: int, evidence: str
+) -> tuple[list[Guess], str]:
+    """Return the config lines that bring a column into a slot, and the helper column they need, "" for none.
 
     A column in another unit, or of the other sign, is read under a helper's name and computed.
 
@@ -105,7 +108,9 @@ def column_guesses(slot: str, column: Column, unit: Unit | None, sign: int, evid
     helper = f"{base}_raw" if factor == 1.0 or unit is None else f"{base}_{unit.name}"
     why = f"from {unit.name} to {DEFAULT_UNIT[slot]}" if helper != f"{base}_raw" else ""
     if sign < 0:
-        turned = "with the sign of the motion" if slot == "force_N" else "as a load that presses counts above 0"
+        turned = (
+            "with the sign of the motion" if slot == "force_N" else "as a load that presses counts above 0"
+        )
         why = f"{why}, and {turned}" if why else turned
     expression = ("-" if sign < 0 else "") + scaled(helper, factor)
     return [

@@ -1,9 +1,9 @@
 """How a text file of numbers is written: separator, decimal sign, header, line of names, units, footer.
 
-The separator is found by clevercsv (van den Burg, Nazabal & Sutton 2019, doi:10.1007/s10618-019-00646-y): on 60 lines
-from the top, header included, and on 40 lines of data alone it was right for 14 of the 14 programs in
-`tests/draft/exports.py`. It says nothing of decimal signs, headers of many lines and footers; for these there is a
-plain rule: the data are the lines that hold numbers where the last lines of the sample do.
+The separator is found by clevercsv (van den Burg, Nazabal & Sutton 2019, doi:10.1007/s10618-019-00646-y): on
+60 lines from the top, header included, and on 40 lines of data alone it was right for 14 of the 14 programs
+in `tests/draft/exports.py`. It says nothing of decimal signs, headers of many lines and footers; for these
+there is a plain rule: the data are the lines that hold numbers where the last lines of the sample do.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ _OF_SNIFFER = {"\t": "tab", " ": "whitespace", "": "whitespace"}
 class Dialect:
     """How one file is written.
 
-    `header` are the lines above the data; `names` and `units` have one entry per column, or none; `names_back` and
-    `units_back` count their lines back from the header's end, 1 the last; `names_are_cells` is False where the reader
-    cuts the line of names in another way, as names hold the separator. `numbers` are the positions (from 0) that hold
-    numbers, `first` is the first line of data, `odd_lines` counts lines between the data that are none, `footer` are
-    the lines below.
+    `header` are the lines above the data; `names` and `units` have one entry per column, or none;
+    `names_back` and `units_back` count their lines back from the header's end, 1 the last; `names_are_cells`
+    is False where the reader cuts the line of names in another way, as names hold the separator. `numbers`
+    are the positions (from 0) that hold numbers, `first` is the first line of data, `odd_lines` counts lines
+    between the data that are none, `footer` are the lines below.
     """
 
     delimiter: str
@@ -80,7 +80,8 @@ def sniff(text: str, *, whole: bool = True, likely: str | None = None) -> Dialec
     text : str
         The file, or with `whole` False its beginning; lines end in a line feed.
     likely : str, optional
-        The separator of files that are named alike; it is tried first, as clevercsv takes longer than all the rest.
+        The separator of files that are named alike; it is tried first, as clevercsv takes longer than all the
+        rest.
     """
     lines = text.split("\n")
     if not whole:
@@ -91,7 +92,8 @@ def sniff(text: str, *, whole: bool = True, likely: str | None = None) -> Dialec
     mixed = None  # with columns of text: right only where no other separator leaves nothing but numbers
     for delimiter in _in_turn(sample, likely):
         found = [_block(sample, delimiter, decimal) for decimal in (".", ",") if decimal != delimiter]
-        best = max(found, key=lambda block: block.score)  # the first, a point, where there are whole numbers only
+        # The first, a point, where there are whole numbers only.
+        best = max(found, key=lambda block: block.score)
         if best.rows >= MIN_ROWS and len(best.numbers) >= 2:
             if best.pure:
                 return _dialect(lines, delimiter, best, whole)
@@ -126,7 +128,7 @@ def _in_turn(sample: Sequence[str], likely: str | None) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Lines of data under one separator and decimal sign: where they begin and which positions hold numbers."""
+    """Data lines under one separator and decimal sign: where they begin and which positions hold numbers."""
 
     decimal: str
     start: int
@@ -141,7 +143,7 @@ class _Block:
 
 
 def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block:
-    """Return the data lines: those with numbers at the positions where most lines of the second half have them."""
+    """Return the data lines: those with numbers where most lines of the second half have them."""
     numbers = [_numeric(line, delimiter, decimal) for line in lines]
     several = [found for found in numbers[len(lines) // 2 :] if found and len(found) >= 2]
     counts = Counter(i for found in several for i in found)
@@ -153,7 +155,11 @@ def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block:
     if start is None:
         return _Block(decimal, 0, 0, ())
     rows = sum(is_data for _, is_data in data[start:])
-    cells = [sum(bool(cell.strip()) for cell in split_line(lines[i], delimiter)) for i, good in data[start:] if good]
+    cells = [
+        sum(bool(cell.strip()) for cell in split_line(lines[i], delimiter))
+        for i, good in data[start:]
+        if good
+    ]
     pure = sum(count == len(core) for count in cells) > 0.9 * len(cells)
     return _Block(decimal, data[start][0], rows, tuple(sorted(core)), pure)
 
@@ -164,7 +170,9 @@ def _numeric(line: str, delimiter: str, decimal: str) -> frozenset[int] | None:
     if not bare.strip(' "'):
         return None
     cells = split_line(bare, delimiter)
-    return frozenset(i for i, cell in enumerate(cells) if cell.strip() and as_number(cell, decimal) is not None)
+    return frozenset(
+        i for i, cell in enumerate(cells) if cell.strip() and as_number(cell, decimal) is not None
+    )
 
 
 def _first_of_many(data: Sequence[bool]) -> int | None:
@@ -216,14 +224,16 @@ def _dialect(lines: list[str], delimiter: str, block: _Block, whole: bool) -> Di
 
 def _ends_in_separator(data: Sequence[str], delimiter: str) -> bool:
     marks = ("\t" if delimiter == "tab" else delimiter, ",", ";")
-    return delimiter != "whitespace" and sum(line.rstrip(" ").endswith(marks) for line in data) > 0.5 * len(data)
+    return delimiter != "whitespace" and sum(line.rstrip(" ").endswith(marks) for line in data) > 0.5 * len(
+        data
+    )
 
 
 def _header_cells(line: str, delimiter: str, width: int) -> list[str]:
     """Return the cells of a header line.
 
-    A mark of comment in a cell of its own is left out; names with blanks in them, above columns of blanks, are those
-    that two blanks part.
+    A mark of comment in a cell of its own is left out; names with blanks in them, above columns of blanks,
+    are those that two blanks part.
     """
     cells = _cells_of(line, delimiter)
     if len(cells) == width + 1 and cells[0] in ("#", "%", "//", ";"):

@@ -23,7 +23,7 @@ SHOWN = ("trace.columns.", "condition", "files.glob", "files.name_pattern", "fil
 
 @dataclass(frozen=True)
 class Draft:
-    """A drafted config: its text, the guesses in it and the doubts; `motion` says how the rig moves, in words."""
+    """A drafted config: its text, the guesses and the doubts; `motion` says in words how the rig moves."""
 
     folder: Path
     text: str
@@ -52,7 +52,8 @@ def draft(folder: Path) -> Draft:
     roles = find_roles(columns_of(found.dialect, list(tables.values())))
     if roles.time is None and roles.force is None:
         raise RequestError(
-            f"{len(found.traces)} files hold tables of numbers, such as {found.traces[0]}, but no time and no force.",
+            f"{len(found.traces)} files hold tables of numbers, such as {found.traces[0]}, "
+            "but no time and no force.",
             file=folder,
             fix="Give the folder that holds traces: time, displacement and force in columns.",
         )
@@ -67,7 +68,8 @@ def draft(folder: Path) -> Draft:
     trace_keys.column_keys(found, roles, units, len(tables), notes)
     run_keys.condition_keys(source, header, notes)
     text = config_text(_name(folder), shlex.quote(str(folder)), notes)
-    parse_config(text, "the drafted config")  # a draft that is no config is a fault of this module, and raises here
+    # A draft that is no config is a fault of this module, and raises here.
+    parse_config(text, "the drafted config")
     column = roles.displacement
     strokes = int(np.median([motion.stroke_count(v) for v in column.values])) if column is not None else 1
     words = trace_keys.motion_words(roles, strokes)

@@ -1,7 +1,7 @@
-"""What the names of trace files and of their folders say: numbers by the letters around them, dates, words that vary.
+"""What the names of trace files and folders say: numbers by the letters around them, dates, words that vary.
 
-Files whose names are cut alike share a pattern; a name in which a word such as `unaged` stands in the place of
-temperature, compression and days is matched, too.
+Files whose names are cut alike share a pattern; a name in which a word such as `unaged` stands in the place
+of temperature, compression and days is matched, too.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FEW = 12
 """Different values up to which a word is a label and a bare number may be a repeat."""
 
 HEIGHT_FROM = 50.0
-"""Percent: a compression below it is how much the rubber was compressed, as none is squeezed to less than half."""
+"""Percent: a smaller compression is how much the rubber was compressed; none is squeezed below half."""
 
 ALIKE = 0.2
 """Share of the names that another way of naming must have for a word to be optional; fewer are slips."""
@@ -95,7 +95,9 @@ def _word(at: int, texts: tuple[str, ...]) -> Part | None:
     if len(texts) == 1:
         return None
     low = {text.lower() for text in texts}
-    pattern = "|".join(sorted(map(re.escape, texts), key=len, reverse=True)) if len(texts) <= FEW else r"[^\W\d_]+"
+    pattern = (
+        "|".join(sorted(map(re.escape, texts), key=len, reverse=True)) if len(texts) <= FEW else r"[^\W\d_]+"
+    )
     if low <= DIRECTIONS.keys():
         return Part(at, "direction", "_direction", pattern, texts, "a word for the direction")
     if low <= RUBBERS:
@@ -110,17 +112,25 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
     after, before = _around(rows, at)
     if after and (said := after_number(re.sub(r"[-_ /]", "", after))):
         ours, factor = said
-        return _scaled(Part(at, ours, "", pattern, texts, f"'{after}' stands after the number"), factor, before)
+        return _scaled(
+            Part(at, ours, "", pattern, texts, f"'{after}' stands after the number"), factor, before
+        )
     ours = before_number(before) if before else ""
     if ours and not (ours in NO_COUNTS and _counts_up(texts)):
-        return _scaled(Part(at, ours, "", pattern, texts, f"'{before}' stands before the number"), 1.0, before)
-    return Part(at, "", "", pattern, texts, f"'{before}' stands before the number" if before else "a bare number")
+        return _scaled(
+            Part(at, ours, "", pattern, texts, f"'{before}' stands before the number"), 1.0, before
+        )
+    return Part(
+        at, "", "", pattern, texts, f"'{before}' stands before the number" if before else "a bare number"
+    )
 
 
 def _counts_up(texts: Sequence[str]) -> bool:
     """Whether numbers are 1, 2, 3 or 0, 1, 2."""
     numbers = sorted({int(text) for text in texts}) if all(text.isdecimal() for text in texts) else [2]
-    return numbers[0] <= 1 and len(numbers) > 1 and numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    return (
+        numbers[0] <= 1 and len(numbers) > 1 and numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    )
 
 
 def _around(rows: Sequence[Sequence[Token]], at: int) -> tuple[str, str]:
@@ -210,11 +220,15 @@ def _without_doubles(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -> 
     """Return the parts with one for each of our columns: the last, as file names say more than folders."""
     made: list[Part] = []
     for part in parts:
-        later = next((other for other in parts if other.at > part.at and part.ours and other.ours == part.ours), None)
+        later = next(
+            (other for other in parts if other.at > part.at and part.ours and other.ours == part.ours), None
+        )
         if later is None:
             made.append(part)
         elif part.ours == "started_at":
-            made.append(replace(part, ours="", group="", pattern=r"[\dTh:_. -]+", why="a date before another one"))
+            made.append(
+                replace(part, ours="", group="", pattern=r"[\dTh:_. -]+", why="a date before another one")
+            )
         elif all(row[part.at].text == row[later.at].text for row in rows):
             made.append(replace(part, ours="", why=f"{part.why}, said again later in the path"))
         else:
@@ -270,14 +284,18 @@ def _unaged(
 def _optional_word(
     main: Sequence[str], groups: Mapping[tuple, Sequence[str]], cut: Mapping[str, list[Token]]
 ) -> tuple[int, str] | None:
-    """Return the place and the text of a word that many names have more than the main ones, before a number."""
+    """Return place and text of a word before a number that many names have and the main ones do not."""
     row = cut[main[0]]
     for members in groups.values():
         pieces = cut[members[0]]
         if len(pieces) != len(row) + 1 or len(members) < ALIKE * len(main):
             continue
         for at in range(len(row)):
-            if row[at].kind == "number" and pieces[at].kind == "word" and _has_word(pieces, (at, pieces[at].text), row):
+            if (
+                row[at].kind == "number"
+                and pieces[at].kind == "word"
+                and _has_word(pieces, (at, pieces[at].text), row)
+            ):
                 return at, pieces[at].text
     return None
 
@@ -294,4 +312,7 @@ def _with_sign(parts: Sequence[Part], sign: tuple[int, str]) -> list[Part]:
     at, text = sign
     why = f"'{text}' stands before the number in some names"
     doubt = f"'{text}' is taken for the other direction"
-    return [*parts, Part(at, "direction", "_direction", f"(?:{re.escape(text)})?", ("", text), why, doubt=doubt)]
+    return [
+        *parts,
+        Part(at, "direction", "_direction", f"(?:{re.escape(text)})?", ("", text), why, doubt=doubt),
+    ]

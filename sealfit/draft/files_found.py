@@ -36,8 +36,8 @@ FORMATS = {
     ".parquet": "Parquet tables", ".h5": "HDF5 files", ".hdf5": "HDF5 files", ".bin": "binary files",
 }  # fmt: skip
 DOCUMENTS = {
-    ".md", ".rst", ".toml", ".json", ".py", ".ipynb", ".m", ".html", ".htm", ".pdf", ".png", ".jpg", ".svg", ".ini",
-    ".xml", ".yml", ".yaml", ".zip", ".gz", ".docx", ".doc", ".pptx", ".exe", ".tex",
+    ".md", ".rst", ".toml", ".json", ".py", ".ipynb", ".m", ".html", ".htm", ".pdf", ".png", ".jpg", ".svg",
+    ".ini", ".xml", ".yml", ".yaml", ".zip", ".gz", ".docx", ".doc", ".pptx", ".exe", ".tex",
 }  # fmt: skip
 NO_TRACES = ("readme", "license", "licence", "notice", "sha256sums", "changelog")
 
@@ -46,9 +46,9 @@ NO_TRACES = ("readme", "license", "licence", "notice", "sha256sums", "changelog"
 class Found:
     """The files of a folder, as paths below it.
 
-    `traces` are those that one config can read, `dialects` how some of them are written, `wider` those of them that
-    have further columns; `otherwise` are traces written in another way, `others` text files that are none,
-    `unreadable` files with the reason, `formats` counts the files that are no text by their suffix.
+    `traces` are those that one config can read, `dialects` how some of them are written, `wider` those of
+    them that have further columns; `otherwise` are traces written in another way, `others` text files that
+    are none, `unreadable` files with the reason, `formats` counts the files that are no text by their suffix.
     """
 
     folder: Path
@@ -104,7 +104,9 @@ def _like(same: Collection[str], rest: Sequence[str], looked_at: Collection[str]
     """Return those of the files not looked at that are named as the traces are, or have their suffix."""
     kinds, known = {_kind(file) for file in same}, {_kind(file) for file in looked_at}
     suffixes = {kind[0] for kind in kinds}
-    return [file for file in rest if (kind := _kind(file)) in kinds or (kind not in known and kind[0] in suffixes)]
+    return [
+        file for file in rest if (kind := _kind(file)) in kinds or (kind not in known and kind[0] in suffixes)
+    ]
 
 
 def _files(folder: Path) -> list[str]:
@@ -131,7 +133,7 @@ def _kind(file: str) -> tuple:
 
 
 def _sniffed(folder: Path, texts: Sequence[str]) -> tuple[dict[str, Dialect | None], dict[str, str]]:
-    """Return how some files of each kind of name are written, None for no table of numbers; and what is unreadable."""
+    """Return how some files of each kind of name are written, None for no table; and what is unreadable."""
     kinds = defaultdict(list)
     for file in texts:
         kinds[_kind(file)].append(file)
@@ -165,10 +167,12 @@ def _text(folder: Path, file: str) -> tuple[str, bool]:
 
 
 def _by_form(tables: dict[str, Dialect]) -> tuple[dict[str, Dialect], dict[str, Dialect], dict[str, Dialect]]:
-    """Return the files written as most are, those that have further columns beside the same ones, and the others."""
+    """Return the files written as most are, those with further columns beside the same, and the others."""
     forms = Counter((one.delimiter, one.names or one.width) for one in tables.values())
     delimiter, named = forms.most_common(1)[0][0]
-    alike = {f: one for f, one in tables.items() if (one.delimiter, one.names or one.width) == (delimiter, named)}
+    alike = {
+        f: one for f, one in tables.items() if (one.delimiter, one.names or one.width) == (delimiter, named)
+    }
     decimals = Counter(one.decimal for one in alike.values() if one.has_fractions)
     decimal = decimals.most_common(1)[0][0] if decimals else ""
     same = {file: one for file, one in alike.items() if one.decimal in (decimal, "")}
@@ -184,7 +188,9 @@ def _holds(one: Dialect, usual: Dialect) -> bool:
     return by_name and one.delimiter == usual.delimiter and set(usual.names) <= set(one.names)
 
 
-def _no_traces(folder: Path, files: Sequence[str], formats: Counter, unreadable: dict[str, str]) -> RequestError:
+def _no_traces(
+    folder: Path, files: Sequence[str], formats: Counter, unreadable: dict[str, str]
+) -> RequestError:
     fix = "Give the folder that holds the trace files, or export them as text (CSV)."
     if not files:
         return RequestError("the folder is empty.", file=folder, fix=fix)
@@ -194,7 +200,10 @@ def _no_traces(folder: Path, files: Sequence[str], formats: Counter, unreadable:
     if formats:
         what = ", ".join(f"{count} {FORMATS[suffix]} ({suffix})" for suffix, count in formats.most_common())
         reason = f"holds {what} and no trace file that is text."
-        fix = "Name their columns in a config (README: Excel, TDMS, MATLAB and Parquet), or export them as text (CSV)."
+        fix = (
+            "Name their columns in a config (README: Excel, TDMS, MATLAB and Parquet), "
+            "or export them as text (CSV)."
+        )
         return RequestError(reason, file=folder, fix=fix)
     shown = ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")
     reason = f"none of {len(files)} files holds a table of numbers with two columns or more ({shown})."

@@ -1,4 +1,4 @@
-"""What the header lines of trace files say of the whole file: when it was started, and how the rig was set."""
+"""What the header lines of trace files say of the whole file: when it was started and how the rig was set."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ from sealfit.draft.vocabulary import Unit, name_and_unit, setting, unit_of
 from sealfit.ingest.files import as_number
 
 SETTINGS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
-UNIT_OF = {"temperature_C": "temperature", "compression_ratio_pct": "share", "aging_days": "time", "load_N": "force"}
+UNIT_OF = {
+    "temperature_C": "temperature",
+    "compression_ratio_pct": "share",
+    "aging_days": "time",
+    "load_N": "force",
+}
 UNIT_OF |= {"speed_mm_s": "speed"}
 
 _LINE = re.compile(r'^"?(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
@@ -22,7 +27,9 @@ _DAYS = (
     (re.compile(r"20\d\d/[01]\d/[0-3]\d"), "%Y/%m/%d"),
     (re.compile(r"[0-3]?\d/[0-3]?\d/20\d\d"), "%m/%d/%Y"),
 )
-_CLOCK = re.compile(r"(?P<clock>[0-2]?\d:[0-5]\d(?P<second>:[0-5]\d)?)(?:[.,]\d+)?(?P<half>\s*[AP]M)?", re.IGNORECASE)
+_CLOCK = re.compile(
+    r"(?P<clock>[0-2]?\d:[0-5]\d(?P<second>:[0-5]\d)?)(?:[.,]\d+)?(?P<half>\s*[AP]M)?", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +108,9 @@ def _with_clock(headers, number: int, line: str, match: re.Match, spelled: str) 
     own = _leading(following[: beside.start()]) + r"(\d+:\d+(?::\d+)?)" if beside else ""
     if not _everywhere(pattern, headers):
         return None
-    return When(pattern, f"{spelled} {_clock_format(beside)}" if beside else spelled, number, line.strip(), own)
+    return When(
+        pattern, f"{spelled} {_clock_format(beside)}" if beside else spelled, number, line.strip(), own
+    )
 
 
 def _clock_format(clock: re.Match) -> str:
@@ -111,7 +120,9 @@ def _clock_format(clock: re.Match) -> str:
 
 def _leading(text: str) -> str:
     """Return a pattern for what stands before the date in its line: the words, and whatever numbers."""
-    return "^" + re.sub(r"\d+(?:[.,]\d+)?", r"[\\d.,]+", re.escape(text).replace(r"\ ", " ").replace("\\\t", r"\t"))
+    return "^" + re.sub(
+        r"\d+(?:[.,]\d+)?", r"[\\d.,]+", re.escape(text).replace(r"\ ", " ").replace("\\\t", r"\t")
+    )
 
 
 def _everywhere(pattern: str, headers: Sequence[Sequence[str]]) -> bool:

@@ -1,4 +1,4 @@
-"""How columns of a trace behave: time rises evenly, displacement is spread over its range, force follows the motion."""
+"""How trace columns behave: time rises evenly, displacement fills its range, force follows the motion."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def is_counter(values: np.ndarray) -> bool:
 
 
 def spread(values: np.ndarray) -> float:
-    """Return how a column is spread over its range: 0.9 where every tenth has as many samples; 0 for a constant."""
+    """Return how a column fills its range: 0.9 if every tenth has as many samples, 0 for a constant."""
     low, high = np.min(values), np.max(values)
     if high <= low:
         return 0.0
@@ -46,7 +46,7 @@ def spread(values: np.ndarray) -> float:
 
 
 def smoothness(values: np.ndarray) -> float:
-    """Return the share of the path of a column that its strokes explain: 1 for a displacement, less with noise."""
+    """Return the share of a column's path that its strokes explain: 1 for a displacement, less with noise."""
     path = float(np.abs(np.diff(values)).sum())
     return float((stroke_count(values) * np.ptp(values)) / path) if path else 0.0
 
@@ -76,7 +76,7 @@ def velocity(time: np.ndarray, displacement: np.ndarray) -> np.ndarray:
 
 
 def mean_speed(speed: np.ndarray) -> float:
-    """Return the mean magnitude of a column of speeds where it moves; slow ones are steps of their resolution."""
+    """Return the mean magnitude of speeds where there is motion; slow ones are steps of their resolution."""
     size = smoothed(np.abs(speed))
     return float(np.mean(size[size >= MOVING * np.quantile(size, 0.95)]))
 
@@ -125,12 +125,14 @@ def plateau_speeds(time: np.ndarray, displacement: np.ndarray) -> list[float]:
     for first, last in pairwise(ends_of_strokes(displacement)):
         if last - first > SMOOTHED:
             sign = float(np.sign(displacement[last] - displacement[first]))
-            speeds += [sign * speed for speed in _steps(time[first : last + 1], displacement[first : last + 1])]
+            speeds += [
+                sign * speed for speed in _steps(time[first : last + 1], displacement[first : last + 1])
+            ]
     return [speed for speed in speeds if np.isfinite(speed) and speed != 0]
 
 
 def _steps(time: np.ndarray, displacement: np.ndarray) -> list[float]:
-    """Return the steady speeds of one stroke: the only one, or those of the steps that a stroke of speed steps has."""
+    """Return the steady speeds of one stroke: the only one, or those of its steps if it has speed steps."""
     cut = np.unique(np.linspace(0, len(time) - 1, PIECES + 1).astype(int))
     with np.errstate(all="ignore"):
         speeds = np.abs(np.diff(displacement[cut]) / np.diff(time[cut]))
@@ -164,8 +166,10 @@ def several_speeds(speeds: list[float]) -> list[float]:
 
     Examples
     --------
-    >>> several_speeds([5.0, 5.0, 1.0, 1.0]), several_speeds([5.0, 5.0, 5.0, 1.0]), several_speeds([1.0, 2.0, 4.0])
-    ([1.0, 5.0], [], [1.0, 2.0, 4.0])
+    >>> several_speeds([5.0, 5.0, 1.0, 1.0]), several_speeds([5.0, 5.0, 5.0, 1.0])
+    ([1.0, 5.0], [])
+    >>> several_speeds([1.0, 2.0, 4.0])
+    [1.0, 2.0, 4.0]
     >>> several_speeds([5.0, -8.0, 5.0, -8.0])
     []
     """

@@ -1,4 +1,4 @@
-"""Names of files cut into words, numbers and what stands between them, and the pattern that finds the pieces again."""
+"""File names cut into words, numbers and what stands between, and the pattern that finds the pieces again."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ class Token:
 class Part:
     """A piece of the names that stands for something.
 
-    `ours` is the column that it gives, "" for none; `group` names it in the pattern, "" for a piece that is matched
-    only. `texts` are its different values; `expression` what computes the column where it is not the number itself.
+    `ours` is the column that it gives, "" for none; `group` names it in the pattern, "" for a piece that is
+    matched only. `texts` are its different values; `expression` what computes the column where it is not the
+    number itself.
     """
 
     at: int
@@ -76,7 +77,8 @@ def tokens(name: str) -> list[Token]:
     """
     kinds = ("date", "dmy", "word", "number", "sep")
     return [
-        Token(next(kind for kind in kinds if match[kind] is not None), match.group()) for match in _TOKEN.finditer(name)
+        Token(next(kind for kind in kinds if match[kind] is not None), match.group())
+        for match in _TOKEN.finditer(name)
     ]
 
 
@@ -101,7 +103,7 @@ def pattern_of(
     middle: tuple[int, int] | None,
     words: Sequence[str],
 ) -> str:
-    """Return the regular expression that finds the parts of names; `middle` is what one of the words replaces."""
+    """Return the regular expression that finds parts of names; `middle` is what one of the words replaces."""
     optional = next((part for part in parts if part.texts[0] == ""), None)
     by_place = {part.at: part for part in parts if part is not optional}
     pieces = []
@@ -145,10 +147,16 @@ def settings_with(pattern: str, parts: Sequence[Part], middle: tuple[int, int] |
             continue
         if any(mark in text for text in part.texts for mark in ",p") and part.ours != "rubber":
             values[part.group] = {text: as_float(text) for text in part.texts if text[:1] in "-0123456789"}
-        if middle is not None and middle[0] <= part.at < middle[1] and (part.ours == "aging_days" or part.expression):
+        if (
+            middle is not None
+            and middle[0] <= part.at < middle[1]
+            and (part.ours == "aging_days" or part.expression)
+        ):
             values.setdefault(part.group, {})[""] = 0.0
         if part.ours == "direction":
-            values[part.group] = {text: float(DIRECTIONS.get(text.lower(), -1 if text else 1)) for text in part.texts}
+            values[part.group] = {
+                text: float(DIRECTIONS.get(text.lower(), -1 if text else 1)) for text in part.texts
+            }
         elif part.expression or (part.group.startswith("_") and part.ours != "specimen_id"):
             compute[part.ours] = (part.expression or "{}").format(part.group)
     columns |= _date_template(pattern) | _specimen_template(parts)
@@ -169,7 +177,9 @@ def _specimen_template(parts: Sequence[Part]) -> dict[str, str]:
     """Return the template of specimen_id: numbers that start again in every condition name pieces of each."""
     if not any(part.ours == "specimen_id" for part in parts):
         return {}
-    settings = [p.group for p in parts if p.ours in ("rubber", "temperature_C", "compression_ratio_pct", "aging_days")]
+    settings = [
+        p.group for p in parts if p.ours in ("rubber", "temperature_C", "compression_ratio_pct", "aging_days")
+    ]
     return {"specimen_id": " ".join("{" + name + "}" for name in [*settings, "_specimen"])}
 
 

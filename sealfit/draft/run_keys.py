@@ -1,4 +1,4 @@
-"""The `[files]` part of a draft: where the traces are, what names or a table of runs say, what makes a condition."""
+"""The `[files]` of a draft: where traces are, what names or a table of runs say, what makes a condition."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import RUNS_CSV, natural
 
 NO_CONDITION = {
-    "repeat", "specimen_id", "speed_mm_s", "load_N", "started_at", "run_id", "direction", "direction_set", "rubber",
-    "file", "stroke",
+    "repeat", "specimen_id", "speed_mm_s", "load_N", "started_at", "run_id", "direction", "direction_set",
+    "rubber", "file", "stroke",
 }  # fmt: skip
 AGREES = 0.2  # as `quality.speed_disagreement`
 MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
 SPEED_UNITS = {
-    60.0: ("mm/min", "{} / 60"), 1e-3: ("m/s", "{} * 1000"), 0.1: ("cm/s", "{} * 10"), 1e3: ("um/s", "{} / 1000"),
-    60 / 25.4: ("in/min", "{} * 25.4 / 60"), 1 / 25.4: ("in/s", "{} * 25.4"),
+    60.0: ("mm/min", "{} / 60"), 1e-3: ("m/s", "{} * 1000"), 0.1: ("cm/s", "{} * 10"),
+    1e3: ("um/s", "{} / 1000"), 60 / 25.4: ("in/min", "{} * 25.4 / 60"), 1 / 25.4: ("in/s", "{} * 25.4"),
 }  # fmt: skip
 MOST_LISTED = 20  # files that are excluded by name; more are said in a sentence
 
 
 @dataclass(frozen=True)
 class Source:
-    """What is known of each file before it is read: names of files, a table of runs, and whether the table counts."""
+    """What is known of each file before it is read: file names, a table of runs, whether the table counts."""
 
     names: Names
     table: RunsTable | None
@@ -51,7 +51,9 @@ class Source:
 
 def settings_of(names: Names) -> Files:
     """Return the part of a config that reads the names."""
-    return Files(name_pattern=names.pattern, values=names.values, compute=names.compute, columns=names.columns)
+    return Files(
+        name_pattern=names.pattern, values=names.values, compute=names.compute, columns=names.columns
+    )
 
 
 def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, float | str]]:
@@ -79,7 +81,7 @@ def improved(names: Names, speeds: Mapping[str, float], found: Found, notes: Not
 
 
 def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Names:
-    """Return the names with the unit of their speed by what was measured, and a number that is the speed as such."""
+    """Return the names with the unit of their speed, or the number that is the speed, by what is measured."""
     said = values_by_file(names, speeds)
     if "speed_mm_s" in names.given:
         ratio = _ratio({f: v.get("speed_mm_s") for f, v in said.items()}, speeds)
@@ -96,7 +98,9 @@ def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Name
 
 def _ratio(said: Mapping[str, object], measured: Mapping[str, float]) -> float | None:
     """Return the named over the measured speed, if most files of two speeds or more have the same."""
-    pairs = [(abs(v), measured[f]) for f, v in said.items() if isinstance(v, int | float) and v and measured.get(f)]
+    pairs = [
+        (abs(v), measured[f]) for f, v in said.items() if isinstance(v, int | float) and v and measured.get(f)
+    ]
     if len({named for named, _ in pairs}) < 2:
         return None
     ratios = sorted(named / speed for named, speed in pairs)
@@ -111,7 +115,9 @@ def _speed_in_unit(names: Names, name: str, ratio: float, notes: Notes) -> Names
     unit = next((said for factor, said in SPEED_UNITS.items() if abs(ratio / factor - 1) <= AGREES / 2), None)
     if unit is None or part.expression:
         reason = f"speeds in names are {ratio:.3g} times those measured."
-        notes.doubt("files.name_pattern", reason, "Check the units of time and displacement, and the speed in names.")
+        notes.doubt(
+            "files.name_pattern", reason, "Check the units of time and displacement, and the speed in names."
+        )
         return names
     spelled, expression = unit
     why = f"{part.why}; {ratio:.3g} times the measured speed in mm/s, so it is in {spelled}"
@@ -141,18 +147,26 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
         return names
     said = values_by_file(names, found.traces)
     aging = names.given & set(AGING_CONDITION)
-    of_run = {*aging, "rubber", "specimen_id", "speed_mm_s", "repeat"} if aging else names.given - {"started_at"}
+    of_run = (
+        {*aging, "rubber", "specimen_id", "speed_mm_s", "repeat"} if aging else names.given - {"started_at"}
+    )
     keys = Counter(tuple((name, one.get(name)) for name in sorted(of_run)) for one in said.values() if one)
     if not keys or max(keys.values()) == 1:
         return names
     count = sum(number for number in keys.values() if number > 1)
     reason = f"the repeat in names does not tell {count} files apart that are named alike otherwise."
-    notes.doubt("files.name_pattern", reason, "It is not used; repeats are numbered in the order of the files.")
+    notes.doubt(
+        "files.name_pattern", reason, "It is not used; repeats are numbered in the order of the files."
+    )
     pattern = names.pattern.replace(f"(?P<{repeat.group}>", "(?:")
     values = {key: value for key, value in names.values.items() if key != repeat.group}
     compute = {key: value for key, value in names.compute.items() if key != "repeat"}
     return replace(
-        names, pattern=pattern, values=values, compute=compute, parts=tuple(p for p in names.parts if p is not repeat)
+        names,
+        pattern=pattern,
+        values=values,
+        compute=compute,
+        parts=tuple(p for p in names.parts if p is not repeat),
     )
 
 
@@ -160,7 +174,7 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
 
 
 def source_keys(found: Found, source: Source, header: Collection[str], notes: Notes) -> None:
-    """Add where the files are, and what names and the table of runs say; `header` is what header lines give."""
+    """Add where files are, and what names and the table of runs say; `header` is what header lines give."""
     table = source.table
     if table is not None and table.is_runs_csv:
         _table_keys(table, notes)
@@ -173,7 +187,8 @@ def source_keys(found: Found, source: Source, header: Collection[str], notes: No
             notes.doubt(
                 "files.runs_columns",
                 f"'{table.file}' lists {table.named} of the trace files, but only {RUNS_CSV} is read.",
-                f"Copy it to {RUNS_CSV}; the columns below are those of this table. Without it, only names count."
+                f"Copy it to {RUNS_CSV}; the columns below are those of this table. "
+                "Without it, only names count."
                 + ("" if table.whole_paths else " Its names of files need their folders and suffixes."),
             )
     if table is None or not table.is_runs_csv or not set(AGING_CONDITION) <= table.given:
@@ -194,8 +209,14 @@ def _otherwise(others: Mapping[str, Dialect], notes: Notes) -> None:
     delimiter = f"separator '{dialect.delimiter}'"
     decimal = f", decimal '{dialect.decimal}'" if dialect.decimal else ""
     names = f", columns {', '.join(dialect.names[:4])}" if dialect.names else ""
-    reason = f"{len(others)} files are written otherwise ({delimiter}{decimal}{names}): {', '.join(list(others)[:3])}."
-    fix = "One config reads files of one form. Move them to a folder of their own and draft a config for them, too."
+    reason = (
+        f"{len(others)} files are written otherwise ({delimiter}{decimal}{names}): "
+        f"{', '.join(list(others)[:3])}."
+    )
+    fix = (
+        "One config reads files of one form. "
+        "Move them to a folder of their own and draft a config for them, too."
+    )
     notes.doubt("files", reason, fix)
 
 
@@ -208,7 +229,9 @@ def _glob_keys(found: Found, source: Source, notes: Notes) -> None:
     surplus = (matched - set(found.traces)) | (unmatched & matched) | (table & matched)
     if surplus:
         excluded = _excluded(surplus, matched)
-        notes.guess("files.exclude", excluded[:MOST_LISTED], "no traces, or named or written otherwise than the rest")
+        notes.guess(
+            "files.exclude", excluded[:MOST_LISTED], "no traces, or named or written otherwise than the rest"
+        )
         if len(excluded) > MOST_LISTED:
             reason = f"{len(excluded) - MOST_LISTED} more files are no traces like the rest."
             notes.doubt("files.exclude", reason, "Move them away, or add them here.")
@@ -256,19 +279,32 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
         if told:
             return
         reason = "the names of the files say nothing that is known here: temperature, days, speed, repeat."
-        notes.doubt("files", reason, f"Write a {RUNS_CSV} with a line for each file, or name_pattern by hand.")
+        notes.doubt(
+            "files", reason, f"Write a {RUNS_CSV} with a line for each file, or name_pattern by hand."
+        )
         return
-    told = [f"{_example(part)} -> {part.ours} ({part.why}: {_values(part)})" for part in names.parts if part.ours]
-    notes.guess("files.name_pattern", names.pattern, f"matches {names.matched} of {files} files. " + "; ".join(told))
+    told = [
+        f"{_example(part)} -> {part.ours} ({part.why}: {_values(part)})" for part in names.parts if part.ours
+    ]
+    notes.guess(
+        "files.name_pattern", names.pattern, f"matches {names.matched} of {files} files. " + "; ".join(told)
+    )
     for part in names.parts:
         if part.doubt and part.ours:
-            notes.doubt("files.name_pattern", f"'{_example(part)}': {part.doubt}.", "Check what it stands for.")
+            notes.doubt(
+                "files.name_pattern", f"'{_example(part)}': {part.doubt}.", "Check what it stands for."
+            )
     for name, template in names.columns.items():
         evidence = "made of parts of the name"
         if name == "specimen_id":
             evidence = "the number of the piece of rubber, within its condition"
-            fix = "If they are repeats with one piece, call the part `repeat` in name_pattern and delete this line."
-            notes.doubt("files.columns.specimen_id", "files of a condition are taken as different pieces.", fix)
+            fix = (
+                "If they are repeats with one piece, "
+                "call the part `repeat` in name_pattern and delete this line."
+            )
+            notes.doubt(
+                "files.columns.specimen_id", "files of a condition are taken as different pieces.", fix
+            )
         notes.guess(f"files.columns.{name}", template, evidence)
     for group, mapped in names.values.items():
         notes.guess(f"files.values.{group}", dict(mapped), "how these are written in the names")
@@ -289,17 +325,28 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
     for theirs, ours in table.ours.items():
         if ours != theirs:
             cell = next((cell for cell in table.cells[theirs] if cell), "")
-            notes.guess(f"files.runs_columns.{ours}", theirs, f"column '{theirs}' of {table.file}, such as '{cell}'")
+            notes.guess(
+                f"files.runs_columns.{ours}", theirs, f"column '{theirs}' of {table.file}, such as '{cell}'"
+            )
     for theirs, unit in table.units.items():
         ours, wanted = table.ours[theirs], 86400.0 if table.ours[theirs] == "aging_days" else 1.0
         if unit.factor != wanted and unit.dimension not in ("temperature", "share", "none"):
             reason = f"column '{theirs}' of {table.file} is in {unit.name}, and {ours} is not."
-            notes.doubt("files.runs_columns", reason, f"Convert it in the table, times {unit.factor / wanted:.6g}.")
-    heights = next((table.cells[theirs] for theirs, ours in table.ours.items() if ours == "compression_ratio_pct"), ())
+            notes.doubt(
+                "files.runs_columns", reason, f"Convert it in the table, times {unit.factor / wanted:.6g}."
+            )
+    heights = next(
+        (table.cells[theirs] for theirs, ours in table.ours.items() if ours == "compression_ratio_pct"), ()
+    )
     numbers = [n for cell in heights if (n := as_number(cell) or as_number(cell, ",")) is not None]
     if numbers and max(numbers) < HEIGHT_FROM:
-        reason = f"compressions up to {max(numbers):g} % look like how much the rubber was compressed, not its height."
-        notes.doubt("files.runs_columns", reason, "Write the height in percent of the original into the table.")
+        reason = (
+            f"compressions up to {max(numbers):g} % look like how much the rubber was compressed, "
+            "not its height."
+        )
+        notes.doubt(
+            "files.runs_columns", reason, "Write the height in percent of the original into the table."
+        )
     _dates_doubt(table, notes)
 
 
@@ -310,7 +357,9 @@ def _dates_doubt(table: RunsTable, notes: Notes) -> None:
     for name, cells in table.cells.items():
         full = [cell for cell in cells if cell]
         if name not in table.ours and full and all(dates.search(cell) for cell in full):
-            reason = f"column '{name}' of {table.file} holds dates that are not ISO 8601, such as '{full[0]}'."
+            reason = (
+                f"column '{name}' of {table.file} holds dates that are not ISO 8601, such as '{full[0]}'."
+            )
             fix = f"Name it, started_at = '{name}', and give files.date_format, such as '%d.%m.%Y %H:%M'."
             notes.doubt("files.runs_columns", reason, fix)
             return
@@ -346,7 +395,9 @@ def condition_keys(source: Source, header: Collection[str], notes: Notes) -> Non
     if own:
         notes.guess("condition", own, "what names give besides speed and repeat")
         fix = "Leave those that change nothing about the sample or the contact out of it."
-        notes.doubt("condition", "nothing says temperature, compression or days: there is no aging to fit.", fix)
+        notes.doubt(
+            "condition", "nothing says temperature, compression or days: there is no aging to fit.", fix
+        )
         return
     notes.guess("condition", ["state"], "nothing tells conditions apart")
     notes.guess("files.columns.state", "one", "the same for all files")
@@ -361,7 +412,7 @@ def _origin(name: str, source: Source) -> str:
 
 
 def needs_no_load(names: Names, roles: Roles) -> Names:
-    """Return the names without a load where a torque is measured: torque over load is no coefficient of friction."""
+    """Return the names without load if a torque is measured: torque over load is no friction coefficient."""
     if roles.force is None or roles.force.unit is None or roles.force.unit.dimension == "force":
         return names
     if "load_N" not in names.compute:

@@ -23,8 +23,8 @@ MAX_BYTES = 4_000_000
 class RunsTable:
     """A table with a line for each trace file.
 
-    `ours` is our name of each of its columns, by theirs; `units` the units that their names carry; `whole_paths` is
-    whether its cells are paths of trace files as they stand, which is what the reader needs.
+    `ours` is our name of each of its columns, by theirs; `units` the units that their names carry;
+    `whole_paths` is whether its cells are paths of trace files as they stand, which is what the reader needs.
     """
 
     file: str
@@ -47,7 +47,7 @@ class RunsTable:
 
 
 def find_table(folder: Path, others: Sequence[str], traces: Sequence[str]) -> RunsTable | None:
-    """Return the table of runs among text files that are no traces: runs.csv first, then the one that names most."""
+    """Return the table of runs among text files other than traces: runs.csv, else the one that names most."""
     tables = [table for file in others if (table := _table(folder, file, traces)) is not None]
     return max(tables, key=lambda table: (table.is_runs_csv, table.named), default=None)
 
@@ -66,7 +66,9 @@ def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
     mark = "tab" if delimiter == "\t" else delimiter
     names = [cell.strip() for cell in split_line(lines[0], mark)]
     rows = [[cell.strip() for cell in split_line(line, mark)] for line in lines[1:]]
-    cells = {name: tuple(row[i] if i < len(row) else "" for row in rows) for i, name in enumerate(names) if name}
+    cells = {
+        name: tuple(row[i] if i < len(row) else "" for row in rows) for i, name in enumerate(names) if name
+    }
     naming = {name: _names_files(column, traces) for name, column in cells.items()}
     best = max(naming, key=lambda name: naming[name], default=None)
     if best is None or naming[best][0] < NAMING * len(rows):
@@ -77,7 +79,7 @@ def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
 
 
 def _names_files(column: Sequence[str], traces: Sequence[str]) -> tuple[int, int]:
-    """Return how many cells name a trace file, with or without folders and suffix, and how many as a whole path."""
+    """Return how many cells name a trace, with or without folders and suffix, and how many by whole path."""
     paths = set(traces)
     short = {PurePosixPath(file).name for file in traces} | {PurePosixPath(file).stem for file in traces}
     posix = [cell.replace("\\", "/") for cell in column if cell]
@@ -111,7 +113,9 @@ def _fits(meaning: str, column: Sequence[str]) -> bool:
         return all(_is_iso(cell) for cell in full)
     if meaning in ("specimen_id", "run_id", "rubber", "file"):
         return True
-    return sum(as_number(cell) is not None or as_number(cell, ",") is not None for cell in full) > 0.8 * len(full)
+    return sum(as_number(cell) is not None or as_number(cell, ",") is not None for cell in full) > 0.8 * len(
+        full
+    )
 
 
 def _is_iso(cell: str) -> bool:

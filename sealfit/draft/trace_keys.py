@@ -17,7 +17,7 @@ from sealfit.draft.header_lines import Setting, settings_in, started_in
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
 
 LONG_S = 3600.0
-"""A trace without a unit of time is not taken to last longer than an hour at a sample per second or slower."""
+"""A trace without a time unit is not taken to last longer than an hour at a sample per second or slower."""
 
 BAD_ROWS = 2
 """Rows with a missing value that may stand above the first whole row of data."""
@@ -50,25 +50,31 @@ def dialect_keys(found: Found, notes: Notes) -> None:
     if footers:
         notes.doubt(
             "trace",
-            f"{len(footers)} of {len(sniffed)} files end in lines that are no data, such as '{footers[0][0][:60]}'.",
-            "A config cannot name them: these lines are left out, and `check` lists them. Delete them in the files, or "
-            "leave them out of the export.",
+            f"{len(footers)} of {len(sniffed)} files end in lines that are no data, "
+            f"such as '{footers[0][0][:60]}'.",
+            "A config cannot name them: these lines are left out, and `check` lists them. "
+            "Delete them in the files, or leave them out of the export.",
         )
     odd = [other.odd_lines for other in sniffed if other.odd_lines]
     if odd:
         notes.doubt(
             "trace",
             f"in {len(odd)} of {len(sniffed)} files up to {max(odd)} lines between the data are none.",
-            "They are left out, and `check` lists them. If a file holds several recordings, export one file each.",
+            "They are left out, and `check` lists them. "
+            "If a file holds several recordings, export one file each.",
         )
 
 
 def _of(looked_at: int, all_files: int) -> str:
-    return f"{looked_at} of {looked_at} files" + (f" looked at, of {all_files}" if all_files > looked_at else "")
+    return f"{looked_at} of {looked_at} files" + (
+        f" looked at, of {all_files}" if all_files > looked_at else ""
+    )
 
 
 def _a_number(line: str) -> str:
-    return f"'{re.search(r'[-+]?[0-9]+,[0-9]+', line).group()}'" if re.search(r"\d,\d", line) else "with a comma"
+    return (
+        f"'{re.search(r'[-+]?[0-9]+,[0-9]+', line).group()}'" if re.search(r"\d,\d", line) else "with a comma"
+    )
 
 
 def _header_keys(found: Found, of: str, notes: Notes) -> None:
@@ -80,9 +86,13 @@ def _header_keys(found: Found, of: str, notes: Notes) -> None:
         notes.guess("trace.names", "none", f"{why} in {of}: columns go by position")
     units_row = back == 2 and one.units_back == 1
     if units_row:
-        notes.guess("trace.units_row", True, f"the line below the names holds units: {_shown(one.header[-1])}")
+        notes.guess(
+            "trace.units_row", True, f"the line below the names holds units: {_shown(one.header[-1])}"
+        )
     elif back is not None and back > 1:
-        evidence = f"the names are in the header's line {count - back + 1} of {count}: {_shown(one.header[-back])}"
+        evidence = (
+            f"the names are in the header's line {count - back + 1} of {count}: {_shown(one.header[-back])}"
+        )
         notes.guess("trace.names_line", back, evidence)
     if not is_unchanged(found.sniffed):
         _varying_header(found, notes)
@@ -99,17 +109,21 @@ def _varying_header(found: Found, notes: Notes) -> None:
     pattern = "^" + re.escape(last[:80]).replace(r"\ ", " ").replace("\\\t", r"\t")
     if last and all(_ends_at(one.header, pattern) for one in found.sniffed):
         notes.guess(
-            "trace.header_ends_at", pattern, f"headers differ in length ({shown}), and this line ends all of them"
+            "trace.header_ends_at",
+            pattern,
+            f"headers differ in length ({shown}), and this line ends all of them",
         )
         return
     count = lengths.most_common(1)[0][0]
     notes.guess("trace.header_lines", count, f"the most frequent of {shown}")
     fix = "Set header_ends_at to a pattern that only the last header line matches, or export all files alike."
-    notes.doubt("trace.header_lines", f"headers differ in length ({shown}), and no one line ends all of them.", fix)
+    notes.doubt(
+        "trace.header_lines", f"headers differ in length ({shown}), and no one line ends all of them.", fix
+    )
 
 
 def _ends_at(header: Sequence[str], pattern: str) -> bool:
-    """Whether the first line that the pattern matches is the last of the header, or one with bad rows below it."""
+    """Whether the first line that the pattern matches is the last of the header or has bad rows below it."""
     first = next((i for i, line in enumerate(header, start=1) if re.search(pattern, line)), 0)
     return first > 0 and len(header) - first <= BAD_ROWS
 
@@ -122,7 +136,9 @@ def _shown(line: str) -> str:
 # ---------------------------------------------------------------- columns
 
 
-def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit | None], read: int, notes: Notes) -> None:
+def column_keys(
+    found: Found, roles: Roles, units: Mapping[str, Unit | None], read: int, notes: Notes
+) -> None:
     """Add which column goes into which slot, and what is done with the others.
 
     Parameters
@@ -147,15 +163,24 @@ def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit | None], re
         helpers += _integrated(roles.speed, notes)
     _missing_slots(roles, notes)
     if roles.force is not None and roles.force.unit is not None and _is_torque(roles.force):
-        notes.guess("quantities.force", {"quantity": "torque", "unit": roles.force.unit.name.replace("pct", "%")},
-                    f"{roles.force.place} is a torque")  # fmt: skip
+        notes.guess(
+            "quantities.force",
+            {"quantity": "torque", "unit": roles.force.unit.name.replace("pct", "%")},
+            f"{roles.force.place} is a torque",
+        )
     if helpers:
-        notes.guess("trace.drop_columns", helpers, "read for the columns computed below, no channels of their own")
+        notes.guess(
+            "trace.drop_columns", helpers, "read for the columns computed below, no channels of their own"
+        )
     _other_columns(found, roles, notes)
 
 
 def _is_torque(column: Column) -> bool:
-    return column.unit.dimension == "torque" or "torque" in plain(column.label) or "moment" in plain(column.label)
+    return (
+        column.unit.dimension == "torque"
+        or "torque" in plain(column.label)
+        or "moment" in plain(column.label)
+    )
 
 
 def _load_sign(column: Column) -> int:
@@ -187,10 +212,14 @@ def _column_doubts(column: Column, role: str, key: str, roles: Roles, notes: Not
         notes.doubt(key, reason, f"Name the right column of {role} here if it is another.")
     if role == "force" and roles.signs_differ:
         reason = f"the sign of {column.place} against the motion is not the same in all files."
-        notes.doubt(key, reason, "Check whether the sensor was turned, or the force was exported as a magnitude.")
+        notes.doubt(
+            key, reason, "Check whether the sensor was turned, or the force was exported as a magnitude."
+        )
     if role == "force" and not unit_fits and column.unit is not None:
         reason = f"{column.place} is not in a unit of force."
-        notes.doubt(key, reason, "Give the factor to N under [trace.compute], or declare it under [quantities].")
+        notes.doubt(
+            key, reason, "Give the factor to N under [trace.compute], or declare it under [quantities]."
+        )
     if role == "force" and roles.both_ways and named and _follows_badly(column, roles):
         reason = f"{column.place} has the same sign in both directions."
         notes.doubt(key, reason, "It looks like a magnitude: export the force with its sign.")
@@ -216,7 +245,9 @@ def _integrated(speed: Column, notes: Notes) -> list[str]:
     if rotation:
         notes.guess("trace.integrate_per", "min", "rpm")
         notes.guess("quantities.displacement", {"quantity": "angle", "unit": "turn"}, f"from {speed.place}")
-        notes.guess("quantities.speed", {"quantity": "rotational speed", "unit": "rpm"}, f"from {speed.place}")
+        notes.guess(
+            "quantities.speed", {"quantity": "rotational speed", "unit": "rpm"}, f"from {speed.place}"
+        )
         notes.guess("position_origin", "file", "an integral begins anew in every file")
     elif scale:
         notes.guess("trace.compute.speed_column_mm_s", scaled(helper, speed.unit.factor), "to mm/s")
@@ -227,7 +258,9 @@ def _integrated(speed: Column, notes: Notes) -> list[str]:
 def _missing_slots(roles: Roles, notes: Notes) -> None:
     wanted = {
         "time": "no column of numbers rises evenly: there is no time.",
-        "displacement": "no column goes along strokes: there is no displacement, and no speed to make it from.",
+        "displacement": (
+            "no column goes along strokes: there is no displacement, and no speed to make it from."
+        ),
         "force": "no column follows the motion: there is no force.",
     }
     for role, reason in wanted.items():
@@ -265,7 +298,7 @@ def _ignored(column: Column) -> str:
 
 
 def _channel(column: Column, taken: set[str]) -> str:
-    """Return the name of a column as a channel, none of those taken; "" if it is none: a ratio, a counter, a copy."""
+    """Return a name for a column as a channel, none of those taken; "" for a ratio, a counter or a copy."""
     if column.copy_of or column.role not in CHANNELS or all(motion.rises(values) for values in column.values):
         return ""
     unit = f"_{column.unit.name}" if column.unit is not None else ""
@@ -301,7 +334,9 @@ def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
         long = float(np.ptp(column.values[0]))
         if step >= 1.0 and long > LONG_S:
             hours = f"{long / 3600:.1f} h"
-            reason = f"{column.place} has no unit; in seconds a file would last {hours}, so it is taken as ms."
+            reason = (
+                f"{column.place} has no unit; in seconds a file would last {hours}, so it is taken as ms."
+            )
             notes.doubt("trace.compute.time_s", reason, "Change the factor if it is another unit.")
             return UNITS["ms"]
     if column.role != role:
@@ -347,8 +382,10 @@ def _setting_keys(one: Setting, notes: Notes) -> None:
     notes.guess(f"trace.compute.{one.ours}", scaled(f"_{base}", factor), f"from {one.unit.name}")
 
 
-def motion_keys(roles: Roles, units: Mapping[str, Unit | None], files: Sequence[str], notes: Notes) -> dict[str, float]:
-    """Say whether strokes go both ways and how many speeds a file has; return the measured speed of each file."""
+def motion_keys(
+    roles: Roles, units: Mapping[str, Unit | None], files: Sequence[str], notes: Notes
+) -> dict[str, float]:
+    """Say whether strokes go both ways and how many speeds a file has; return each file's measured speed."""
     if roles.time is None or (roles.displacement is None and roles.speed is None):
         return {}
     speeds: dict[str, list[float]] = {}
@@ -356,19 +393,29 @@ def motion_keys(roles: Roles, units: Mapping[str, Unit | None], files: Sequence[
         if roles.displacement is None:
             speeds[file] = [motion.mean_speed(roles.speed.values[i])]
             continue
-        factors = {role: unit.factor if (unit := units.get(role)) else 1.0 for role in ("time", "displacement")}
-        time, way = roles.time.values[i] * factors["time"], roles.displacement.values[i] * factors["displacement"]
+        factors = {
+            role: unit.factor if (unit := units.get(role)) else 1.0 for role in ("time", "displacement")
+        }
+        time, way = (
+            roles.time.values[i] * factors["time"],
+            roles.displacement.values[i] * factors["displacement"],
+        )
         speeds[file] = motion.plateau_speeds(time, way)
     several = {file: found for file, all_ in speeds.items() if (found := motion.several_speeds(all_))}
     if several:
         file, found = next(iter(several.items()))
         shown = ", ".join(f"{speed:.3g}" for speed in found[:6])
         reason = (
-            f"{len(several)} of {len(files)} files read hold several speeds in one direction: {shown} mm/s in {file}."
+            f"{len(several)} of {len(files)} files read hold several speeds in one direction: "
+            f"{shown} mm/s in {file}."
         )
         fix = "The strokes of a file in one direction are one run: write each speed into a file of its own."
         notes.doubt("strokes", reason, fix)
-    return {file: float(np.median(np.abs(found))) for file, found in speeds.items() if found and file not in several}
+    return {
+        file: float(np.median(np.abs(found)))
+        for file, found in speeds.items()
+        if found and file not in several
+    }
 
 
 def motion_words(roles: Roles, strokes: int) -> str:

@@ -1,4 +1,4 @@
-"""What columns, parts of file names and header lines are called, in English and German, and the units they are in."""
+"""What columns, parts of file names and header lines are called, in English and German, and their units."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 class Unit:
     """A unit as files write it.
 
-    `factor` turns a number into s, mm, N, mm/s, days or what `dimension` is counted in; `name` can be part of a
-    column's name.
+    `factor` turns a number into s, mm, N, mm/s, days or what `dimension` is counted in; `name` can be part of
+    a column's name.
     """
 
     dimension: str
@@ -33,7 +33,10 @@ def _ascii(unit: str) -> str:
 
 
 UNITS = {
-    **{spelled: Unit("time", 1.0, "s") for spelled in ("s", "sec", "secs", "second", "seconds", "sek", "sekunden")},
+    **{
+        spelled: Unit("time", 1.0, "s")
+        for spelled in ("s", "sec", "secs", "second", "seconds", "sek", "sekunden")
+    },
     **{spelled: Unit("time", 1e-3, "ms") for spelled in ("ms", "msec", "millisec", "milliseconds")},
     **{spelled: Unit("time", 1e-6, "us") for spelled in ("us", "µs", "μs")},
     **{spelled: Unit("time", 60.0, "min") for spelled in ("min", "minutes", "minuten")},
@@ -54,7 +57,10 @@ UNITS = {
         for time, seconds in _TIMES.items()
     },
     **{spelled: Unit("rotation", 1.0, "rpm") for spelled in ("rpm", "1/min", "U/min", "min-1")},
-    **{spelled: Unit("torque", 1.0, spelled.replace(" ", "")) for spelled in ("Nm", "mNm", "N m", "mN m", "Ncm")},
+    **{
+        spelled: Unit("torque", 1.0, spelled.replace(" ", ""))
+        for spelled in ("Nm", "mNm", "N m", "mN m", "Ncm")
+    },
     **{spelled: Unit("angle", 1.0, "deg") for spelled in ("deg", "°", "rad", "turn")},
     **{spelled: Unit("temperature", 1.0, "C") for spelled in ("°C", "C", "degC", "deg C", "Grad C", "ºC")},
     **{spelled: Unit("share", 1.0, "pct") for spelled in ("%", "pct", "percent", "prozent", "Prozent")},
@@ -116,8 +122,8 @@ STRONG, WEAK = 3, 1  # a word that says it, a single letter that may
 
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
 _COLUMN_WORDS = (
-    ("none", r"\bcof\b|\bmue?\b|coefficient|reibwert|reibungszahl|reibzahl|\bindex\b|\bscan\b|\bsample\b|\bnr\b|\bno\b"
-             r"|count|segment|cycle|zyklus|comment|kommentar|alarm"
+    ("none", r"\bcof\b|\bmue?\b|coefficient|reibwert|reibungszahl|reibzahl|\bindex\b|\bscan\b|\bsample\b"
+             r"|\bnr\b|\bno\b|count|segment|cycle|zyklus|comment|kommentar|alarm"
              r"|\bsoll|set ?point|command|target|demand|stress|strain|spannung|dehnung|volt|\braw\b"),
     ("temperature", r"temp"),
     ("humidity", r"humid|feucht"),
@@ -127,10 +133,17 @@ _COLUMN_WORDS = (
     ("speed", r"speed|velocity|geschwind|\bvel\b"),
     ("torque", r"torque|moment"),
     ("force", r"force|kraft|friction|reib|tangential|load.?cell|kmd|\bfx\b|\bft\b|\bfr\b|\bfy\b|\bload\b"),
-    ("displacement", r"displace|position|extension|crosshead|weg|verschieb|travel|traverse|\bhub\b|stroke|lvdt|verfahr"
-                     r"|\bpos\b|path|distance|auslenk|slide|schlitten"),
+    ("displacement", r"displace|position|extension|crosshead|weg|verschieb|travel|traverse|\bhub\b|stroke"
+                     r"|lvdt|verfahr|\bpos\b|path|distance|auslenk|slide|schlitten"),
 )  # fmt: skip
-_LETTERS = {"t": "time", "x": "displacement", "y": "displacement", "s": "displacement", "f": "force", "v": "speed"}
+_LETTERS = {
+    "t": "time",
+    "x": "displacement",
+    "y": "displacement",
+    "s": "displacement",
+    "f": "force",
+    "v": "speed",
+}
 
 
 def plain(text: str) -> str:
@@ -189,14 +202,19 @@ def setting(name: str) -> str:
 
 
 # ---------------------------------------------------------------- parts of file names
-# What stands before or after a number in a file name. The case of single letters matters: T80 is a temperature.
+# What stands before or after a number in a file name. The case of single letters matters: T80 is a
+# temperature.
 
 BEFORE = {
     **dict.fromkeys(("T", "temp", "temperature", "temperatur"), "temperature_C"),
-    **dict.fromkeys(("C", "K", "comp", "compr", "compression", "verpressung", "H", "height"), "compression_ratio_pct"),
+    **dict.fromkeys(
+        ("C", "K", "comp", "compr", "compression", "verpressung", "H", "height"), "compression_ratio_pct"
+    ),
     **dict.fromkeys(("d", "D", "t", "day", "days", "tag", "tage", "age", "aged", "alter"), "aging_days"),
     **dict.fromkeys(("v", "V", "speed", "vel", "velocity", "geschw"), "speed_mm_s"),
-    **dict.fromkeys(("r", "R", "rep", "repeat", "run", "w", "W", "wdh", "wiederholung", "test", "trial"), "repeat"),
+    **dict.fromkeys(
+        ("r", "R", "rep", "repeat", "run", "w", "W", "wdh", "wiederholung", "test", "trial"), "repeat"
+    ),
     **dict.fromkeys(("F", "FN", "Fn", "L", "N", "load", "last"), "load_N"),
     **dict.fromkeys(("S", "s", "P", "sp", "spec", "specimen", "sample", "probe", "rawdata"), "specimen_id"),
 }
@@ -218,7 +236,19 @@ AFTER = {
     **dict.fromkeys(("rpm",), ("speed_rpm", 1.0)),
     **dict.fromkeys(("Hz",), ("frequency_Hz", 1.0)),
 }
-UNAGED = {"unaged", "fresh", "new", "virgin", "neu", "ungealtert", "frisch", "ref", "reference", "rt", "initial"}
+UNAGED = {
+    "unaged",
+    "fresh",
+    "new",
+    "virgin",
+    "neu",
+    "ungealtert",
+    "frisch",
+    "ref",
+    "reference",
+    "rt",
+    "initial",
+}
 RUBBERS = {
     "nbr",
     "hnbr",
@@ -244,10 +274,10 @@ DIRECTIONS = {
 
 
 def before_number(letters: str) -> str:
-    """Return what a number with these letters before it is; "" if they do not say. Single letters by their case."""
+    """Return what a number after these letters is; "" if they do not say. Case counts for single letters."""
     return BEFORE.get(letters) or (BEFORE.get(letters.lower(), "") if len(letters) > 1 else "")
 
 
 def after_number(letters: str) -> tuple[str, float] | None:
-    """Return what a number with this unit after it is, and the factor to our unit; None if it does not say."""
+    """Return what a number followed by this unit is, and the factor to our unit; None if it does not say."""
     return AFTER.get(letters) or (AFTER.get(letters.lower()) if len(letters) > 1 else None)

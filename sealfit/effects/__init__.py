@@ -1,7 +1,8 @@
 """Physical effects, a file for each family, and the list of them.
 
-Mechanisms come first, then closed forms of any channel. `sealfit.effects.free` builds free shapes, whose number of
-parameters depends on the data; `sealfit.effects.user` reads the effects of users; `contract` describes an effect.
+Mechanisms come first, then closed forms of any channel. `sealfit.effects.free` builds free shapes, whose
+number of parameters depends on the data; `sealfit.effects.user` reads the effects of users; `contract`
+describes an effect.
 """
 
 from sealfit.effects import aging_laws, closed_forms, history, products, sensors, sliding, warming
@@ -9,4 +10,6 @@ from sealfit.effects.contract import Effect
 
 FAMILIES = (warming, sensors, history, sliding, aging_laws, closed_forms, products)
 
-EFFECTS = {effect.id: effect for family in FAMILIES for effect in vars(family).values() if isinstance(effect, Effect)}
+EFFECTS = {
+    effect.id: effect for family in FAMILIES for effect in vars(family).values() if isinstance(effect, Effect)
+}

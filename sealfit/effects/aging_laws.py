@@ -17,18 +17,19 @@ STANDARD_C = 23.0
 def arrhenius_aging_shape(inputs, *, A, E):
     r"""Arrhenius acceleration of aging with temperature: of the loss a, or of the time b of its onset.
 
-    Oxidation, scission and cross-linking of network bonds have an activation energy E, and a rate proportional to
-    :math:`e^{-E / R T}`. A share A of the aging is of that kind; the rest is assumed to be independent of temperature,
+    Oxidation, scission and cross-linking of network bonds have an activation energy E, and a rate
+    proportional to :math:`e^{-E / R T}`. A share A of the aging is of that kind; the rest is assumed to be
+    independent of temperature,
 
     .. math:: h = A [e^{E / R\, (1 / T_{ref} - 1 / T)} - 1]
 
-    with T in kelvin. A = 1 is Arrhenius' law, a factor :math:`e^{E / R\, (1 / T_{ref} - 1 / T)}`. On a, the rate of the
-    loss, E is positive. On b, a time, E is negative, and A = 1 shifts the curve of Eq. 15 along the logarithm of time
-    (time-temperature superposition). Unaged rubber does not change.
+    with T in kelvin. A = 1 is Arrhenius' law, a factor :math:`e^{E / R\, (1 / T_{ref} - 1 / T)}`. On a, the
+    rate of the loss, E is positive. On b, a time, E is negative, and A = 1 shifts the curve of Eq. 15 along
+    the logarithm of time (time-temperature superposition). Unaged rubber does not change.
 
-    Two temperatures determine one parameter, three distinguish A and E; for a small exponent only A E is determined.
-    The declared model has a separate a and b for each series. The effect can be seen only if one series contains
-    several temperatures, that is if `condition` in the config does not list the temperature.
+    Two temperatures determine one parameter, three distinguish A and E; for a small exponent only A E is
+    determined. The declared model has a separate a and b for each series. The effect can be seen only if one
+    series contains several temperatures, that is if `condition` in the config does not list the temperature.
     """
     kelvin = positive(np.asarray(inputs["temperature_C"], dtype=float) + ZERO_C)
     at_reference = reference(inputs, "temperature_C", STANDARD_C) + ZERO_C
@@ -44,7 +45,9 @@ ARRHENIUS_AGING = Effect(
     reads=("temperature_C",),
     acts_on=(("a", "multiply"), ("b", "multiply")),
     parameters=(
-        Parameter("A", "{y}", 1.0, (-10.0, 10.0), "share of the aging that is thermally activated", linear=True),
+        Parameter(
+            "A", "{y}", 1.0, (-10.0, 10.0), "share of the aging that is thermally activated", linear=True
+        ),
         Parameter(
             "E",
             "J/mol",
@@ -55,10 +58,10 @@ ARRHENIUS_AGING = Effect(
         ),
     ),
     shape=arrhenius_aging_shape,
-    source="Arrhenius 1889, Z. Phys. Chem. 4, 226-248; for the life of rubber: ISO 11346. With a share that is not "
-    "activated: ours.",
-    # By hand: E = R T_ref ln 16 and T = 2 T_ref: the exponent is ln 16 / 2 = ln 4, and 0.5 (4 - 1) = 1.5. In numbers:
-    # T_ref = 300 K, E = 8.314462618 * 300 * 2.772588722239781, T = 600 K.
+    source="Arrhenius 1889, Z. Phys. Chem. 4, 226-248; for the life of rubber: ISO 11346. "
+    "With a share that is not activated: ours.",
+    # By hand: E = R T_ref ln 16 and T = 2 T_ref: the exponent is ln 16 / 2 = ln 4, and 0.5 (4 - 1) = 1.5. In
+    # numbers: T_ref = 300 K, E = 8.314462618 * 300 * 2.772588722239781, T = 600 K.
     worked=(
         {"temperature_C": 326.85, "temperature_C_ref": 26.85},
         {"A": 0.5, "E": 8.314462618 * 300 * 2.772588722239781},
@@ -70,16 +73,17 @@ ARRHENIUS_AGING = Effect(
 def compression_factor_shape(inputs, *, A):
     r"""Compression during aging: it changes aging, or friction after aging.
 
-    A seal ages under compression. Strain changes which bonds form and break (compression set), and the surface has less
-    contact with air. With c the height in per cent of the original height, to first order,
+    A seal ages under compression. Strain changes which bonds form and break (compression set), and the
+    surface has less contact with air. With c the height in per cent of the original height, to first order,
 
     .. math:: h = A (100 - c) / 100
 
-    A is the relative change per full compression, so that 80 % gives A / 5; the reference is uncompressed rubber. On a
-    or b it changes aging; on mu it also changes the friction of unaged rubber with a compression.
+    A is the relative change per full compression, so that 80 % gives A / 5; the reference is uncompressed
+    rubber. On a or b it changes aging; on mu it also changes the friction of unaged rubber with a
+    compression.
 
-    The declared model has a separate a and b for each series. An effect on a or b can be seen only if one series
-    contains several heights.
+    The declared model has a separate a and b for each series. An effect on a or b can be seen only if one
+    series contains several heights.
     """
     return A * (100.0 - np.asarray(inputs["compression_ratio_pct"], dtype=float)) / 100.0
 
@@ -91,8 +95,16 @@ COMPRESSION_FACTOR = Effect(
     form="A (100 - c) / 100",
     reference="not compressed (100 %)",
     reads=("compression_ratio_pct",),
-    acts_on=(("a", "multiply"), ("b", "multiply"), ("mu", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
-    parameters=(Parameter("A", "{y}", 0.5, AMPLITUDE, "relative change per whole height taken away", linear=True),),
+    acts_on=(
+        ("a", "multiply"),
+        ("b", "multiply"),
+        ("mu", "multiply"),
+        ("mu_s", "multiply"),
+        ("mu_c", "multiply"),
+    ),
+    parameters=(
+        Parameter("A", "{y}", 0.5, AMPLITUDE, "relative change per whole height taken away", linear=True),
+    ),
     shape=compression_factor_shape,
     source="Friction after aging at 80, 90 and 100 % of the height: Wu et al. 2020, Polymers 12(1), 102, "
     "doi:10.3390/polym12010102. First order: ours.",
@@ -108,8 +120,8 @@ def aging_floor_shape(inputs, *, A, t_f):
 
     .. math:: h = A \ln(t / t_f) \quad (t > t_f), \qquad h = 0 \quad (t \le t_f)
 
-    As a change of mu_s or mu_c, A = a stops the fall of :math:`\mu_0 - a \ln(1 + t / b)` altogether for t well beyond
-    b, and a smaller A slows it. As a factor on mu, A is relative to mu.
+    As a change of mu_s or mu_c, A = a stops the fall of :math:`\mu_0 - a \ln(1 + t / b)` altogether for t
+    well beyond b, and a smaller A slows it. As a factor on mu, A is relative to mu.
     """
     return A * np.log(np.maximum(np.asarray(inputs["aging_days"], dtype=float) / t_f, 1.0))
 
@@ -121,7 +133,13 @@ AGING_FLOOR = Effect(
     form="A ln(max(1, t / t_f))",
     reference="no more than {t_f} days",
     reads=("aging_days",),
-    acts_on=(("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply")),
+    acts_on=(
+        ("mu", "multiply"),
+        ("mu_c", "add"),
+        ("mu_s", "add"),
+        ("mu_c", "multiply"),
+        ("mu_s", "multiply"),
+    ),
     parameters=(
         Parameter("A", "{y}", 0.03, (-10.0, 10.0), "fall given back per factor e of the time", linear=True),
         Parameter("t_f", "{x}", 8.0, (1e-3, 1e5), "day from which it is given back", search="inside"),
@@ -137,8 +155,8 @@ AGING_FLOOR = Effect(
 def aging_induction_shape(inputs, *, A, t_i):
     r"""Aging with an induction time: at first the coefficient falls less than by the logarithm.
 
-    Antioxidants delay oxidation until they are consumed. The difference from Eq. 15 is zero at day 0, largest at t_i
-    and vanishes later:
+    Antioxidants delay oxidation until they are consumed. The difference from Eq. 15 is zero at day 0, largest
+    at t_i and vanishes later:
 
     .. math:: h = A \frac{t}{t_i} e^{1 - t / t_i}
 
@@ -155,7 +173,13 @@ AGING_INDUCTION = Effect(
     form="A (t / t_i) exp(1 - t / t_i)",
     reference="unaged",
     reads=("aging_days",),
-    acts_on=(("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply")),
+    acts_on=(
+        ("mu", "multiply"),
+        ("mu_c", "add"),
+        ("mu_s", "add"),
+        ("mu_c", "multiply"),
+        ("mu_s", "multiply"),
+    ),
     parameters=(
         Parameter("A", "{y}", 0.05, (-10.0, 10.0), "largest lag behind the logarithmic law", linear=True),
         Parameter("t_i", "{x}", 2.0, (1e-3, 1e5), "day of the largest lag", search="inside"),
@@ -170,14 +194,14 @@ AGING_INDUCTION = Effect(
 def aging_delay_shape(inputs, *, A, t_i, b):
     r"""Aging with a delay: Eq. 15 starts at a day t_i.
 
-    Antioxidants delay oxidation until they are consumed. The declared law starts at day 0, so the effect is the
-    difference of the two laws,
+    Antioxidants delay oxidation until they are consumed. The declared law starts at day 0, so the effect is
+    the difference of the two laws,
 
     .. math:: h = A \left[\ln(1 + t / b) - \ln(1 + \max(t - t_i, 0) / b)\right]
 
-    which is zero at day 0 and vanishes as :math:`A t_i / t`. If A is the a of the declared law (relative to mu, for a
-    factor) and b its b, the law with the effect is Eq. 15 with :math:`t - t_i` for t. `aging_induction` is a smooth
-    delay.
+    which is zero at day 0 and vanishes as :math:`A t_i / t`. If A is the a of the declared law (relative to
+    mu, for a factor) and b its b, the law with the effect is Eq. 15 with :math:`t - t_i` for t.
+    `aging_induction` is a smooth delay.
     """
     days = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0)
     return A * (np.log1p(days / b) - np.log1p(np.maximum(days - t_i, 0.0) / b))
@@ -189,7 +213,13 @@ AGING_DELAY = Effect(
     equation=r"h = A [\ln(1 + t / b) - \ln(1 + \max(t - t_i, 0) / b)]",
     form="A (ln(1 + t / b) - ln(1 + max(t - t_i, 0) / b))",
     reads=("aging_days",),
-    acts_on=(("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply")),
+    acts_on=(
+        ("mu", "multiply"),
+        ("mu_c", "add"),
+        ("mu_s", "add"),
+        ("mu_c", "multiply"),
+        ("mu_s", "multiply"),
+    ),
     parameters=(
         Parameter("A", "{y}", 0.05, (-10.0, 10.0), "loss for each unit of the logarithm", linear=True),
         Parameter("t_i", "{x}", 2.0, (1e-3, 1e5), "day on which aging starts", search="inside"),
@@ -197,19 +227,23 @@ AGING_DELAY = Effect(
     ),
     shape=aging_delay_shape,
     reference="unaged",
-    source="Eq. 15 with a later start; the induction period of oxidation: Celina, Gillen & Assink 2005, Polymer "
-    "Degradation and Stability 90(3), 395-404, doi:10.1016/j.polymdegradstab.2005.05.004.",
+    source="Eq. 15 with a later start; the induction period of oxidation: Celina, Gillen & Assink 2005, "
+    "Polymer Degradation and Stability 90(3), 395-404, doi:10.1016/j.polymdegradstab.2005.05.004.",
     # By hand: day 4, start at day 2, b = 1: ln 5 - ln 3 = 1.6094379124341003 - 1.0986122886681098.
-    worked=({"aging_days": 4.0}, {"A": 0.1, "t_i": 2.0, "b": 1.0}, 0.1 * (1.6094379124341003 - 1.0986122886681098)),
+    worked=(
+        {"aging_days": 4.0},
+        {"A": 0.1, "t_i": 2.0, "b": 1.0},
+        0.1 * (1.6094379124341003 - 1.0986122886681098),
+    ),
 )
 
 
 def stribeck_speed_aging_shape(inputs, *, A, t_0):
     r"""Stribeck speed that changes with age: the declared model has one v_s for all days of a series.
 
-    v_s is the speed of the transition from boundary friction to a film or a molecular time scale. Hardened rubber
-    conforms less to roughness and relaxes more slowly, which changes v_s. As for the coefficients, the change is a
-    logarithm of time,
+    v_s is the speed of the transition from boundary friction to a film or a molecular time scale. Hardened
+    rubber conforms less to roughness and relaxes more slowly, which changes v_s. As for the coefficients, the
+    change is a logarithm of time,
 
     .. math:: h = A \ln(1 + t / t_0)
 
@@ -227,7 +261,14 @@ STRIBECK_SPEED_AGING = Effect(
     reads=("aging_days",),
     acts_on=(("v_s", "multiply"),),
     parameters=(
-        Parameter("A", "{y}", 0.1, (-5.0, 20.0), "relative change of v_s per factor e of the aging time", linear=True),
+        Parameter(
+            "A",
+            "{y}",
+            0.1,
+            (-5.0, 20.0),
+            "relative change of v_s per factor e of the aging time",
+            linear=True,
+        ),
         Parameter(
             "t_0",
             "{x}",
@@ -246,14 +287,15 @@ STRIBECK_SPEED_AGING = Effect(
 
 
 def viscosity_aging_shape(inputs, *, A, t_0):
-    r"""Viscous coefficient that changes with age: the declared model has one sigma_2 for all days of a series.
+    r"""Viscous coefficient that changes with age.
 
-    The remaining lubricant and the damping of the rubber change with age. As for the coefficients, the change is a
-    logarithm of time,
+    The declared model has one sigma_2 for all days of a series. The remaining lubricant and the damping of
+    the rubber change with age. As for the coefficients, the change is a logarithm of time,
 
     .. math:: h = A \ln(1 + t / t_0)
 
-    A is the change of sigma_2 per factor e of the aging time (as a factor: relative to it), zero for unaged rubber.
+    A is the change of sigma_2 per factor e of the aging time (as a factor: relative to it), zero for unaged
+    rubber.
     """
     return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
 
@@ -267,7 +309,9 @@ VISCOSITY_AGING = Effect(
     reads=("aging_days",),
     acts_on=(("sigma_2", "add"), ("sigma_2", "multiply")),
     parameters=(
-        Parameter("A", "{y}", 0.01, AMPLITUDE, "change of sigma_2 per factor e of the aging time", linear=True),
+        Parameter(
+            "A", "{y}", 0.01, AMPLITUDE, "change of sigma_2 per factor e of the aging time", linear=True
+        ),
         Parameter(
             "t_0",
             "{x}",

@@ -48,8 +48,8 @@ LINEAR = closed_form(
 def linear_each_way_shape(inputs, *, A_f, A_b):
     r"""Straight line in any channel with a separate slope in each direction.
 
-    A lip that turns over or wears on one side changes the friction in one direction only. The interval of the slope in
-    the other direction then contains 0.
+    A lip that turns over or wears on one side changes the friction in one direction only. The interval of the
+    slope in the other direction then contains 0.
     """
     return np.where(np.asarray(inputs["direction"]) > 0, A_f, A_b) * deviation(inputs, CHANNEL)
 
@@ -134,7 +134,9 @@ LOG_GROWTH = closed_form(
     form="A ln(1 + x / x_0)",
     reference="{x} = 0",
     parameters=(
-        Parameter("A", "{y}", 0.05, AMPLITUDE, "change per factor e of the channel, well beyond x_0", linear=True),
+        Parameter(
+            "A", "{y}", 0.05, AMPLITUDE, "change per factor e of the channel, well beyond x_0", linear=True
+        ),
         Parameter("x_0", "{x}", 1.0, (1e-6, 1e9), "where the logarithm sets in", search="span"),
     ),
     shape=log_growth_shape,
@@ -147,8 +149,8 @@ LOG_GROWTH = closed_form(
 def power_shape(inputs, *, A, n):
     r"""Power of any positive channel, zero at its reference.
 
-    n = -1 is a hyperbola, n = 1 the straight line; n towards 0 is the logarithm, with A growing as 1/n. NaN where the
-    channel is not positive.
+    n = -1 is a hyperbola, n = 1 the straight line; n towards 0 is the logarithm, with A growing as 1/n. NaN
+    where the channel is not positive.
     """
     # expm1 keeps all digits where the power is close to one.
     return A * np.expm1(n * np.log(positive(inputs[CHANNEL]) / positive(reference(inputs, CHANNEL, 1.0))))
@@ -199,8 +201,8 @@ EXPONENTIAL_APPROACH = closed_form(
 def saturation_shape(inputs, *, A, x_half):
     r"""Saturation by a hyperbola, from 0, in any channel that is not negative.
 
-    It approaches its limit more slowly than an exponential: half at x_half, nine tenths at nine times that. NaN where
-    the channel is negative.
+    It approaches its limit more slowly than an exponential: half at x_half, nine tenths at nine times that.
+    NaN where the channel is negative.
     """
     x = not_negative(inputs[CHANNEL])
     return A * x / (x + x_half)
@@ -217,7 +219,8 @@ SATURATION = closed_form(
         Parameter("x_half", "{x}", 1.0, (1e-6, 1e9), "where half of the limit is reached", search="span"),
     ),
     shape=saturation_shape,
-    source="Form: Langmuir 1918, J. Am. Chem. Soc. 40(9), 1361-1403, doi:10.1021/ja02242a004: places that fill up.",
+    source="Form: Langmuir 1918, J. Am. Chem. Soc. 40(9), 1361-1403, doi:10.1021/ja02242a004: "
+    "places that fill up.",
     # By hand: x = 3 x_half is three quarters of 2.
     worked=({"x": 6.0, "x_ref": 1.0}, {"A": 2.0, "x_half": 2.0}, 1.5),
 )
@@ -228,9 +231,10 @@ def hyperbolic_shape(inputs, *, A, x_half):
 
     It falls to a half at x_half and to a tenth at nine times that. NaN where the channel is negative.
 
-    It equals a constant minus `saturation`. Coefficients, parameters and the friction force have a free constant in the
-    declared model, so that the two forms are equivalent on them, and `saturation` is used. An added force has no free
-    constant; this form acts only there. The hyperbola A (x_ref / x - 1) is `power` with n = -1.
+    It equals a constant minus `saturation`. Coefficients, parameters and the friction force have a free
+    constant in the declared model, so that the two forms are equivalent on them, and `saturation` is used. An
+    added force has no free constant; this form acts only there. The hyperbola A (x_ref / x - 1) is `power`
+    with n = -1.
     """
     return A / (1 + not_negative(inputs[CHANNEL]) / x_half)
 
@@ -323,7 +327,9 @@ SINUSOID = closed_form(
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude", linear=True),
         Parameter("lambda_", "{x}", 1.0, (1e-6, 1e9), "period", search="span"),
-        Parameter("phi", "rad", 0.0, (-4 * np.pi, 4 * np.pi), "phase at 0", search=tuple(np.arange(4) * np.pi / 4)),
+        Parameter(
+            "phi", "rad", 0.0, (-4 * np.pi, 4 * np.pi), "phase at 0", search=tuple(np.arange(4) * np.pi / 4)
+        ),
     ),
     shape=sinusoid_shape,
     source="Form: ours. The first Fourier term of anything periodic.",
@@ -340,9 +346,9 @@ TURN = 4 * np.pi
 def sinusoid_harmonics_shape(inputs, *, A, B, lambda_, phi, phi_2):
     r"""Sine of any channel with its second harmonic.
 
-    A bent and misaligned shaft, or the torque of a motor with its pole pairs, has components once and twice per turn.
-    The loop does not try this form, as it finds harmonics one at a time, each a ripple or sine with its own period. It
-    is for simulated campaigns and effects of users.
+    A bent and misaligned shaft, or the torque of a motor with its pole pairs, has components once and twice
+    per turn. The loop does not try this form, as it finds harmonics one at a time, each a ripple or sine with
+    its own period. It is for simulated campaigns and effects of users.
     """
     angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_
     once, twice = (sine_attenuation(inputs, CHANNEL, lambda_ / k) for k in (1, 2))
@@ -362,12 +368,18 @@ SINUSOID_HARMONICS = closed_form(
         Parameter("lambda_", "{x}", 1.0, (1e-6, 1e9), "period", search="span"),
         Parameter("phi", "rad", 0.0, (-TURN, TURN), "phase at 0", search=tuple(np.arange(4) * np.pi / 4)),
         Parameter(
-            "phi_2", "rad", 0.0, (-TURN, TURN), "phase of the harmonic at 0", search=tuple(np.arange(4) * np.pi / 4)
+            "phi_2",
+            "rad",
+            0.0,
+            (-TURN, TURN),
+            "phase of the harmonic at 0",
+            search=tuple(np.arange(4) * np.pi / 4),
         ),
     ),
     shape=sinusoid_harmonics_shape,
     source="Form: ours. The first two Fourier terms of anything periodic.",
-    # By hand: 0.02 of a period of 0.04 is half a turn: 4 sin(pi + pi/6) = -2; a whole one: 1.5 sin(2 pi + pi/2) = 1.5.
+    # By hand: 0.02 of a period of 0.04 is half a turn: 4 sin(pi + pi/6) = -2; a whole one: 1.5 sin(2 pi +
+    # pi/2) = 1.5.
     worked=({"x": 0.02}, {"A": 4.0, "B": 1.5, "lambda_": 0.04, "phi": np.pi / 6, "phi_2": np.pi / 2}, -0.5),
     periodic=True,
 )

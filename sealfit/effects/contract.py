@@ -1,7 +1,7 @@
 """The description of an effect, and its shape as one pure function.
 
-The search, the fit, the tables, the plots and the report read the description, so that a new effect is one definition
-in the file of its family. Effects of users follow the same contract.
+The search, the fit, the tables, the plots and the report read the description, so that a new effect is one
+definition in the file of its family. Effects of users follow the same contract.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ ANYWHERE: tuple[tuple[Target, Operation], ...] = (
 class Parameter:
     """One parameter of an effect.
 
-    In `unit`, `{x}` and `{z}` stand for the units of the channels and `{y}` for that of the result: the unit of force
-    for an added force, none for a factor, that of the parameter for a change of it; see `fill_unit`. A name that is a
-    Python keyword ends in an underscore; `symbol` is the printed name.
+    In `unit`, `{x}` and `{z}` stand for the units of the channels and `{y}` for that of the result: the unit
+    of force for an added force, none for a factor, that of the parameter for a change of it; see `fill_unit`.
+    A name that is a Python keyword ends in an underscore; `symbol` is the printed name.
 
-    `linear` marks an amplitude: the shape is linear in the vector of amplitudes. `search` gives the grid of a nonlinear
-    parameter: numbers, or "inside" (quantiles of the channel), "between" (midpoints of its neighbouring values, for a
-    jump), "span" (logarithmic, from a fraction of the channel's range to a few ranges), "ratio" (logarithmic, over the
-    magnitudes of the channel).
+    `linear` marks an amplitude: the shape is linear in the vector of amplitudes. `search` gives the grid of a
+    nonlinear parameter: numbers, or "inside" (quantiles of the channel), "between" (midpoints of its
+    neighbouring values, for a jump), "span" (logarithmic, from a fraction of the channel's range to a few
+    ranges), "ratio" (logarithmic, over the magnitudes of the channel).
     """
 
     name: str
@@ -85,13 +85,15 @@ class Parameter:
 class Effect:
     """One physical effect, or one closed form of any channel.
 
-    `shape(inputs, **values)` is a pure function. `inputs` maps each name in `reads` to an array, shape (n,), and
-    `<name>_ref` to a fixed reference of the channel, its mean over the campaign, which a shape gets by `reference`. The
-    shape is the added force, the factor minus one, or the change of the parameter, shape (n,). It is zero if all
-    amplitudes are zero, and NaN (without a warning) where the form is not defined, such as the logarithm of zero.
+    `shape(inputs, **values)` is a pure function. `inputs` maps each name in `reads` to an array, shape (n,),
+    and `<name>_ref` to a fixed reference of the channel, its mean over the campaign, which a shape gets by
+    `reference`. The shape is the added force, the factor minus one, or the change of the parameter, shape
+    (n,). It is zero if all amplitudes are zero, and NaN (without a warning) where the form is not defined,
+    such as the logarithm of zero.
 
-    `reference` describes the state in which the shape is zero; mu_0, a and b of the after-model refer to it. `{x}`,
-    `{z}` and `{load_N}` stand for channels, `{x_ref}` and the like for fixed reference values, `{x_0}` for a parameter.
+    `reference` describes the state in which the shape is zero; mu_0, a and b of the after-model refer to it.
+    `{x}`, `{z}` and `{load_N}` stand for channels, `{x_ref}` and the like for fixed reference values, `{x_0}`
+    for a parameter.
     """
 
     id: str
@@ -103,7 +105,8 @@ class Effect:
     parameters: tuple[Parameter, ...]
     shape: Callable[..., np.ndarray]
     source: str
-    worked: tuple[Mapping[str, float], Mapping[str, float], float]  # inputs, values and result of a check by hand
+    # inputs, values and result of a check by hand
+    worked: tuple[Mapping[str, float], Mapping[str, float], float]
     physical: bool = True  # false for a closed form that names no mechanism
     reference: str = ""  # state in which the shape is zero
     periodic: bool = False  # searched in the spectrum; its mean over a bin has a closed form
@@ -177,12 +180,12 @@ def deviation(inputs: Mapping[str, object], name: str) -> np.ndarray:
 
 
 def log_ratio(inputs: Mapping[str, object], name: str) -> np.ndarray:
-    """Return the logarithm of a channel over its reference value, shape (n,); NaN where the channel is not positive."""
+    """Return the logarithm of a channel over its reference, shape (n,); NaN where it is not positive."""
     return np.log(positive(inputs[name]) / reference(inputs, name, 1.0))
 
 
 def log_ratio_from_zero(inputs: Mapping[str, object], name: str) -> np.ndarray:
-    """Return ln((1 + z) / (1 + z_ref)) of a channel that starts at zero, shape (n,); NaN where it is negative."""
+    """Return ln((1 + z) / (1 + z_ref)) of a channel that starts at zero, (n,); NaN where it is negative."""
     return np.log1p(not_negative(inputs[name])) - np.log1p(max(reference(inputs, name, 0.0), 0.0))
 
 

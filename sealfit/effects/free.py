@@ -16,8 +16,8 @@ from sealfit.errors import ParameterError
 # .. math:: \frac{1}{n} \sum_k \sin(\alpha + \beta_k)
 #           = \frac{\sin(\pi w / \lambda)}{n \sin(\pi w / (n \lambda))} \sin \alpha
 #
-# for n samples spread evenly over a width w about the phase alpha (the Dirichlet kernel). It is small in bins that are
-# longer than the wavelength.
+# for n samples spread evenly over a width w about the phase alpha (the Dirichlet kernel). It is small in bins
+# that are longer than the wavelength.
 
 # Key of the inputs of an effect: number of samples in each row's mean.
 SAMPLES = "samples"
@@ -29,7 +29,7 @@ def width_of(name: str) -> str:
 
 
 def sine_attenuation(inputs: Mapping, name: str, wavelength: float):
-    """Return the factor by which averaging reduces a sine in each row, shape (n,); 1 if the rows are not means.
+    """Return the factor by which averaging reduces a sine in each row, shape (n,); 1 if rows are not means.
 
     Examples
     --------
@@ -45,16 +45,19 @@ def sine_attenuation(inputs: Mapping, name: str, wavelength: float):
     half, samples = np.pi * np.asarray(width, float) / wavelength, np.asarray(inputs[SAMPLES], float)
     each = np.sin(half / samples)
     equal = np.abs(each) < 1e-9  # samples whole wavelengths apart have equal values
-    return np.where(equal, np.cos(half) * np.cos(half / samples), np.sin(half) / np.where(equal, 1.0, samples * each))
+    return np.where(
+        equal, np.cos(half) * np.cos(half / samples), np.sin(half) / np.where(equal, 1.0, samples * each)
+    )
 
 
 # ---------------------------------------------------------------- categories
-# Free shapes of a categorical channel: one level per category, or one straight line in another channel per category.
+# Free shapes of a categorical channel: one level per category, or one straight line in another channel per
+# category.
 #
 # .. math:: h = \sum_k d_k [x = k], \qquad h = \sum_k e_k [z = k] (x - x_{ref})
 #
-# They name no mechanism. If the mean of levels over the campaign is given it is subtracted, as the declared model has a
-# constant already.
+# They name no mechanism. If the mean of levels over the campaign is given it is subtracted, as the declared
+# model has a constant already.
 
 LEVELS, SLOPES = "levels", "slopes"
 LESS_MEAN = "; less its mean over the campaign"
@@ -70,12 +73,14 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
     categories : sequence of str
         At least two different categories.
     means : sequence of float, optional
-        Share of each category in the campaign, for levels whose mean is zero; else the first category is zero.
+        Share of each category in the campaign, for levels whose mean is zero; else the first category is
+        zero.
 
     Returns
     -------
     Effect
-        Amplitudes `d_1`, `d_2`, ... for the categories after the first. A category that is not listed gives NaN.
+        Amplitudes `d_1`, `d_2`, ... for the categories after the first. A category that is not listed gives
+        NaN.
 
     Raises
     ------
@@ -110,7 +115,9 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
 def _different(id: str, categories: Sequence[str]) -> tuple[str, ...]:
     names = tuple(str(c) for c in categories)
     if len(names) < 2 or len(set(names)) != len(names):
-        raise ParameterError(f"{id}: {list(names)} must be two or more different categories.", fix="List each once.")
+        raise ParameterError(
+            f"{id}: {list(names)} must be two or more different categories.", fix="List each once."
+        )
     return names
 
 
@@ -187,18 +194,20 @@ def listed(values: Sequence[object]) -> str:
 
 
 # ---------------------------------------------------------------- free
-# Free shapes, with a number of parameters that depends on the data: a smooth curve of a channel, a surface of two.
+# Free shapes, with a number of parameters that depends on the data: a smooth curve of a channel, a surface of
+# two.
 #
 # They name no mechanism. `free_effect` builds them from plain values, which is the form in model files.
 #
 # .. math:: h = \sum_j c_j B_j(x)
 #
-# B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the reference knot has none. Beyond the
-# outer knots the shape is constant, as nothing was measured there. If its mean over the campaign is given it is
-# subtracted, as the declared model has a constant already.
+# B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the reference knot has none.
+# Beyond the outer knots the shape is constant, as nothing was measured there. If its mean over the campaign
+# is given it is subtracted, as the declared model has a constant already.
 
 SMOOTH, SURFACE = "smooth", "surface"
-# A positive channel with at least this ratio of its largest to its smallest value is transformed by the logarithm.
+# A positive channel with at least this ratio of its largest to its smallest value is transformed by the
+# logarithm.
 WIDE = 20.0
 # Powers of the two scaled channels in the terms of a free surface.
 BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))
@@ -234,7 +243,9 @@ def smooth_effect(
     """
     places = tuple(float(k) for k in knots)
     if len(places) < 2 or not np.isfinite(places).all() or not (np.diff(places) > 0).all():
-        raise ParameterError(f"smooth: knots {list(places)} must be two or more rising numbers.", fix="Sort them.")
+        raise ParameterError(
+            f"smooth: knots {list(places)} must be two or more rising numbers.", fix="Sort them."
+        )
     zero = _nearest(places, reference)
     free = [j for j in range(len(places)) if j != zero]
     x = places[free[-1]]
@@ -270,7 +281,9 @@ def smooth_effect(
     )
 
 
-def _spline(places: tuple[float, ...], zero: int, means: tuple[float, ...], inputs: Mapping, **values) -> np.ndarray:
+def _spline(
+    places: tuple[float, ...], zero: int, means: tuple[float, ...], inputs: Mapping, **values
+) -> np.ndarray:
     basis = natural(places, np.asarray(inputs[CHANNEL], dtype=float)) - means
     amplitude = np.array([0.0 if j == zero else values[f"c_{j + 1}"] for j in range(len(places))])
     return basis @ amplitude
@@ -291,12 +304,13 @@ def natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def roughness(places: tuple[float, ...], reference: float | None = None) -> np.ndarray:
-    r"""Return S with :math:`c^T S c = \int h''^2` of the spline through c at the knots, scaled to a range of 1.
+    r"""Return S with :math:`c^T S c = \int h''^2` of the spline through c at knots scaled to a range of 1.
 
     Parameters
     ----------
     places : tuple of float
-        Knots. If they are positive with a ratio of `WIDE` or more, derivatives are with respect to their logarithm.
+        Knots. If they are positive with a ratio of `WIDE` or more, derivatives are with respect to their
+        logarithm.
     reference : float, optional
         As in `smooth_effect`: its knot has no amplitude.
 
@@ -307,7 +321,8 @@ def roughness(places: tuple[float, ...], reference: float | None = None) -> np.n
     """
     x = np.log(places) if places[0] > 0 and places[-1] / places[0] >= WIDE else np.array(places)
     bend = _cardinal(tuple(((x - x[0]) / (x[-1] - x[0])).tolist())).derivative(2)
-    at, width = bend(bend.x), np.diff(bend.x)[:, None]  # h'' of each cardinal spline is straight between knots
+    # h'' of each cardinal spline is straight between knots
+    at, width = bend(bend.x), np.diff(bend.x)[:, None]
     left, right = at[:-1], at[1:]
     across = left.T @ (width / 6 * right)
     whole = left.T @ (width / 3 * left) + right.T @ (width / 3 * right) + across + across.T
@@ -321,13 +336,14 @@ def _nearest(places: Sequence[float], reference: float | None) -> int:
 
 
 def surface_effect(x_knots: Sequence[float], z_knots: Sequence[float]) -> Effect:
-    """Return a free surface of two channels: the mixed terms of a polynomial, zero if either is at its middle.
+    """Return a free surface of two channels: mixed terms of a polynomial, zero if either is at its middle.
 
     Parameters
     ----------
     x_knots, z_knots : sequence of float
-        Rising values of each channel that are mapped to even steps from -1 to 1, linear in between and constant beyond.
-        Tested values are then about evenly spaced, for channels set in steps as well as in decades.
+        Rising values of each channel that are mapped to even steps from -1 to 1, linear in between and
+        constant beyond. Tested values are then about evenly spaced, for channels set in steps as well as in
+        decades.
 
     Returns
     -------
@@ -398,8 +414,8 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
     id : str
         `smooth`, `levels`, `surface` or `slopes`.
     fixed : mapping
-        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `means`, if any, for smooth
-        and levels; `x_knots` and `z_knots` for a surface. Other entries are ignored.
+        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `means`, if any,
+        for smooth and levels; `x_knots` and `z_knots` for a surface. Other entries are ignored.
 
     Raises
     ------

@@ -22,9 +22,10 @@ from sealfit.effects.contract import (
 
 
 class Scales(NamedTuple):
-    """How the two channels enter a product: x through u and z through w, both zero at the channel's reference.
+    """How two channels enter a product: x through u and z through w, both zero at the channel's reference.
 
-    The references are the channels' means over the campaign, so that a product excludes what either channel does alone.
+    The references are the channels' means over the campaign, so that a product excludes what either channel
+    does alone.
     """
 
     suffix: str  # of the id
@@ -40,12 +41,13 @@ class Scales(NamedTuple):
     worked: tuple[float, float]  # A u w at A = 0.5; A u w + B u + C w at A = 0.5, B = 1, C = 2
 
 
-# ln x is for a channel that spans decades, such as the speed; it is NaN where x is not positive. ln(1 + z) is for a
-# channel that starts at 0 and acts ever more slowly, as days of aging do; it is NaN where z is negative.
+# ln x is for a channel that spans decades, such as the speed; it is NaN where x is not positive. ln(1 + z) is
+# for a channel that starts at 0 and acts ever more slowly, as days of aging do; it is NaN where z is
+# negative.
 SCALES = (
     Scales(
-        "", "{x} and {z}", "x - x_{ref}", "z - z_{ref}", deviation, deviation, ("{y}/({x} {z})", "{y}/{x}", "{y}/{z}"),
-        "slope of a slope", "two channels",
+        "", "{x} and {z}", "x - x_{ref}", "z - z_{ref}", deviation, deviation,
+        ("{y}/({x} {z})", "{y}/{x}", "{y}/{z}"), "slope of a slope", "two channels",
         # By hand: u = 2, w = -3; 0.5 * 2 * -3 = -3, and -3 + 2 - 6.
         {"x": 12.0, "x_ref": 10.0, "z": 1.0, "z_ref": 4.0}, (-3.0, -7.0),
     ),
@@ -57,7 +59,8 @@ SCALES = (
     ),
     Scales(
         "_logs", "log {x} and log of 1 + {z}", r"\ln(x / x_{ref})", r"\ln((1 + z) / (1 + z_{ref}))",
-        log_ratio, log_ratio_from_zero, ("{y}", "{y}", "{y}"), "slope of a slope, in logarithms", "ln x and ln(1 + z)",
+        log_ratio, log_ratio_from_zero, ("{y}", "{y}", "{y}"), "slope of a slope, in logarithms",
+        "ln x and ln(1 + z)",
         # By hand: u = ln e = 1, w = ln e^2 = 2; 1, and 1 + 1 + 4.
         {"x": np.e, "x_ref": 1.0, "z": np.e**2 - 1.0, "z_ref": 0.0}, (1.0, 6.0),
     ),
@@ -81,12 +84,16 @@ def _factor(latex: str) -> str:
 def _closed_form(scales: Scales, kind: str, *, alone: bool) -> Effect:
     """Return the product of two channels, with the terms of each channel alone if wanted.
 
-    A product alone is for an effect that shows only where both channels are away from their means. Speed times days:
-    aged rubber loses more friction at high speed than unaged rubber does.
+    A product alone is for an effect that shows only where both channels are away from their means. Speed
+    times days: aged rubber loses more friction at high speed than unaged rubber does.
     """
     s, product = scales, f"{_factor(scales.u)} {_factor(scales.w)}"
     values = {"A": 0.5, "B": 1.0, "C": 2.0}
-    meanings = ("slope of a slope" if alone else s.meaning, "slope in the first channel", "slope in the second channel")
+    meanings = (
+        "slope of a slope" if alone else s.meaning,
+        "slope in the first channel",
+        "slope in the second channel",
+    )
     names = ("A", "B", "C")[: 3 if alone else 1]
     return Effect(
         id=kind + s.suffix,
@@ -101,7 +108,8 @@ def _closed_form(scales: Scales, kind: str, *, alone: bool) -> Effect:
             for name, unit, meaning in zip(names, s.units, meanings, strict=False)
         ),
         shape=partial(bilinear_shape, s.first, s.second),
-        source=f"Form: ours, the first {'terms' if alone else 'mixed term'} of a Taylor series in {s.variables}.",
+        source=f"Form: ours, the first {'terms' if alone else 'mixed term'} of a Taylor series "
+        f"in {s.variables}.",
         worked=(s.inputs, {name: values[name] for name in names}, s.worked[alone]),
         physical=False,
     )

@@ -11,11 +11,12 @@ from sealfit.effects.free import sine_attenuation
 def ripple_shape(inputs, *, A, lambda_, phi):
     r"""Ripple along the rig's position, due to a screw, a guide or a periodic track.
 
-    A lead screw with a pitch error, a bent shaft or an eccentric coupling gives a force that is periodic in the rig's
-    coordinate. The wavelength is the pitch, or an integer fraction of it for a screw of several starts. It is an added
-    force, the same in both directions, if the drive strains the sensor, and a factor on friction if the pressure or the
-    surface of the contact is periodic along the track. A harmonic is a further ripple of half or a third of the
-    wavelength. Positions beyond the tested ones are extrapolated in phase.
+    A lead screw with a pitch error, a bent shaft or an eccentric coupling gives a force that is periodic in
+    the rig's coordinate. The wavelength is the pitch, or an integer fraction of it for a screw of several
+    starts. It is an added force, the same in both directions, if the drive strains the sensor, and a factor
+    on friction if the pressure or the surface of the contact is periodic along the track. A harmonic is a
+    further ripple of half or a third of the wavelength. Positions beyond the tested ones are extrapolated in
+    phase.
     """
     angle = 2 * np.pi * np.asarray(inputs["displacement_mm"], dtype=float) / lambda_ + phi
     return A * np.sin(angle) * sine_attenuation(inputs, "displacement_mm", lambda_)
@@ -32,14 +33,25 @@ RIPPLE = Effect(
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude", linear=True),
         Parameter(
-            "lambda_", "{x}", 2.0, (1e-4, 1e6), "wavelength: pitch of the screw, or its whole fraction", search="span"
+            "lambda_",
+            "{x}",
+            2.0,
+            (1e-4, 1e6),
+            "wavelength: pitch of the screw, or its whole fraction",
+            search="span",
         ),
         Parameter(
-            "phi", "rad", 0.0, (-4 * np.pi, 4 * np.pi), "phase at position 0", search=tuple(np.arange(4) * np.pi / 4)
+            "phi",
+            "rad",
+            0.0,
+            (-4 * np.pi, 4 * np.pi),
+            "phase at position 0",
+            search=tuple(np.arange(4) * np.pi / 4),
         ),
     ),
     shape=ripple_shape,
-    source="Form: ours. A cyclic error of a screw is periodic in its angle; the sine is its first Fourier term.",
+    source="Form: ours. A cyclic error of a screw is periodic in its angle; "
+    "the sine is its first Fourier term.",
     # By hand: 0.5 mm of a 2 mm pitch is a quarter turn, pi/2; with phi = pi/3 the sine is cos(pi/3) = 1/2.
     worked=({"displacement_mm": 0.5}, {"A": 3.0, "lambda_": 2.0, "phi": np.pi / 3}, 1.5),
     periodic=True,
@@ -49,8 +61,8 @@ RIPPLE = Effect(
 def drift_shape(inputs, *, A):
     r"""Drift of the force channel along a record: a strain-gauge bridge or its amplifier warming up.
 
-    A is the rate. The added force does not depend on the direction of motion. Time is that of the file, so that the
-    drift restarts with every file.
+    A is the rate. The added force does not depend on the direction of motion. Time is that of the file, so
+    that the drift restarts with every file.
     """
     return A * np.asarray(inputs["time_s"], dtype=float)
 
@@ -74,8 +86,9 @@ DRIFT = Effect(
 def zero_offset_shape(inputs, *, A):
     r"""Zero offset of the force channel: a constant added force, the same in both directions.
 
-    It is the half-sum of forward and backward force. Strokes in one direction do not distinguish it from friction that
-    is independent of speed, so that it reads the direction. An offset within the sensor's accuracy is not significant.
+    It is the half-sum of forward and backward force. Strokes in one direction do not distinguish it from
+    friction that is independent of speed, so that it reads the direction. An offset within the sensor's
+    accuracy is not significant.
     """
     return A * np.ones_like(np.asarray(inputs["direction"], dtype=float))
 
@@ -99,9 +112,9 @@ ZERO_OFFSET = Effect(
 def offset_slope_shape(inputs, *, A, B):
     r"""Zero offset of the force that changes with a channel, the same in both directions.
 
-    The force on a piston is pressure times area, so that an error dA of the area adds dA p to the measured friction. A
-    is then the error of the area, and B that error times the reference pressure. Another cause is an amplifier whose
-    zero depends on the room temperature.
+    The force on a piston is pressure times area, so that an error dA of the area adds dA p to the measured
+    friction. A is then the error of the area, and B that error times the reference pressure. Another cause is
+    an amplifier whose zero depends on the room temperature.
     """
     return A * deviation(inputs, CHANNEL) + B
 
@@ -129,12 +142,13 @@ OFFSET_SLOPE = Effect(
 def asymmetry_shape(inputs, *, A):
     r"""Direction asymmetry: a parameter that differs between the two directions.
 
-    Friction of a lip seal, a misaligned sample or a polished track depends on the direction. With d = +1 or -1,
+    Friction of a lip seal, a misaligned sample or a polished track depends on the direction. With d = +1 or
+    -1,
 
     .. math:: h = A d / 2
 
-    A is the forward value minus the backward one, relative to their mean, or in its unit for an added change. The mean
-    of the two directions does not change.
+    A is the forward value minus the backward one, relative to their mean, or in its unit for an added change.
+    The mean of the two directions does not change.
     """
     return A * np.asarray(inputs["direction"], dtype=float) / 2
 
@@ -173,9 +187,9 @@ def campaign_drift_shape(inputs, *, A):
 
     .. math:: h = A t
 
-    with t the time since the campaign's first file. A is the change per time, relative for friction, in N for the zero.
-    A drift along the order of runs is `linear` in `run_order`. If tests follow the calendar of aging it is not
-    distinguishable from the aging law.
+    with t the time since the campaign's first file. A is the change per time, relative for friction, in N for
+    the zero. A drift along the order of runs is `linear` in `run_order`. If tests follow the calendar of
+    aging it is not distinguishable from the aging law.
     """
     return A * np.asarray(inputs["elapsed_h"], dtype=float)
 

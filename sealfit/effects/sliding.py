@@ -10,16 +10,17 @@ from sealfit.effects.contract import AMPLITUDE, Effect, Parameter, positive, ref
 def load_exponent_shape(inputs, *, A):
     r"""Load exponent of rubber: friction grows more slowly than the load, so the coefficient falls with it.
 
-    The true contact area of a smooth elastic asperity goes with the load to the power 2/3, so that :math:`F \propto
-    N^n` and :math:`\mu = \mu_{ref} (N / N_{ref})^{n - 1}` with n between 2/3 and 1. To first order in n - 1,
+    The true contact area of a smooth elastic asperity goes with the load to the power 2/3, so that :math:`F
+    \propto N^n` and :math:`\mu = \mu_{ref} (N / N_{ref})^{n - 1}` with n between 2/3 and 1. To first order in
+    n - 1,
 
     .. math:: h = A \ln(N / N_{ref}), \qquad A \approx n - 1
 
-    which is fitted, as A is then a linear parameter. The neglected term is :math:`\frac12 A^2 \ln^2(N / N_{ref})`,
-    0.7 % of friction at A = -1/6 and twice the load; `power` is the full curve.
+    which is fitted, as A is then a linear parameter. The neglected term is :math:`\frac12 A^2 \ln^2(N /
+    N_{ref})`, 0.7 % of friction at A = -1/6 and twice the load; `power` is the full curve.
 
-    If the local coefficient depends on the local pressure, :math:`\mu(p) \propto p^{n - 1}`, the exponent is the same,
-    and the pressure distribution gives a constant factor on mu.
+    If the local coefficient depends on the local pressure, :math:`\mu(p) \propto p^{n - 1}`, the exponent is
+    the same, and the pressure distribution gives a constant factor on mu.
     """
     return A * np.log(positive(inputs["load_N"]) / reference(inputs, "load_N", 1.0))
 
@@ -32,7 +33,9 @@ LOAD_EXPONENT = Effect(
     reference="{load_N} = {load_N_ref}",
     reads=("load_N",),
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply")),
-    parameters=(Parameter("A", "{y}", -0.1, (-2.0, 2.0), "load exponent of friction minus one", linear=True),),
+    parameters=(
+        Parameter("A", "{y}", -0.1, (-2.0, 2.0), "load exponent of friction minus one", linear=True),
+    ),
     shape=load_exponent_shape,
     source="Schallamach 1952, The load dependence of rubber friction, Proc. Phys. Soc. B 65, 657-661. "
     "First order: ours.",
@@ -42,21 +45,21 @@ LOAD_EXPONENT = Effect(
 
 
 def stribeck_exponent_shape(inputs, *, A, v_s, n):
-    r"""Stribeck exponent other than 2: friction falls with speed more gradually or more abruptly than declared.
+    r"""Stribeck exponent other than 2: friction falls with speed more gradually or abruptly than declared.
 
-    The declared curve falls from mu_s to mu_c as a Gaussian of the speed, by convention. A wide distribution of contact
-    strengths gives n near 1 or below; the sudden formation of a film gives n well above 2. The effect is the difference
-    of the two decays,
+    The declared curve falls from mu_s to mu_c as a Gaussian of the speed, by convention. A wide distribution
+    of contact strengths gives n near 1 or below; the sudden formation of a film gives n well above 2. The
+    effect is the difference of the two decays,
 
     .. math:: h = A [e^{-(|v| / v_s)^n} - e^{-(v / v_s)^2}]
 
-    which is zero at rest, at v_s, far above v_s, and everywhere for n = 2. With A = mu_s - mu_c and the declared v_s,
-    the curve with the effect is exactly :math:`\mu_c + (\mu_s - \mu_c) e^{-(|v| / v_s)^n}`. As a factor on mu, A is
-    relative to mu, and this is an approximation for small changes of mu around v_s.
+    which is zero at rest, at v_s, far above v_s, and everywhere for n = 2. With A = mu_s - mu_c and the
+    declared v_s, the curve with the effect is exactly :math:`\mu_c + (\mu_s - \mu_c) e^{-(|v| / v_s)^n}`. As
+    a factor on mu, A is relative to mu, and this is an approximation for small changes of mu around v_s.
 
-    Three parameters here and four of the declared curve need seven speeds in one direction, several on each side of
-    v_s. Near n = 2 the shape is :math:`A (2 - n) r^2 \ln r\, e^{-r^2}` with :math:`r = |v| / v_s`, so that only the
-    product A (2 - n) is determined.
+    Three parameters here and four of the declared curve need seven speeds in one direction, several on each
+    side of v_s. Near n = 2 the shape is :math:`A (2 - n) r^2 \ln r\, e^{-r^2}` with :math:`r = |v| / v_s`, so
+    that only the product A (2 - n) is determined.
     """
     ratio = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / v_s
     return A * (np.exp(-(ratio**n)) - np.exp(-(ratio**2)))
@@ -73,11 +76,14 @@ STRIBECK_EXPONENT = Effect(
     parameters=(
         Parameter("A", "{y}", 0.3, (-10.0, 10.0), "drop of friction across the Stribeck curve", linear=True),
         Parameter("v_s", "{x}", 5.0, (1e-6, 1e6), "Stribeck speed", search="ratio"),
-        Parameter("n", "", 1.0, (0.2, 10.0), "Stribeck exponent", search=(0.4, 0.6, 0.8, 1.0, 1.4, 3.0, 4.0, 6.0)),
+        Parameter(
+            "n", "", 1.0, (0.2, 10.0), "Stribeck exponent", search=(0.4, 0.6, 0.8, 1.0, 1.4, 3.0, 4.0, 6.0)
+        ),
     ),
     shape=stribeck_exponent_shape,
-    source="Exponents from 1/2 upwards: Bo & Pavelescu 1982, Wear 82(3), 277-289; review: Armstrong-Helouvry, Dupont & "
-    "Canudas de Wit 1994, Automatica 30(7), 1083-1138, doi:10.1016/0005-1098(94)90209-7. As a difference: ours.",
+    source="Exponents from 1/2 upwards: Bo & Pavelescu 1982, Wear 82(3), 277-289; review: "
+    "Armstrong-Helouvry, Dupont & Canudas de Wit 1994, Automatica 30(7), 1083-1138, "
+    "doi:10.1016/0005-1098(94)90209-7. As a difference: ours.",
     # By hand: twice v_s, n = 1: exp(-2) - exp(-4) = 0.1353352832366127 - 0.01831563888873418.
     worked=(
         {"speed_mm_s": -10.0},
@@ -94,8 +100,8 @@ def log_rate_shape(inputs, *, A):
 
     .. math:: h = A \ln(|v| / v_{ref})
 
-    A is the relative change per factor e of the speed: positive if the breaking of bonds dominates (strengthening with
-    rate), negative if the age of the contacts does. It is not defined at rest.
+    A is the relative change per factor e of the speed: positive if the breaking of bonds dominates
+    (strengthening with rate), negative if the age of the contacts does. It is not defined at rest.
     """
     return A * np.log(positive(np.abs(inputs["speed_mm_s"])) / reference(inputs, "speed_mm_s", 1.0))
 
@@ -119,9 +125,9 @@ LOG_RATE = Effect(
 def power_viscous_shape(inputs, *, A, n):
     r"""Viscous friction by a power of the speed: shear-thinning grease, or a film that thickens with speed.
 
-    The drag of a Newtonian film of constant thickness is the declared sigma_2 v. That of a shear-thinning film is
-    proportional to :math:`|v|^n` with n < 1. A hydrodynamic film, as under a seal lip, has a thickness proportional to
-    the root of the speed and n near 1/2.
+    The drag of a Newtonian film of constant thickness is the declared sigma_2 v. That of a shear-thinning
+    film is proportional to :math:`|v|^n` with n < 1. A hydrodynamic film, as under a seal lip, has a
+    thickness proportional to the root of the speed and n near 1/2.
 
     A is the force at the reference speed. At n = 1 it is not distinguishable from sigma_2 v.
     """
@@ -139,11 +145,14 @@ POWER_VISCOUS = Effect(
     acts_on=(("force", "add"),),
     parameters=(
         Parameter("A", "{y}", 1.0, AMPLITUDE, "force at the reference speed", linear=True),
-        Parameter("n", "", 0.5, (0.05, 4.0), "exponent of the speed", search=(0.2, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0)),
+        Parameter(
+            "n", "", 0.5, (0.05, 4.0), "exponent of the speed", search=(0.2, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0)
+        ),
     ),
     shape=power_viscous_shape,
-    source="Form: Ostwald-de Waele power law as a friction term; speed-dependent friction terms: Armstrong-Helouvry, "
-    "Dupont & Canudas de Wit 1994, Automatica 30(7), 1083-1138, doi:10.1016/0005-1098(94)90209-7.",
+    source="Form: Ostwald-de Waele power law as a friction term; speed-dependent friction terms: "
+    "Armstrong-Helouvry, Dupont & Canudas de Wit 1994, Automatica 30(7), 1083-1138, "
+    "doi:10.1016/0005-1098(94)90209-7.",
     # By hand: four times the reference speed, backward: -2 * sqrt(4).
     worked=({"speed_mm_s": -20.0, "speed_mm_s_ref": 5.0}, {"A": 2.0, "n": 0.5}, -4.0),
 )
@@ -152,13 +161,13 @@ POWER_VISCOUS = Effect(
 def grosch_peak_shape(inputs, *, A, v_p, w):
     r"""Viscoelastic peak over log speed (Grosch): rubber friction has a maximum where its loss has one.
 
-    Deformation by asperities and molecular adhesion dissipate most at different rates. Each gives a bell over the
-    logarithm of the speed, shifted by temperature (WLF),
+    Deformation by asperities and molecular adhesion dissipate most at different rates. Each gives a bell over
+    the logarithm of the speed, shifted by temperature (WLF),
 
     .. math:: h = A \exp[-(\log_{10}(|v| / v_p) / w)^2]
 
-    A is the height of the bell, relative to the Stribeck curve or as an added coefficient of friction. The height of a
-    peak beyond the tested speeds is not determined.
+    A is the height of the bell, relative to the Stribeck curve or as an added coefficient of friction. The
+    height of a peak beyond the tested speeds is not determined.
     """
     decades = np.log10(positive(np.abs(inputs["speed_mm_s"])) / v_p)
     return A * np.nan_to_num(np.exp(-((decades / w) ** 2)), nan=0.0)
@@ -175,11 +184,14 @@ GROSCH_PEAK = Effect(
     parameters=(
         Parameter("A", "{y}", 0.1, (-0.95, 10.0), "height of the peak", linear=True),
         Parameter("v_p", "{x}", 10.0, (1e-6, 1e6), "speed at the peak", search="ratio"),
-        Parameter("w", "decade", 1.0, (0.05, 10.0), "half-width at 1/e", search=(0.2, 0.4, 0.7, 1.0, 1.5, 2.5)),
+        Parameter(
+            "w", "decade", 1.0, (0.05, 10.0), "half-width at 1/e", search=(0.2, 0.4, 0.7, 1.0, 1.5, 2.5)
+        ),
     ),
     shape=grosch_peak_shape,
-    source="Bell over log speed: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112; shift: Williams, "
-    "Landel & Ferry 1955, J. Am. Chem. Soc. 77, 3701-3707, doi:10.1021/ja01619a008. Gaussian form: ours.",
+    source="Bell over log speed: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112; "
+    "shift: Williams, Landel & Ferry 1955, J. Am. Chem. Soc. 77, 3701-3707, doi:10.1021/ja01619a008. "
+    "Gaussian form: ours.",
     # By hand: two decades above the peak with w = 2: 1/e = 0.36787944117144233.
     worked=({"speed_mm_s": -100.0}, {"A": 0.3, "v_p": 1.0, "w": 2.0}, 0.3 * 0.36787944117144233),
 )
@@ -188,13 +200,13 @@ GROSCH_PEAK = Effect(
 def humidity_shape(inputs, *, A):
     r"""Humidity of the laboratory: a film of water between rubber and track.
 
-    Water from the air weakens adhesion and lubricates at speed. Over the humidities of a laboratory the effect is about
-    linear,
+    Water from the air weakens adhesion and lubricates at speed. Over the humidities of a laboratory the
+    effect is about linear,
 
     .. math:: h = A (H - H_{ref})
 
-    A is the relative change per per cent of relative humidity. It needs a column `humidity_pct`; for another name the
-    effect is `linear`.
+    A is the relative change per per cent of relative humidity. It needs a column `humidity_pct`; for another
+    name the effect is `linear`.
     """
     return A * (np.asarray(inputs["humidity_pct"], dtype=float) - reference(inputs, "humidity_pct", 0.0))
 
@@ -206,8 +218,16 @@ HUMIDITY = Effect(
     form="A (H - H_ref)",
     reference="{humidity_pct} = {humidity_pct_ref}",
     reads=("humidity_pct",),
-    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
-    parameters=(Parameter("A", "{y}/{x}", -0.001, AMPLITUDE, "change per per cent of relative humidity", linear=True),),
+    acts_on=(
+        ("mu", "multiply"),
+        ("force", "add"),
+        ("force", "multiply"),
+        ("mu_s", "multiply"),
+        ("mu_c", "multiply"),
+    ),
+    parameters=(
+        Parameter("A", "{y}/{x}", -0.001, AMPLITUDE, "change per per cent of relative humidity", linear=True),
+    ),
     shape=humidity_shape,
     source="Form: ours. First order in the humidity about its mean.",
     # By hand: 20 % below the reference at -0.1 % of friction per per cent.

@@ -1,7 +1,8 @@
 """Effects of users: Python files in a folder that the command line names (see `store.paths`).
 
-This is the only place where Python of a user is run. A file defines one or more `Effect` at its top level, like the
-modules of this package. Modules it imports must be installed. Files whose name starts with an underscore are not read.
+This is the only place where Python of a user is run. A file defines one or more `Effect` at its top level,
+like the modules of this package. Modules it imports must be installed. Files whose name starts with an
+underscore are not read.
 """
 
 from __future__ import annotations
@@ -32,12 +33,15 @@ def load_user_effects(folder: Path) -> dict[str, Effect]:
     Raises
     ------
     ConfigError
-        With the file and a fix: if the folder is missing, a file cannot be run or defines no effect, an id exists
-        already or is no identifier, or an effect violates the contract (worked value, linearity, shape).
+        With the file and a fix: if the folder is missing, a file cannot be run or defines no effect, an id
+        exists already or is no identifier, or an effect violates the contract (worked value, linearity,
+        shape).
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ConfigError("there is no such folder.", file=folder, fix="Check loop.effects_folder in the config.")
+        raise ConfigError(
+            "there is no such folder.", file=folder, fix="Check loop.effects_folder in the config."
+        )
     found: dict[str, Effect] = {}
     for path in sorted(folder.glob("*.py")):
         if path.name.startswith("_"):
@@ -46,14 +50,16 @@ def load_user_effects(folder: Path) -> dict[str, Effect]:
             _refuse_taken(effect.id, found, path)
             fault = contract_fault(effect)
             if fault:
-                raise ConfigError(f"effect '{effect.id}': {fault}.", file=path, fix=f"Fix the file. {EXAMPLE}")
+                raise ConfigError(
+                    f"effect '{effect.id}': {fault}.", file=path, fix=f"Fix the file. {EXAMPLE}"
+                )
             found[effect.id] = replace(effect, shape=FileShape(path.resolve(), effect.id, effect.shape))
     return found
 
 
 @dataclass(frozen=True)
 class FileShape:
-    """The shape of an effect in a user's file; a worker process, which cannot import it, reads the file again."""
+    """The shape of an effect in a user's file; worker processes cannot import it and read the file again."""
 
     path: Path
     id: str
@@ -75,7 +81,8 @@ def _read_again(path: Path, id: str) -> FileShape:
 
 def _effects_of(path: Path) -> list[Effect]:
     own = [value for value in vars(_run(path)).values() if isinstance(value, Effect)]
-    unique = {id(effect): effect for effect in own if EFFECTS.get(effect.id) is not effect}  # not what it imported
+    # not what it imported
+    unique = {id(effect): effect for effect in own if EFFECTS.get(effect.id) is not effect}
     if not unique:
         raise ConfigError(
             "holds no effect.", file=path, fix=f"Define one at its top level, or move the file. {EXAMPLE}"
@@ -99,7 +106,9 @@ def _run(path: Path) -> ModuleType:
         del sys.modules[name]
         line = _line_in(path, error)
         message = f"cannot be run: {type(error).__name__}: {error}."
-        raise ConfigError(message, file=path, line=line, fix="Fix the file, or move it out of the folder.") from error
+        raise ConfigError(
+            message, file=path, line=line, fix="Fix the file, or move it out of the folder."
+        ) from error
     return module
 
 
@@ -117,11 +126,17 @@ def _line_in(path: Path, error: BaseException) -> int | None:
 
 def _refuse_taken(name: str, found: Mapping[str, Effect], path: Path) -> None:
     if not (isinstance(name, str) and name.isidentifier()):
-        raise ConfigError(f"id {name!r} is not a plain name.", file=path, fix="Use letters, digits and underscores.")
+        raise ConfigError(
+            f"id {name!r} is not a plain name.", file=path, fix="Use letters, digits and underscores."
+        )
     if name in EFFECTS or name in FREE:
-        raise ConfigError(f"the catalogue has an effect '{name}' already.", file=path, fix="Give it another id.")
+        raise ConfigError(
+            f"the catalogue has an effect '{name}' already.", file=path, fix="Give it another id."
+        )
     if name in found:
-        raise ConfigError(f"another file of the folder has an effect '{name}' already.", file=path, fix="Rename one.")
+        raise ConfigError(
+            f"another file of the folder has an effect '{name}' already.", file=path, fix="Rename one."
+        )
 
 
 def contract_fault(effect: Effect) -> str:
@@ -183,7 +198,10 @@ def _shape_fault(effect: Effect) -> str:
     amplitudes = {name: values[name] for name in effect.linear}
     doubled = effect.shape(arrays, **{**values, **{name: 2 * value for name, value in amplitudes.items()}})
     if not np.allclose(doubled, 2 * result, rtol=TOLERANCE, atol=1e-12):
-        return f"its shape is not linear in {', '.join(amplitudes)}: twice the amplitude must give twice the shape"
+        return (
+            f"its shape is not linear in {', '.join(amplitudes)}: "
+            "twice the amplitude must give twice the shape"
+        )
     nothing = effect.shape(arrays, **{**values, **dict.fromkeys(amplitudes, 0.0)})
     if np.any(nothing != 0):
         return f"its shape is not zero where {', '.join(amplitudes)} is zero"

@@ -11,14 +11,14 @@ def warming_time_shape(inputs, *, A, tau):
     r"""Warming by sliding, along time: friction falls as the contact warms, and approaches a limit.
 
     A body of heat capacity C that loses heat by conductance G, heated by the power P of friction, warms as
-    :math:`\Delta T = (P / G)(1 - e^{-t / \tau})` with :math:`\tau = C / G`. Rubber friction falls with temperature
-    above its peak (Grosch 1963), to first order in proportion, so mu is multiplied by one plus
+    :math:`\Delta T = (P / G)(1 - e^{-t / \tau})` with :math:`\tau = C / G`. Rubber friction falls with
+    temperature above its peak (Grosch 1963), to first order in proportion, so mu is multiplied by one plus
 
     .. math:: h = -A (1 - e^{-t / \tau})
 
-    A is the share of friction lost when warm, negative if friction rises with temperature. Time is that of the stroke
-    or the file; before 0 the contact is cold. The power is assumed to be the same in every run; in `warming_power` it
-    is proportional to speed and load.
+    A is the share of friction lost when warm, negative if friction rises with temperature. Time is that of
+    the stroke or the file; before 0 the contact is cold. The power is assumed to be the same in every run; in
+    `warming_power` it is proportional to speed and load.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
     return A * np.expm1(-time / tau)
@@ -47,9 +47,9 @@ WARMING_TIME = Effect(
 def warming_distance_shape(inputs, *, A, s_0):
     r"""Warming by sliding, along distance: friction falls with the work of friction, and approaches a limit.
 
-    At one normal force the heat up to a distance s is the work of friction, mu N s, at any speed. If the contact warms
-    a fixed mass and loses heat to cold track in proportion to the distance slid, the temperature approaches its limit
-    over a distance instead of a time:
+    At one normal force the heat up to a distance s is the work of friction, mu N s, at any speed. If the
+    contact warms a fixed mass and loses heat to cold track in proportion to the distance slid, the
+    temperature approaches its limit over a distance instead of a time:
 
     .. math:: h = -A (1 - e^{-s / s_0})
 
@@ -82,13 +82,14 @@ WARMING_DISTANCE = Effect(
 def warming_power_shape(inputs, *, A, tau):
     r"""Warming by the power of friction: as `warming_time`, but fast and heavily loaded runs warm more.
 
-    The power that friction turns into heat is :math:`P = \mu N |v|`, so the limit :math:`P / G` of a lumped body's
-    warming follows load times speed, and the share of friction lost follows it to first order:
+    The power that friction turns into heat is :math:`P = \mu N |v|`, so the limit :math:`P / G` of a lumped
+    body's warming follows load times speed, and the share of friction lost follows it to first order:
 
     .. math:: h = -A \frac{N |v|}{N_{ref} v_{ref}} (1 - e^{-t / \tau})
 
-    A is the share lost when warm at the reference load and speed, well below 1: the form is linear in the temperature,
-    and P is computed without the fall of mu. Several speeds or loads are needed to distinguish it from `warming_time`.
+    A is the share lost when warm at the reference load and speed, well below 1: the form is linear in the
+    temperature, and P is computed without the fall of mu. Several speeds or loads are needed to distinguish
+    it from `warming_time`.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
     speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
@@ -106,14 +107,20 @@ WARMING_POWER = Effect(
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
     parameters=(
         Parameter(
-            "A", "{y}", 0.05, (-5.0, 0.95), "share of friction lost when warm at reference load and speed", linear=True
+            "A",
+            "{y}",
+            0.05,
+            (-5.0, 0.95),
+            "share of friction lost when warm at reference load and speed",
+            linear=True,
         ),
         Parameter("tau", "{x}", 5.0, (1e-4, 1e7), "time constant of warming", search="span"),
     ),
     shape=warming_power_shape,
     source="Newtonian (lumped) warming: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford. "
     "Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112.",
-    # By hand: twice the speed, half the load: the power is the reference's; t = tau gives 1 - 1/e = 0.6321205588285577.
+    # By hand: twice the speed, half the load: the power is the reference's; t = tau gives 1 - 1/e =
+    # 0.6321205588285577.
     worked=(
         {"time_s": 8.0, "speed_mm_s": -20.0, "speed_mm_s_ref": 10.0, "load_N": 25.0, "load_N_ref": 50.0},
         {"A": 0.1, "tau": 8.0},
@@ -125,16 +132,21 @@ WARMING_POWER = Effect(
 def warming_conduction_shape(inputs, *, A):
     r"""Warming limited by conduction into the rubber: friction falls with the root of speed times distance.
 
-    Rubber is a poor conductor: during a stroke heat enters a thin layer only. The surface of a half-space under a
-    constant flux q warms by :math:`2 q \sqrt{t / (\pi k \rho c)}` in a time t. The flux of friction is :math:`q \propto
-    \mu p |v|`, and :math:`t = s / |v|`, so
+    Rubber is a poor conductor: during a stroke heat enters a thin layer only. The surface of a half-space
+    under a constant flux q warms by :math:`2 q \sqrt{t / (\pi k \rho c)}` in a time t. The flux of friction
+    is :math:`q \propto \mu p |v|`, and :math:`t = s / |v|`, so
 
-    .. math:: \Delta T \propto p |v| \sqrt{s / |v|} = p \sqrt{|v| s}, \qquad h = -A \sqrt{\frac{|v| s}{v_{ref} s_{ref}}}
+    .. math::
+        \Delta T \propto p |v| \sqrt{s / |v|} = p \sqrt{|v| s}, \qquad
+        h = -A \sqrt{\frac{|v| s}{v_{ref} s_{ref}}}
 
-    A is the share of friction lost at the reference speed and distance, at one load; `warming_conduction_load` is for
-    several loads. It is valid until the warm layer reaches the back of the sample, and for a loss well below 1.
+    A is the share of friction lost at the reference speed and distance, at one load;
+    `warming_conduction_load` is for several loads. It is valid until the warm layer reaches the back of the
+    sample, and for a loss well below 1.
     """
-    distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(inputs, "distance_mm", 1.0)
+    distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(
+        inputs, "distance_mm", 1.0
+    )
     speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
     return -A * np.sqrt(speed * distance)
 
@@ -149,7 +161,12 @@ WARMING_CONDUCTION = Effect(
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
     parameters=(
         Parameter(
-            "A", "{y}", 0.05, (-5.0, 0.95), "share of friction lost at reference speed and distance", linear=True
+            "A",
+            "{y}",
+            0.05,
+            (-5.0, 0.95),
+            "share of friction lost at reference speed and distance",
+            linear=True,
         ),
     ),
     shape=warming_conduction_shape,
@@ -166,16 +183,18 @@ WARMING_CONDUCTION = Effect(
 
 
 def warming_conduction_load_shape(inputs, *, A):
-    r"""Warming limited by conduction into the rubber, at several loads: as `warming_conduction`, times the load.
+    r"""Warming limited by conduction into the rubber, at several loads: `warming_conduction` times the load.
 
-    The flux of friction is :math:`q \propto \mu p |v|`. For a constant contact area the pressure p is proportional to
-    the load, so the surface warms as :math:`N \sqrt{|v| s}` and
+    The flux of friction is :math:`q \propto \mu p |v|`. For a constant contact area the pressure p is
+    proportional to the load, so the surface warms as :math:`N \sqrt{|v| s}` and
 
     .. math:: h = -A \frac{N}{N_{ref}} \sqrt{\frac{|v| s}{v_{ref} s_{ref}}}
 
     A is the share of friction lost at the reference load, speed and distance; small against 1.
     """
-    distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(inputs, "distance_mm", 1.0)
+    distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(
+        inputs, "distance_mm", 1.0
+    )
     speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
     load = np.asarray(inputs["load_N"], dtype=float) / reference(inputs, "load_N", 1.0)
     return -A * load * np.sqrt(speed * distance)
@@ -191,7 +210,12 @@ WARMING_CONDUCTION_LOAD = Effect(
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
     parameters=(
         Parameter(
-            "A", "{y}", 0.05, (-5.0, 0.95), "share of friction lost at reference load, speed and distance", linear=True
+            "A",
+            "{y}",
+            0.05,
+            (-5.0, 0.95),
+            "share of friction lost at reference load, speed and distance",
+            linear=True,
         ),
     ),
     shape=warming_conduction_load_shape,
@@ -217,13 +241,13 @@ WARMING_CONDUCTION_LOAD = Effect(
 def lab_temperature_shape(inputs, *, A):
     r"""Laboratory temperature: friction follows the room, a few per mille for each degree.
 
-    Above its peak over speed, rubber friction falls with temperature. Over the few degrees of a laboratory the effect
-    is about linear,
+    Above its peak over speed, rubber friction falls with temperature. Over the few degrees of a laboratory
+    the effect is about linear,
 
     .. math:: h = A (T - T_{ref})
 
-    A is the relative change per degree. It needs a column `lab_temperature_C`, which is not the aging temperature; for
-    another name the effect is `linear`.
+    A is the relative change per degree. It needs a column `lab_temperature_C`, which is not the aging
+    temperature; for another name the effect is `linear`.
     """
     temperature = np.asarray(inputs["lab_temperature_C"], dtype=float)
     return A * (temperature - reference(inputs, "lab_temperature_C", 0.0))
@@ -236,11 +260,17 @@ LAB_TEMPERATURE = Effect(
     form="A (T - T_ref)",
     reference="{lab_temperature_C} = {lab_temperature_C_ref}",
     reads=("lab_temperature_C",),
-    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
+    acts_on=(
+        ("mu", "multiply"),
+        ("force", "add"),
+        ("force", "multiply"),
+        ("mu_s", "multiply"),
+        ("mu_c", "multiply"),
+    ),
     parameters=(Parameter("A", "{y}/{x}", -0.005, AMPLITUDE, "change per degree", linear=True),),
     shape=lab_temperature_shape,
-    source="Friction and temperature of rubber: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112. "
-    "First order: ours.",
+    source="Friction and temperature of rubber: Grosch 1963, Proc. R. Soc. A 274, 21-39, "
+    "doi:10.1098/rspa.1963.0112. First order: ours.",
     # By hand: 3 degrees above the reference at -0.4 % per degree.
     worked=({"lab_temperature_C": 25.0, "lab_temperature_C_ref": 22.0}, {"A": -0.004}, -0.012),
 )

@@ -1,7 +1,8 @@
 """Chunks of work on a running Dask cluster, with results in order.
 
-Nothing is kept on the cluster: a chunk is sent as bytes, and its answer comes back or, for what is large, lies on the
-file system that all workers share. So Dask may do a chunk again on another worker if one dies, as often as it likes.
+Nothing is kept on the cluster: a chunk is sent as bytes, and its answer comes back or, for what is large,
+lies on the file system that all workers share. So Dask may do a chunk again on another worker if one dies, as
+often as it likes.
 """
 
 from __future__ import annotations
@@ -79,7 +80,8 @@ class Cluster:
                 if not there:
                     raise RequestError(
                         f"the worker {worker} does not see the folder {folder.resolve()}.",
-                        fix="Put campaign and OUT on a file system that all workers share, under the same path.",
+                        fix="Put campaign and OUT on a file system that all workers share, under the same "
+                        "path.",
                     )
 
     def threads(self) -> int:
@@ -105,10 +107,14 @@ class Cluster:
 
         def send() -> None:
             room = max(2, WAITING_PER_THREAD * self.threads()) - len(sent)
-            with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):  # a fold is large
+            with dask.config.set(
+                {"distributed.admin.large-graph-warning-threshold": "1 TB"}
+            ):  # a fold is large
                 for chunk in islice(chunks, max(room, 0)):
                     # A unique key, because Dask would merge equal chunks of two runs.
-                    sent.append(self._client.submit(function, chunk, key=f"sealfit-{uuid.uuid4().hex}", pure=False))
+                    sent.append(
+                        self._client.submit(function, chunk, key=f"sealfit-{uuid.uuid4().hex}", pure=False)
+                    )
 
         try:
             send()
@@ -126,7 +132,8 @@ class Cluster:
             if sent and sent[0].status == "error":  # raised by the work itself
                 raise
             raise WorkerError(
-                f"the cluster {self.scheduler} went away.", fix="Look at the scheduler, and run the command again."
+                f"the cluster {self.scheduler} went away.",
+                fix="Look at the scheduler, and run the command again.",
             ) from error
         finally:
             if sent:
@@ -156,14 +163,20 @@ def _connected(scheduler: str) -> Client:
     except ImportError as error:
         raise RequestError("Dask is not installed.", fix="Run: pip install 'sealfit[cluster]'") from error
     try:
-        address = json.loads(Path(scheduler).read_text("utf-8"))["address"] if Path(scheduler).is_file() else scheduler
+        address = (
+            json.loads(Path(scheduler).read_text("utf-8"))["address"]
+            if Path(scheduler).is_file()
+            else scheduler
+        )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RequestError(
             f"{scheduler} is not a scheduler file.", fix=f"Give one that Dask wrote, or {EXAMPLE}."
         ) from error
     place = re.fullmatch(r"\w+://\[?(?P<host>[^]]+)\]?:(?P<port>\d+)", address)
     if place is None:
-        raise RequestError(f"'{scheduler}' is not an address of a scheduler.", fix=f"Write {EXAMPLE}, or its file.")
+        raise RequestError(
+            f"'{scheduler}' is not an address of a scheduler.", fix=f"Write {EXAMPLE}, or its file."
+        )
     try:  # checked first, because a client without a scheduler blocks for a minute
         socket.create_connection((place["host"], int(place["port"])), timeout=CONNECT_S).close()
         return Client(address, timeout=CONNECT_S, set_as_default=False)

@@ -76,18 +76,22 @@ def on_cluster(scheduler: str | None, *folders: Path) -> Iterator[None]:
 
 
 def run_map(
-    function: Callable[[Given], Made], items: Iterable[Given], *, workers: int = 1, together: int | None = None
+    function: Callable[[Given], Made],
+    items: Iterable[Given],
+    *,
+    workers: int = 1,
+    together: int | None = None,
 ) -> Iterator[Made]:
     """Yield `function(item)` for every item, in the order of the items.
 
-    With one worker, one item, or inside a worker, the work is done here; otherwise in `workers` new processes, or on
-    the cluster of `on_cluster`, several items at a time. Results do not depend on where.
+    With one worker, one item, or inside a worker, the work is done here; otherwise in `workers` new
+    processes, or on the cluster of `on_cluster`, several items at a time. Results do not depend on where.
 
     Parameters
     ----------
     function : callable
-        A pure function at the top level of a module: processes find it by its name. An exception it raises ends the
-        map and is raised here.
+        A pure function at the top level of a module: processes find it by its name. An exception it raises
+        ends the map and is raised here.
     items : iterable
         What to map over; each item is sent to a process, so keep it small.
     workers : int
@@ -133,12 +137,14 @@ def _apply(pickled: bytes) -> list:
 # Chunks of work in processes of this computer, with results in order.
 
 WAITING_PER_WORKER = 2  # chunks submitted ahead; bounds the memory of waiting results
-# Not fork: it copies the locks of pyarrow's and BLAS's threads without the threads that free them. A fork server has
-# no threads, and has loaded what the workers need before the first of them is wanted.
+# Not fork: it copies the locks of pyarrow's and BLAS's threads without the threads that free them. A fork
+# server has no threads, and has loaded what the workers need before the first of them is wanted.
 START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 
 
-def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], workers: int, *, load: str) -> Iterator[list]:
+def in_processes(
+    apply: Callable[[bytes], list], chunks: Iterator[bytes], workers: int, *, load: str
+) -> Iterator[list]:
     """Yield the list that `apply` returns for each chunk.
 
     Parameters
@@ -189,7 +195,8 @@ def in_processes(apply: Callable[[bytes], list], chunks: Iterator[bytes], worker
 
 def _died() -> WorkerError:
     return WorkerError(
-        "a worker process died before it had answered.", fix="If memory ran out, use fewer workers (--workers 1)."
+        "a worker process died before it had answered.",
+        fix="If memory ran out, use fewer workers (--workers 1).",
     )
 
 
@@ -197,7 +204,8 @@ def _died() -> WorkerError:
 def _no_interrupt_for_children() -> Iterator[None]:
     """Start processes that ignore Ctrl-C; the parent stops them, so that they print no traceback.
 
-    A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not lost.
+    A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not
+    lost.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -214,9 +222,10 @@ def _no_interrupt_for_children() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _main_out_of_sight() -> Iterator[None]:
-    """Start processes that do not load the script that runs: one that calls `sealfit.run` would be run again in each.
+    """Start processes that do not load the script that runs.
 
-    They need nothing of it: what they do is found in modules.
+    A script that calls `sealfit.run` would be run again in each of them. They need nothing of it: what they
+    do is found in modules.
     """
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")

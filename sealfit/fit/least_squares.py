@@ -41,8 +41,8 @@ def levenberg_marquardt(
     Parameters
     ----------
     evaluate : callable
-        `evaluate(x, rows)` -> weighted residual, shape (r, n), and its derivative, shape (r, p, n), of the problems
-        `rows` (r,) at x (r, p).
+        `evaluate(x, rows)` -> weighted residual, shape (r, n), and its derivative, shape (r, p, n), of the
+        problems `rows` (r,) at x (r, p).
     start : ndarray, shape (problems, p)
         Starting points; they are moved inside the bounds.
     low, high : ndarray, shape (p,) or (problems, p)
@@ -58,8 +58,9 @@ def levenberg_marquardt(
 
     Notes
     -----
-    The scale of each parameter is the largest norm of its column so far (More 1978, Lecture Notes in Mathematics 630,
-    105-116). The damped step is computed by singular values, more accurately than by normal equations.
+    The scale of each parameter is the largest norm of its column so far (More 1978, Lecture Notes in
+    Mathematics 630, 105-116). The damped step is computed by singular values, more accurately than by normal
+    equations.
     """
     low, high = np.broadcast_to(low, start.shape), np.broadcast_to(high, start.shape)
     x, todo = np.clip(start, low, high), np.arange(len(start))
@@ -78,7 +79,10 @@ def levenberg_marquardt(
             pull = -(slope[todo] @ rest[todo, :, None])[..., 0]
             free = ~((at <= low[todo]) & (pull <= 0)) & ~((at >= high[todo]) & (pull >= 0))
             own_scale = np.where(scale[todo] > 0, scale[todo], 1.0)
-            move = _damped(slope[todo] / own_scale[..., None] * free[..., None], rest[todo], damping[todo]) / own_scale
+            move = (
+                _damped(slope[todo] / own_scale[..., None] * free[..., None], rest[todo], damping[todo])
+                / own_scale
+            )
             trial = np.clip(at + move, low[todo], high[todo])
             trial_rest, trial_slope = evaluate(trial, todo)
             gain, step = rss[todo] - _squares(trial_rest), np.linalg.norm((trial - at) * size, axis=1)
@@ -99,7 +103,7 @@ def levenberg_marquardt(
 
 
 def _damped(slope: np.ndarray, rest: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return the x that minimise |x slope + rest|^2 + damping |x|^2, shape (r, p); slope (r, p, n), rest (r, n)."""
+    """Return x of least |x slope + rest|^2 + damping |x|^2, shape (r, p); slope (r, p, n), rest (r, n)."""
     axes, singular, rows = np.linalg.svd(slope, full_matrices=False)
     share = np.where(singular > 0, singular / (singular**2 + damping[:, None]), 0.0)
     return -(axes @ (share * (rows @ rest[..., None])[..., 0])[..., None])[..., 0]
@@ -113,8 +117,9 @@ def _squares(rest: np.ndarray) -> np.ndarray:
 def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
     """Return the derivative of `residual` at `x`, shape (n, p), by central differences of fourth order.
 
-    The step is 1e-4 of each parameter. Rounding errors are near 1e-12 of the derivative, and a location parameter a
-    hundred widths from the origin (a peak at 450 nm, 4 nm wide) changes by a hundredth of its width.
+    The step is 1e-4 of each parameter. Rounding errors are near 1e-12 of the derivative, and a location
+    parameter a hundred widths from the origin (a peak at 450 nm, 4 nm wide) changes by a hundredth of its
+    width.
 
     Parameters
     ----------
@@ -130,7 +135,7 @@ def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray
 
 
 def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple[np.ndarray, int]:
-    """Return (J'J)^-1, shape (p, p), and its rank; parameters that J does not determine have infinite variance.
+    """Return (J'J)^-1, shape (p, p), and its rank; parameters not determined by J have infinite variance.
 
     Parameters
     ----------
@@ -160,7 +165,8 @@ def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple
 
 
 # ---------------------------------------------------------------- variable projection
-# Least squares with one nonlinear parameter: the linear parameters are solved for exactly at each of its values.
+# Least squares with one nonlinear parameter: the linear parameters are solved for exactly at each of its
+# values.
 #
 # Many problems are solved together as arrays: the conditions of a campaign, or the draws of a bootstrap.
 # Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036 (variable projection).
@@ -169,8 +175,8 @@ def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple
 DEPENDENT = 1e-13
 # Number of values in a temporary array: 16 MB.
 CHUNK = 2_000_000
-# Absolute tolerance of the nonlinear parameter (usually a logarithm) in the search. The sum of squares is constant in
-# double precision within it.
+# Absolute tolerance of the nonlinear parameter (usually a logarithm) in the search. The sum of squares is
+# constant in double precision within it.
 CLOSE = 1e-9
 # Largest number of steps of this search.
 MOST_STEPS = 60
@@ -182,10 +188,10 @@ STEPS_OF_DERIVATIVE = 1e-3 * np.array([-2, -1, 0, 1, 2])
 
 # ---------------------------------------------------------------- the linear part
 def solve_kept(gram, moment, keep):
-    """Return the coefficients of the columns in `keep`, (..., p), the others 0; gram (..., p, p) has unit diagonal.
+    """Return the coefficients of columns in `keep`, (..., p), others 0; gram (..., p, p) has unit diagonal.
 
-    Cholesky factorisation, written out over the columns so that all problems are solved together. A linearly dependent
-    column has coefficient 0.
+    Cholesky factorisation, written out over the columns so that all problems are solved together. A linearly
+    dependent column has coefficient 0.
     """
     p = moment.shape[-1]
     lower = [[None] * p for _ in range(p)]
@@ -243,7 +249,7 @@ def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
 
 
 def project(columns, y, nonnegative, refine: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients, shape (..., p), of weighted columns (..., n, p) and y (..., n), and the rss, (...)."""
+    """Return coefficients, (..., p), of weighted columns (..., n, p) and y (..., n), and the rss, (...)."""
     norm = np.sqrt(np.einsum("...np,...np->...p", columns, columns))
     scaled = columns / np.where(norm > 0, norm, 1.0)[..., None, :]
     transposed = np.swapaxes(scaled, -1, -2)
@@ -261,7 +267,7 @@ def project(columns, y, nonnegative, refine: int = 2) -> tuple[np.ndarray, np.nd
 # ---------------------------------------------------------------- one nonlinear parameter, many problems
 @dataclass(frozen=True)
 class BatchFit:
-    """Optimum of each problem; u is the argument of the basis, usually the logarithm of the nonlinear parameter."""
+    """Optimum per problem; u is the argument of the basis, usually the nonlinear parameter's logarithm."""
 
     u: np.ndarray  # (problems,)
     coefficients: np.ndarray  # (problems, p)
@@ -275,7 +281,8 @@ class Separable:
     Attributes
     ----------
     basis : callable
-        `basis(u, rows)` -> columns, shape (r, g, n, p), for the problems `rows`, shape (r,), at u, shape (r, g).
+        `basis(u, rows)` -> columns, shape (r, g, n, p), for the problems `rows`, shape (r,), at u, shape (r,
+        g).
     y, weight : ndarray, shape (problems, n)
         Measured values and 1/variance; weight 0 for padding.
     nonnegative : sequence of bool, length p
@@ -289,7 +296,9 @@ class Separable:
 
     def some(self, own: np.ndarray) -> Separable:
         """Return the problems with some numbers, shape (r,)."""
-        return replace(self, basis=lambda u, rows: self.basis(u, own[rows]), y=self.y[own], weight=self.weight[own])
+        return replace(
+            self, basis=lambda u, rows: self.basis(u, own[rows]), y=self.y[own], weight=self.weight[own]
+        )
 
 
 def profile(problems: Separable, u: np.ndarray, *, refine: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -349,7 +358,11 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     bracket = tuple(grid[problem, k + step] for step in range(3))
     stops = {"xatol": CLOSE, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0}
     valley = find_minimum(
-        lambda u, problem: solved(u, problem)[0][:, 0], bracket, args=(problem,), tolerances=stops, maxiter=MOST_STEPS
+        lambda u, problem: solved(u, problem)[0][:, 0],
+        bracket,
+        args=(problem,),
+        tolerances=stops,
+        maxiter=MOST_STEPS,
     ).x
     start = np.column_stack([solved(valley, problem)[1][:, 0], valley])
     valley = _to_all_digits(problems.some(problem), start, grid[problem][:, [0, -1]])
@@ -363,7 +376,7 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
 
 
 def _to_all_digits(problems: Separable, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Return the nonlinear parameters at full accuracy, shape (r,), from starts near the optimum, shape (r, p + 1).
+    """Return the nonlinear parameters at full accuracy, (r,), from starts near the optimum, (r, p + 1).
 
     A search by the sum of squares alone gives only half of the digits.
     """
@@ -383,7 +396,7 @@ def _to_all_digits(problems: Separable, start: np.ndarray, ends: np.ndarray) -> 
 
 
 def even_grid(low, high, per_decade: int) -> np.ndarray:
-    """Return even points from `low` to `high`, natural logarithms, shape (problems, g), `per_decade` or more each."""
+    """Return `per_decade` or more even points from `low` to `high`, natural logarithms, (problems, g)."""
     points = int(np.ceil(per_decade * np.max(high - low) / np.log(10))) + 1
     return low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
 
@@ -397,4 +410,6 @@ def check(y, weight) -> None:
         If one is not finite, or a weight is negative.
     """
     if not (np.all(np.isfinite(y)) and np.all(np.isfinite(weight)) and np.all(weight >= 0)):
-        raise FitError("measured values and weights must be finite, weights not negative.", fix="Look for empty cells.")
+        raise FitError(
+            "measured values and weights must be finite, weights not negative.", fix="Look for empty cells."
+        )

@@ -1,7 +1,8 @@
 """How a fit is stored: its parameters in one table, their covariances and shifts in tables of their own.
 
-The fits hand each other one long table, in which `quantity` also is "covariance", "sensor_shift" or "effect_shift". On
-the disk every table has one meaning, so that `steady_fit` has one row per condition and parameter.
+The fits hand each other one long table, in which `quantity` also is "covariance", "sensor_shift" or
+"effect_shift". On the disk every table has one meaning, so that `steady_fit` has one row per condition and
+parameter.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ AFTER = "_after"
 
 
 def stored(name: str, fit: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the tables in which table `name` is stored, by name; itself alone unless it is a fit with covariances.
+    """Return the tables that store table `name`, by name; itself alone unless it is a fit with covariances.
 
     Parameters
     ----------
@@ -44,14 +45,17 @@ def stored(name: str, fit: pd.DataFrame) -> dict[str, pd.DataFrame]:
     if covariance is None:
         return {name: fit}
     quantity = fit["quantity"]
-    tables = {name: fit[~quantity.isin(BESIDE)], covariance + suffix: _covariances(fit[quantity == COVARIANCE])}
+    tables = {
+        name: fit[~quantity.isin(BESIDE)],
+        covariance + suffix: _covariances(fit[quantity == COVARIANCE]),
+    }
     if shift is not None:
         tables[shift + suffix] = _shifts(fit[quantity.isin([SENSOR, EFFECTS])])
     return {name: table.reset_index(drop=True) for name, table in tables.items()}
 
 
 def _covariances(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return covariances with both parameters in columns; in a law, "mu_s:mu_0,mu_s:a" is of quantity mu_s."""
+    """Return covariances with both parameters in columns; a law's "mu_s:mu_0,mu_s:a" is of quantity mu_s."""
     pairs = [text.split(",") for text in rows["parameter"]]
     ends = {"parameter": [one for one, _ in pairs], "other": [other for _, other in pairs]}
     named = {name: [text.split(":")[-1] for text in texts] for name, texts in ends.items()}
@@ -63,7 +67,10 @@ def _covariances(rows: pd.DataFrame) -> pd.DataFrame:
 def _shifts(rows: pd.DataFrame) -> pd.DataFrame:
     """Return shifts with what causes them: the sensor, or a direction of the effects' uncertainty, from 1."""
     parts = [text.partition(":") for text in rows["parameter"]]
-    named = {"source": [number or "sensor" for *_, number in parts], "parameter": [name for name, *_ in parts]}
+    named = {
+        "source": [number or "sensor" for *_, number in parts],
+        "parameter": [name for name, *_ in parts],
+    }
     return _without_intervals(rows).assign(**_texts(named, rows.index))
 
 

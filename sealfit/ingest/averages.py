@@ -13,22 +13,25 @@ from sealfit.ingest.segments import Pieces, median
 
 # ---------------------------------------------------------------- average
 
-LAGS = 20  # the sum of correlations ends within so few, unless the noise is slow: then all lags are computed at once
+# The sum of correlations ends within so few lags, unless the noise is slow: then all are computed at once.
+LAGS = 20
 
 Samples = Mapping[str, np.ndarray]  # columns of equal length
 Strokes = Mapping[str, Sequence]
 
 
 def standard_error(values: np.ndarray) -> float:
-    """Return the standard error of the mean of a series, with the correlation of neighbouring samples counted in.
+    """Return the standard error of the mean of a series, counting in the correlation of neighbouring samples.
 
-    SE = s sqrt(2 tau / n), with the autocorrelation time tau = 1/2 + sum of rho(k) over lags up to the first M that
-    is at least 5 tau (Sokal's window): beyond, the sum adds noise only. A trend or a ripple within the window is
-    correlation too, and makes the standard error larger; correlation that would make it smaller is not believed.
+    SE = s sqrt(2 tau / n), with the autocorrelation time tau = 1/2 + sum of rho(k) over lags up to the first
+    M that is at least 5 tau (Sokal's window): beyond, the sum adds noise only. A trend or a ripple within the
+    window is correlation too, and makes the standard error larger; correlation that would make it smaller is
+    not believed.
 
     Notes
     -----
-    Sokal 1997, Monte Carlo Methods in Statistical Mechanics, section 3, doi:10.1007/978-1-4899-0319-8_6; GUM 4.2.7.
+    Sokal 1997, Monte Carlo Methods in Statistical Mechanics, section 3, doi:10.1007/978-1-4899-0319-8_6; GUM
+    4.2.7.
 
     Examples
     --------
@@ -53,7 +56,7 @@ def standard_error(values: np.ndarray) -> float:
 
 
 def _slow_tau(centred: np.ndarray) -> float:
-    """Return the autocorrelation time of a series, all lags at once; the largest sum where the window never ends."""
+    """Return a series' autocorrelation time, all lags at once; the largest sum if the window never ends."""
     n = len(centred)
     spectrum = np.fft.rfft(centred, 1 << (2 * n - 1).bit_length())  # padded so that no lag wraps around
     lagged = np.fft.irfft(spectrum * spectrum.conj())[:n]
@@ -63,7 +66,7 @@ def _slow_tau(centred: np.ndarray) -> float:
 
 
 def mean_by_group(values: np.ndarray, group: np.ndarray, groups: int, count: np.ndarray) -> np.ndarray:
-    """Return the mean of `values` in each of `groups` groups, shape (groups,); `count` samples each, NaN for none."""
+    """Return the mean of `values` in each group, shape (groups,), of `count` samples each; NaN for none."""
     with np.errstate(invalid="ignore"):
         return np.bincount(group, values, minlength=groups) / count
 
@@ -83,15 +86,17 @@ def common_by_group(values: np.ndarray, group: np.ndarray, groups: int) -> np.nd
 def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, np.ndarray]:
     """Return the steady window of every stroke cut along displacement, a row per bin.
 
-    All strokes of a run share the edges of their bins, which span the windows of all of them, so a pattern along
-    displacement falls into the same bins in every repeat. A run has `per_stroke` bins, or fewer where its strokes
-    have too few samples; the few bins that still hold less than `min_samples` are joined to their neighbours.
+    All strokes of a run share the edges of their bins, which span the windows of all of them, so a pattern
+    along displacement falls into the same bins in every repeat. A run has `per_stroke` bins, or fewer where
+    its strokes have too few samples; the few bins that still hold less than `min_samples` are joined to their
+    neighbours.
 
     Parameters
     ----------
     samples : mapping of str to ndarray, shape (n,)
-        Samples of the steady windows, stroke after stroke, at least one: `row` (place in `strokes`), displacement_mm,
-        force_N and further columns, numbers or labels, whose means (or most frequent labels) are wanted.
+        Samples of the steady windows, stroke after stroke, at least one: `row` (place in `strokes`),
+        displacement_mm, force_N and further columns, numbers or labels, whose means (or most frequent labels)
+        are wanted.
     strokes : mapping of str to sequence, one value per stroke
         `run_id`, `direction`.
     settings : Bins
@@ -100,7 +105,8 @@ def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, n
     Returns
     -------
     dict of str to ndarray
-        `row`, `bin` (from 0 in the direction of motion), `n`, `force_sd_N`, and the mean of every column of `samples`.
+        `row`, `bin` (from 0 in the direction of motion), `n`, `force_sd_N`, and the mean of every column of
+        `samples`.
     """
     row, own = owners(samples["row"])
     run, runs = _numbered(strokes["run_id"], row)
@@ -125,7 +131,7 @@ def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, n
 
 
 def owners(row: np.ndarray) -> tuple[np.ndarray, Pieces]:
-    """Return the strokes that have samples, and where those of each lie; `row` says whose every sample is, rising."""
+    """Return the strokes with samples, and where those of each lie; `row` is each sample's stroke, rising."""
     count = np.bincount(row)
     there = np.flatnonzero(count)
     return there, Pieces(count[there])
@@ -154,7 +160,9 @@ def _bin_of(
     return own.spread(first) + np.where(own.spread(back), -place, place), room
 
 
-def range_of_runs(low: np.ndarray, high: np.ndarray, run: np.ndarray, runs: int) -> tuple[np.ndarray, np.ndarray]:
+def range_of_runs(
+    low: np.ndarray, high: np.ndarray, run: np.ndarray, runs: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the least and the largest value of every run, shape (runs,), from those of its strokes."""
     least, largest = np.full(runs, np.inf), np.full(runs, -np.inf)
     np.minimum.at(least, run, low)
@@ -163,7 +171,7 @@ def range_of_runs(low: np.ndarray, high: np.ndarray, run: np.ndarray, runs: int)
 
 
 def _joined(group: np.ndarray, strokes: int, width: int, least: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the group of every sample after thin bins have joined their nearest neighbour, and the counts."""
+    """Return the group of every sample after thin bins joined their nearest neighbour, and the counts."""
     count = np.bincount(group, minlength=strokes * width)
     thin = np.flatnonzero((count > 0) & (count < least))
     if not len(thin):
@@ -191,14 +199,15 @@ BRIDGED = 3  # empty cells in a row that are filled by a straight line: scarce s
 def mean_traces(samples: Samples, strokes: Strokes) -> dict[str, np.ndarray]:
     """Return the mean over repeats on a displacement grid that the repeats of a run share.
 
-    Cells are as wide as the usual step between samples, so the pre-sliding rise keeps its shape. The strokes of one
-    file are averaged first; mean and standard error are then those of the files of the run, each weighing the same.
+    Cells are as wide as the usual step between samples, so the pre-sliding rise keeps its shape. The strokes
+    of one file are averaged first; mean and standard error are then those of the files of the run, each
+    weighing the same.
 
     Parameters
     ----------
     samples : mapping of str to ndarray, shape (n,)
-        Samples of sliding, stroke after stroke, at least one: `row` (place in `strokes`), displacement_mm, force_N,
-        steady.
+        Samples of sliding, stroke after stroke, at least one: `row` (place in `strokes`), displacement_mm,
+        force_N, steady.
     strokes : mapping of str to sequence, one value per stroke
         file, run_id, direction.
 
@@ -211,7 +220,8 @@ def mean_traces(samples: Samples, strokes: Strokes) -> dict[str, np.ndarray]:
     (run, runs), (file, files) = (_numbered(strokes[name], row) for name in ("run_id", "file"))
     back = np.asarray(strokes["direction"])[row] < 0
     low, step, cells = _grid(np.asarray(samples["displacement_mm"]), own, run, runs)
-    grid, places = Pieces(cells[run]), Pieces(cells)  # the cells of every stroke, and of every run, end to end
+    # The cells of every stroke, and of every run, end to end.
+    grid, places = Pieces(cells[run]), Pieces(cells)
     force, steady = _of_cells(samples, own, grid, low[run], step[run])
     force, steady = _bridged(force, steady, grid)
     known = np.flatnonzero(np.isfinite(force))
@@ -226,7 +236,9 @@ def mean_traces(samples: Samples, strokes: Strokes) -> dict[str, np.ndarray]:
     count = np.bincount(spot, minlength=places.rows)
     mean = mean_by_group(force, spot, places.rows, count)
     square = np.bincount(spot, (force - mean[spot]) ** 2, minlength=places.rows)
-    error = np.sqrt(np.divide(square, (count - 1.0) * count, out=np.full(places.rows, np.nan), where=count > 1))
+    error = np.sqrt(
+        np.divide(square, (count - 1.0) * count, out=np.full(places.rows, np.nan), where=count > 1)
+    )
     shown = np.flatnonzero(count)
     of = places.of[shown]
     return {
@@ -239,7 +251,9 @@ def mean_traces(samples: Samples, strokes: Strokes) -> dict[str, np.ndarray]:
     }
 
 
-def _grid(x: np.ndarray, own: Pieces, run: np.ndarray, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _grid(
+    x: np.ndarray, own: Pieces, run: np.ndarray, runs: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return start, step and number of the cells of every run."""
     start, stop = own.min(x), own.max(x)
     low, high = range_of_runs(start, stop, run, runs)
@@ -255,18 +269,20 @@ def _grid(x: np.ndarray, own: Pieces, run: np.ndarray, runs: int) -> tuple[np.nd
 def _of_cells(
     samples: Samples, own: Pieces, grid: Pieces, low: np.ndarray, step: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean force in every cell of every stroke, NaN in empty ones, and whether all samples are steady."""
+    """Return the mean force in each cell of each stroke, NaN if empty, and whether all samples are steady."""
     x = np.asarray(samples["displacement_mm"])
     cell = ((x - own.spread(low)) / own.spread(step)).astype(int)
     np.minimum(cell, own.spread(grid.size - 1), out=cell)
     cell += own.spread(grid.start)
-    force = mean_by_group(np.asarray(samples["force_N"]), cell, grid.rows, np.bincount(cell, minlength=grid.rows))
+    force = mean_by_group(
+        np.asarray(samples["force_N"]), cell, grid.rows, np.bincount(cell, minlength=grid.rows)
+    )
     unsteady = cell[~np.asarray(samples["steady"], bool)]
     return force, np.bincount(unsteady, minlength=grid.rows) == 0
 
 
 def _bridged(force: np.ndarray, steady: np.ndarray, grid: Pieces) -> tuple[np.ndarray, np.ndarray]:
-    """Return force and steady flag with short runs of empty cells of a stroke filled along a straight line."""
+    """Return force and steady flag with short runs of a stroke's empty cells filled along a straight line."""
     full = np.flatnonzero(np.isfinite(force))
     missing = np.diff(full) - 1
     short = np.flatnonzero((missing > 0) & (missing <= BRIDGED))
@@ -288,13 +304,14 @@ def _travel(cell: np.ndarray, owner: np.ndarray, back: np.ndarray) -> np.ndarray
     return np.where(own.spread(back), turn - cell, cell - turn)
 
 
-def _comparable(spot: np.ndarray, spots: int, steady: np.ndarray, travel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which cells of which strokes may be averaged with the others at the same place (`spot`) of their run, and
-    the places where these are steady.
+def _comparable(
+    spot: np.ndarray, spots: int, steady: np.ndarray, travel: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which cells of strokes may be averaged with others at their place, and which places are steady.
 
-    Repeats need not start at the same place: where one slides steadily, another may just be starting, and its
-    pre-sliding rise would be a dip in the mean. So steady strokes are averaged where there are any, and elsewhere those
-    that have come equally far from their own start.
+    The place in the run is `spot`. Repeats need not start at the same place: where one slides steadily,
+    another may just be starting, and its pre-sliding rise would be a dip in the mean. So steady strokes are
+    averaged where there are any, and elsewhere those that have come equally far from their own start.
     """
     somewhere = np.bincount(spot[steady], minlength=spots) > 0
     keep = steady.copy()
@@ -305,7 +322,9 @@ def _comparable(spot: np.ndarray, spots: int, steady: np.ndarray, travel: np.nda
     return keep, somewhere
 
 
-def _one_per_file(spot: np.ndarray, file: np.ndarray, files: int, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _one_per_file(
+    spot: np.ndarray, file: np.ndarray, files: int, force: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return place and mean force once for every file at every place."""
     pair, own, count = np.unique(spot * files + file, return_inverse=True, return_counts=True)
     if len(pair) == len(spot):

@@ -47,7 +47,7 @@ def inputs_table(
     used: np.ndarray,
     faults: Sequence[Fault],
 ) -> tuple[pd.DataFrame, Fingerprints]:
-    """Return table `inputs`, every trace file of the campaign and those that are not used, and their fingerprints.
+    """Return table `inputs`, every trace file of the campaign and those not used, and their fingerprints.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ SHOWN = 20  # faults that a campaign without a single usable stroke lists, those
 
 @dataclass(frozen=True)
 class Place:
-    """Where parts are stored, those that are there already, by their keys, and the campaign's files as they are now.
+    """Where parts are stored, those already there, by their keys, and the campaign's files as they are now.
 
     Without a folder the parts are kept in memory.
     """
@@ -114,10 +114,10 @@ class Place:
 
 @dataclass(frozen=True)
 class Ingested:
-    """Tables inputs, runs, quality and steady, and traces, traces_mean and bins where they are not stored by parts.
+    """Tables inputs, runs, quality and steady, and traces, traces_mean and bins unless stored by parts.
 
-    `faults` are the warnings and errors among the findings of `quality`; `marks` the files as they were read; `stored`
-    the files of the parts, by their names below OUT, with their sizes.
+    `faults` are the warnings and errors among the findings of `quality`; `marks` the files as they were read;
+    `stored` the files of the parts, by their names below OUT, with their sizes.
     """
 
     tables: dict[str, pd.DataFrame]
@@ -147,8 +147,8 @@ def ingest_campaign(
     on_file : callable, optional
         Called as files have been read with their number so far, and the number of files to be read.
     place : Place, optional
-        Where the tables of samples are to be stored, so that they need not fit into memory; only what is not there yet
-        is read.
+        Where the tables of samples are to be stored, so that they need not fit into memory; only what is not
+        there yet is read.
 
     Raises
     ------
@@ -171,7 +171,9 @@ def ingest_campaign(
     faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: order[fault.file])
     files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
     order = np.argsort(files, kind="stable")
-    strokes = strokes_of([stored_strokes(part, place.folder) for part in parts]).take(order).reset_index(drop=True)
+    strokes = (
+        strokes_of([stored_strokes(part, place.folder) for part in parts]).take(order).reset_index(drop=True)
+    )
     files = files[order]
     parts = [replace(part, strokes=None) for part in parts]  # they are in one table now
     strokes, found = judged(strokes)
@@ -195,7 +197,9 @@ def ingest_campaign(
         "steady": shaped(steady, STEADY),
     }
     if place.folder is None:
-        tables |= {name: _stacked([part.tables[name] for part in parts if name in part.tables]) for name in SAMPLED}
+        tables |= {
+            name: _stacked([part.tables[name] for part in parts if name in part.tables]) for name in SAMPLED
+        }
     stored = {name: size for part in parts for name, size in part.stored.items()}
     return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY], marks, stored)
 
@@ -203,7 +207,8 @@ def ingest_campaign(
 def _plan(campaign: Path, listing: Listing, marks: Fingerprints) -> list[np.ndarray]:
     """Return the files of each part, by their numbers in the listing."""
     sizes = [
-        _size(os.path.join(campaign, file)) if marks[file].size is None else marks[file].size for file in listing.files
+        _size(os.path.join(campaign, file)) if marks[file].size is None else marks[file].size
+        for file in listing.files
     ]
     plan = plan_parts(listing.conditions, listing.columns["run_id"], sizes)
     return [np.array(files) for files in plan]
@@ -216,7 +221,9 @@ def _size(path: str) -> int:
         return 0
 
 
-def _known_parts(listings: Sequence[Listing], marks: Fingerprints, place: Place, config: Config) -> dict[int, Made]:
+def _known_parts(
+    listings: Sequence[Listing], marks: Fingerprints, place: Place, config: Config
+) -> dict[int, Made]:
     """Return the parts that are stored, by their numbers in the plan."""
     made, seen = {}, seen_by_parts(config)
     for i, listing in enumerate(listings if place.known else ()):
@@ -231,8 +238,8 @@ def _known_parts(listings: Sequence[Listing], marks: Fingerprints, place: Place,
 class _Reader:
     """Reads the parts of a plan.
 
-    `make` reads one of them, `listings` are their files. `marks` are the files that were read, and `reread` counts
-    them.
+    `make` reads one of them, `listings` are their files. `marks` are the files that were read, and `reread`
+    counts them.
     """
 
     make: Callable[[Asked], Made]
@@ -249,7 +256,7 @@ class _Reader:
         return [made[i] for i in range(len(self.listings))]
 
     def reestimated(self, parts: Sequence[Made], unused: Sequence[frozenset]) -> list[Made]:
-        """Return the parts, made again where the whole campaign leaves out other strokes or has other columns."""
+        """Return the parts, made again if the whole campaign omits other strokes or has other columns."""
         columns = common_columns(parts)
         again = {
             i: Asked(self.listings[i], out, columns if part.columns else None)
@@ -275,22 +282,26 @@ class _Reader:
 
 
 def _ruled_out(plan: Sequence[np.ndarray], strokes: pd.DataFrame, files: np.ndarray) -> list[frozenset]:
-    """Return, per part, its strokes that are not used although their own file shows nothing wrong with them."""
+    """Return the strokes of each part that are not used although their own file shows nothing wrong."""
     part = np.empty(sum(len(rows) for rows in plan), int)
     for i, rows in enumerate(plan):
         part[rows] = i
     out: list[set] = [set() for _ in plan]
     gone = ~strokes["used"].to_numpy(bool) & strokes["by_itself"].to_numpy(bool)
-    for i, file, stroke in zip(part[files[gone]], strokes["file"][gone], strokes["stroke"][gone].tolist(), strict=True):
+    for i, file, stroke in zip(
+        part[files[gone]], strokes["file"][gone], strokes["stroke"][gone].tolist(), strict=True
+    ):
         out[i].add((file, stroke))
     return [frozenset(strokes) for strokes in out]
 
 
 def strokes_of(parts: Sequence[pa.Table]) -> pd.DataFrame:
-    """Return the strokes of all parts in one table; a column that holds words in one part holds words in all."""
+    """Return the strokes of all parts in one table; a column with words in one part has words in all."""
     whole = [part for part in parts if part.num_rows]
     if not whole:
-        return pd.DataFrame({"file": pd.array([], "str"), "used": np.array([], bool), "by_itself": np.array([], bool)})
+        return pd.DataFrame(
+            {"file": pd.array([], "str"), "used": np.array([], bool), "by_itself": np.array([], bool)}
+        )
     table = joined(whole).to_pandas()
     return table.assign(by_itself=table["used"])
 
@@ -317,7 +328,7 @@ def _worded(part: pa.Table, words: set[str]) -> pa.Table:
 
 
 def judged(strokes: pd.DataFrame) -> tuple[pd.DataFrame, list[Fault]]:
-    """Return the strokes with `used` false for those that a comparison with the others rules out, and findings."""
+    """Return the strokes with `used` false where a comparison with others rules them out, and findings."""
     faults: list[Fault] = []
     for rule in (constant_strokes, reversed_strokes):
         if strokes["used"].any():
@@ -342,5 +353,7 @@ def _nothing_left(faults: Sequence[Fault], files: int) -> list[Fault]:
     errors = [fault for fault in faults if fault.severity == "error"]
     shown = [fault for group in grouped(errors)[:SHOWN] for fault in group]
     more = len(errors) - len(shown)
-    reason = f"none of {files} trace files can be used" + (f"; {more} more faults are not shown." if more > 0 else ".")
+    reason = f"none of {files} trace files can be used" + (
+        f"; {more} more faults are not shown." if more > 0 else "."
+    )
     return [*shown, Fault("nothing_left", reason, fix="Fix what is said above; start with one file.")]

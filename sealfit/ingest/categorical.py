@@ -64,15 +64,17 @@ def taken(columns: Columns, files: Iterable[int]) -> Columns:
 
 
 def in_order(columns: Columns) -> Columns:
-    """Return the columns in the order of the first file that has a value in each, without those that none has."""
-    first = {name: next((i for i, value in enumerate(c) if value is not None), None) for name, c in columns.items()}
+    """Return the columns in the order of the first file with a value in each, without those that none has."""
+    first = {
+        name: next((i for i, value in enumerate(c) if value is not None), None) for name, c in columns.items()
+    }
     filled = [name for name in columns if first[name] is not None]
     return {name: columns[name] for name in sorted(filled, key=lambda name: first[name])}
 
 
 # ---------------------------------------------------------------- conditions
-# The keys `condition`, `series` and `rubber` of a table, built from its condition columns; the one place that spells
-# them.
+# The keys `condition`, `series` and `rubber` of a table, built from its condition columns; the one place that
+# spells them.
 
 UNAGED = "unaged"
 ALL = "all"  # the series of a rig whose only condition is its age
@@ -80,17 +82,18 @@ ONE_RUBBER = "rubber"
 
 
 def condition_columns(config: Config) -> list[str]:
-    """Return the columns that make a condition: the config's, and the rubber columns that are not among them."""
+    """Return the columns that make a condition: the config's, and the rubber columns not among them."""
     return [*config.condition, *(name for name in config.rubber if name not in config.condition)]
 
 
 def add_keys(table: pd.DataFrame, config: Config) -> pd.DataFrame:
     """Return `table` with `condition`, `series` and `rubber`.
 
-    A condition is spelled "temperature_C=60, compression_ratio_pct=80, aging_days=4"; a series is the condition
-    without days ("all" when no other column is left). Rows with aging_days = 0 are "unaged" in both ("unaged,
-    <rubber>" where the config names rubber columns), whatever stands in their other condition cells. Without days,
-    series and condition are equal. A row with an empty condition cell has null for both, unless it is unaged.
+    A condition is spelled "temperature_C=60, compression_ratio_pct=80, aging_days=4"; a series is the
+    condition without days ("all" when no other column is left). Rows with aging_days = 0 are "unaged" in both
+    ("unaged, <rubber>" where the config names rubber columns), whatever stands in their other condition
+    cells. Without days, series and condition are equal. A row with an empty condition cell has null for both,
+    unless it is unaged.
 
     Parameters
     ----------
@@ -106,7 +109,9 @@ def add_keys(table: pd.DataFrame, config: Config) -> pd.DataFrame:
 
     Examples
     --------
-    >>> runs = pd.DataFrame({"temperature_C": [60, 60], "compression_ratio_pct": [80, 80], "aging_days": [4, 0]})
+    >>> runs = pd.DataFrame(
+    ...     {"temperature_C": [60, 60], "compression_ratio_pct": [80, 80], "aging_days": [4, 0]}
+    ... )
     >>> add_keys(runs, Config())[["condition", "series"]].values.tolist()[1]
     ['unaged', 'unaged']
     """
@@ -121,8 +126,10 @@ def add_keys(table: pd.DataFrame, config: Config) -> pd.DataFrame:
     return table.assign(**{key: pd.array(words, dtype="str") for key, words in keys.items()})
 
 
-def keys_of(columns: Mapping[str, Sequence[object]], rows: int, config: Config) -> dict[str, list[str | None]]:
-    """Return `condition`, `series` and `rubber` of every row, as `add_keys`; `columns` has all condition columns."""
+def keys_of(
+    columns: Mapping[str, Sequence[object]], rows: int, config: Config
+) -> dict[str, list[str | None]]:
+    """Return `condition`, `series` and `rubber` of every row, as `add_keys`, from all condition columns."""
     texts = {name: _spelled(columns[name]) for name in condition_columns(config)}
     words = {name: [t if t is None else f"{name}={t}" for t in own] for name, own in texts.items()}
     condition = _joined(words.values(), rows)

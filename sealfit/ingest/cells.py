@@ -16,7 +16,8 @@ from sealfit.errors import BadFile, Fault
 from sealfit.ingest.files import Layout, as_number, split_line, without_strays
 
 # ---------------------------------------------------------------- rows
-# Rows of a trace on their way to a clean table: what is no measurement, or out of time, is named and left out.
+# Rows of a trace on their way to a clean table: what is no measurement, or out of time, is named and left
+# out.
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,9 @@ def clean(rows: Rows, names: list[str], file: str) -> tuple[Rows, int, list[Faul
             continue
         wrong, overload = ~np.isfinite(sizes), (sizes >= OVERLOAD) & np.isfinite(sizes)
         finite &= ~(wrong | overload)
-        faults += _row_faults("not_finite", "the computed value is not a finite number.", name, rows, wrong, file)
+        faults += _row_faults(
+            "not_finite", "the computed value is not a finite number.", name, rows, wrong, file
+        )
         faults += _row_faults("overload", "is an instrument's mark for overload.", name, rows, overload, file)
     good = rows.where(finite)
     back = _out_of_order(good.columns["time_s"])
@@ -76,8 +79,8 @@ def _row_faults(check: str, reason: str, name: str, rows: Rows, wrong: np.ndarra
 def _out_of_order(time_s: np.ndarray) -> np.ndarray:
     """Return a mask of the fewest rows whose removal leaves a time that rises from row to row.
 
-    They are the rows outside a longest rising subsequence (patience sorting), so one wrong time that lies far ahead
-    costs one row and not all that follow.
+    They are the rows outside a longest rising subsequence (patience sorting), so one wrong time that lies far
+    ahead costs one row and not all that follow.
     """
     if len(time_s) < 2 or (np.diff(time_s) > 0).all():
         return np.zeros(len(time_s), bool)
@@ -99,10 +102,11 @@ def _out_of_order(time_s: np.ndarray) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- cells
-# Data lines of a trace file to columns of numbers: Arrow's CSV reader, and a patient one for what it cannot read.
+# Data lines of a trace file to columns of numbers: Arrow's CSV reader, and a patient one for what it cannot
+# read.
 #
-# Both give the same columns and the line number of every row; the patient one also names what stands in the way: text
-# where a number belongs, remarks typed beside a number, lines with too few or too many cells.
+# Both give the same columns and the line number of every row; the patient one also names what stands in the
+# way: text where a number belongs, remarks typed beside a number, lines with too few or too many cells.
 
 OVERLOAD = 1e30  # no rig measures this; instruments write 9.9e37 for overload and 9.91e37 for no value (SCPI)
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
@@ -114,8 +118,8 @@ _REMARK = re.compile(r"\s*([-+]?[\d.,]+(?:[eE][-+]?\d+)?)[\s,;]+(?P<remark>.*[^\
 class Cells:
     """Columns by position from 0: float64 arrays, or object arrays of text (None where empty).
 
-    `line` is the 1-based line number of every row; `bad` marks rows with a cell that is not a number; `faults` names
-    what was found in them.
+    `line` is the 1-based line number of every row; `bad` marks rows with a cell that is not a number;
+    `faults` names what was found in them.
     """
 
     columns: dict[int, np.ndarray]
@@ -135,7 +139,12 @@ class ColumnOfFile:
 
     def fault(self, row: int, check: str, reason: str, **more) -> Fault:
         """Return a fault of the cell in a row, which is left out."""
-        place = {"file": self.file, "line": int(self.line[row]), "column": self.name, "action": "row left out"}
+        place = {
+            "file": self.file,
+            "line": int(self.line[row]),
+            "column": self.name,
+            "action": "row left out",
+        }
         return Fault(check, reason, **place, **more)
 
     def not_a_number(self, row: int, cell: str) -> Fault:
@@ -151,7 +160,7 @@ class ColumnOfFile:
 
 
 def listed(rows: np.ndarray, make: Callable[[int], Fault], rest: Callable[[int], Fault]) -> list[Fault]:
-    """Return a fault for each of the first rows, and one that counts the others: nothing floods, all is counted."""
+    """Return a fault for each of the first rows and one counting the rest: nothing floods, all is counted."""
     faults = [make(int(row)) for row in rows[:LISTED]]
     return [*faults, rest(len(rows) - LISTED)] if len(rows) > LISTED else faults
 
@@ -211,10 +220,13 @@ def read_cells(
     ]
 
 
-def array_cells(columns: Sequence[np.ndarray], numeric: Mapping[int, str], settings: TraceFormat, file: str) -> Cells:
+def array_cells(
+    columns: Sequence[np.ndarray], numeric: Mapping[int, str], settings: TraceFormat, file: str
+) -> Cells:
     """Return the columns of a file that is not text, a row of each sample; their numbers count from 1.
 
-    Times of day, as datetime64, are seconds since the first where a number is needed, and else text in ISO 8601.
+    Times of day, as datetime64, are seconds since the first where a number is needed, and else text in ISO
+    8601.
     """
     line = np.arange(1, len(columns[0]) + 1)
     bad = np.zeros(len(line), bool)
@@ -228,7 +240,8 @@ def array_cells(columns: Sequence[np.ndarray], numeric: Mapping[int, str], setti
             wrong = np.flatnonzero(~np.isfinite(numbers))
             bad[wrong] = True
             cells = {
-                row: "" if values[row] is None or values[row] != values[row] else str(values[row]) for row in wrong
+                row: "" if values[row] is None or values[row] != values[row] else str(values[row])
+                for row in wrong
             }
             faults += _cell_faults(ColumnOfFile(file, numeric[i], line, settings.decimal), wrong, cells, ())
         plain = i in numeric or not any(cell is not None for cell in values[np.isnan(numbers)])
@@ -276,7 +289,9 @@ def _arrow(body: bytes, settings: TraceFormat, numeric: Mapping[int, str]) -> pa
     try:
         return pacsv.read_csv(
             pa.BufferReader(body),
-            read_options=pacsv.ReadOptions(column_names=names, use_threads=False, block_size=max(len(body) + 1, 1024)),
+            read_options=pacsv.ReadOptions(
+                column_names=names, use_threads=False, block_size=max(len(body) + 1, 1024)
+            ),
             parse_options=pacsv.ParseOptions(delimiter=mark),
             convert_options=pacsv.ConvertOptions(
                 decimal_point=settings.decimal, column_types={str(i): pa.float64() for i in numeric}
@@ -315,7 +330,9 @@ def _single_tabs(body: bytes) -> bytes:
     return body
 
 
-def _patient(body: bytes, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str], file: str) -> Cells:
+def _patient(
+    body: bytes, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str], file: str
+) -> Cells:
     """Return the cells line by line, with a fault for everything that is not as it should be."""
     lines = body.decode("utf-8", "replace").split("\n")
     rows, number = [], []
@@ -341,7 +358,9 @@ def _patient(body: bytes, layout: Layout, settings: TraceFormat, numeric: Mappin
     bad |= beyond
     for i in range(width):
         if i not in columns:
-            columns[i] = np.array([(row[i].strip() or None) if i < len(row) else None for row in rows], dtype=object)
+            columns[i] = np.array(
+                [(row[i].strip() or None) if i < len(row) else None for row in rows], dtype=object
+            )
             if all(cell is None or as_number(cell, settings.decimal) is not None for cell in columns[i]):
                 columns[i] = np.array([_float(cell, settings.decimal) for cell in columns[i]])
     return Cells(columns, line, bad, tuple(faults))
@@ -364,7 +383,9 @@ def _cell_faults(
             reason = f"the line ends after {len(rows[i])} cells."
             return column.fault(i, "too_few_cells", reason, fix="Complete or delete the line.")
         if not cell.strip():
-            return column.fault(i, "empty_cell", "the cell is empty.", value="", fix="Fill it or delete the line.")
+            return column.fault(
+                i, "empty_cell", "the cell is empty.", value="", fix="Fill it or delete the line."
+            )
         if as_number(cell, column.decimal) is not None:
             fix = "Delete the line."
             return column.fault(i, "not_finite", "is not a finite number.", value=cell.strip(), fix=fix)
@@ -373,7 +394,10 @@ def _cell_faults(
             fix = "Put the right number alone in the cell."
             return column.fault(i, "remark", reason, value=cell.strip(), fix=fix)
         if i == 0 and len(at) < len(cells) and not any(char.isdigit() for char in cell):
-            fix = "If this is a row of units, set units_row = true in the rig config; otherwise delete the line."
+            fix = (
+                "If this is a row of units, set units_row = true in the rig config; "
+                "otherwise delete the line."
+            )
             return column.fault(i, "not_a_number", "is not a number.", value=cell.strip(), fix=fix)
         if _CLOCK.fullmatch(cell.strip()):
             fix = "Export the time as seconds, not as time of day."

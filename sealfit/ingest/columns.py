@@ -18,11 +18,13 @@ from sealfit.tables import BINS, RUNS
 
 SLOTS = ("time_s", "displacement_mm", "force_N", "load_N")  # always numbers
 # Columns that our tables make themselves: a channel of that name in a trace file gets another, `stroke_file`.
-RESERVED = ({column.name for schema in (BINS, RUNS) for column in schema.columns} | {"line", "steady"}) - set(SLOTS)
+RESERVED = ({column.name for schema in (BINS, RUNS) for column in schema.columns} | {"line", "steady"}) - set(
+    SLOTS
+)
 
 
 def numeric_names(settings: TraceFormat) -> set[str]:
-    """Return the columns that must hold numbers: the slots and whatever an expression or the integral reads."""
+    """Return the columns that must hold numbers: the slots and what an expression or the integral reads."""
     texts = [parse(text) for text in settings.compute.values()]
     if settings.keep is not None:
         texts.append(parse(settings.keep, condition=True))
@@ -33,8 +35,8 @@ def numeric_names(settings: TraceFormat) -> set[str]:
 def locate(layout: Layout, width: int, settings: TraceFormat, file: str) -> dict[int, str]:
     """Return our name for each position (from 0) of a file with `width` columns.
 
-    Columns that the config does not list keep the file's name (`column_4` where it has none), or a name beside it
-    where the config gives that name to another column.
+    Columns that the config does not list keep the file's name (`column_4` where it has none), or a name
+    beside it where the config gives that name to another column.
 
     Raises
     ------
@@ -53,7 +55,14 @@ def locate(layout: Layout, width: int, settings: TraceFormat, file: str) -> dict
         elif positions:
             fix = "Rename one, or name the column by its position in the rig config."
             faults.append(
-                _fault("duplicate_column", f"stands {len(positions)} times in the header.", layout, file, theirs, fix)
+                _fault(
+                    "duplicate_column",
+                    f"stands {len(positions)} times in the header.",
+                    layout,
+                    file,
+                    theirs,
+                    fix,
+                )
             )
         elif ours not in settings.optional:
             faults.append(_missing(theirs, layout, width, settings, file))
@@ -95,9 +104,15 @@ def required(table: Mapping[str, object], layout: Layout, file: str) -> None:
     """Raise `BadFile` if, after everything is computed, a slot that every trace needs is not there."""
     missing = [name for name in SLOTS[:3] if name not in table]
     if missing:
-        fix = "Name it under [trace.columns], compute it under [trace.compute], or integrate it from a speed column."
+        fix = (
+            "Name it under [trace.columns], compute it under [trace.compute], "
+            "or integrate it from a speed column."
+        )
         raise BadFile(
-            *(_fault("missing_column", "there is no such column.", layout, file, name, fix) for name in missing)
+            *(
+                _fault("missing_column", "there is no such column.", layout, file, name, fix)
+                for name in missing
+            )
         )
 
 
@@ -106,7 +121,9 @@ def _missing(theirs: str | int, layout: Layout, width: int, settings: TraceForma
         reason = f"there is no column {theirs}: the lines have {width}."
         fix = "Check delimiter and positions in the rig config."
         return _fault("missing_column", reason, layout, file, theirs, fix)
-    fix = suggestion(theirs, layout.names) if layout.names else "Columns without names go by position, from 1."
+    fix = (
+        suggestion(theirs, layout.names) if layout.names else "Columns without names go by position, from 1."
+    )
     if len(layout.names) <= 1 and layout.names_line is not None:
         line = layout.header[layout.names_line - 1]
         for mark, word in ((";", '";"'), ("\t", '"tab"'), (",", '","'), (" ", '"whitespace"')):
@@ -117,13 +134,17 @@ def _missing(theirs: str | int, layout: Layout, width: int, settings: TraceForma
 
 
 def _fault(check: str, reason: str, layout: Layout, file: str, column: str | int, fix: str) -> Fault:
-    return Fault(check, reason, file=file, line=layout.names_line, column=str(column), action="file left out", fix=fix)
+    return Fault(
+        check, reason, file=file, line=layout.names_line, column=str(column), action="file left out", fix=fix
+    )
 
 
 # ---------------------------------------------------------------- channels
 # Further columns of a trace file: which are channels of numbers, which are labels, and which are neither.
 
-MAX_LABELS = 20  # a text column with more different values, most of them used once, is a clock or a serial number
+MAX_LABELS = (
+    20  # a text column with more different values, most of them used once, is a clock or a serial number
+)
 
 
 def channel_columns(
@@ -135,9 +156,9 @@ def channel_columns(
 ) -> tuple[dict[str, np.ndarray], np.ndarray, list[Fault]]:
     """Return the columns that are of use, a mask of rows to leave out, and the faults.
 
-    A channel with a few cells missing costs these rows; one with more than `quality.max_bad_rows` of them missing is
-    left out itself, and the file stays. Text is a label; where most cells are numbers, the others are faults; where
-    most cells are empty, the rest are remarks, and each is named.
+    A channel with a few cells missing costs these rows; one with more than `quality.max_bad_rows` of them
+    missing is left out itself, and the file stays. Text is a label; where most cells are numbers, the others
+    are faults; where most cells are empty, the rest are remarks, and each is named.
 
     Parameters
     ----------
@@ -168,7 +189,9 @@ def channel_columns(
             faults.append(_left_out(name, "the column is empty", "info", file))
             del kept[name]
         elif share > config.quality.max_bad_rows:
-            faults.append(_left_out(name, f"{missing.sum()} of {good.sum()} cells hold no number", "warning", file))
+            faults.append(
+                _left_out(name, f"{missing.sum()} of {good.sum()} cells hold no number", "warning", file)
+            )
             del kept[name]
         elif share:
             drop |= missing
@@ -188,10 +211,14 @@ def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarr
 
         def make(i: int) -> Fault:
             place = {"line": int(line[i]), "column": name, "value": texts[i]}
-            return Fault("remark", "a remark; the row is kept.", file=file, severity="info", action="kept", **place)
+            return Fault(
+                "remark", "a remark; the row is kept.", file=file, severity="info", action="kept", **place
+            )
 
         def rest(count: int) -> Fault:
-            return Fault("remark", f"and {count} more remarks.", file=file, column=name, severity="info", action="kept")
+            return Fault(
+                "remark", f"and {count} more remarks.", file=file, column=name, severity="info", action="kept"
+            )
 
         return listed(np.flatnonzero(full), make, rest)
     labels = len(set(texts[full]))
@@ -201,17 +228,26 @@ def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarr
 
 
 def _left_out(name: str, reason: str, severity: str, file: str) -> Fault:
-    fix = "Fill it, or list it under trace.optional and leave it out of the export." if severity == "warning" else ""
+    fix = (
+        "Fill it, or list it under trace.optional and leave it out of the export."
+        if severity == "warning"
+        else ""
+    )
     reason = f"{reason}; the column is not used."
-    return Fault("channel_left_out", reason, file=file, column=name, severity=severity, action="kept", fix=fix)
+    return Fault(
+        "channel_left_out", reason, file=file, column=name, severity=severity, action="kept", fix=fix
+    )
 
 
-def _cell_faults(column: ColumnOfFile, at: np.ndarray, numbers: np.ndarray, texts: np.ndarray | None) -> list[Fault]:
+def _cell_faults(
+    column: ColumnOfFile, at: np.ndarray, numbers: np.ndarray, texts: np.ndarray | None
+) -> list[Fault]:
     def make(i: int) -> Fault:
         cell = None if texts is None else texts[i]
         if cell is not None and as_number(cell, column.decimal) is None:
             return column.not_a_number(i, cell)
-        value = cell if cell is not None else "" if np.isnan(numbers[i]) else str(numbers[i])  # JSON has no inf
+        # As text: JSON has no inf.
+        value = cell if cell is not None else "" if np.isnan(numbers[i]) else str(numbers[i])
         reason = "is not a measured number." if value != "" else "the cell holds no number."
         return column.fault(i, "not_finite", reason, value=value, fix="Fill it or delete the line.")
 

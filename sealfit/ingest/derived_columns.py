@@ -11,7 +11,17 @@ import numpy as np
 
 from sealfit.config import Config
 from sealfit.errors import CampaignError, ConfigError, Fault
-from sealfit.ingest.categorical import Column, Columns, condition_columns, keys_of, known, mapped, over, put, where
+from sealfit.ingest.categorical import (
+    Column,
+    Columns,
+    condition_columns,
+    keys_of,
+    known,
+    mapped,
+    over,
+    put,
+    where,
+)
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.file_names import TEXT_COLUMNS
 from sealfit.ingest.files import as_number
@@ -19,7 +29,8 @@ from sealfit.ingest.listing import Entries, Entry
 from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- run values
-# Cells of runs.csv and of file names to values: which columns are numbers, which are labels, and what cannot be.
+# Cells of runs.csv and of file names to values: which columns are numbers, which are labels, and what cannot
+# be.
 
 NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
 COUNTS = {"repeat": "repeats", "stroke": "strokes"}  # whole numbers
@@ -33,15 +44,17 @@ _AGED_ONLY = ("temperature_C", "compression_ratio_pct")  # of unaged rubber nobo
 def with_day_0(columns: Columns, config: Config) -> Columns:
     """Return the columns with the days of unaged rubber as 0, and with none of its words where numbers stand.
 
-    Unaged is what has 0, or one of `UNAGED_WORDS`, in its days; or, where no days are given, such a word in another
-    condition column. Its temperature and compression may hold any word.
+    Unaged is what has 0, or one of `UNAGED_WORDS`, in its days; or, where no days are given, such a word in
+    another condition column. Its temperature and compression may hold any word.
 
     Examples
     --------
     >>> with_day_0({"aging_days": ["fresh", "4"], "temperature_C": ["RT", "60"]}, Config())
     {'aging_days': [0.0, '4'], 'temperature_C': [None, '60']}
     """
-    others = [n for n in condition_columns(config) if n in columns and n != "aging_days" and n not in config.rubber]
+    others = [
+        n for n in condition_columns(config) if n in columns and n != "aging_days" and n not in config.rubber
+    ]
     if not config.aging or not columns:
         return columns
     files = len(next(iter(columns.values())))
@@ -68,9 +81,9 @@ def _is_word(cell: float | str) -> bool:
 
 
 def with_computed(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
-    """Return the columns with the config's constants and computed columns, without helpers; faults of the latter.
+    """Return the columns with the config's constants and computed columns, and faults of the computed ones.
 
-    A constant stands where a file has no value. Helpers are columns whose name begins with "_".
+    A constant stands where a file has no value. Helpers, columns whose name begins with "_", are left out.
 
     Raises
     ------
@@ -89,11 +102,15 @@ def with_computed(entries: Entries, columns: Columns, config: Config) -> tuple[C
             place = {"file": f"config '{config.name}'", "column": f"runs.compute.{name}", "fix": error.fix}
             raise CampaignError([Fault("config", error.message, **place)]) from error
         values = np.broadcast_to(values, len(entries)).astype(float)
-        whole = np.all([np.ones(len(entries), bool), *(where(cells, _is_fine) for cells in read.values())], axis=0)
+        whole = np.all(
+            [np.ones(len(entries), bool), *(where(cells, _is_fine) for cells in read.values())], axis=0
+        )
         wrong = whole & ~np.isfinite(values)
         fix = "Correct the cells that it reads, or the expression."
         faults += [
-            entries[i].fault("not_finite", f'is computed as "{text}", which is no number here.', name, fix=fix)
+            entries[i].fault(
+                "not_finite", f'is computed as "{text}", which is no number here.', name, fix=fix
+            )
             for i in np.flatnonzero(wrong).tolist()
         ]
         known_here = np.where(whole, values, math.nan).tolist()
@@ -106,13 +123,13 @@ def _is_fine(value: float | str) -> bool:
 
 
 def _as_array(column: Column) -> np.ndarray:
-    """Return a column as an expression reads it: numbers with nan, or words with "", where there is no value."""
+    """Return a column as an expression reads it: numbers with nan, or words with "", for no value."""
     words = any(isinstance(value, str) for value in column)
     return np.array([("" if words else math.nan) if value is None else value for value in column])
 
 
 def _of_its_kind(name: str, value: float) -> float | str:
-    """Return a computed number as its column holds it: a whole number of repeats or strokes, a name as text."""
+    """Return a computed number as its column holds it: an integer for repeats or strokes, text for a name."""
     if name in COUNTS and value == int(value):
         return int(value)
     return f"{value:g}" if name in TEXT_COLUMNS else value
@@ -121,8 +138,8 @@ def _of_its_kind(name: str, value: float) -> float | str:
 def to_values(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
     """Return the columns as numbers or as labels, and faults of cells that are neither.
 
-    A column of numbers is one whose name says so, one of the config's condition columns or a channel where more than
-    four fifths of the cells are numbers, and any where all are.
+    A column of numbers is one whose name says so, one of the config's condition columns or a channel where
+    more than four fifths of the cells are numbers, and any where all are.
     """
     faults: list[Fault] = []
     made: Columns = {}
@@ -149,13 +166,17 @@ def _column(name: str, cells: Column, entries: Entries, config: Config) -> tuple
         place = {"severity": "warning", "action": "kept", "value": labels[i], "fix": fix}
         return labels, [entries[i].fault("not_a_number", reason, name, **place)]
     fix = "Put a number there."
-    faults = [entries[i].fault("not_a_number", "is not a number.", name, value=labels[i], fix=fix) for i in wrong]
+    faults = [
+        entries[i].fault("not_a_number", "is not a number.", name, value=labels[i], fix=fix) for i in wrong
+    ]
     if name not in COUNTS:
         return values, faults
     fix = f"Number the {COUNTS[name]} 1, 2, 3."
     faults += [
         entries[i].fault("not_a_number", "is not a whole number.", name, value=values[i], fix=fix)
-        for i in np.flatnonzero(where(values, lambda value: math.isfinite(value) and value != int(value))).tolist()
+        for i in np.flatnonzero(
+            where(values, lambda value: math.isfinite(value) and value != int(value))
+        ).tolist()
     ]
     return mapped(values, lambda value: int(value) if math.isfinite(value) else -1), faults
 
@@ -166,14 +187,16 @@ def _number(cell: float | str) -> float:
 
 
 def in_our_units(columns: Columns, conversions: Mapping[str, Conversion]) -> Columns:
-    """Return the columns with numbers of other units converted; cells that are no numbers stay as they are."""
+    """Return the columns with numbers of other units converted; cells without a number stay as they are."""
 
     def converted(cell: float | str, convert: Conversion) -> float | str:
         number = _number(cell)
         return convert.of_cell(number) if math.isfinite(number) else cell
 
     changed = {name: convert for name, convert in conversions.items() if name in columns}
-    return columns | {name: mapped(columns[name], partial(converted, convert=c)) for name, c in changed.items()}
+    return columns | {
+        name: mapped(columns[name], partial(converted, convert=c)) for name, c in changed.items()
+    }
 
 
 def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
@@ -186,7 +209,12 @@ def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
             "is not above 0.",
             "A normal load presses; leave the cell empty if it is unknown.",
         ),
-        ("speed_mm_s", lambda value: value == 0, "is not a sliding speed.", "Leave it empty if it is unknown."),
+        (
+            "speed_mm_s",
+            lambda value: value == 0,
+            "is not a sliding speed.",
+            "Leave it empty if it is unknown.",
+        ),
     )
     found = [
         (i, entries[i].fault("out_of_range", reason, name, value=columns[name][i], fix=fix))
@@ -202,8 +230,12 @@ def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
 #
 # Everything here works on what is already known of each file, and reads none.
 
-SETTING = 0.005  # commanded speeds and loads closer than this share are one setting; a plate or a step is more
-SAME_SPEED = 0.05  # measured speeds closer than this share are one commanded speed; rigs repeat within a few percent
+SETTING = (
+    0.005  # commanded speeds and loads closer than this share are one setting; a plate or a step is more
+)
+SAME_SPEED = (
+    0.05  # measured speeds closer than this share are one commanded speed; rigs repeat within a few percent
+)
 
 
 def condition_keys(columns: Columns, files: int, config: Config) -> list[str]:
@@ -228,10 +260,12 @@ def _text(value: float | str) -> str:
 def as_set(columns: Columns) -> Columns:
     """Return the columns with commanded speeds and loads that differ by rounding only taken as one setting.
 
-    Values within `SETTING` of the smallest of them become the one that most files have. A controller's readback, or a
-    change of units, leaves such differences, and runs must not fall apart over them.
+    Values within `SETTING` of the smallest of them become the one that most files have. A controller's
+    readback, or a change of units, leaves such differences, and runs must not fall apart over them.
     """
-    return columns | {name: _one_setting(columns[name]) for name in ("speed_mm_s", "load_N") if name in columns}
+    return columns | {
+        name: _one_setting(columns[name]) for name in ("speed_mm_s", "load_N") if name in columns
+    }
 
 
 def _one_setting(column: Column) -> Column:
@@ -269,8 +303,8 @@ def add_runs(
     conditions : list of str
         Condition of each file in words.
     measured : sequence of float
-        Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run. So do strokes there
-        and back of one record, a file each, as the column `stroke` tells them.
+        Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run. So do
+        strokes there and back of one record, a file each, as the column `stroke` tells them.
     unit : str
         Unit of the speeds.
     """
@@ -301,7 +335,10 @@ def add_runs(
     added = {**columns, "run_id": put(given, run_ids)}
     if not groups:
         return added, []
-    reason = "neither run_id nor a commanded speed is given; files of one condition share a run within 5 % of speed."
+    reason = (
+        "neither run_id nor a commanded speed is given; "
+        "files of one condition share a run within 5 % of speed."
+    )
     said = Fault("run_id_derived", reason, severity="info", action="kept", fix="Give run_id or speed_mm_s.")
     return added, [said]
 
@@ -318,7 +355,7 @@ def _of_one_speed(members: Sequence[int], measured: Sequence[float]) -> list[lis
 
 
 def _there_and_back(strokes: Sequence[Sequence[int | None]]) -> bool:
-    """Whether the files of two speeds hold the odd strokes of one record and the even ones, each stroke once."""
+    """Whether the files of two speeds hold the odd and the even strokes of one record, each stroke once."""
     if len(strokes) != 2 or None in (every := [*strokes[0], *strokes[1]]) or len({*every}) < len(every):
         return False
     first, second = ({int(number) % 2 for number in own} for own in strokes)
@@ -326,7 +363,7 @@ def _there_and_back(strokes: Sequence[Sequence[int | None]]) -> bool:
 
 
 def add_repeats(columns: Columns) -> Columns:
-    """Return the columns with a `repeat`: where missing by `started_at` if the whole run has it, else by file order.
+    """Return the columns with `repeat`, filled by `started_at` if the whole run has it, else by file order.
 
     Files that hold different strokes of a run, as their column `stroke` says, are numbered stroke by stroke.
     """
@@ -349,7 +386,7 @@ def add_repeats(columns: Columns) -> Columns:
 
 
 def disagreements(entries: Entries, columns: Columns, conditions: list[str]) -> list[Fault]:
-    """Return faults of runs: a repeat that stands twice, or differs from its run in condition, speed or load."""
+    """Return faults of runs: a repeat stands twice or differs from its run in condition, speed or load."""
     none = [None] * len(entries)
     run, repeat, specimen = (columns[name] for name in ("run_id", "repeat", "specimen_id"))
     stroke = columns.get("stroke", none)
@@ -373,8 +410,14 @@ def disagreements(entries: Entries, columns: Columns, conditions: list[str]) -> 
                 value = "none" if mine is None else mine
                 faults.append(entry.fault("run_disagrees", reason, name, value=value, fix=fix))
         if specimen[i] != specimen[j] and _same(told["speed_mm_s"][i], told["speed_mm_s"][j]):
-            reason = f"run '{run[i]}' has repeats on several specimens; their scatter counts as that of repeats."
-            place = {"severity": "warning", "action": "kept", "fix": "Give each specimen a run_id of its own."}
+            reason = (
+                f"run '{run[i]}' has repeats on several specimens; their scatter counts as that of repeats."
+            )
+            place = {
+                "severity": "warning",
+                "action": "kept",
+                "fix": "Give each specimen a run_id of its own.",
+            }
             faults.append(entry.fault("run_specimens", reason, "specimen_id", value=specimen[i], **place))
     return faults
 

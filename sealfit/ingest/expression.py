@@ -1,7 +1,8 @@
 """Safe expressions of rig configs and SPECs: `(force_raw - pressure_bar * 1e5 * pi * (0.0257 / 2) ** 2)`.
 
-These are text files that people pass around, so an expression is never run as Python: it is parsed into a tree, every
-node of the tree is checked against a short list, and only numbers and arrays are ever computed with.
+These are text files that people pass around, so an expression is never run as Python: it is parsed into a
+tree, every node of the tree is checked against a short list, and only numbers and arrays are ever computed
+with.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ MAX_DEPTH = 60
 """Deepest nesting: keeps the walk far below Python's recursion limit."""
 
 FUNCTIONS = {  # name: (function, fewest arguments, most arguments)
-    **{name: (getattr(np, name), 1, 1) for name in ("abs", "sqrt", "exp", "log", "sin", "cos", "tanh", "sign")},
+    **{
+        name: (getattr(np, name), 1, 1)
+        for name in ("abs", "sqrt", "exp", "log", "sin", "cos", "tanh", "sign")
+    },
     "min": (lambda *values: reduce(np.minimum, values), 2, 20),
     "max": (lambda *values: reduce(np.maximum, values), 2, 20),
     "where": (np.where, 3, 3),
@@ -46,8 +50,8 @@ _COMPARE = {
     ast.NotEq: np.not_equal,
 }
 _FIX = (
-    "Allowed are numbers, column names, pi, + - * / **, parentheses, comparisons, and, or, not, a category as in "
-    f"batch == 'B', and {', '.join(FUNCTIONS)}."
+    "Allowed are numbers, column names, pi, + - * / **, parentheses, comparisons, and, or, not, "
+    f"a category as in batch == 'B', and {', '.join(FUNCTIONS)}."
 )
 Values = Mapping[str, object]
 Computed = Callable[[Values], np.ndarray]
@@ -71,7 +75,8 @@ def parse(text: str, *, condition: bool = False) -> Expression:
     text : str
         For example `"-torque_pct * 9.84 / 100"`; with `condition`, `"load_N > 4.9 and time_s < 60"`.
     condition : bool
-        Whether it must be a condition; a comparison in a number counts 1 where it holds and 0 where it does not.
+        Whether it must be a condition; a comparison in a number counts 1 where it holds and 0 where it does
+        not.
 
     Raises
     ------
@@ -89,7 +94,8 @@ def parse(text: str, *, condition: bool = False) -> Expression:
         raise ConfigError(f"an expression of {len(text)} characters.", fix=f"Keep it below {MAX_CHARACTERS}.")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # "1if": a remark of Python's about text that is refused below anyway
+            # "1if": a remark of Python's about text that is refused below anyway.
+            warnings.simplefilter("ignore")
             tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = getattr(error, "msg", None) or "it is nested too deeply"
@@ -102,8 +108,9 @@ def parse(text: str, *, condition: bool = False) -> Expression:
 def evaluate(expression: Expression, values: Values) -> np.ndarray:
     """Return the expression's value: an array of shape (n,), or of shape () if only constants are read.
 
-    Arithmetic is in double precision; what is undefined (0/0, the root of a negative number) gives NaN and what is too
-    large gives infinity, without a warning: the rows concerned are reported where cells are checked.
+    Arithmetic is in double precision; what is undefined (0/0, the root of a negative number) gives NaN and
+    what is too large gives infinity, without a warning: the rows concerned are reported where cells are
+    checked.
 
     Raises
     ------
@@ -169,14 +176,17 @@ class _Checked:
             ) if not name.startswith("__"):
                 self.names.add(name)
                 return lambda values: _COMPARE[type(op)](np.asarray(values[name]).astype(str), label)
-            case ast.Compare(left=left, ops=ops, comparators=rights) if all(type(op) in _COMPARE for op in ops):
+            case ast.Compare(left=left, ops=ops, comparators=rights) if all(
+                type(op) in _COMPARE for op in ops
+            ):
                 sides = [self.number(part, depth + 1) for part in (left, *rights)]
                 return lambda values: _compared(ops, [side(values) for side in sides])
             case ast.Compare():
                 raise self.refusal(f"'{ast.unparse(node)}'")
         self.number(node, depth + 1)  # refuses with its own words what is not even a number
         raise ConfigError(
-            f"in \"{self.text}\": '{ast.unparse(node)}' compares nothing.", fix="Write for example load_N > 4.9."
+            f"in \"{self.text}\": '{ast.unparse(node)}' compares nothing.",
+            fix="Write for example load_N > 4.9.",
         )
 
     def call(self, name: str, arguments: list[ast.expr], depth: int) -> Computed:
@@ -184,7 +194,9 @@ class _Checked:
         function, fewest, most = FUNCTIONS[name]
         if not fewest <= len(arguments) <= most:
             wanted = str(fewest) if fewest == most else f"{fewest} to {most}"
-            raise ConfigError(f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.', fix=_FIX)
+            raise ConfigError(
+                f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.', fix=_FIX
+            )
         inner = [self.number(part, depth + 1) for part in arguments]
         return lambda values: function(*(part(values) for part in inner))
 

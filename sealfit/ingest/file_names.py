@@ -23,12 +23,12 @@ from sealfit.units import Conversion
 
 @dataclass(frozen=True, slots=True)
 class TraceRef:
-    """One trace file and everything that runs.csv, its name, its header or its constant columns say of the whole file.
+    """One trace file and all that runs.csv, its name, header or constant columns say of the whole file.
 
-    `file` is relative to the campaign folder, with forward slashes. `channels` always holds `run_id`, `repeat`,
-    `specimen_id` and the condition columns (day 0 may lack those other than the days), and where they are known
-    `speed_set_mm_s` (magnitude), `load_N`, `started_at` (ISO 8601), `run_order`, `elapsed_h` and the campaign's own
-    channels. What is not known is not there.
+    `file` is relative to the campaign folder, with forward slashes. `channels` always holds `run_id`,
+    `repeat`, `specimen_id` and the condition columns (day 0 may lack those other than the days), and where
+    they are known `speed_set_mm_s` (magnitude), `load_N`, `started_at` (ISO 8601), `run_order`, `elapsed_h`
+    and the campaign's own channels. What is not known is not there.
     """
 
     file: str
@@ -93,9 +93,9 @@ def names_speak(settings: Files) -> bool:
 def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion] = SAME_UNITS) -> NameParts:
     """Return what the relative path `file` says under the config's `files`.
 
-    Every named group of `name_pattern` is a part; a part with a value map takes the mapped value where the map has
-    one; numbers become numbers; `compute` and the templates of `columns` then add columns. Empty parts say nothing.
-    Numbers in other units than ours are converted, those of parts first.
+    Every named group of `name_pattern` is a part; a part with a value map takes the mapped value where the
+    map has one; numbers become numbers; `compute` and the templates of `columns` then add columns. Empty
+    parts say nothing. Numbers in other units than ours are converted, those of parts first.
 
     Raises
     ------
@@ -134,14 +134,17 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
         texts[name] = _FIELD.sub(lambda found: _part(found.group(1), texts, template), template)  # noqa: B023
         values[name] = texts[name] if name in TEXT_COLUMNS else _value(texts[name])
         _convert(name, texts, values, conversions)
-    return NameParts(True, {name: value for name, value in values.items() if value != "" or name.startswith("_")})
+    return NameParts(
+        True, {name: value for name, value in values.items() if value != "" or name.startswith("_")}
+    )
 
 
-_OPEN = re.compile(r"(\((\?(:|P<\w+>|=|!|<=|<!|<)?)?|\|)$")  # a group or a choice of which nothing is there yet
+# A group or a choice of which nothing is there yet.
+_OPEN = re.compile(r"(\((\?(:|P<\w+>|=|!|<=|<!|<)?)?|\|)$")
 
 
 def matched_part(pattern: str, file: str) -> tuple[str, str]:
-    """Return as much of a path as the longest part of a pattern matches that matches at all, and the pattern's rest.
+    """Return as much of a path as the longest matching part of a pattern matches, and the pattern's rest.
 
     Examples
     --------
@@ -156,7 +159,7 @@ def matched_part(pattern: str, file: str) -> tuple[str, str]:
 
 @cache
 def _parts_of(pattern: str) -> list[tuple[re.Pattern, int]]:
-    """Return the beginnings of a pattern that are patterns, open groups closed, and their lengths, longest first."""
+    """Return the valid beginnings of a pattern, with open groups closed, and their lengths, longest first."""
     found = []
     for length in range(len(pattern), 0, -1):
         begin = pattern[:length]
@@ -200,5 +203,7 @@ def _value(text: str) -> float | str:
 def _part(name: str, texts: Mapping[str, str], template: str) -> str:
     if name not in texts:
         known = ", ".join(texts) or "none"
-        raise ConfigError(f"template {template!r} reads a part '{name}' that the name has not.", fix=f"Parts: {known}.")
+        raise ConfigError(
+            f"template {template!r} reads a part '{name}' that the name has not.", fix=f"Parts: {known}."
+        )
     return texts[name]

@@ -17,13 +17,14 @@ from sealfit.errors import BadFile, Fault
 from sealfit.store.manifest import Fingerprint, fingerprint, fingerprint_of
 
 # ---------------------------------------------------------------- folder
-# Files of a campaign folder as bytes: never one outside it, each opened once for its text and its fingerprint.
+# Files of a campaign folder as bytes: never one outside it, each opened once for its text and its
+# fingerprint.
 
 _BLANK = b"\xef\xbb\xbf\xff\xfe \t\r\n\0"
 
 
 class Folder:
-    """A campaign folder; where its subfolders lie, links followed, is looked up once for all of their files."""
+    """A campaign folder; where its subfolders lie, links followed, is looked up once for all their files."""
 
     def __init__(self, campaign: Path):
         self.campaign = campaign
@@ -102,11 +103,14 @@ def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, 
         if not stat.S_ISREG(status.st_mode):
             raise _bad_path(file, "unreadable_file", "is not a file.", "Check the path.")
         raw = os.read(handle, status.st_size + 1 if size is None else size)
-        # Short where it is the whole file; a network's file system, or a file above 2 GB, may give it piece by piece.
+        # Short where it is the whole file; a network's file system, or a file above 2 GB, may give it piece
+        # by piece.
         while size is None and len(raw) != status.st_size and (more := os.read(handle, 1 << 24)):
             raw += more
     except OSError as error:
-        raise _bad_path(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.") from error
+        raise _bad_path(
+            file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights."
+        ) from error
     finally:
         os.close(handle)
     if not raw[:64].strip(_BLANK) and not raw.strip(_BLANK):
@@ -133,12 +137,15 @@ def _similar(path: Path) -> str:
             if other.name.lower() == path.name.lower():
                 return f"There is '{other.name}': the case of letters matters."
     except OSError:
-        return f"There is no folder '{path.parent.name}' either; paths are relative to the folder of runs.csv."
+        return (
+            f"There is no folder '{path.parent.name}' either; paths are relative to the folder of runs.csv."
+        )
     return "Paths are relative to the folder of runs.csv."
 
 
 # ---------------------------------------------------------------- text
-# Bytes of a file to clean UTF-8 text, and where its header ends: encodings, byte-order marks, line ends, names.
+# Bytes of a file to clean UTF-8 text, and where its header ends: encodings, byte-order marks, line ends,
+# names.
 
 HEAD_BYTES = 65_536  # a header longer than this is no header
 _BOMS = (  # UTF-32 first: its mark begins with that of UTF-16
@@ -179,7 +186,8 @@ class Layout:
 def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> bytes:
     """Return the text as UTF-8 bytes without byte-order mark, lines ended by a single line feed.
 
-    `auto` looks for a byte-order mark, then for the zero bytes of UTF-16, then tries UTF-8, then takes Latin-1.
+    `auto` looks for a byte-order mark, then for the zero bytes of UTF-16, then tries UTF-8, then takes
+    Latin-1.
 
     Raises
     ------
@@ -223,7 +231,7 @@ def _refuse_packed(raw: bytes, file: str) -> None:
 
 
 def _is_plain(raw: bytes) -> bool:
-    """Return whether the bytes are letters, figures and marks of ASCII between line feeds, and nothing else."""
+    """Return whether the bytes are only letters, figures and marks of ASCII between line feeds."""
     codes = np.frombuffer(raw, np.uint8)
     return bool(codes.max(initial=0) < 127) and np.count_nonzero(codes < 32) == np.count_nonzero(codes == 10)
 
@@ -252,7 +260,9 @@ def find_layout(text: bytes, settings: TraceFormat, file: str) -> Layout:
     if back > count:
         reason = f"has a header of {count} lines, and its names should stand {back} lines before the data."
         raise _bad(file, "header_not_found", reason, "Check header_lines and names_line in the rig config.")
-    names = tuple(name.strip() for name in split_line(without_strays(header[-back], settings), settings.delimiter))
+    names = tuple(
+        name.strip() for name in split_line(without_strays(header[-back], settings), settings.delimiter)
+    )
     return Layout(header, names, count - back + 1, start, count + 1)
 
 
@@ -270,7 +280,7 @@ def split_line(line: str, delimiter: str) -> list[str]:
 
 
 def header_fields(header: tuple[str, ...], settings: TraceFormat) -> dict[str, float | str]:
-    """Return the channels that the config reads from header lines: the first match of each, numbers as numbers."""
+    """Return the channels the config reads from header lines: the first match of each, numbers as numbers."""
     found: dict[str, float | str] = {}
     for name, pattern in settings.header_fields.items():
         for line in header:
@@ -308,7 +318,7 @@ def _bad(file: str, check: str, reason: str, fix: str, line: int | None = None) 
 
 
 def _guess(raw: bytes) -> str:
-    """Return "utf-16-le" or "-be" where every other byte is zero, as in UTF-16 of Latin letters; else "utf-8"."""
+    """Return "utf-16-le" or "-be" if every other byte is zero, as in UTF-16 of Latin text; else "utf-8"."""
     sample = raw[:4096]
     half = len(sample) // 2
     if half > 1 and sample[1::2].count(0) > 0.8 * half and sample[::2].count(0) < 0.1 * half:
@@ -331,10 +341,13 @@ def _header_lines(lines: list[str], settings: TraceFormat, file: str) -> int:
             if re.search(settings.header_ends_at, line):
                 return number
         reason = f"no line matches header_ends_at = {settings.header_ends_at!r}."
-        raise _bad(file, "header_not_found", reason, "Check header_ends_at in the rig config against the file.")
+        raise _bad(
+            file, "header_not_found", reason, "Check header_ends_at in the rig config against the file."
+        )
     if settings.header_lines is not None:
         return settings.header_lines
     if settings.names == "none":
         return 0
-    blank = next((i for i, line in enumerate(lines) if line.strip()), 0)  # blank lines may stand before the names
+    # Blank lines may stand before the names.
+    blank = next((i for i, line in enumerate(lines) if line.strip()), 0)
     return blank + 1 + settings.units_row

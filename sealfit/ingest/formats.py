@@ -1,7 +1,8 @@
 """Trace files of arrays, not of text: TDMS, MATLAB and Parquet, each read by the library made for it.
 
-Every reader gives the same: header lines `name<tab>text`, names of the columns, and a column each. What follows is done
-as for text. The libraries are optional (`pip install 'sealfit[formats]'`) and loaded where a file needs them.
+Every reader gives the same: header lines `name<tab>text`, names of the columns, and a column each. What
+follows is done as for text. The libraries are optional (`pip install 'sealfit[formats]'`) and loaded where a
+file needs them.
 """
 
 from __future__ import annotations
@@ -36,13 +37,18 @@ ENDINGS = {
     ".pq": "parquet",
 }
 OF_ARRAYS = ("tdms", "mat", "parquet")
-CALLED = {"xlsx": "an Excel workbook", "tdms": "a TDMS file", "mat": "a MAT-file", "parquet": "a Parquet file"}
+CALLED = {
+    "xlsx": "an Excel workbook",
+    "tdms": "a TDMS file",
+    "mat": "a MAT-file",
+    "parquet": "a Parquet file",
+}
 _LIBRARIES = {"xlsx": "openpyxl", "tdms": "nptdms"}  # that every file of the kind needs
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]+")
 
 
 def kind_of(file: str, settings: TraceFormat | None = None) -> str:
-    """Return how a file is written: by the config's `format`, else by its ending; "csv" for all other endings.
+    """Return how a file is written: by the config's `format`, else by its ending; "csv" for other endings.
 
     Examples
     --------
@@ -82,7 +88,7 @@ def require_libraries(files: Sequence[str], settings: TraceFormat) -> None:
 
 @contextmanager
 def damage_named(file: str, kind: str) -> Iterator[None]:
-    """Turn whatever a library raises into a fault of the file; a library meets damage with any kind of exception."""
+    """Turn whatever a library raises into a fault of the file; damage causes any kind of exception."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on styles and the like, which are of no concern here
@@ -107,8 +113,8 @@ def bad(file: str, check: str, reason: str, fix: str, **place) -> BadFile:
 class Arrays:
     """A file's header lines, the names of its columns and the columns, each of shape (n,).
 
-    `names` is empty where columns go by position. A column holds float64, datetime64, or text as objects (None where
-    empty); `faults` name what is no column.
+    `names` is empty where columns go by position. A column holds float64, datetime64, or text as objects
+    (None where empty); `faults` name what is no column.
     """
 
     header: tuple[str, ...]
@@ -145,8 +151,10 @@ def value_text(value: object) -> str:
 
     Examples
     --------
-    >>> value_text(80.0), value_text(0.1), value_text(True), value_text(datetime(2024, 3, 1, 9, 30)), value_text(None)
-    ('80', '0.1', 'TRUE', '2024-03-01T09:30:00', '')
+    >>> value_text(80.0), value_text(0.1), value_text(True), value_text(None)
+    ('80', '0.1', 'TRUE', '')
+    >>> value_text(datetime(2024, 3, 1, 9, 30))
+    '2024-03-01T09:30:00'
     """
     if value is None:
         return ""
@@ -169,13 +177,15 @@ def _column(values: np.ndarray) -> np.ndarray | None:
         return values
     if values.dtype.kind == "m":
         return values / np.timedelta64(1, "s")
-    if values.dtype.kind in "UO" and all(value is None or isinstance(value, str) for value in values.tolist()):
+    if values.dtype.kind in "UO" and all(
+        value is None or isinstance(value, str) for value in values.tolist()
+    ):
         return np.array([(value or "").strip() or None for value in values.tolist()], dtype=object)
     return None
 
 
 def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceFormat, file: str) -> Arrays:
-    """Return named columns, those of another length than the longest, and those of other things, left out and named.
+    """Return named columns; those shorter than the longest, or of other things, are left out and named.
 
     Raises
     ------
@@ -190,7 +200,9 @@ def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceF
             kept[name] = column
             continue
         reason = (
-            "holds neither numbers nor text" if column is None else f"has {len(values)} values where others have {rows}"
+            "holds neither numbers nor text"
+            if column is None
+            else f"has {len(values)} values where others have {rows}"
         )
         if name in needed:
             fix = "Export all channels at one rate." if column is not None else "Export it as numbers."
@@ -201,7 +213,11 @@ def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceF
 
 
 def _chosen(
-    options: Mapping[str, Collection[str]], key: str, settings: TraceFormat, file: str, derived: str | int | None = None
+    options: Mapping[str, Collection[str]],
+    key: str,
+    settings: TraceFormat,
+    file: str,
+    derived: str | int | None = None,
 ) -> str:
     """Return the one of several tables in a file that the config names, or the only one that fits it.
 
@@ -223,7 +239,9 @@ def _chosen(
         fix = suggestion(wanted, list(options)).replace("columns are", f"{key}s are")
         raise bad(file, "missing_table", f"holds no {key} '{wanted}' (trace.{key}) with data.", fix)
     names = {
-        name for ours, name in settings.their_columns.items() if isinstance(name, str) and ours not in settings.optional
+        name
+        for ours, name in settings.their_columns.items()
+        if isinstance(name, str) and ours not in settings.optional
     }
     fitting = [option for option, columns in options.items() if names - {derived} <= set(columns)]
     if len(options) == 1 or len(fitting) == 1:
@@ -242,15 +260,24 @@ def _tdms(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
     read = nptdms.TdmsFile.read_metadata if head else nptdms.TdmsFile.read
     tdms = read(io.BytesIO(raw))
     if tdms.file_status.incomplete_final_segment:
-        raise bad(file, "damaged_file", "is cut off: its last segment is not complete.", "Copy it again from the rig.")
-    groups = {group.name: group for group in tdms.groups() if any(len(channel) for channel in group.channels())}
+        raise bad(
+            file,
+            "damaged_file",
+            "is cut off: its last segment is not complete.",
+            "Copy it again from the rig.",
+        )
+    groups = {
+        group.name: group for group in tdms.groups() if any(len(channel) for channel in group.channels())
+    }
     time_name = settings.their_columns.get("time_s")
     names = {name: [channel.name for channel in group.channels()] for name, group in groups.items()}
     group = groups[_chosen(names, "group", settings, file, derived=time_name)]
     header = [header_line(name, value) for name, value in tdms.properties.items()]
     header += [header_line(f"{group.name}/{name}", value) for name, value in group.properties.items()]
     for channel in group.channels():
-        header += [header_line(f"{group.name}/{channel.name}/{k}", value) for k, value in channel.properties.items()]
+        header += [
+            header_line(f"{group.name}/{channel.name}/{k}", value) for k, value in channel.properties.items()
+        ]
     if head:
         return Arrays(tuple(header))
     filled = {channel.name: channel for channel in group.channels() if len(channel)}
@@ -290,7 +317,9 @@ def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
         return Arrays(tuple(header))
     tables = _tables(variables)
     if not tables:
-        fix = "Save the columns as vectors, as a matrix or as a struct: s = table2struct(T, 'ToScalar', true)."
+        fix = (
+            "Save the columns as vectors, as a matrix or as a struct: s = table2struct(T, 'ToScalar', true)."
+        )
         raise bad(file, "no_rows", "holds no vectors, matrix or struct of numbers.", fix)
     options = {name: table if isinstance(table, dict) else () for name, table in tables.items()}
     name = _chosen(options, "variable", settings, file)
@@ -298,7 +327,9 @@ def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
     if isinstance(table, dict):
         return _arrays(header, table, settings, file)
     if table.shape[0] < table.shape[1]:
-        reason = f"variable '{name}' has {table.shape[0]} rows and {table.shape[1]} columns; samples are rows."
+        reason = (
+            f"variable '{name}' has {table.shape[0]} rows and {table.shape[1]} columns; samples are rows."
+        )
         raise bad(file, "column_shape", reason, "Save its transpose.")
     return Arrays(tuple(header), (), tuple(table.T.astype(float)))
 
@@ -307,7 +338,9 @@ def _is_vector(value: object) -> bool:
     return isinstance(value, np.ndarray) and value.ndim == 1 and value.size > 1
 
 
-def _tables(variables: Mapping[str, object], inside: str = "") -> dict[str, dict[str, np.ndarray] | np.ndarray]:
+def _tables(
+    variables: Mapping[str, object], inside: str = ""
+) -> dict[str, dict[str, np.ndarray] | np.ndarray]:
     """Return every matrix, and the vectors of every struct and of the file itself, by their names."""
     found: dict[str, dict[str, np.ndarray] | np.ndarray] = {}
     vectors = {name: value for name, value in variables.items() if _is_vector(value)}
@@ -344,7 +377,7 @@ def _hdf5(folder: Mapping) -> dict[str, object]:
 
 
 def _hdf5_value(item) -> np.ndarray | float | str | None:
-    """Return an array, which MATLAB writes transposed, without dimensions of length 1; a number or text as such."""
+    """Return an array, which MATLAB transposes, without dimensions of length 1; a number or text as such."""
     if "MATLAB_empty" in item.attrs or item.dtype.kind not in "fiub":
         return None
     values = np.squeeze(item[()].T)
@@ -363,7 +396,9 @@ def _parquet(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays
     import pyarrow.parquet as pq
 
     opened = pq.ParquetFile(pa.BufferReader(raw))
-    about = {k.decode(): v.decode("utf-8", "replace") for k, v in (opened.schema_arrow.metadata or {}).items()}
+    about = {
+        k.decode(): v.decode("utf-8", "replace") for k, v in (opened.schema_arrow.metadata or {}).items()
+    }
     header = [header_line(name, text) for name, text in about.items() if name.encode() not in _OF_WRITERS]
     if head:
         return Arrays(tuple(header))
@@ -380,7 +415,12 @@ def _from_arrow(column) -> np.ndarray:
     kind = column.type
     if pa.types.is_dictionary(kind):
         column, kind = column.cast(kind.value_type), kind.value_type
-    if pa.types.is_decimal(kind) or pa.types.is_null(kind) or pa.types.is_boolean(kind) or pa.types.is_integer(kind):
+    if (
+        pa.types.is_decimal(kind)
+        or pa.types.is_null(kind)
+        or pa.types.is_boolean(kind)
+        or pa.types.is_integer(kind)
+    ):
         return column.cast(pa.float64(), safe=False).to_numpy()
     if pa.types.is_date(kind):
         column = column.cast(pa.timestamp("s"))

@@ -57,7 +57,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entries(Sequence[Entry]):
-    """The trace files of a campaign in order, and the line of each in the table of runs, where there is one."""
+    """The trace files of a campaign in order, and the line of each in the table of runs, if there is one."""
 
     files: list[str]
     lines: list[int] | None = None
@@ -81,8 +81,8 @@ def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list
 
     Cells are text, those that say that there is nothing left out; errors stop the run.
 
-    The table of runs is read where there is one; otherwise the config's glob finds the files, in natural order (2
-    before 10).
+    The table of runs is read where there is one; otherwise the config's glob finds the files, in natural
+    order (2 before 10).
 
     Raises
     ------
@@ -109,7 +109,9 @@ def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list
 
 def natural(name: str) -> list[tuple[int, int, str]]:
     """Return a sort key that puts `run2` before `run10`."""
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+    return [
+        (0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
+    ]
 
 
 def _stop(check: str, reason: str, fix: str, **place) -> CampaignError:
@@ -123,7 +125,9 @@ def _runs_table(campaign: Path, config: Config) -> str | None:
         fix = "Delete or rename one, or name the one that counts: runs_table under [files] in the rig config."
         raise _stop("several_tables", f"{' and '.join(found)} are both there.", fix, file=found[0])
     if named is not None and not found:
-        raise _stop("missing_file", "does not exist, but files.runs_table names it.", "Check its path.", file=named)
+        raise _stop(
+            "missing_file", "does not exist, but files.runs_table names it.", "Check its path.", file=named
+        )
     return found[0] if found else None
 
 
@@ -140,13 +144,18 @@ def _read_runs(campaign: Path, config: Config, table: str) -> tuple[Entries, Col
         fix = suggestion("file", _cells(head, delimiter) if head else [])
         raise _stop("missing_column", "there is no such column.", fix, file=table, line=1, column="file")
     lines, columns = _rows(text, names, delimiter, faults)
-    if delimiter != ",":  # decimal commas are plain here: no cell of a table of ; or tabs can be split by them
+    # Decimal commas are plain here: no cell of a table of ; or tabs can be split by them.
+    if delimiter != ",":
         columns = {name: mapped(column, _decimal_point) for name, column in columns.items()}
     files = [_posix(campaign, file) for file in columns.pop("file", [])]
     if not files and not any(fault.severity == "error" for fault in faults):
         raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=table)
     faults = [replace(fault, file=table) for fault in faults]
-    return Entries(files, lines, table), {name: mapped(column, _said) for name, column in columns.items()}, faults
+    return (
+        Entries(files, lines, table),
+        {name: mapped(column, _said) for name, column in columns.items()},
+        faults,
+    )
 
 
 def _lines(text: bytes) -> Iterator[tuple[int, str]]:
@@ -175,12 +184,16 @@ def _rows(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) ->
         cells = _cells(line, delimiter)
         if any(cells[len(names) :]):
             reason = f"the line has {len(cells)} cells where {len(names)} are named."
-            faults.append(Fault("too_many_cells", reason, file=RUNS_CSV, line=number, fix="Quote cells with commas."))
+            faults.append(
+                Fault("too_many_cells", reason, file=RUNS_CSV, line=number, fix="Quote cells with commas.")
+            )
             continue
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
         if "file" not in row:
             reason = "no trace file is named."
-            faults.append(Fault("empty_cell", reason, file=RUNS_CSV, line=number, column="file", fix="Name it."))
+            faults.append(
+                Fault("empty_cell", reason, file=RUNS_CSV, line=number, column="file", fix="Name it.")
+            )
             continue
         lines.append(number)
         rows.append(row)
@@ -194,10 +207,15 @@ def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault
     faults = []
     for name in sorted({name for name in names if name and names.count(name) > 1}):
         reason = f"stands {names.count(name)} times in the header."
-        faults.append(Fault("duplicate_column", reason, file=RUNS_CSV, line=1, column=name, fix="Rename one."))
+        faults.append(
+            Fault("duplicate_column", reason, file=RUNS_CSV, line=1, column=name, fix="Rename one.")
+        )
     for theirs in ours:
         if theirs not in header:
-            reason, fix = "there is no such column, but files.runs_columns names it.", suggestion(theirs, header)
+            reason, fix = (
+                "there is no such column, but files.runs_columns names it.",
+                suggestion(theirs, header),
+            )
             faults.append(Fault("missing_column", reason, file=RUNS_CSV, line=1, column=theirs, fix=fix))
     wanted = [*dict.fromkeys([*KNOWN, *config.condition])]
     for name in names:
@@ -206,14 +224,17 @@ def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault
             reason, fix = f"differs from '{close}' in the case of letters only.", f"Write '{close}'."
             faults.append(Fault("column_name", reason, file=RUNS_CSV, line=1, column=name, fix=fix))
         elif close and close not in names and SequenceMatcher(None, name, close).ratio() > 0.85:
-            reason, fix = f"is kept as a channel; it looks like '{close}'.", f"Write '{close}' if that is meant."
+            reason, fix = (
+                f"is kept as a channel; it looks like '{close}'.",
+                f"Write '{close}' if that is meant.",
+            )
             place = {"file": RUNS_CSV, "line": 1, "column": name}
             faults.append(Fault("column_name", reason, severity="warning", action="kept", fix=fix, **place))
     return names, faults
 
 
 def _posix(campaign: Path, file: str) -> str:
-    """Return a path as listed with forward slashes and without detours; Windows' backslashes are understood."""
+    """Return a listed path with forward slashes and without detours; Windows' backslashes are understood."""
     if "\\" in file and not (campaign / file).exists():
         file = file.replace("\\", "/")
     return os.path.normpath(file) if file else file
@@ -222,10 +243,17 @@ def _posix(campaign: Path, file: str) -> str:
 def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
     glob = config.files.glob
     if PurePosixPath(glob).is_absolute() or ".." in PurePosixPath(glob).parts or not glob:
-        raise _stop("path_outside", f"files.glob = {glob!r} leads outside the campaign folder.", "Make it relative.")
-    files = sorted((p.relative_to(campaign).as_posix() for p in campaign.glob(glob) if not p.is_dir()), key=natural)
+        raise _stop(
+            "path_outside", f"files.glob = {glob!r} leads outside the campaign folder.", "Make it relative."
+        )
+    files = sorted(
+        (p.relative_to(campaign).as_posix() for p in campaign.glob(glob) if not p.is_dir()), key=natural
+    )
     if not files:
-        reason = f"no file in '{campaign}' matches files.glob = {glob!r}, which stands for paths below that folder."
+        reason = (
+            f"no file in '{campaign}' matches files.glob = {glob!r}, "
+            "which stands for paths below that folder."
+        )
         raise _stop("missing_file", reason, _nearest_file(campaign, glob))
     faults, kept = [], []
     for file in files:
@@ -255,7 +283,9 @@ def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:
             faults.append(entry.fault("path_outside", reason, "file", value=entry.file, fix=fix))
         elif entry.file in lines:
             reason = f"the trace file is listed already on line {lines[entry.file]}."
-            faults.append(entry.fault("duplicate_file", reason, "file", value=entry.file, fix="Delete one line."))
+            faults.append(
+                entry.fault("duplicate_file", reason, "file", value=entry.file, fix="Delete one line.")
+            )
         lines.setdefault(entry.file, entry.line)
     if entries and not faults and not any((campaign / file).is_file() for file in entries.files):
         reason = f"none of the {len(entries)} trace files listed exists."
@@ -265,7 +295,7 @@ def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:
 
 
 def _unlisted(campaign: Path, entries: Entries, outside: set[str], config: Config) -> list[Fault]:
-    """Return files that runs.csv does not list: beside the traces and of the same ending, or matched by the glob."""
+    """Return files that runs.csv omits: beside the traces and of the same ending, or matched by the glob."""
     if not entries or entries.lines is None:
         return []
     listed = set(entries.files)
@@ -276,14 +306,21 @@ def _unlisted(campaign: Path, entries: Entries, outside: set[str], config: Confi
     files = there - listed - {entries.table}
     fix = "Add it to runs.csv if it is a trace."
     return [
-        Fault("not_listed", f"is not in {entries.table}.", file=f, severity="info", action="file left out", fix=fix)
+        Fault(
+            "not_listed",
+            f"is not in {entries.table}.",
+            file=f,
+            severity="info",
+            action="file left out",
+            fix=fix,
+        )
         for f in sorted(files, key=natural)
         if not any(fnmatchcase(f, pattern) for pattern in config.files.exclude)
     ]
 
 
 def files_beside(campaign: Path, files: Collection[str]) -> set[str]:
-    """Return the files that lie beside `files`, in the same folders and with one of their endings; not `files`."""
+    """Return the files beside `files`, in the same folders and with one of their endings; not `files`."""
     endings, found = {os.path.splitext(file)[1] for file in files}, set()
     for folder in {file.rpartition("/")[0] for file in files}:
         below = f"{folder}/" if folder else ""

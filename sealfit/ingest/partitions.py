@@ -36,11 +36,13 @@ STEADY_ONLY = tuple(
 
 
 def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.DataFrame:
-    """Return the schema's columns in order and with their types, then the open ones but `drop` and `INNER`."""
+    """Return the schema's columns in order with their types, then the open ones but `drop` and `INNER`."""
     fixed = {}
     for column in schema.columns:
         values = (
-            table[column.name] if column.name in table.columns else pd.Series(None, index=table.index, dtype=object)
+            table[column.name]
+            if column.name in table.columns
+            else pd.Series(None, index=table.index, dtype=object)
         )
         if column.dtype == FLOAT:
             fixed[column.name] = pd.to_numeric(values, errors="coerce").astype(float)
@@ -55,10 +57,12 @@ def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.
 
 
 # ---------------------------------------------------------------- parts
-# A campaign cut into parts of whole runs: what is read at once, by one process, and stored in one file a table.
+# A campaign cut into parts of whole runs: what is read at once, by one process, and stored in one file a
+# table.
 #
-# Where a cut lies depends on the runs beside it alone (content-defined chunking), so files that are added to a campaign
-# change the part they belong to and, at most, its neighbours; everything else stays as it is on the disk.
+# Where a cut lies depends on the runs beside it alone (content-defined chunking), so files that are added to
+# a campaign change the part they belong to and, at most, its neighbours; everything else stays as it is on
+# the disk.
 
 # Files of a part: few enough to be read for one condition, many enough that 100,000 files are some 400 parts.
 PART_FILES = 256
@@ -71,8 +75,9 @@ LEAST, MOST = 0.25, 2.0
 def plan_parts(conditions: Sequence[str], runs: Sequence[str], sizes: Sequence[int]) -> list[list[int]]:
     """Return the files of each part, by their numbers, rising within a part; every file is in one part.
 
-    Conditions stay together unless one is larger than a part; runs always. A part holds conditions that are neighbours
-    in the order of their names, so the least and the largest name, which Parquet keeps, tell a reader what to skip.
+    Conditions stay together unless one is larger than a part; runs always. A part holds conditions that are
+    neighbours in the order of their names, so the least and the largest name, which Parquet keeps, tell a
+    reader what to skip.
 
     Parameters
     ----------
@@ -121,7 +126,8 @@ def _cut(name: str, weight: float) -> bool:
 
 
 # ---------------------------------------------------------------- part
-# One part of a campaign: its files read, their strokes in one table, and the tables that grow with the samples.
+# One part of a campaign: its files read, their strokes in one table, and the tables that grow with the
+# samples.
 
 SAMPLED = ("traces", "traces_mean", "bins")  # tables that are made, and stored, part by part
 
@@ -132,8 +138,8 @@ Stroke = tuple[str, int]  # file, and number of the stroke in it
 class Asked:
     """Files to read together: whole runs.
 
-    `unused` are strokes that a comparison with other parts has ruled out; `columns`, per table, those that it is to
-    have, and their types, since other parts have them.
+    `unused` are strokes that a comparison with other parts has ruled out; `columns`, per table, those that it
+    is to have, and their types, since other parts have them.
     """
 
     refs: Listing
@@ -155,9 +161,9 @@ class FileFound:
 class Part:
     """What one part gives.
 
-    `strokes` has a row per stroke with everything that is known of it, the keys included, and `used` by what the file
-    itself shows; `tables` are those of `SAMPLED` that have rows, without the strokes that are not used or were asked
-    to be left out; their words are dictionaries.
+    `strokes` has a row per stroke with everything that is known of it, the keys included, and `used` by what
+    the file itself shows; `tables` are those of `SAMPLED` that have rows, without the strokes that are not
+    used or were asked to be left out; their words are dictionaries.
     """
 
     files: tuple[FileFound, ...]
@@ -214,13 +220,18 @@ def _two_runs(strokes: Mapping[str, list]) -> dict[str, list[str]]:
     """Return `run_id` with its direction where needed, and `run`, as it was."""
     names = [str(name) for name in strokes["run_id"]]
     ways = defaultdict(set)
-    for run, file, way, used in zip(names, strokes["file"], strokes["direction"], strokes["used"], strict=True):
+    for run, file, way, used in zip(
+        names, strokes["file"], strokes["direction"], strokes["used"], strict=True
+    ):
         ways[run, file].add(way)
         if used:
             ways[run, None].add(way)
     both = {run for (run, _), found in ways.items() if len(found) > 1}
     signed = (f"{run}{'+' if way > 0 else '-'}" for run, way in zip(names, strokes["direction"], strict=True))
-    return {"run_id": [new if run in both else run for run, new in zip(names, signed, strict=True)], "run": names}
+    return {
+        "run_id": [new if run in both else run for run, new in zip(names, signed, strict=True)],
+        "run": names,
+    }
 
 
 def _array(values: Sequence[object]) -> pa.Array:
@@ -232,8 +243,10 @@ def _array(values: Sequence[object]) -> pa.Array:
 
 
 def sample_columns(files: Sequence[FileStrokes], strokes: Mapping[str, list]) -> dict[str, np.ndarray]:
-    """Return all samples, with `row` (place in `strokes`); `steady` and `sliding` are false throughout a stroke that is
-    not used."""
+    """Return all samples, with `row` (place in `strokes`).
+
+    `steady` and `sliding` are false throughout a stroke that is not used.
+    """
     parts = [made for made in files if made.samples is not None]
     names = list(dict.fromkeys(name for made in parts for name in made.samples))
     length = [len(made.samples["time_s"]) for made in parts]
@@ -252,8 +265,12 @@ def _stacked(parts: list[np.ndarray | None], length: list[int]) -> np.ndarray:
     """Return the parts in one array; null where a file lacks the channel."""
     kinds = {part.dtype.kind for part in parts if part is not None}
     if kinds <= set("fiub"):
-        return np.concatenate([np.full(n, np.nan) if p is None else p for p, n in zip(parts, length, strict=True)])
-    return np.concatenate([np.full(n, None, object) if p is None else p for p, n in zip(parts, length, strict=True)])
+        return np.concatenate(
+            [np.full(n, np.nan) if p is None else p for p, n in zip(parts, length, strict=True)]
+        )
+    return np.concatenate(
+        [np.full(n, None, object) if p is None else p for p, n in zip(parts, length, strict=True)]
+    )
 
 
 def _traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
@@ -270,13 +287,17 @@ def _mean_traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list],
     made = mean_traces({name: samples[name][rows] for name in names}, strokes)
     row = made.pop("row")
     words = {name: as_dictionary(_array(strokes[name]), row) for name in ("run_id", "condition")}
-    return to_arrow({**made, "direction": np.array(strokes["direction"])[row], **words}, TRACES_MEAN, config.units)
+    return to_arrow(
+        {**made, "direction": np.array(strokes["direction"])[row], **words}, TRACES_MEAN, config.units
+    )
 
 
 def _bins(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
-    """Return table `bins`: means of what was measured along the trace, and what is known of the whole stroke."""
+    """Return table `bins`: means of what is measured along a trace, and what is known of the whole stroke."""
     rows = np.flatnonzero(samples["steady"])
-    measured = {name: values[rows] for name, values in samples.items() if name not in ("stroke", "steady", "sliding")}
+    measured = {
+        name: values[rows] for name, values in samples.items() if name not in ("stroke", "steady", "sliding")
+    }
     measured["force_N"] = measured["force_N"] - measured["presliding_N"]
     made = bin_table(measured, strokes, config.bins)
     binned, place = np.unique(made.pop("row"), return_inverse=True)

@@ -9,15 +9,18 @@ import numpy as np
 
 from sealfit.ingest.segments import median, quantile
 
-# Rise lengths after which a rise is over: 1/50000 of it is left. 1/5000 still showed in means over a campaign.
+# Rise lengths after which a rise is over: 1/50000 of it is left. 1/5000 still showed in means over a
+# campaign.
 SETTLED = np.log(50000.0)
 # Rise lengths after a speed ramp: the bristles follow the changing speed over one of them.
 AFTER_RAMP = 3.0
-# Rise lengths after which a rise is over where `SETTLED` would take more than a third of the stroke: 1 % is left.
+# Rise lengths after which a rise is over where `SETTLED` would take more than a third of the stroke: 1 % is
+# left.
 ENOUGH = np.log(100.0)
 # Share of its level above which a force that begins there comes up, if at all, over a short distance.
 HALF_WAY = 0.75
-# That distance, as a share of the stroke. A longer climb is an effect (run-in, warming) and stays inside the window.
+# That distance, as a share of the stroke. A longer climb is an effect (run-in, warming) and stays inside the
+# window.
 SHORT = 0.01
 # Share of the stroke in which the fall of an overshoot comes down by 63 %, at most.
 SOON = 0.03
@@ -48,8 +51,11 @@ FAR = 500.0
 
 
 class Start(NamedTuple):
-    """How a stretch of motion starts: distance from standstill in mm, never falling, and force in N, positive against
-    the motion, both of shape (n,); and the row at which the speed has reached its plateau."""
+    """How a stretch of motion starts, and the row at which the speed has reached its plateau.
+
+    The distance from standstill in mm never falls. The force in N is positive against the motion. Both have
+    shape (n,).
+    """
 
     distance_mm: np.ndarray
     force_N: np.ndarray
@@ -64,8 +70,8 @@ class Start(NamedTuple):
 class Rise(NamedTuple):
     """Where the rise of one start is over, and what is left of it: `left_N * exp(-distance / length_mm)`.
 
-    `left_N` is the force at distance 0 less that of steady sliding, negative where the force comes up; 0 where there
-    is no rise, or none that follows the bristles' law. `length_mm` is 0 where there is no rise.
+    `left_N` is the force at distance 0 less that of steady sliding, negative where the force comes up; 0
+    where there is no rise, or none that follows the bristles' law. `length_mm` is 0 where there is no rise.
     """
 
     end_mm: float
@@ -74,24 +80,29 @@ class Rise(NamedTuple):
 
     def at(self, distance_mm: np.ndarray) -> np.ndarray:
         """Return what is left of the rise, in N, shape (n,)."""
-        return self.left_N * np.exp(-distance_mm / self.length_mm) if self.left_N else np.zeros(len(distance_mm))
+        return (
+            self.left_N * np.exp(-distance_mm / self.length_mm) if self.left_N else np.zeros(len(distance_mm))
+        )
 
 
 def rise_of(start: Start) -> Rise:
     """Return where the pre-sliding rise of a start is over (0 mm without one), and what is left of it there.
 
-    A bristle at constant speed follows dz/dx = 1 - z / z_ss (LuGre, Eq. 2 divided by v), so the force comes up as
-    F(x) = A + B x - C exp(-x / x_0); A + B x stands for whatever changes slowly beside it. For every x_0 on a grid
-    the rest is linear least squares; the x_0 with the smallest sum of squares is taken, and the rise ends where
-    1/50000 of it is left. A rig that comes up along a straight line (its own elasticity) is over well before.
+    A bristle at constant speed follows dz/dx = 1 - z / z_ss (LuGre, Eq. 2 divided by v), so the force comes
+    up as F(x) = A + B x - C exp(-x / x_0); A + B x stands for whatever changes slowly beside it. For every
+    x_0 on a grid the rest is linear least squares; the x_0 with the smallest sum of squares is taken, and the
+    rise ends where 1/50000 of it is left. A rig that comes up along a straight line (its own elasticity) is
+    over well before.
 
-    Where that would take more than a third of the stroke, the rise ends earlier; where it takes more than a tenth of
-    the stroke to come up by 63 %, it ends where the force first arrives in the band of the late plateau. What is left
-    of it then is known from the same law, fitted once more to the rows of constant speed.
+    Where that would take more than a third of the stroke, the rise ends earlier; where it takes more than a
+    tenth of the stroke to come up by 63 %, it ends where the force first arrives in the band of the late
+    plateau. What is left of it then is known from the same law, fitted once more to the rows of constant
+    speed.
 
-    Only a force that begins below everything the plateau later shows is a rise: the trough of a ripple, or a force
-    that warming lets fall, is not. With much damping of the bristles (sigma_1) a fast stroke's force comes up at once,
-    to more than its level, and falls to it by the same law; then the fall from its peak is what has to be over.
+    Only a force that begins below everything the plateau later shows is a rise: the trough of a ripple, or a
+    force that warming lets fall, is not. With much damping of the bristles (sigma_1) a fast stroke's force
+    comes up at once, to more than its level, and falls to it by the same law; then the fall from its peak is
+    what has to be over.
 
     Notes
     -----
@@ -116,8 +127,11 @@ def rise_of(start: Start) -> Rise:
 
 
 def _early_peak(start: Start) -> int | None:
-    """Return the row at which the force peaks in the first half of the stroke, if the fall from there may be over soon
-    enough (`_by_damping`); None where it cannot, or where the force is highest at the end of that half."""
+    """Return the row at which the force peaks in the first half of the stroke, or None.
+
+    It is None if the fall from the peak cannot be over soon enough (`_by_damping`), or if the force is
+    highest at the end of that half.
+    """
     distance = start.distance_mm
     half = int(distance.searchsorted(EARLY[1] * distance[-1]))
     if half < 2:
@@ -136,8 +150,11 @@ def _turned(start: Start, peak: int) -> Start:
 
 
 def _by_damping(start: Start, peak_mm: float, fall: Rise) -> bool:
-    """Return whether a peak may be the bristles' damping: reached while the speed rises, and over within a share of the
-    stroke. The peak of a break-away falls over a longer distance."""
+    """Return whether a peak may be the bristles' damping.
+
+    Such a peak is reached while the speed rises and is over within a share of the stroke. The peak of a
+    break-away falls over a longer distance.
+    """
     soon = 0.0 < fall.length_mm < SOON * float(start.distance_mm[-1])
     return soon and peak_mm <= start.plateau_mm + fall.length_mm
 
@@ -150,7 +167,9 @@ def _rise(start: Start) -> Rise:
         return Rise(0.0)
     slow = _slow(start, level, scale)
     length = _rise_length_mm(start, 12.0 * scale, scale * LENGTHS, not slow)
-    end = MARGIN * _arrival_mm(start.distance_mm, start.force_N) if slow else _settled_mm(start, level, length)
+    end = (
+        MARGIN * _arrival_mm(start.distance_mm, start.force_N) if slow else _settled_mm(start, level, length)
+    )
     if not end > 0.0:
         return Rise(end)
     ramp = start.plateau_mm if start.plateau_mm > length else 0.0  # along a short one nothing else happens
@@ -174,14 +193,16 @@ def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
     force = beside.free(plateau.force_N[:n])
     left, squares = beside.fitted(_shape(x, length), force)
     ends = [_rise_length_mm(plateau, reach, length * ENDS, sloped, power) for power in POWERS]
-    rival = min(beside.fitted(_shape(x, end, power), force)[1] for power, end in zip(POWERS, ends, strict=True))
+    rival = min(
+        beside.fitted(_shape(x, end, power), force)[1] for power, end in zip(POWERS, ends, strict=True)
+    )
     if n * math.log(max(squares, 1e-300) / max(rival, 1e-300)) > UNLIKELY:
         left = 0.0
     return left * math.exp(min(start.plateau_mm / length, FAR)), length
 
 
 class _Beside:
-    """What stands beside a rise, A + B x, and is taken out of what is fitted; B is 0 where there is no slope."""
+    """What stands beside a rise, A + B x, and is taken out of what is fitted; B is 0 without a slope."""
 
     def __init__(self, x_mm: np.ndarray, has_slope: bool) -> None:
         self.x = x_mm - x_mm.mean() if has_slope else None
@@ -192,7 +213,7 @@ class _Beside:
         return values if self.x is None else values - (self.x @ values) / (self.x @ self.x) * self.x
 
     def fitted(self, shape: np.ndarray, force_N: np.ndarray) -> tuple[float, float]:
-        """Return C of A + B x + C shape by least squares, and the sum of squares it leaves of a force that is free."""
+        """Return C of A + B x + C shape by least squares, and the sum of squares left of a free force."""
         shape = self.free(shape)
         square = float(shape @ shape)
         left = float(shape @ force_N) / square if square > 0.0 else 0.0
@@ -241,7 +262,7 @@ def _below(plateau_N: np.ndarray, begin_N: float) -> bool:
 
 
 def _arrival_mm(distance_mm: np.ndarray, force_N: np.ndarray) -> float:
-    """Return the distance at which the force first comes into the band in which it stays late in the stroke."""
+    """Return the distance at which the force first enters the band in which it stays late in the stroke."""
     low, high = np.searchsorted(distance_mm, [share * distance_mm[-1] for share in LATE])
     if high - low < 8:
         return 0.0
@@ -249,8 +270,10 @@ def _arrival_mm(distance_mm: np.ndarray, force_N: np.ndarray) -> float:
 
 
 def _scale_mm(start: Start, level_N: float | None) -> float:
-    """Return the distance over which the force first comes up by 63 %, between samples; counted from where it begins
-    to. 0 where it does not."""
+    """Return the distance over which the force first comes up by 63 %, between samples; 0 if it does not.
+
+    The distance is counted from where the force begins to come up.
+    """
     if level_N is None:
         return 0.0
     distance = start.distance_mm
@@ -275,9 +298,9 @@ def _rise_length_mm(
 ) -> float:
     """Return x_0 of F = A + B x - C exp(-x / x_0) by least squares on a grid of lengths, refined.
 
-    What A + B x explains is the same for every x_0. So both are taken out of the force and of each exponential, and
-    the best x_0 is the one whose exponential's rest explains most of the force's rest. B is 0 where the start is not
-    `sloped`; with a `power`, the exponential is that of `_shape`.
+    What A + B x explains is the same for every x_0. So both are taken out of the force and of each
+    exponential, and the best x_0 is the one whose exponential's rest explains most of the force's rest. B is
+    0 where the start is not `sloped`; with a `power`, the exponential is that of `_shape`.
     """
     n = _rows_within(start, reach_mm)
     distance, force = start.distance_mm[:n], start.force_N[:n]
@@ -296,12 +319,15 @@ def _rise_length_mm(
 
 
 def _at_most(lengths_mm: np.ndarray, explained: np.ndarray) -> float:
-    """Return the length at which most is explained: the vertex of the parabola, over the logarithm, through the best
-    of the lengths and the two beside it. It moves without a jump from one length to the next.
+    """Return the length at which most is explained.
+
+    It is the vertex of the parabola, over the logarithm, through the best of the lengths and the two beside
+    it. It moves without a jump from one length to the next.
 
     Examples
     --------
-    >>> round(_at_most(np.array([1.0, 2.0, 4.0, 8.0]), np.array([0.0, 3.0, 3.0, 0.0])), 4)  # the square root of 8
+    >>> lengths_mm, explained = np.array([1.0, 2.0, 4.0, 8.0]), np.array([0.0, 3.0, 3.0, 0.0])
+    >>> round(_at_most(lengths_mm, explained), 4)  # the square root of 8
     2.8284
     """
     best, step = int(np.argmax(explained)), 0.0

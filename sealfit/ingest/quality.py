@@ -1,7 +1,7 @@
 """What is wrong with a stroke by itself, with its fix; and the table of all that was found in a campaign.
 
-Every rule is scaled by the trace itself (its noise, its resolution, its sampling), so a coarse sensor is not taken for
-a stuck one, nor a slow rig for a gappy one. Single samples and the commanded speed are judged in
+Every rule is scaled by the trace itself (its noise, its resolution, its sampling), so a coarse sensor is not
+taken for a stuck one, nor a slow rig for a gappy one. Single samples and the commanded speed are judged in
 `trace_checks.py`, and what needs other traces for comparison in `repeat_checks.py`.
 """
 
@@ -20,25 +20,28 @@ from sealfit.tables import QUALITY, STEADY
 from sealfit.units import conversion
 
 LOAD_TOLERANCE = 0.1  # dead weights are better than that, and a wrong plate is worse
-# Seals on a full film of oil slide at about 0.01, soft dry rubber at up to about 4. Dry rubber at 0.6 to 1 is above
-# with its load in kg, which makes mu 9.81 times too large, and below with its load in g: 102 times too small.
+# Seals on a full film of oil slide at about 0.01, soft dry rubber at up to about 4. Dry rubber at 0.6 to 1 is
+# above with its load in kg, which makes mu 9.81 times too large, and below with its load in g: 102 times too
+# small.
 MU_RANGE = (0.01, 5.0)
 _HEAVIER = (
-    'Is the load in kg or lb, or the force in mN? Give the unit in the rig config: load_N = {unit = "kgf"} under '
-    "[files.runs_columns] (kg is a mass; its weight is kgf, or 9.80665 times the kg in N)."
+    'Is the load in kg or lb, or the force in mN? Give the unit in the rig config: load_N = {unit = "kgf"} '
+    "under [files.runs_columns] (kg is a mass; its weight is kgf, or 9.80665 times the kg in N)."
 )
 _LIGHTER = (
-    'Is the load in g, or the force in kg or kN? Give the unit in the rig config: load_N = {unit = "gf"} under '
-    '[files.runs_columns], or force_N = {name = "..", unit = "kgf"} under [trace.columns].'
+    'Is the load in g, or the force in kg or kN? Give the unit in the rig config: load_N = {unit = "gf"} '
+    'under [files.runs_columns], or force_N = {name = "..", unit = "kgf"} under [trace.columns].'
 )
 FINE = 0.3  # share of equal neighbours below which noise is plainly larger than the sensor's steps
-# Above this share (noise of a third of a step) a reading that rests in the middle of a step, as long as the force does,
-# cannot be told from a stuck one.
+# Above this share (noise of a third of a step) a reading that rests in the middle of a step, as long as the
+# force does, cannot be told from a stuck one.
 COARSE = 0.6
 FEW_LEVELS = 5
 NEXT_LEVELS = 30
 BY_CHANCE = 1e-4  # that so many samples lie at the extreme; few strokes come so far that it is asked
-STILL_RISING = 0.01  # share of the force that may be missing where a stroke ends: more, and it was never steady
+STILL_RISING = (
+    0.01  # share of the force that may be missing where a stroke ends: more, and it was never steady
+)
 FINE_FILE = {"check": "ok", "severity": "info", "action": "kept", "reason": "nothing found.", "fix": ""}
 
 
@@ -61,7 +64,8 @@ def stroke_faults(
                 f"{stroke.short}.",
                 value=float(len(stroke.rows)),
                 action="stroke left out",
-                fix="Slide further or sample faster; or set strokes.min_samples and min_steady_share in the config.",
+                fix="Slide further or sample faster; "
+                "or set strokes.min_samples and min_steady_share in the config.",
             )
         ]
     whole, steady = slice(stroke.start, stroke.stop), stroke.rows
@@ -87,8 +91,8 @@ def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:
     return [
         Fault(
             "never_steady",
-            f"the stroke ends before its friction is steady: {abs(left_N):.3g} of {abs(force_N):.4g} {unit} are still "
-            "to come. Its steady force is extrapolated by the bristle model.",
+            f"the stroke ends before its friction is steady: {abs(left_N):.3g} of {abs(force_N):.4g} {unit} "
+            "are still to come. Its steady force is extrapolated by the bristle model.",
             column="force_N",
             value=abs(left_N),
             severity="info",
@@ -109,8 +113,8 @@ def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault
     return [
         Fault(
             "gaps",
-            f"{count} gap{'s' if count > 1 else ''} in time, {hidden:.1%} of the stroke; the longest, after this line, "
-            f"is {steps[widest]:.3g} where {usual:.3g} is usual.",
+            f"{count} gap{'s' if count > 1 else ''} in time, {hidden:.1%} of the stroke; "
+            f"the longest, after this line, is {steps[widest]:.3g} where {usual:.3g} is usual.",
             line=int(line[widest]),
             column="time_s",
             value=hidden,
@@ -122,7 +126,7 @@ def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault
 
 
 def equal_neighbours(force_N: np.ndarray) -> float:
-    """Return the share of samples that equal the one before; near 0 where noise is finer than the sensor's steps."""
+    """Return the share of samples that equal the one before; near 0 if noise exceeds the sensor's steps."""
     return float(np.mean(np.diff(force_N) == 0.0)) if len(force_N) > 1 else 0.0
 
 
@@ -132,7 +136,12 @@ def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list
     top = size == size.max()
     others = force_N[~top]
     share = float(top.mean())
-    if share < settings.saturated_share or top.sum() < 5 or len(others) < 20 or len(np.unique(others)) < FEW_LEVELS:
+    if (
+        share < settings.saturated_share
+        or top.sum() < 5
+        or len(others) < 20
+        or len(np.unique(others)) < FEW_LEVELS
+    ):
         return []
     at_next_level = np.count_nonzero(np.abs(others) == np.abs(others).max())
     if not _shows_noise(force_N, ~top, FINE) or top.sum() <= 2 * at_next_level:
@@ -140,26 +149,33 @@ def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list
     if not _piled_up(size):
         return []
     value = float(force_N[np.argmax(size)])
-    reason = f"{share:.0%} of the steady samples lie exactly at the extreme {value:g}: the end of the sensor's range."
-    return [_broken("saturated", reason, line[np.argmax(top)], value, "Use a larger range and measure again.")]
+    reason = (
+        f"{share:.0%} of the steady samples lie exactly at the extreme {value:g}: "
+        "the end of the sensor's range."
+    )
+    return [
+        _broken("saturated", reason, line[np.argmax(top)], value, "Use a larger range and measure again.")
+    ]
 
 
 def _piled_up(size_N: np.ndarray) -> bool:
     """Return whether more samples lie at the very extreme than chance puts there.
 
-    Samples thin out towards their extreme. So of those at the extreme and at the k levels next to it no more than a
-    share of 1 / (k + 1) is expected at the extreme; a binomial tail says how many more chance may make it.
+    Samples thin out towards their extreme. So of those at the extreme and at the k levels next to it no more
+    than a share of 1 / (k + 1) is expected at the extreme; a binomial tail says how many more chance may make
+    it.
     """
     from scipy.special import bdtrc  # here, as scipy takes its time to load and few strokes come so far
 
     away = np.rint((size_N.max() - size_N) / resolution(size_N))  # levels below the extreme
     levels = np.arange(NEXT_LEVELS + 1)
-    near = np.searchsorted(np.sort(away), levels, side="right")  # samples at the extreme and the k levels next to it
+    # Samples at the extreme and the k levels next to it.
+    near = np.searchsorted(np.sort(away), levels, side="right")
     return bool(bdtrc(near[0] - 1, near[1:], 1 / (levels[1:] + 1)).min() < BY_CHANCE)
 
 
 def _shows_noise(force_N: np.ndarray, rows: np.ndarray, most_equal: float) -> bool:
-    """Return whether neighbours among `rows` differ mostly, and up and down as noise does, not along a smooth curve."""
+    """Return whether neighbours in `rows` mostly differ, up and down like noise, not along a smooth curve."""
     change = np.diff(force_N)[rows[1:] & rows[:-1]]
     if len(change) < 10 or np.mean(change == 0.0) > most_equal:
         return False
@@ -173,8 +189,12 @@ def _stuck(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fau
         return []
     first, count = place
     value = float(force_N[first])
-    reason = f"{count} samples in a row are exactly {value:g} while the platform moves; elsewhere they change."
-    return [_broken("stuck", reason, line[first], value, "Check the cable and the logger, and measure again.")]
+    reason = (
+        f"{count} samples in a row are exactly {value:g} while the platform moves; elsewhere they change."
+    )
+    return [
+        _broken("stuck", reason, line[first], value, "Check the cable and the logger, and measure again.")
+    ]
 
 
 def _broken(check: str, reason: str, line: int, value: float, fix: str) -> Fault:
@@ -183,13 +203,12 @@ def _broken(check: str, reason: str, line: int, value: float, fix: str) -> Fault
 
 
 def stuck_samples(force_N: np.ndarray, samples: int) -> tuple[int, int] | None:
-    """Return place and length of a run of equal samples that this sensor would not show by itself; None if there is
-    none.
+    """Return place and length of a run of equal samples that this sensor would not show by itself, or None.
 
-    The run must be `samples` long, five times as long as the long ones among the others, and longer than as many
-    samples with this share of equal neighbours would show by chance (1e-6); and the sensor must show its noise, or a
-    reading that rests on one of its coarse steps would be called stuck. A stroke that is constant all along has no
-    others: see `repeat_checks.constant_strokes`.
+    The run must be `samples` long, five times as long as the long ones among the others, and longer than as
+    many samples with this share of equal neighbours would show by chance (1e-6); and the sensor must show its
+    noise, or a reading that rests on one of its coarse steps would be called stuck. A stroke that is constant
+    all along has no others: see `repeat_checks.constant_strokes`.
     """
     edges = np.concatenate(([0], np.flatnonzero(np.diff(force_N) != 0.0) + 1, [len(force_N)]))
     lengths = np.diff(edges)
@@ -245,7 +264,7 @@ def load_faults(measured: float, declared: float, unit: str) -> list[Fault]:
 
 
 def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
-    """Return that the friction force over the load is no coefficient of friction, in some conditions or in all.
+    """Return that friction force over load is no coefficient of friction, in some conditions or in all.
 
     Parameters
     ----------
@@ -267,7 +286,10 @@ def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
     for wrong, fix in ((mu > MU_RANGE[1], _HEAVIER), (mu < MU_RANGE[0], _LIGHTER)):
         if wrong.any():
             middle = float(mu[wrong].median())
-            reason = f"the friction force is {middle:.2g} times the load in {wrong.sum()} of {len(mu)} conditions; "
+            reason = (
+                f"the friction force is {middle:.2g} times the load "
+                f"in {wrong.sum()} of {len(mu)} conditions; "
+            )
             reason += f"coefficients of friction are {MU_RANGE[0]:g} to {MU_RANGE[1]:g}."
             place = {"column": "load_N", "value": middle, "severity": "warning", "action": "kept"}
             faults.append(Fault("improbable_load", reason, fix=fix, **place))
@@ -285,7 +307,9 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
         Every trace file of the campaign, in order.
     """
     place = {file: i for i, file in enumerate(files)}
-    ordered = sorted(faults, key=lambda fault: (place.get(fault.file or "", -1), fault.stroke or 0, fault.line or 0))
+    ordered = sorted(
+        faults, key=lambda fault: (place.get(fault.file or "", -1), fault.stroke or 0, fault.line or 0)
+    )
     told = np.array([place.get(fault.file or "", -1) for fault in ordered], int)
     silent = np.flatnonzero(~np.isin(np.arange(len(files)), told))
     order = np.argsort(np.concatenate([told, silent]), kind="stable")
@@ -309,7 +333,9 @@ def _as_text(value: str | float | None) -> str | None:
 # ---------------------------------------------------------------- incomplete
 # Columns of the campaign that some of its files have no value of.
 
-LEAST_KNOWN = 0.8  # share of the files that have a value, from which the search for effects still looks at a column
+LEAST_KNOWN = (
+    0.8  # share of the files that have a value, from which the search for effects still looks at a column
+)
 NO_VALUE = "(no value)"  # level of a category in files without one
 CALENDAR = ("run_order", "elapsed_h")  # both from started_at
 
@@ -333,7 +359,10 @@ def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) ->
             continue
         missing = used["file"][used[name].isna() & (aged if name in aged_only else True)].nunique()
         if 0 < missing < files:
-            reason = f"{missing} of {files} files have no value: {_what_follows(name, used[name], missing / files)}."
+            reason = (
+                f"{missing} of {files} files have no value: "
+                f"{_what_follows(name, used[name], missing / files)}."
+            )
             fix = "Fill started_at." if name in CALENDAR else "Fill it for these files too."
             place = {"column": name, "value": float(missing), "severity": "warning", "action": "kept"}
             faults.append(Fault("incomplete_column", reason, fix=fix, **place))

@@ -1,4 +1,4 @@
-"""One trace file to one clean table: read, computed, filtered, checked; every fault named with its place and fix."""
+"""One trace file to a clean table: read, computed, filtered, checked; every fault with its place and fix."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
 class Trace:
     """One trace as it was measured, in our columns and units.
 
-    `columns` holds time_s, displacement_mm and force_N (and load_N, where it was measured) as float64 and any further
-    channel as float64 or text, each of shape (n,); bad rows are left out. `line` is the 1-based line in the file of
-    every row, `rows_read` the number of data rows in the file, and `faults` what was found in it.
+    `columns` holds time_s, displacement_mm and force_N (and load_N, where it was measured) as float64 and any
+    further channel as float64 or text, each of shape (n,); bad rows are left out. `line` is the 1-based line
+    in the file of every row, `rows_read` the number of data rows in the file, and `faults` what was found in
+    it.
     """
 
     ref: TraceRef
@@ -65,8 +66,8 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
     Raises
     ------
     BadFile
-        If the file must be left out: missing, empty, binary, a column missing, too many bad rows, a speed that
-        contradicts the commanded one. It carries every fault found, the deciding one last.
+        If the file must be left out: missing, empty, binary, a column missing, too many bad rows, a speed
+        that contradicts the commanded one. It carries every fault found, the deciding one last.
     """
     (found,) = read_traces([(ref, read_bytes(campaign, ref.file))], config)
     if isinstance(found, BadFile):
@@ -77,8 +78,8 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
 def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list[Trace | BadFile]:
     """Return a trace for each of several files, or why it must be left out.
 
-    Files with the same header are parsed in one go: Arrow hands every call over to another thread, which takes longer
-    than to parse a short file.
+    Files with the same header are parsed in one go: Arrow hands every call over to another thread, which
+    takes longer than to parse a short file.
 
     Parameters
     ----------
@@ -110,9 +111,9 @@ def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list
 class _Opened:
     """A trace file before its cells are parsed.
 
-    `body` are its data lines, `width` is the number of cells in the first of them; `ours` holds our name of each
-    position (from 0), `numeric` those that must hold numbers. `settings` say how the text is written. Where the file
-    is not text, `arrays` are its columns.
+    `body` are its data lines, `width` is the number of cells in the first of them; `ours` holds our name of
+    each position (from 0), `numeric` those that must hold numbers. `settings` say how the text is written.
+    Where the file is not text, `arrays` are its columns.
     """
 
     layout: Layout
@@ -158,8 +159,10 @@ def _cells(files: Sequence[str], opened: Sequence[_Opened]) -> list[Cells]:
     return made
 
 
-def _text(raw: bytes, file: str, settings: TraceFormat, *, head: bool = False) -> tuple[bytes, Layout, TraceFormat]:
-    """Return a file of text or a sheet of a workbook as UTF-8, its layout, and the settings with its delimiter."""
+def _text(
+    raw: bytes, file: str, settings: TraceFormat, *, head: bool = False
+) -> tuple[bytes, Layout, TraceFormat]:
+    """Return a text file or workbook sheet as UTF-8, its layout, and the settings with its delimiter."""
     if kind_of(file, settings) == "csv":
         text = as_utf8(raw, settings.encoding, file, head=head)
         return text, find_layout(text, settings, file), settings
@@ -213,7 +216,9 @@ def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trac
         rows = rows.where(_kept(rows, known, settings, file))
     if len(rows.line) < MIN_ROWS:
         reason = f"{len(rows.line)} of {len(good)} data rows are left; a trace needs {MIN_ROWS}."
-        raise BadFile(*faults, _bad_file("no_rows", reason, file, "Check drop_first_rows, keep and the export."))
+        raise BadFile(
+            *faults, _bad_file("no_rows", reason, file, "Check drop_first_rows, keep and the export.")
+        )
     if fault := speed_fault(ref, rows.columns["time_s"], rows.columns["displacement_mm"], config):
         faults.append(fault)
         if fault.action == "file left out":
@@ -221,7 +226,9 @@ def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trac
     return Trace(ref, _named_beside(rows, ref, settings), rows.line, len(good), tuple(faults))
 
 
-def _in_our_units(columns: dict[str, np.ndarray], config: Config, layout: Layout, file: str) -> dict[str, np.ndarray]:
+def _in_our_units(
+    columns: dict[str, np.ndarray], config: Config, layout: Layout, file: str
+) -> dict[str, np.ndarray]:
     """Return the columns with numbers of other units converted; raises `BadFile` where they are labels."""
     changed = {name: convert for name, convert in config.conversions("trace").items() if name in columns}
     for name in changed:
@@ -235,13 +242,14 @@ def _in_our_units(columns: dict[str, np.ndarray], config: Config, layout: Layout
 def _derive(
     rows: Rows, known: Mapping[str, object], settings: TraceFormat, layout: Layout, file: str
 ) -> tuple[Rows, int, list[Fault]]:
-    """Return the rows with computed columns and integrated displacement, the number of bad ones, and the faults."""
+    """Return rows with computed columns and integrated displacement, the number of bad ones, and faults."""
     speed = settings.integrate_displacement
     compute = {name: parse(text) for name, text in settings.compute.items()}
     later = _after_integral(compute) if speed else []
     rows = _computed(rows, {n: e for n, e in compute.items() if n not in later}, known, settings, file)
     if speed:
-        # The integral needs its time and speed clean first: one bad row would shift every displacement after it.
+        # The integral needs its time and speed clean first: one bad row would shift every displacement after
+        # it.
         if speed not in rows.columns or "time_s" not in rows.columns:
             missing = speed if speed not in rows.columns else "time_s"
             raise BadFile(_missing(missing, layout, file))
@@ -258,7 +266,9 @@ def _derive(
 def _missing(name: str, layout: Layout, file: str) -> Fault:
     fix = "Name it under [trace.columns], or compute it under [trace.compute]."
     return replace(
-        _bad_file("missing_column", "there is no such column.", file, fix), column=name, line=layout.names_line
+        _bad_file("missing_column", "there is no such column.", file, fix),
+        column=name,
+        line=layout.names_line,
     )
 
 
@@ -271,7 +281,9 @@ def _after_integral(compute: Mapping[str, object]) -> list[str]:
     return later
 
 
-def _computed(rows: Rows, compute: Mapping, known: Mapping[str, object], settings: TraceFormat, file: str) -> Rows:
+def _computed(
+    rows: Rows, compute: Mapping, known: Mapping[str, object], settings: TraceFormat, file: str
+) -> Rows:
     columns = dict(rows.columns)
     for name, expression in compute.items():
         value = _evaluate(expression, {**known, **settings.constants, **columns}, file)
@@ -283,7 +295,9 @@ def _evaluate(expression, values: Mapping[str, object], file: str) -> np.ndarray
     try:
         return evaluate(expression, values)
     except ConfigError as error:
-        raise BadFile(replace(_bad_file("expression", error.message, file, error.fix), column=error.column)) from error
+        raise BadFile(
+            replace(_bad_file("expression", error.message, file, error.fix), column=error.column)
+        ) from error
 
 
 def _kept(rows: Rows, known: Mapping[str, object], settings: TraceFormat, file: str) -> np.ndarray:
@@ -292,8 +306,11 @@ def _kept(rows: Rows, known: Mapping[str, object], settings: TraceFormat, file: 
 
 
 def _integral(rows: Rows, speed: str, settings: TraceFormat) -> np.ndarray:
-    """Return the displacement, trapezoid rule over time, 0 at the first row; a speed per minute is divided by 60."""
-    time_s, v = rows.columns["time_s"], rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
+    """Return the displacement by the trapezoid rule, starting at 0; a speed per minute is divided by 60."""
+    time_s, v = (
+        rows.columns["time_s"],
+        rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0),
+    )
     return np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(time_s))]) if len(v) else v
 
 
@@ -310,9 +327,9 @@ def _too_many(bad: int, counted: int, faults: list[Fault], config: Config, file:
 def _named_beside(rows: Rows, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:
     """Return slots first, then channels, without helper columns.
 
-    A channel that `ref` has too is left out where it is constant (`ref` says it); one that varies is another quantity
-    than the one set for the whole file, and is renamed, `temperature_file_C` beside `temperature_C`; so is one whose
-    name a table of ours makes itself.
+    A channel that `ref` has too is left out where it is constant (`ref` says it); one that varies is another
+    quantity than the one set for the whole file, and is renamed, `temperature_file_C` beside `temperature_C`;
+    so is one whose name a table of ours makes itself.
     """
     columns = {name: rows.columns[name] for name in SLOTS if name in rows.columns}
     for name, values in rows.columns.items():

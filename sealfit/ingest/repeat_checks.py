@@ -1,4 +1,4 @@
-"""What only a comparison of strokes shows: a wrong sign, a dead sensor, a repeat that disagrees with its run."""
+"""What only comparing strokes shows: a wrong sign, a dead sensor, a repeat that disagrees with its run."""
 
 from __future__ import annotations
 
@@ -49,20 +49,22 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        Rows of `means` with `run_mean_N` (the run's mean without it), `t`, `p` (adjusted over the campaign) and
-        `alone` (true where two repeats disagree and which of them is wrong cannot be known: both are returned).
+        Rows of `means` with `run_mean_N` (the run's mean without it), `t`, `p` (adjusted over the campaign)
+        and `alone` (true where two repeats disagree and which of them is wrong cannot be known: both are
+        returned).
 
     Notes
     -----
     The generalized extreme studentized deviate procedure (Rosner 1983, Technometrics 25(2), 165-172,
-    doi:10.1080/00401706.1983.10487848), on residuals within runs: the most extreme repeat is taken out, scatter and
-    pattern are estimated without it, and so on; the outliers are those up to the last one that exceeds its limit. So
-    neither does an outlier widen the scale it is judged by, nor do two hide each other. The limit is Sidak's for
-    the repeats left, on Student's t with the pooled degrees of freedom.
+    doi:10.1080/00401706.1983.10487848), on residuals within runs: the most extreme repeat is taken out,
+    scatter and pattern are estimated without it, and so on; the outliers are those up to the last one that
+    exceeds its limit. So neither does an outlier widen the scale it is judged by, nor do two hide each other.
+    The limit is Sidak's for the repeats left, on Student's t with the pooled degrees of freedom.
 
-    In large campaigns the most extreme repeats of several runs are taken out at once, so that the work grows with the
-    number of repeats and not with its square; each is then judged by a scatter between those with and without them,
-    and where that leaves the last outlier in doubt, by the scatter that one by one would have given.
+    In large campaigns the most extreme repeats of several runs are taken out at once, so that the work grows
+    with the number of repeats and not with its square; each is then judged by a scatter between those with
+    and without them, and where that leaves the last outlier in doubt, by the scatter that one by one would
+    have given.
     """
     layout = Layout.of(means)
     force = means["force_N"].to_numpy(float)
@@ -95,7 +97,7 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
 
 
 def _furthest(layout: Layout, fit: ScatterFit, kept: np.ndarray, most: int) -> list[np.ndarray]:
-    """Return the rows to take out next, the most extreme first, one of a run: alone, or with the only other repeat."""
+    """Return the rows to take out next, the most extreme first, one per run: alone or with its only peer."""
     size = np.where(kept & (fit.share > ALONE), np.abs(fit.t), -1.0)
     order = np.argsort(-size, kind="stable")[: int((size >= 0.0).sum())]
     first = np.flatnonzero(~pd.Index(layout.run[order]).duplicated())
@@ -103,7 +105,9 @@ def _furthest(layout: Layout, fit: ScatterFit, kept: np.ndarray, most: int) -> l
     first = first[: max(1, min(most, few))]
     count = np.bincount(layout.run[kept], minlength=layout.runs)
     return [
-        np.flatnonzero(kept & (layout.run == layout.run[row])) if count[layout.run[row]] == 2 else np.array([row])
+        np.flatnonzero(kept & (layout.run == layout.run[row]))
+        if count[layout.run[row]] == 2
+        else np.array([row])
         for row in order[first]
     ]
 
@@ -113,8 +117,8 @@ def _take_out(
 ) -> tuple[list[np.ndarray], np.ndarray, ScatterFit]:
     """Return what is taken out, which rows are kept then, and the fit to these.
 
-    Without the furthest of its run another repeat may lie further out than some of the rest: these then wait, so that
-    the most extreme goes first.
+    Without the furthest of its run another repeat may lie further out than some of the rest: these then wait,
+    so that the most extreme goes first.
     """
     without = _less(kept, furthest)
     apart = fit_scatter(layout, force_N, without)
@@ -140,8 +144,8 @@ def _judge(
 ) -> list[_Judged]:
     """Return t and p of each that was taken out, by the scatter without it and without those before it.
 
-    Between the scatters with and without all of them, variances go by the share of the squares that is out, degrees of
-    freedom by the number.
+    Between the scatters with and without all of them, variances go by the share of the squares that is out,
+    degrees of freedom by the number.
     """
     worst = np.array([rows[np.argmax(np.abs(fit.t[rows]))] for rows in taken])
     square = np.nan_to_num(fit.t[worst] ** 2, posinf=1.0)
@@ -150,7 +154,10 @@ def _judge(
     force = fit.mean[worst]
     sd = np.sqrt((1.0 - gone) * fit.scatter.sd_N(force) ** 2 + gone * apart.scatter.sd_N(force) ** 2)
     t = fit.residual[worst] / (np.maximum(sd, tiny) * np.sqrt(fit.share[worst]))
-    df = [(1.0 - n) * fit.df_at(f) + n * apart.df_at(f) for n, f in zip(number.tolist(), force.tolist(), strict=True)]
+    df = [
+        (1.0 - n) * fit.df_at(f) + n * apart.df_at(f)
+        for n, f in zip(number.tolist(), force.tolist(), strict=True)
+    ]
     p_one = _two_sided_p(t, df, beyond_doubt=NEAR * level / tests)
     judged = []
     for k, rows in enumerate(taken):
@@ -162,23 +169,31 @@ def _judge(
 
 
 def _two_sided_p(t: np.ndarray, df: list[float], *, beyond_doubt: float) -> np.ndarray:
-    """Return the chance of Student's t so far out; the normal distribution's, which is less, if all of those are larger
-    than what is beyond doubt: then nothing lies outside, and scipy, which takes long to load, is not wanted."""
+    """Return the chance of Student's t so far out, shape (n,).
+
+    It is the normal distribution's, which is less, if all of those are larger than what is beyond doubt: then
+    nothing lies outside, and scipy, which takes long to load, is not wanted.
+    """
     least = np.array([math.erfc(size / math.sqrt(2.0)) for size in np.abs(t).tolist()])
-    if np.all(least > 2.0 * beyond_doubt):  # twice, as many tests together are a little less likely than their sum
+    # Twice, as many tests together are a little less likely than their sum.
+    if np.all(least > 2.0 * beyond_doubt):
         return least
     from scipy.special import stdtr
 
     return 2.0 * stdtr(df, -np.abs(t))
 
 
-def _outliers(layout: Layout, force_N: np.ndarray, found: list[_Judged], level: float, tiny: float) -> list[_Judged]:
+def _outliers(
+    layout: Layout, force_N: np.ndarray, found: list[_Judged], level: float, tiny: float
+) -> list[_Judged]:
     """Return those up to the last one that exceeds its limit."""
     for last in range(len(found), 0, -1):
         one = found[last - 1]
         if level / NEAR < one.p < level * NEAR:
             kept = _less(np.ones(len(force_N), bool), [other.rows for other in found[: last - 1]])
-            with_it, without = (fit_scatter(layout, force_N, rows) for rows in (kept, _less(kept, [one.rows])))
+            with_it, without = (
+                fit_scatter(layout, force_N, rows) for rows in (kept, _less(kept, [one.rows]))
+            )
             one = _judge(with_it, without, [one.rows], one.tests, level, tiny)[0]
         if one.p < level:
             return [*found[: last - 1], one]
@@ -187,16 +202,17 @@ def _outliers(layout: Layout, force_N: np.ndarray, found: list[_Judged], level: 
 
 # ---------------------------------------------------------------- peers
 
-AGAINST = -0.5  # share of its peers' force by which a force against its motion is of the wrong sign, not an offset
+# Share of its peers' force by which a force against its motion is of the wrong sign, not an offset.
+AGAINST = -0.5
 
 
 def reversed_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     """Return which strokes to keep, shape (n,), and findings on force signs that contradict the motion.
 
-    Friction opposes the motion, so force times direction is positive. Where one stroke of a run has it negative
-    against its peers (the other strokes of its run, else those of the same direction), it is left out: a sensor or a
-    sign was turned round. Where most strokes of a direction have it negative, an offset or the sign convention is the
-    cause: said once per file, and kept.
+    Friction opposes the motion, so force times direction is positive. Where one stroke of a run has it
+    negative against its peers (the other strokes of its run, else those of the same direction), it is left
+    out: a sensor or a sign was turned round. Where most strokes of a direction have it negative, an offset or
+    the sign convention is the cause: said once per file, and kept.
 
     Parameters
     ----------
@@ -230,7 +246,8 @@ class _Leaving:
         self.sorted, of = values[order], group[order]
         names, first, count = np.unique(of, return_index=True, return_counts=True)
         self.span = {
-            name: (a, a + n) for name, a, n in zip(names.tolist(), first.tolist(), count.tolist(), strict=True)
+            name: (a, a + n)
+            for name, a, n in zip(names.tolist(), first.tolist(), count.tolist(), strict=True)
         }
 
     def others(self, i: int) -> int:
@@ -274,16 +291,17 @@ def _against(row: pd.Series, force_N: float, wrong: bool) -> Fault:
 
 
 def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
-    """Return which strokes to keep, shape (n,), and findings on forces that never change in the steady window.
+    """Return which strokes to keep, shape (n,), and findings on forces constant in the steady window.
 
-    Where the other strokes show noise larger than the sensor's steps, the sensor is dead, or at the end of its range if
-    the value is the largest of the stroke. Where they do not, it is coarse (or without noise), and they are kept.
+    Where the other strokes show noise larger than the sensor's steps, the sensor is dead, or at the end of
+    its range if the value is the largest of the stroke. Where they do not, it is coarse (or without noise),
+    and they are kept.
 
     Parameters
     ----------
     strokes : DataFrame
-        One row per stroke: file, stroke, several, equal (share of samples equal to the one before), extreme (whether
-        the window's largest force is the stroke's), force_N, used.
+        One row per stroke: file, stroke, several, equal (share of samples equal to the one before), extreme
+        (whether the window's largest force is the stroke's), force_N, used.
     """
     used = strokes["used"].to_numpy(bool)
     constant = used & (strokes["equal"].to_numpy(float) >= 1.0)
@@ -320,8 +338,8 @@ def _constant(row: pd.Series, dead: bool) -> Fault:
 def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, list[Fault]]:
     """Return `steady` with `outlier` and `used`, and a finding per repeat that disagrees with its run.
 
-    Flagged always, left out of the fits only where the config says `quality.drop_outliers`; and never where only two
-    repeats disagree, since which of them is wrong cannot be known.
+    Flagged always, left out of the fits only where the config says `quality.drop_outliers`; and never where
+    only two repeats disagree, since which of them is wrong cannot be known.
     """
     flagged = outlying_repeats(repeat_means(steady), config.quality.outlier_p)
     outlier, dropped, found = np.zeros(len(steady), bool), np.zeros(len(steady), bool), []
@@ -341,7 +359,8 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
                 value=float(row.force_N),
                 severity="warning",
                 action="file left out" if out else "kept",
-                fix="Look into the notes of that test; quality.drop_outliers in the config leaves such repeats out.",
+                fix="Look into the notes of that test; "
+                "quality.drop_outliers in the config leaves such repeats out.",
             )
         )
     return steady.assign(outlier=outlier, used=steady["used"].to_numpy(bool) & ~dropped), found
@@ -350,6 +369,7 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
 def _disagreement(row, unit: str) -> str:
     others = "its only other repeat gives" if row.alone else "the other repeats of its run give"
     return (
-        f"repeat {row.repeat} of run {row.run_id} is {row.force_N:.4g} {unit}; {others} {row.run_mean_N:.4g} {unit}, "
-        f"their common pattern removed: {abs(row.t):.1f} SDs of the scatter pooled over runs (p = {row.p:.1g})."
+        f"repeat {row.repeat} of run {row.run_id} is {row.force_N:.4g} {unit}; "
+        f"{others} {row.run_mean_N:.4g} {unit}, their common pattern removed: "
+        f"{abs(row.t):.1f} SDs of the scatter pooled over runs (p = {row.p:.1g})."
     )

@@ -1,7 +1,8 @@
 """The trace files of a campaign and everything that is known of each before it is fitted to anything.
 
-What runs.csv, the file name, the header lines and the constant columns of the trace say is put together here, in this
-order of precedence; runs, repeats, specimens and the order of the campaign are derived where they are not given.
+What runs.csv, the file name, the header lines and the constant columns of the trace say is put together here,
+in this order of precedence; runs, repeats, specimens and the order of the campaign are derived where they are
+not given.
 """
 
 from __future__ import annotations
@@ -71,8 +72,9 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     Raises
     ------
     CampaignError
-        With every fault of the campaign at once: a missing folder or column, a path outside, cells that are no
-        numbers, doubled files or repeats, repeats that differ from their run, a config that cannot be meant.
+        With every fault of the campaign at once: a missing folder or column, a path outside, cells that are
+        no numbers, doubled files or repeats, repeats that differ from their run, a config that cannot be
+        meant.
     """
     if faults := _config_faults(config):
         raise CampaignError(faults)
@@ -145,14 +147,26 @@ def _config_faults(config: Config) -> list[Fault]:
     settings, faults = config.trace, []
 
     def add(column: str, value: str, reason: str, fix: str) -> None:
-        faults.append(Fault("config", reason, file=f"config '{config.name}'", column=column, value=value, fix=fix))
+        faults.append(
+            Fault("config", reason, file=f"config '{config.name}'", column=column, value=value, fix=fix)
+        )
 
     if not _is_encoding(settings.encoding):
         add("trace.encoding", settings.encoding, "is not an encoding.", "Use auto, utf-8, latin-1 or utf-16.")
     if not _is_delimiter(settings.delimiter):
-        add("trace.delimiter", settings.delimiter, "is not a delimiter.", "Use one character, 'tab' or 'whitespace'.")
+        add(
+            "trace.delimiter",
+            settings.delimiter,
+            "is not a delimiter.",
+            "Use one character, 'tab' or 'whitespace'.",
+        )
     if settings.delimiter == settings.decimal:
-        add("trace.delimiter", settings.delimiter, "is the decimal mark too.", "Set trace.delimiter or trace.decimal.")
+        add(
+            "trace.delimiter",
+            settings.delimiter,
+            "is the decimal mark too.",
+            "Set trace.delimiter or trace.decimal.",
+        )
     for name in sorted({"file", "speed_mm_s"} & set(config.condition)):
         add(
             "condition",
@@ -200,7 +214,9 @@ def _named(entries: Entries, config: Config) -> tuple[np.ndarray, Columns, list[
         try:
             named = name_parts(entry.file, config.files, config.conversions("names"))
         except ConfigError as error:
-            raise CampaignError([entry.fault("file_name", error.message, error.column, fix=error.fix)]) from error
+            raise CampaignError(
+                [entry.fault("file_name", error.message, error.column, fix=error.fix)]
+            ) from error
         if not named.matched:
             listed = entry.line is not None
             reason, fix = unmatched(entry.file, config.files.name_pattern)
@@ -236,7 +252,7 @@ def _header(campaign: Path, file: str, config: Config) -> Mapping[str, float | s
 
 @dataclass(frozen=True, slots=True)
 class _Needed:
-    """The condition columns that a file must have; of unaged rubber only the days and the rubber are needed."""
+    """The condition columns that a file must have; unaged rubber needs only the days and the rubber."""
 
     aged: tuple[str, ...]
     unaged: tuple[str, ...]
@@ -250,7 +266,9 @@ class _Needed:
         """Return which of so many files lack each of them, shape (files,)."""
         none = [None] * files
         unaged = where(columns.get("aging_days", none), lambda days: days == 0)
-        return {name: ~known(columns.get(name, none)) & (~unaged | (name in self.unaged)) for name in self.aged}
+        return {
+            name: ~known(columns.get(name, none)) & (~unaged | (name in self.unaged)) for name in self.aged
+        }
 
 
 def _from_traces(
@@ -279,7 +297,8 @@ def _from_traces(
         _, plateau = measured_speed(table["time_s"].to_numpy(), table["displacement_mm"].to_numpy())
         measured[i] = plateau * speed_factor(config.units)
         sources = {
-            name: beside(name, RESERVED) for name in ("run_id", "repeat", "specimen_id", "started_at", "speed_mm_s")
+            name: beside(name, RESERVED)
+            for name in ("run_id", "repeat", "specimen_id", "started_at", "speed_mm_s")
         }
         sources |= {name: name for name in wanted}
         for name, column in sources.items():
@@ -289,7 +308,9 @@ def _from_traces(
             if (values == values.iloc[0]).all():
                 added.setdefault(name, {})[i] = _constant(name, values.iloc[0])
             elif name in wanted:
-                reason = f"varies within the file, {values.min()} to {values.max()}; a condition is one value."
+                reason = (
+                    f"varies within the file, {values.min()} to {values.max()}; a condition is one value."
+                )
                 fix = "Write the value that was set into runs.csv."
                 place = {"file": file, "column": name, "action": "file left out", "fix": fix}
                 faults.append(Fault("condition_varies", reason, **place))
@@ -318,6 +339,10 @@ def _missing(entries: Entries, columns: Columns, needed: _Needed) -> list[Fault]
         elif len(rows):
             reason = "there is no such column in runs.csv, file names, header lines or traces."
             fix = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."
-            place = {"file": entries.table if entries.lines is not None else None, "column": name, "fix": fix.strip()}
+            place = {
+                "file": entries.table if entries.lines is not None else None,
+                "column": name,
+                "fix": fix.strip(),
+            }
             faults.append(Fault("missing_column", reason, **place))
     return faults

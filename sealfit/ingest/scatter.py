@@ -1,11 +1,11 @@
 """Type A: how far repeats of a run scatter, as a function of the force, pooled over runs.
 
-Three repeats say next to nothing about their own scatter: of a standard deviation with two degrees of freedom, the 95 %
-interval spans a factor of twelve. Scatter is therefore pooled over runs (GUM 4.2.4; ISO 5725-2, 7.5: sr as a function
-of the level m), as sd^2 = s0^2 + (g F)^2: a part that every run has, and a part in proportion to the force. What all
-repeats have in common from first to last (run-in, Mullins) is no scatter and is taken out before. The sensor's
-accuracy (type B) is one unknown that all repeats share, so it is not in their scatter and is kept apart
-(`config.sensor`).
+Three repeats say next to nothing about their own scatter: of a standard deviation with two degrees of
+freedom, the 95 % interval spans a factor of twelve. Scatter is therefore pooled over runs (GUM 4.2.4; ISO
+5725-2, 7.5: sr as a function of the level m), as sd^2 = s0^2 + (g F)^2: a part that every run has, and a part
+in proportion to the force. What all repeats have in common from first to last (run-in, Mullins) is no scatter
+and is taken out before. The sensor's accuracy (type B) is one unknown that all repeats share, so it is not in
+their scatter and is kept apart (`config.sensor`).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ PATTERN_RUNS = 3
 class Scatter:
     """Standard deviation of a repeat about its run: `sd_N(force) = sqrt(s0_N^2 + (g |force|)^2)`, with `df`.
 
-    `pattern` holds, per repeat number, the share by which repeats of that number differ from their runs' means. With no
-    repeats at all `df` is 0 and `s0_N` and `g` are NaN.
+    `pattern` holds, per repeat number, the share by which repeats of that number differ from their runs'
+    means. With no repeats at all `df` is 0 and `s0_N` and `g` are NaN.
     """
 
     s0_N: float
@@ -40,13 +40,16 @@ class Scatter:
 
 
 def repeat_means(steady: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per file and run: `file`, `run_id`, `repeat`, `force_N` (size of its strokes' mean force).
+    """Return one row per file and run: `file`, `run_id`, `repeat`, `force_N` (size of its strokes' mean).
 
-    The strokes of a file share its set-up; its mean is the unit that is repeated. Rows with `used` false are left out.
+    The strokes of a file share its set-up; its mean is the unit that is repeated. Rows with `used` false are
+    left out.
     """
     rows = steady[steady["used"].to_numpy(bool)] if "used" in steady.columns else steady
     if not len(rows):
-        return pd.DataFrame({"file": [], "run_id": [], "repeat": np.array([], int), "force_N": np.array([], float)})
+        return pd.DataFrame(
+            {"file": [], "run_id": [], "repeat": np.array([], int), "force_N": np.array([], float)}
+        )
     means = rows.groupby(["run_id", "repeat", "file"], sort=True, observed=True)["force_N"].mean().abs()
     return means.reset_index()[["file", "run_id", "repeat", "force_N"]]
 
@@ -66,9 +69,9 @@ def repeat_scatter(steady: pd.DataFrame) -> Scatter:
 
     Notes
     -----
-    Maximum likelihood of the run variances, s_r^2 ~ sd^2(F_r) chi^2(n_r - 1) / (n_r - 1), with s0^2 and g^2 not below
-    zero: weighted least squares of s_r^2 on [1, F_r^2], weights renewed until they stay (Fisher scoring). The common
-    pattern of the repeats costs one degree of freedom per repeat number but one.
+    Maximum likelihood of the run variances, s_r^2 ~ sd^2(F_r) chi^2(n_r - 1) / (n_r - 1), with s0^2 and g^2
+    not below zero: weighted least squares of s_r^2 on [1, F_r^2], weights renewed until they stay (Fisher
+    scoring). The common pattern of the repeats costs one degree of freedom per repeat number but one.
     """
     means = repeat_means(steady)
     return fit_scatter(Layout.of(means), means["force_N"].to_numpy(float), np.ones(len(means), bool)).scatter
@@ -103,7 +106,9 @@ class ScatterFit:
     t: np.ndarray
 
     def df_at(self, force_N: float) -> float:
-        """Degrees of freedom of the variance at this force: those of all runs only where one number describes them all.
+        """Return the degrees of freedom of the variance at this force.
+
+        They are those of all runs only where one number describes them all.
 
         Welch-Satterthwaite: a variance with standard error u has 2 variance^2 / u^2 (GUM, G.4.1).
         """

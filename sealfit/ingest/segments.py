@@ -1,4 +1,4 @@
-"""Flat arrays that hold many strokes or runs one after the other, and medians and stretches along one trace."""
+"""Flat arrays of many strokes or runs one after the other, and medians and stretches along one trace."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When files were started, as the log writes it: to ISO 8601, and to the order and the hours of the campaign."""
+"""When files were started, as the log writes it: to ISO 8601, and to the order and hours of the campaign."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CLOCKS = (" %H:%M:%S", " %H:%M", " %I:%M:%S %p", " %I:%M %p", "", "T%H:%M:%S", 
 
 
 def join_date_and_time(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
-    """Return the columns with `started_at` in place of the config's columns of date and time; faults of these."""
+    """Return the columns with `started_at` in place of the config's date and time; faults of these."""
     two = config.files.started_at
     if two is None:
         return columns, []
@@ -41,7 +41,9 @@ def join_date_and_time(entries: Entries, columns: Columns, config: Config) -> tu
         if (cells[0] is None) != (cells[1] is None):
             empty, other = (two.date, two.time) if cells[0] is None else (two.time, two.date)
             reason = f"the cell is empty, but '{other}' is not."
-            faults.append(entries[i].fault("empty_cell", reason, empty, value="", fix="Fill it, or empty both."))
+            faults.append(
+                entries[i].fault("empty_cell", reason, empty, value="", fix="Fill it, or empty both.")
+            )
         # A workbook's date is a midnight: 2024-03-01 00:00:00.
         day = re.sub(r"[ T]00:00(:00)?$", "", str(cells[0]).strip())
         joined.append(None if None in cells else f"{day} {str(cells[1]).strip()}")
@@ -50,11 +52,11 @@ def join_date_and_time(entries: Entries, columns: Columns, config: Config) -> tu
 
 
 def add_order(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
-    """Return the columns with `run_order` and `elapsed_h` where files say when they were started; faults of bad times.
+    """Return the columns with `run_order` and `elapsed_h` where files have start times; faults of bad times.
 
-    Times in one of the config's formats, and Excel's serial numbers, become ISO 8601. Equal times share the order of
-    the first of them. A time with a zone is an instant; one without is taken as it stands, and as UTC beside others
-    with zones, so that one campaign with and without zones keeps one order.
+    Times in one of the config's formats, and Excel's serial numbers, become ISO 8601. Equal times share the
+    order of the first of them. A time with a zone is an instant; one without is taken as it stands, and as
+    UTC beside others with zones, so that one campaign with and without zones keeps one order.
     """
     if "started_at" not in columns:
         return columns, []
@@ -68,10 +70,15 @@ def add_order(entries: Entries, columns: Columns, config: Config) -> tuple[Colum
         if text is not None and time is None
     ]
     as_given = not formats and config.files.started_at is None
-    as_iso = {text: time.isoformat() if time and not (as_given and _iso(text)) else text for text, time in read.items()}
+    as_iso = {
+        text: time.isoformat() if time and not (as_given and _iso(text)) else text
+        for text, time in read.items()
+    }
     columns = columns | {"started_at": mapped(texts, as_iso.__getitem__)}
     if any(time.tzinfo for time in times if time is not None):
-        times = mapped(times, lambda time: (time if time.tzinfo else time.replace(tzinfo=UTC)).astimezone(UTC))
+        times = mapped(
+            times, lambda time: (time if time.tzinfo else time.replace(tzinfo=UTC)).astimezone(UTC)
+        )
     moments = pd.Series(pd.to_datetime(pd.Series(times, dtype=object), utc=True))
     if not moments.notna().any():
         return columns, faults
@@ -85,8 +92,10 @@ def _with_none(values: pd.Series) -> Column:
 
 
 def _time(text: str, formats: Sequence[str]) -> datetime | None:
-    """Return the time by the first format that fits, else by ISO 8601, else by Excel's serial number; None if none."""
-    return next((time for one in formats if (time := _by_format(text, one))), None) or _iso(text) or _excel(text)
+    """Return the time by the first format that fits, else ISO 8601, else Excel's serial number, or None."""
+    return (
+        next((time for one in formats if (time := _by_format(text, one))), None) or _iso(text) or _excel(text)
+    )
 
 
 def _by_format(text: str, one: str) -> datetime | None:
@@ -104,7 +113,7 @@ def _iso(text: str) -> datetime | None:
 
 
 def _excel(text: str) -> datetime | None:
-    """Return the time of a day's serial number, or of a day's and a share of a day's: 45352.395833, 45352 0.395833."""
+    """Return the time of a day's serial number, or of a day's and a share's: 45352.395833, 45352 0.395833."""
     numbers = [as_number(part) for part in text.split()]
     if not numbers or None in numbers or not EXCEL_DAYS[0] <= sum(numbers) < EXCEL_DAYS[1]:
         return None
@@ -121,5 +130,9 @@ def _fix(text: str) -> str:
     found = (date + clock for clock in _CLOCKS for date in _USUAL if _by_format(text, date + clock))
     likely = list(dict.fromkeys(found))[:2]
     if likely:
-        return f"Set date_format = {' or '.join(repr(one) for one in likely)} under [files] in the rig config."
-    return "Write it as 2024-03-01T09:30:00, or give its format: date_format = '%d.%m.%Y %H:%M' under [files]."
+        return (
+            f"Set date_format = {' or '.join(repr(one) for one in likely)} under [files] in the rig config."
+        )
+    return (
+        "Write it as 2024-03-01T09:30:00, or give its format: date_format = '%d.%m.%Y %H:%M' under [files]."
+    )

@@ -1,4 +1,4 @@
-"""Parts of a campaign on the disk: written by whoever reads them, and the samples of strokes read from them again."""
+"""Parts of a campaign on disk: written by whoever reads them, and samples of strokes read from them again."""
 
 from __future__ import annotations
 
@@ -66,7 +66,9 @@ def by_conditions(parts: Mapping[Path, Iterable[str]]) -> list[StoredTraces]:
     return sorted(groups, key=lambda group: min(group.conditions, default=""))
 
 
-def a_part_at_a_time(traces: pd.DataFrame | Sequence[StoredTraces], columns: list[str]) -> Iterator[pd.DataFrame]:
+def a_part_at_a_time(
+    traces: pd.DataFrame | Sequence[StoredTraces], columns: list[str]
+) -> Iterator[pd.DataFrame]:
     """Yield table `traces`, or each part of where it lies: these columns of it, files as categories there."""
     if isinstance(traces, pd.DataFrame):
         yield traces[columns]
@@ -104,24 +106,29 @@ def strokes_of(traces: pd.DataFrame, strokes: pd.MultiIndex) -> tuple[np.ndarray
         file, names = pd.factorize(file)
     stroke = traces["stroke"].to_numpy()
     first = np.flatnonzero(np.r_[True, (file[1:] != file[:-1]) | (stroke[1:] != stroke[:-1])])
-    own = strokes.get_indexer(pd.MultiIndex.from_arrays([np.asarray(names, object)[file[first]], stroke[first]]))
+    own = strokes.get_indexer(
+        pd.MultiIndex.from_arrays([np.asarray(names, object)[file[first]], stroke[first]])
+    )
     return np.r_[first, file.size], own
 
 
 def noise_from_bends(bends: np.ndarray) -> float:
     """Return the standard deviation of a sample from second differences of neighbours; 0 without any.
 
-    Their variance is six times a sample's; the median absolute deviation is blind to where the signal itself bends.
+    Their variance is six times a sample's; the median absolute deviation is blind to where the signal itself
+    bends.
     """
     return 1.4826 * median(np.abs(bends - median(bends))) / np.sqrt(6.0) if bends.size else 0.0
 
 
 # ---------------------------------------------------------------- stored parts
-# Parts of a campaign on the disk: written by whoever reads them, and taken as they are while nothing has changed.
+# Parts of a campaign on the disk: written by whoever reads them, and taken as they are while nothing has
+# changed.
 #
-# A part's files are named by what it was made from, so a process that does the work a second time (its first answer was
-# lost) writes the same names, and a part that is as it was keeps its files. Beside its tables a part has a file of its
-# strokes and findings: with it, the whole campaign can be judged anew without reading the samples.
+# A part's files are named by what it was made from, so a process that does the work a second time (its first
+# answer was lost) writes the same names, and a part that is as it was keeps its files. Beside its tables a
+# part has a file of its strokes and findings: with it, the whole campaign can be judged anew without reading
+# the samples.
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
 ARROW = ".arrow"
@@ -135,11 +142,11 @@ Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each col
 class Made:
     """One part as the campaign needs it.
 
-    Of its files, in the order in which they were asked for, `rows` are the rows that were read, and `found` the
-    strokes; `marks` are the fingerprints of those that were read now. `strokes` is None where they are left on the disk
-    (`stored_strokes`), and once they are let go. `unused` and `wanted` are what was asked for (`part.Asked`); `columns`
-    are those of its tables; the tables themselves are in `tables`, or on the disk in `stored`: files by their names
-    below OUT, with their sizes in bytes.
+    Of its files, in the order in which they were asked for, `rows` are the rows that were read, and `found`
+    the strokes; `marks` are the fingerprints of those that were read now. `strokes` is None where they are
+    left on the disk (`stored_strokes`), and once they are let go. `unused` and `wanted` are what was asked
+    for (`part.Asked`); `columns` are those of its tables; the tables themselves are in `tables`, or on the
+    disk in `stored`: files by their names below OUT, with their sizes in bytes.
     """
 
     marks: Mapping[str, Fingerprint]
@@ -167,17 +174,24 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     rows, count = [found.rows for found in part.files], [found.strokes for found in part.files]
     tables = part.tables
     if folder is None:
-        return Made(marks, rows, count, part.faults, part.strokes, asked.unused, asked.columns, {}, tables, {})
-    columns = {name: {f.name: str(f.type) for f in parquet.spelled_out(table.schema)} for name, table in tables.items()}
+        return Made(
+            marks, rows, count, part.faults, part.strokes, asked.unused, asked.columns, {}, tables, {}
+        )
+    columns = {
+        name: {f.name: str(f.type) for f in parquet.spelled_out(table.schema)}
+        for name, table in tables.items()
+    }
     if asked.columns is not None:
         tables = {
-            name: parquet.with_columns(table, asked.columns[name], config.units) for name, table in tables.items()
+            name: parquet.with_columns(table, asked.columns[name], config.units)
+            for name, table in tables.items()
         }
     hashes = [found.mark.sha256 for found in part.files]
     name = _file_name(part_key(asked.refs, hashes, seen_by_parts(config)), asked)
     with disk(folder.parent), _whole_files(folder) as write:
         stored = {
-            (file := f"{of}{PARQUET}/{name}"): write(file, table, parquet.write_arrow) for of, table in tables.items()
+            (file := f"{of}{PARQUET}/{name}"): write(file, table, parquet.write_arrow)
+            for of, table in tables.items()
         }
         about = {
             "unused": sorted(asked.unused),
@@ -191,7 +205,8 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         metadata = {**(part.strokes.schema.metadata or {}), _ABOUT: json.dumps(about)}
         file = f"{PARTS}/{Path(name).with_suffix(ARROW)}"
         stored[file] = write(file, part.strokes.replace_schema_metadata(metadata), parquet.write_ipc)
-    # Its strokes are not sent: whoever asked finds them on the disk, and need not hold them while other parts are read.
+    # Its strokes are not sent: whoever asked finds them on the disk, and need not hold them while other parts
+    # are read.
     return Made(marks, rows, count, part.faults, None, asked.unused, asked.columns, columns, {}, stored)
 
 
@@ -203,7 +218,7 @@ def stored_strokes(part: Made, folder: Path | None) -> pa.Table:
 
 
 def seen_by_parts(config: Config) -> str:
-    """Return in words what every part is made by, whatever its files: the version of the program and the rig."""
+    """Return in words what every part is made by, whatever its files: the program's version and the rig."""
     return json.dumps([__version__, FORMAT, config.model_dump(mode="json")])
 
 
@@ -226,7 +241,9 @@ def part_key(listing: Listing, hashes: Sequence[str | None], seen: str) -> str |
 
 
 def _file_name(key: str | None, asked: Asked) -> str:
-    variant = hashlib.sha256(json.dumps([sorted(asked.unused), asked.columns], sort_keys=True).encode()).hexdigest()
+    variant = hashlib.sha256(
+        json.dumps([sorted(asked.unused), asked.columns], sort_keys=True).encode()
+    ).hexdigest()
     return f"{key or uuid.uuid4().hex[:20]}-{variant[:8]}{PARQUET}"
 
 
@@ -283,8 +300,8 @@ def agrees(part: Made, columns: Columns) -> bool:
 def _whole_files(folder: Path) -> Iterator[Callable[[str, pa.Table, Callable], int]]:
     """Give a function that writes a table to a file below `folder` and returns its size.
 
-    All are on the disk and in their places when the block ends, each whole or not there at all; two processes that
-    write the same do not disturb each other.
+    All are on the disk and in their places when the block ends, each whole or not there at all; two processes
+    that write the same do not disturb each other.
     """
     drafts: dict[Path, Path] = {}
 

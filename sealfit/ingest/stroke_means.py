@@ -13,7 +13,13 @@ from sealfit.errors import BadFile, Fault
 from sealfit.ingest.averages import standard_error
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.files import Folder
-from sealfit.ingest.quality import equal_neighbours, load_faults, rising_faults, speed_column_faults, stroke_faults
+from sealfit.ingest.quality import (
+    equal_neighbours,
+    load_faults,
+    rising_faults,
+    speed_column_faults,
+    stroke_faults,
+)
 from sealfit.ingest.reader import Trace, read_traces
 from sealfit.ingest.strokes import Stroke, find_strokes
 from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, speed_factor
@@ -26,7 +32,7 @@ SLOTS = ("time_s", "displacement_mm", "force_N")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FileStrokes:
-    """What one file gives: its fingerprint, findings, a row per stroke, and its samples as columns of equal length."""
+    """What a file gives: fingerprint, findings, a row per stroke, and samples as columns of equal length."""
 
     file: str
     mark: Fingerprint
@@ -78,7 +84,9 @@ def _file_strokes(trace: Trace, mark: Fingerprint, config: Config) -> FileStroke
 
 def _with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
     """Return the trace without rows that are spikes, and its strokes."""
-    keep, faults = displacement_spikes(trace.ref.file, trace.columns["displacement_mm"], trace.line, config.quality)
+    keep, faults = displacement_spikes(
+        trace.ref.file, trace.columns["displacement_mm"], trace.line, config.quality
+    )
     trace = trace.where(keep, faults)
     strokes = find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
     keep, faults = force_spikes(trace.ref.file, trace.columns["force_N"], strokes, trace.line, config.quality)
@@ -107,8 +115,10 @@ def _strokes_before(ref: TraceRef) -> int:
 
 
 def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[str, np.ndarray]:
-    """Return the samples of a trace with stroke, distance, and flags; time from the stroke's start if there are
-    several."""
+    """Return the samples of a trace with stroke, distance and flags.
+
+    Time is counted from the stroke's start if there are several strokes.
+    """
     time_s, displacement, force = (trace.columns[name] for name in SLOTS)
     size = [stroke.stop - stroke.start for stroke in strokes]
     origin = np.array([stroke.origin for stroke in strokes])
@@ -137,7 +147,9 @@ def _stroke_rows(
         means = _means(stroke, samples)
         row = {**ref.channels, **means, "file": ref.file, "direction": stroke.direction}
         row["speed_mm_s"] = speed_factor(config.units) * stroke.speed_mm_s
-        found = stroke_faults(stroke, trace.columns["time_s"], trace.columns["force_N"], trace.line, config.quality)
+        found = stroke_faults(
+            stroke, trace.columns["time_s"], trace.columns["force_N"], trace.line, config.quality
+        )
         used = not any(fault.action == "stroke left out" for fault in found)
         if used:
             found += rising_faults(row["left"], row["force_N"], unit)
@@ -145,7 +157,9 @@ def _stroke_rows(
             found += speed_column_faults(row["speed_mm_s"], row[OWN_SPEED], config)
         row |= {"several": several, "used": used, "stroke": stroke.number + _strokes_before(ref)}
         rows.append(row)
-        faults += [replace(fault, file=ref.file, stroke=stroke.number if several else None) for fault in found]
+        faults += [
+            replace(fault, file=ref.file, stroke=stroke.number if several else None) for fault in found
+        ]
     return tuple(rows), faults + _load_faults(trace, rows, config)
 
 
@@ -162,7 +176,9 @@ def _load_faults(trace: Trace, rows: Sequence[Mapping[str, object]], config: Con
 def _means(stroke: Stroke, samples: Mapping[str, np.ndarray]) -> dict[str, object]:
     """Return the means of the samples of a stroke over its steady window, and what else is found there."""
     rows = stroke.rows
-    window = {name: values[rows] for name, values in samples.items() if name not in ("steady", "sliding", ALONG)}
+    window = {
+        name: values[rows] for name, values in samples.items() if name not in ("steady", "sliding", ALONG)
+    }
     window["force_N"] = force = window["force_N"] - window["presliding_N"]
     place, n = window["displacement_mm"], len(rows)
     size = np.abs(samples["force_N"][stroke.start : stroke.stop])

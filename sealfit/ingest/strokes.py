@@ -1,9 +1,10 @@
 """Strokes of a trace, and in each the window in which it slides steadily: found from the data.
 
-A stroke runs from one turning point of the smoothed displacement to the next. Its steady window begins when the speed
-has reached its plateau and the force has ended its pre-sliding rise, and ends before the platform slows down; rests
-in between are left out with what follows them until sliding is steady again. Nothing that changes slowly (warming,
-drift, a ripple, a Stribeck curve) is taken for a rise: only a force below everything it later shows counts as one.
+A stroke runs from one turning point of the smoothed displacement to the next. Its steady window begins when
+the speed has reached its plateau and the force has ended its pre-sliding rise, and ends before the platform
+slows down; rests in between are left out with what follows them until sliding is steady again. Nothing that
+changes slowly (warming, drift, a ripple, a Stribeck curve) is taken for a rise: only a force below everything
+it later shows counts as one.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ from sealfit.ingest.window import slope, speed_along, steady_window
 class Stroke:
     """One stroke: rows `start` to `stop` (exclusive) of its trace.
 
-    `origin` is the row where it begins to move, from which its distance counts (and, in a file of several strokes, its
-    time): the first row, unless rows of rest come before the file's first stroke. `speed_mm_s` is in displacement units
-    per time unit, signed. Arrays are of shape (stop - start,): `steady` marks the rows of the window, `sliding` those
-    in which it moves; `presliding_N` is what is left of the pre-sliding rise in the window, with the sign of the
-    force, 0 elsewhere; `speed_along_mm_s` is the speed at every row, where it is seen to differ from the stroke's.
-    `short` says why the window is too short to be used; None if it is long enough.
+    `origin` is the row where it begins to move, from which its distance counts (and, in a file of several
+    strokes, its time): the first row, unless rows of rest come before the file's first stroke. `speed_mm_s`
+    is in displacement units per time unit, signed. Arrays are of shape (stop - start,): `steady` marks the
+    rows of the window, `sliding` those in which it moves; `presliding_N` is what is left of the pre-sliding
+    rise in the window, with the sign of the force, 0 elsewhere; `speed_along_mm_s` is the speed at every row,
+    where it is seen to differ from the stroke's. `short` says why the window is too short to be used; None if
+    it is long enough.
     """
 
     number: int
@@ -67,8 +69,8 @@ def find_strokes(
     Parameters
     ----------
     time_s, displacement_mm, force_N : ndarray, shape (n,)
-        A trace in the rig's own units, finite, time rising (steps may differ, and hide gaps); displacement without
-        spikes.
+        A trace in the rig's own units, finite, time rising (steps may differ, and hide gaps); displacement
+        without spikes.
     settings : Strokes
         The config's `strokes`.
 
@@ -134,10 +136,11 @@ def _whole_file(time_s: np.ndarray, displacement_mm: np.ndarray, settings: Strok
 def displacement_noise_mm(displacement_mm: np.ndarray) -> float:
     """Return the standard deviation of one displacement sample of a trace, noise and resolution together.
 
-    Second differences of a steady motion hold noise only: their variance is six times that of a sample. The 90th
-    percentile is blind to gaps, stops and spikes. Where most of the way is covered by single steps between rows that
-    hardly differ, these are the resolution, whose rounding error is uniform: step / sqrt(12). A rest before or after
-    the motion is no such step, be its rows equal or not. 0 of less than three samples.
+    Second differences of a steady motion hold noise only: their variance is six times that of a sample. The
+    90th percentile is blind to gaps, stops and spikes. Where most of the way is covered by single steps
+    between rows that hardly differ, these are the resolution, whose rounding error is uniform: step /
+    sqrt(12). A rest before or after the motion is no such step, be its rows equal or not. 0 of less than
+    three samples.
     """
     if len(displacement_mm) < 3:
         return 0.0
@@ -156,8 +159,8 @@ def displacement_noise_mm(displacement_mm: np.ndarray) -> float:
 def turning_rows(smooth_mm: np.ndarray, travel_mm: float) -> list[int]:
     """Return the rows where the motion begins, turns and ends: extremes more than `travel_mm` apart.
 
-    A turn counts once the displacement has come back by `travel_mm`, so neither noise nor a small backlash is one.
-    Fewer than two rows where nothing moves that far.
+    A turn counts once the displacement has come back by `travel_mm`, so neither noise nor a small backlash is
+    one. Fewer than two rows where nothing moves that far.
     """
     step = np.sign(np.diff(smooth_mm))
     moving = np.flatnonzero(step)
@@ -184,7 +187,7 @@ def turning_rows(smooth_mm: np.ndarray, travel_mm: float) -> list[int]:
 
 
 def _bounds(smooth_mm: np.ndarray, turns: list[int], near_mm: float, samples: int) -> tuple[list[int], int]:
-    """Return the first row of every stroke, with the number of rows at the end, and the row where the first one moves.
+    """Return every stroke's first row, with the number of rows at the end, and the row where the first moves.
 
     A rest at a turn belongs to the stroke before it: a stroke begins with the last row of rest.
     """
@@ -209,5 +212,8 @@ def _too_short(along_mm: np.ndarray, steady: np.ndarray, settings: Strokes) -> s
     covered = np.abs(np.diff(along_mm))[steady[1:] & steady[:-1]].sum()
     share = covered / max(float(np.ptp(along_mm)), 1e-300)
     if share < settings.min_steady_share:
-        return f"the steady window is {share:.0%} of the stroke; at least {settings.min_steady_share:.0%} is needed"
+        return (
+            f"the steady window is {share:.0%} of the stroke; "
+            f"at least {settings.min_steady_share:.0%} is needed"
+        )
     return None

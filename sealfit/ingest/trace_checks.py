@@ -16,7 +16,8 @@ from sealfit.ingest.strokes import Stroke, displacement_noise_mm
 from sealfit.units import Units
 
 # ---------------------------------------------------------------- spikes
-# Single samples that cannot be right: a displacement that jumps away and back, a force far off its neighbours.
+# Single samples that cannot be right: a displacement that jumps away and back, a force far off its
+# neighbours.
 
 # Samples of the running median. Five are blind to one or two wrong ones, and exact on any slope.
 NEIGHBOURS = 5
@@ -39,7 +40,7 @@ def _beyond(force_N: np.ndarray, suspects: np.ndarray) -> np.ndarray:
 def displacement_spikes(
     file: str, displacement_mm: np.ndarray, line: np.ndarray, settings: Quality
 ) -> tuple[np.ndarray, list[Fault]]:
-    """Return which rows to keep, shape (n,): not those whose displacement jumps away and back; a finding for each.
+    """Return which rows to keep, shape (n,): none whose displacement jumps away and back; a finding for each.
 
     More than `max_bad_rows` of them are the nature of the signal, and all are kept.
     """
@@ -47,7 +48,8 @@ def displacement_spikes(
     if len(displacement_mm) < 4 * NEIGHBOURS:
         return keep, []
     off = displacement_mm - median_filter(displacement_mm, NEIGHBOURS, mode="mirror")
-    # At a turn the median lags by one step of the fastest samples around, never by more than a few of the usual ones.
+    # At a turn the median lags by one step of the fastest samples around, never by more than a few of the
+    # usual ones.
     step = median(np.abs(np.diff(displacement_mm)))
     noise = displacement_noise_mm(displacement_mm)
     least = max(STEPS * step, APART * quantile(np.abs(off), USUAL), 1e-9 * float(np.ptp(displacement_mm)))
@@ -61,12 +63,12 @@ def displacement_spikes(
 def force_spikes(
     file: str, force_N: np.ndarray, strokes: Sequence[Stroke], line: np.ndarray, settings: Quality
 ) -> tuple[np.ndarray, list[Fault]]:
-    """Return which rows to keep, shape (n,): not single samples of force far off their neighbours; a finding for each.
+    """Return which rows to keep, shape (n,): no single force far off its neighbours; a finding for each.
 
-    "Far" is `spike_sigma` robust standard deviations of what the samples of the steady windows are off the median of
-    their neighbours, and apart from the bulk of these. Outside the windows, where a break-away peak may be as sharp,
-    a spike must also reach beyond the rest of the trace by half of its range. More than `max_bad_rows` spikes are the
-    nature of the signal: said, and kept.
+    "Far" is `spike_sigma` robust standard deviations of what the samples of the steady windows are off the
+    median of their neighbours, and apart from the bulk of these. Outside the windows, where a break-away peak
+    may be as sharp, a spike must also reach beyond the rest of the trace by half of its range. More than
+    `max_bad_rows` spikes are the nature of the signal: said, and kept.
     """
     keep = np.ones(len(force_N), bool)
     if len(force_N) < 4 * NEIGHBOURS:
@@ -84,11 +86,24 @@ def force_spikes(
         return keep, []
     spikes = np.flatnonzero(suspects & (steady | _beyond(force_N, suspects)))
     if len(spikes) > settings.max_bad_rows * len(force_N):
-        reason = f"{len(spikes)} samples jump away from their neighbours: too many to be single wrong samples."
+        reason = (
+            f"{len(spikes)} samples jump away from their neighbours: too many to be single wrong samples."
+        )
         fix = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
         value = float(len(spikes))
         return keep, [
-            Fault("spikes", reason, file, None, None, "force_N", value, severity="warning", action="kept", fix=fix)
+            Fault(
+                "spikes",
+                reason,
+                file,
+                None,
+                None,
+                "force_N",
+                value,
+                severity="warning",
+                action="kept",
+                fix=fix,
+            )
         ]
     keep[spikes] = False
     starts = np.array([stroke.start for stroke in strokes])
@@ -101,7 +116,7 @@ def force_spikes(
 
 
 def resolution(values: np.ndarray) -> float:
-    """Return the smallest step between different values: the sensor's resolution if coarse, else next to nothing."""
+    """Return the smallest step between different values: the sensor's resolution if coarse, else near 0."""
     different = np.unique(values)
     return float(np.diff(different).min()) if len(different) > 1 else 0.0
 
@@ -131,13 +146,15 @@ SHORT = {"rpm": ("turn", "min"), "rps": ("turn", "s")}
 
 
 def speed_factor(units: Units) -> float:
-    """Return what turns displacement unit per time unit into the speed's unit: 60 for turn, s and rpm; 1 for mm, s
-    and mm/s.
+    """Return what turns displacement unit per time unit into the speed's unit.
+
+    It is 60 for turn, s and rpm, and 1 for mm, s and mm/s.
 
     Raises
     ------
     ConfigError
-        If the units do not fit together (turn and mm/s), or are not known and not spelled "<displacement>/<time>".
+        If the units do not fit together (turn and mm/s), or are not known and not spelled
+        "<displacement>/<time>".
 
     Examples
     --------
@@ -160,7 +177,8 @@ def speed_factor(units: Units) -> float:
 
 
 # ---------------------------------------------------------------- speed check
-# Does the displacement move as fast as commanded? A factor that is wrong in a known way names the unit mixed up.
+# Does the displacement move as fast as commanded? A factor that is wrong in a known way names the unit mixed
+# up.
 
 # Pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke.
 BLOCKS = 100
@@ -168,12 +186,13 @@ BLOCKS = 100
 FEWEST = 6
 # Noise of a step between the means of two pieces, as a share of the step.
 NOISE_OF_PATH = 0.1
-# Factor beyond which the file contradicts itself and is left out. Below it the commanded speed may be nominal.
+# Factor beyond which the file contradicts itself and is left out. Below it the commanded speed may be
+# nominal.
 GROSS = 1.5
 
 
 def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
-    """Return the mean speed of a trace, rests included, and its plateau speed; magnitudes, nan if there is none.
+    """Return the mean speed of a trace, rests included, and its plateau speed; magnitudes, nan for none.
 
     Parameters
     ----------
@@ -182,9 +201,10 @@ def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[flo
 
     Notes
     -----
-    A trace is cut into 100 pieces, or 50 per stroke. The mean is that of all pieces; the plateau is the median of
-    those faster than half their 90th percentile, so rests, turns and ramps do not count. In stick-slip the speed that
-    was set is the mean, in a stroke with rests it is the plateau; elsewhere the two agree.
+    A trace is cut into 100 pieces, or 50 per stroke. The mean is that of all pieces; the plateau is the
+    median of those faster than half their 90th percentile, so rests, turns and ramps do not count. In
+    stick-slip the speed that was set is the mean, in a stroke with rests it is the plateau; elsewhere the two
+    agree.
 
     Examples
     --------
@@ -210,7 +230,7 @@ def _of_cuts(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, fl
 
 
 def _strokes(displacement_mm: np.ndarray) -> int:
-    """Return how often the trace goes from its lowest quarter to its highest or back: roughly, its strokes."""
+    """Return how often a trace goes from its lowest quarter to its highest or back: roughly, its strokes."""
     low, high = quantile(displacement_mm, 0.01), quantile(displacement_mm, 0.99)
     ends = displacement_mm[
         (displacement_mm < low + 0.25 * (high - low)) | (displacement_mm > high - 0.25 * (high - low))
@@ -218,13 +238,15 @@ def _strokes(displacement_mm: np.ndarray) -> int:
     return int(np.count_nonzero(np.diff(ends > 0.5 * (low + high))))
 
 
-def speed_fault(ref: TraceRef, time_s: np.ndarray, displacement_mm: np.ndarray, config: Config) -> Fault | None:
+def speed_fault(
+    ref: TraceRef, time_s: np.ndarray, displacement_mm: np.ndarray, config: Config
+) -> Fault | None:
     """Return a fault if time and displacement of a trace disagree with the commanded speed.
 
-    None if they agree or no speed is commanded. They agree if the commanded speed lies between the measured mean and
-    the plateau, or misses them by no more than `quality.speed_disagreement`. Up to a factor of 1.5 the file is kept
-    with a warning: every table holds the measured speed. Beyond, the file is left out, and the fix names the mix-up
-    that fits the factor. Arguments as in `measured_speed`.
+    None if they agree or no speed is commanded. They agree if the commanded speed lies between the measured
+    mean and the plateau, or misses them by no more than `quality.speed_disagreement`. Up to a factor of 1.5
+    the file is kept with a warning: every table holds the measured speed. Beyond, the file is left out, and
+    the fix names the mix-up that fits the factor. Arguments as in `measured_speed`.
     """
     commanded = _commanded(ref)
     if commanded is None:
@@ -267,10 +289,10 @@ def _nearest(commanded: float, mean: float, plateau: float) -> float:
 
 
 def _speeds_of_means(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
-    """Return mean and plateau speed of one trace from the means of pieces, as few as its noise asks for; else nan.
+    """Return mean and plateau speed of a trace from means of pieces, as few as its noise asks for; else nan.
 
-    The mean of a piece of m samples has a noise of sd / sqrt(m), and two make a step; the path of `count` steps is
-    longer by noise that must stay small beside the travel.
+    The mean of a piece of m samples has a noise of sd / sqrt(m), and two make a step; the path of `count`
+    steps is longer by noise that must stay small beside the travel.
     """
     n, travel = len(time_s), float(np.ptp(displacement_mm))
     noise = displacement_noise_mm(displacement_mm)

@@ -1,4 +1,4 @@
-"""The steady window of a stroke: where its speed is on the plateau and its force past the pre-sliding rise."""
+"""The steady window of a stroke: its speed is on the plateau and its force past the pre-sliding rise."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from sealfit.ingest.segments import median, stretches, weighted_median
 REST = 0.5
 # Share of the plateau speed below which the platform stands still: it does not move yet, or no more.
 STANDSTILL = 0.05
-# A straight ramp: its time to 90 % of the plateau speed over that to 50 % (0.9 / 0.5), and how much of the ramp is
-# left out after 90 %, as a share. The ramp itself takes 0.11 more.
+# A straight ramp: its time to 90 % of the plateau speed over that to 50 % (0.9 / 0.5), and how much of the
+# ramp is left out after 90 %, as a share. The ramp itself takes 0.11 more.
 STRAIGHT = (1.8, 0.25)
-# The same of a first-order lag, ln(10) / ln(2) and ln(1000) / ln(10) - 1, after which 99.9 % are reached. Between the
-# two shapes the share is interpolated.
+# The same of a first-order lag, ln(10) / ln(2) and ln(1000) / ln(10) - 1, after which 99.9 % are reached.
+# Between the two shapes the share is interpolated.
 LAG = (3.3, 2.0)
 # Share of the braking time by which an S-shaped stop leaves the plateau earlier than a straight one, at most.
 BEFORE_STOP = 0.5
@@ -32,7 +32,8 @@ SPEED_PIECES = (8, 64)
 LEAST_ROWS = 8
 # Share by which speeds may differ without a finding. Errors of screws and scales are of that size.
 SAME_SPEED = 0.001
-# Scatter of the speeds, in units of that by chance, from which they differ. 3 strokes of 1,000 exceed it by chance.
+# Scatter of the speeds, in units of that by chance, from which they differ. 3 strokes of 1,000 exceed it by
+# chance.
 CLEAR = 3.0
 # Noise of the local speed, as a share of the tolerance. A false exit from the plateau then takes four SDs.
 SPEED_NOISE = 0.25
@@ -44,9 +45,9 @@ LEAST_SAMPLES = 4
 class Window:
     """The steady window of one stroke; arrays of shape (n,).
 
-    `steady` marks its rows, `sliding` those in which the stroke moves at all; `left_N` is what is left in the window
-    of the pre-sliding rise, positive against the motion, 0 outside; `rise_mm` is the length of that rise, 0 without
-    one.
+    `steady` marks its rows, `sliding` those in which the stroke moves at all; `left_N` is what is left in the
+    window of the pre-sliding rise, positive against the motion, 0 outside; `rise_mm` is the length of that
+    rise, 0 without one.
     """
 
     steady: np.ndarray
@@ -56,7 +57,12 @@ class Window:
 
 
 def steady_window(
-    time_s: np.ndarray, along_mm: np.ndarray, force_N: np.ndarray, origin: int, noise_mm: float, tolerance: float
+    time_s: np.ndarray,
+    along_mm: np.ndarray,
+    force_N: np.ndarray,
+    origin: int,
+    noise_mm: float,
+    tolerance: float,
 ) -> Window:
     """Return the steady window of one stroke.
 
@@ -76,7 +82,9 @@ def steady_window(
     if n < LEAST_SAMPLES:
         return Window(steady, sliding, left, length)
     # A glitch of one sample is not a rest.
-    speed, half, blurred = local_speed(time_s, median_filter(along_mm, 5, mode="nearest"), noise_mm, tolerance)
+    speed, half, blurred = local_speed(
+        time_s, median_filter(along_mm, 5, mode="nearest"), noise_mm, tolerance
+    )
     plateau = plateau_speed(time_s, speed)
     moves = speed > REST * plateau
     sliding = speed > STANDSTILL * plateau
@@ -136,15 +144,19 @@ def _averaged(values: np.ndarray, rows: int) -> np.ndarray:
 def local_speed(
     time_s: np.ndarray, along_mm: np.ndarray, noise_mm: float, tolerance: float
 ) -> tuple[np.ndarray, int, bool]:
-    """Return the speed over `half` rows to either side of each row; `half`, wide enough for the noise; and whether a
-    rest or a ramp shorter than that cannot be seen.
+    """Return the speed over `half` rows to either side of each row, `half`, and whether rests may be hidden.
 
-    Differences of displacement over differences of time: a gap does no harm. Of single samples, or, where these would
-    have to be more than a quarter of the stroke apart, of the means of all samples to either side.
+    `half` is wide enough for the noise. The last value says whether a rest or a ramp shorter than that cannot
+    be seen.
+
+    Differences of displacement over differences of time: a gap does no harm. Of single samples, or, where
+    these would have to be more than a quarter of the stroke apart, of the means of all samples to either
+    side.
     """
     n = len(time_s)
     mean_step = abs(along_mm[-1] - along_mm[0]) / (n - 1)
-    # The speed's SD is sqrt(2) noise over the width, wanted below SPEED_NOISE * tolerance of the speed itself.
+    # The speed's SD is sqrt(2) noise over the width, wanted below SPEED_NOISE * tolerance of the speed
+    # itself.
     wanted = np.sqrt(2.0) * noise_mm / max(2.0 * SPEED_NOISE * tolerance * mean_step, 1e-300)
     most = max(n // 8, 1)
     if wanted > most:
@@ -158,8 +170,10 @@ def local_speed(
 
 
 def _speed_of_means(time_s: np.ndarray, along_mm: np.ndarray, half: int) -> np.ndarray:
-    """Return the speed at every row of a stroke from the means of `half` rows before and after it; near the ends that
-    of the nearest row which has so many."""
+    """Return the speed at every row of a stroke from the means of `half` rows before and after it.
+
+    Near the ends it is that of the nearest row which has so many.
+    """
     sums = [np.concatenate(([0.0], np.cumsum(values - values[0]))) for values in (along_mm, time_s)]
     place = np.clip(np.arange(len(time_s)), half, len(time_s) - half)
     moved, lasted = (total[place + half] - 2.0 * total[place] + total[place - half] for total in sums)
@@ -167,7 +181,7 @@ def _speed_of_means(time_s: np.ndarray, along_mm: np.ndarray, half: int) -> np.n
 
 
 def first_motion(force_N: np.ndarray, since: int) -> int:
-    """Return the row, from `since` on, from which the force comes up to its level: the last at which it is at rest.
+    """Return the row from which the force comes up to its level: the last one at rest, from `since` on.
 
     Examples
     --------
@@ -185,14 +199,15 @@ def first_motion(force_N: np.ndarray, since: int) -> int:
 
 
 def plateau_speed(time_s: np.ndarray, speed: np.ndarray) -> float:
-    """Return the speed at which half of the distance is slid slower and half faster: blind to rests and ramps."""
+    """Return the speed below which half of the distance is slid: blind to rests and ramps."""
     return weighted_median(speed, np.maximum(speed, 0.0) * np.gradient(time_s))
 
 
 def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -> float:
-    """Return the slope of displacement over time by least squares, with one slope for all pieces of a steady window.
+    """Return the slope of displacement over time by least squares, one for all pieces of a steady window.
 
-    Each piece (between rests) has its own intercept, so a rest does not count as slow sliding. NaN without samples.
+    Each piece (between rests) has its own intercept, so a rest does not count as slow sliding. NaN without
+    samples.
     """
     product = square = 0.0
     for first, stop in stretches(steady):
@@ -206,27 +221,33 @@ def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -
 def speed_along(
     time_s: np.ndarray, displacement_mm: np.ndarray, window: Window, speed: float, noise_mm: float
 ) -> np.ndarray:
-    """Return the speed that the friction at every row of a steady window follows, shape (n,): the stroke's, and how
-    it changes along it, a rise length before: bristles follow a slow change by the length of their rise behind (Eq. 2).
+    """Return the speed that the friction at every row of a steady window follows, shape (n,).
 
-    The window is cut into pieces of equal time, each with a slope by least squares; where these differ clearly, the
-    speed is straight between their middles. `speed` is that of the stroke; it is returned as it is elsewhere, and
-    where the window is short or has rests. `noise_mm` of a displacement sample decides how many pieces it has.
+    It is the stroke's speed, and how it changes along the stroke, a rise length before: bristles follow a
+    slow change by the length of their rise behind (Eq. 2).
+
+    The window is cut into pieces of equal time, each with a slope by least squares; where these differ
+    clearly, the speed is straight between their middles. `speed` is that of the stroke; it is returned as it
+    is elsewhere, and where the window is short or has rests. `noise_mm` of a displacement sample decides how
+    many pieces it has.
     """
     made = np.full(len(time_s), speed)
     parts = stretches(window.steady)
     if len(parts) == 1 and abs(speed) > 0.0 and parts[0][1] - parts[0][0] >= SPEED_PIECES[0] * LEAST_ROWS:
         rows = slice(*parts[0])
-        made[rows] += _off_speed(time_s[rows], displacement_mm[rows], speed, noise_mm, window.rise_mm / abs(speed))
+        made[rows] += _off_speed(
+            time_s[rows], displacement_mm[rows], speed, noise_mm, window.rise_mm / abs(speed)
+        )
     return made
 
 
 def _off_speed(
     time_s: np.ndarray, displacement_mm: np.ndarray, speed: float, noise_mm: float, lag_s: float
 ) -> np.ndarray:
-    """Return by how much the speed, so long before, differs from the stroke's at every row of a window, shape (n,)."""
+    """Return how much the speed `lag_s` before each row of a window differs from the stroke's, shape (n,)."""
     n, error = len(time_s), SAME_SPEED * abs(speed)
-    # k slopes of n / k samples over 1/k of the time have errors of sqrt(12 k^3 / n) noise over the whole of it.
+    # k slopes of n / k samples over 1/k of the time have errors of sqrt(12 k^3 / n) noise over the whole of
+    # it.
     noise = max(noise_mm / (time_s[-1] - time_s[0]), 1e-9 * error)
     least, most = SPEED_PIECES
     pieces = int(min(max((n * (error / noise) ** 2 / 12.0) ** (1.0 / 3.0), least), most, n // LEAST_ROWS))
@@ -237,7 +258,8 @@ def _off_speed(
     square = (t * t).sum(axis=1)
     slope = (t * x).sum(axis=1) / square
     residual = x - slope[:, None] * t
-    # Neighbours that err alike (steps of a coarse sensor) count as one: a sign lasts for two of independent ones.
+    # Neighbours that err alike (steps of a coarse sensor) count as one: a sign lasts for two of independent
+    # ones.
     alike = residual.size / max(2 * np.count_nonzero(np.diff(np.sign(residual), axis=1)), 1)
     variance = (residual**2).mean() * max(alike, 1.0) / square + error**2
     scatter = float(((slope - slope.mean()) ** 2 / variance).sum())
@@ -267,10 +289,10 @@ class _Motion:
         return self.speed < STANDSTILL * self.plateau
 
     def moving(self, moves: np.ndarray) -> list[tuple[int, int]]:
-        """Return first and last (exclusive) row of every stretch of motion, from where it is faster than a rest.
+        """Return first and last (exclusive) row of every motion, from where it is faster than a rest.
 
-        Slow samples are a rest only if they cost more time than the width over which the speed is taken: noise does
-        not.
+        Slow samples are a rest only if they cost more time than the width over which the speed is taken:
+        noise does not.
         """
         joined: list[tuple[int, int]] = []
         time_s, along_mm, half = self.time_s, self.along_mm, self.half
@@ -286,7 +308,7 @@ class _Motion:
         return [(first, last) for first, last in joined if last - first > 2 * half + 3]
 
     def standstill(self, since: int, first: int) -> int:
-        """Return the last row from `since` on, and before `first`, at which the platform still stood; else `since`."""
+        """Return the last row from `since` to before `first` where the platform still stood, else `since`."""
         still = _last(self.slow[since:first])
         return since if still is None else since + still
 
@@ -324,7 +346,7 @@ class _Motion:
 
 
 def _after_ramp(shape: float) -> float:
-    """Return how much of the ramp follows after 90 % of the plateau, from the times to 90 % and to 50 % of it."""
+    """Return how much of the ramp follows 90 % of the plateau, from the times to 90 % and to 50 % of it."""
     (low, least), (high, most) = STRAIGHT, LAG
     return least + (most - least) / (high - low) * (min(max(shape, low), high) - low)
 

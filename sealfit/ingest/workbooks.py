@@ -1,4 +1,4 @@
-"""Excel workbooks and tables of runs to text: lines of cells between tabs, read as those of any other text file.
+"""Excel workbooks and tables of runs to text: lines of cells between tabs, read as any other text file.
 
 The number of a line is that of the sheet's row. Numbers are written without loss, dates in ISO 8601.
 """
@@ -48,7 +48,13 @@ class Sheet:
 
 
 def read_sheet(
-    raw: bytes, file: str, sheet: str | int | None, *, decimal: str = ".", first: bool = False, head: bool = False
+    raw: bytes,
+    file: str,
+    sheet: str | int | None,
+    *,
+    decimal: str = ".",
+    first: bool = False,
+    head: bool = False,
 ) -> Sheet:
     """Return a sheet of a workbook as text.
 
@@ -121,7 +127,9 @@ def _title(book, wanted: str | int | None, first: bool, file: str) -> str:
     if isinstance(wanted, int):
         if 0 < wanted <= len(titles):
             return titles[wanted - 1]
-        raise bad(file, "missing_sheet", f"there is no sheet {wanted}: it has {len(titles)}.", _listed(titles))
+        raise bad(
+            file, "missing_sheet", f"there is no sheet {wanted}: it has {len(titles)}.", _listed(titles)
+        )
     if wanted is not None:
         if wanted in titles:
             return wanted
@@ -157,10 +165,13 @@ def _lines(sheet, decimal: str, head: bool) -> tuple[list[str], list[tuple[int, 
     A row is at least as long as the longest above it: what it lacks are empty cells.
     """
     lines, formulas, width = [], [], 0
-    for number, row in enumerate(sheet.iter_rows(max_row=HEAD_ROWS if head else None, values_only=True), start=1):
+    for number, row in enumerate(
+        sheet.iter_rows(max_row=HEAD_ROWS if head else None, values_only=True), start=1
+    ):
         cells = []
         for place, value in enumerate(row, start=1):
-            if (isinstance(value, str) and value.startswith("=")) or hasattr(value, "ref"):  # a range of formulas
+            # A range of formulas has a `ref`.
+            if (isinstance(value, str) and value.startswith("=")) or hasattr(value, "ref"):
                 formulas.append((number, place))
             cells.append(_cell(value, decimal))
         while cells and not cells[-1]:
@@ -206,7 +217,9 @@ def _merged(raw: bytes, title: str) -> tuple[tuple[str, int], ...]:
 def _part(packed: zipfile.ZipFile, title: str) -> str:
     """Return the file inside a workbook that holds a sheet."""
     sheets = ElementTree.fromstring(packed.read("xl/workbook.xml")).iter()
-    number = next(sheet.get(_RELATION) for sheet in sheets if sheet.get("name") == title and sheet.get(_RELATION))
+    number = next(
+        sheet.get(_RELATION) for sheet in sheets if sheet.get("name") == title and sheet.get(_RELATION)
+    )
     relations = ElementTree.fromstring(packed.read("xl/_rels/workbook.xml.rels"))
     target = next(relation.get("Target") for relation in relations if relation.get("Id") == number)
     return target.removeprefix("/") if target.startswith("/") else f"xl/{target}"

@@ -12,7 +12,8 @@ from sealfit.units import Units
 
 OF_CONDITIONS = ("steady", "dynamic")  # `quantity` of the rows that are parameters of a condition
 OF_LAWS = ("mu_s", "mu_c", "F_s", "F_c")  # and of those that are parameters of an aging law
-PARAMETERS = ("mu_s", "mu_c", "F_s", "F_c", "v_s", "sigma_2", "sigma_0", "sigma_1")  # in the order of the equations
+# In the order of the equations.
+PARAMETERS = ("mu_s", "mu_c", "F_s", "F_c", "v_s", "sigma_2", "sigma_0", "sigma_1")
 ESTIMATE = ("value", "se", "lo95", "hi95", "u_sys", "unit", "before", "identified", "reason", "model")
 ERRORS = {
     "rmse_N": "rms error of the bins, in sample",
@@ -40,7 +41,9 @@ def with_units(frame: pd.DataFrame, units: Units, schema: Schema | None = None) 
     {'units': {'force_N': 'mN m'}}
     """
     columns = {column.name: column for column in schema.columns} if schema else {}
-    found = {name: units.of(name) or (columns[name].unit if name in columns else "") for name in map(str, frame)}
+    found = {
+        name: units.of(name) or (columns[name].unit if name in columns else "") for name in map(str, frame)
+    }
     frame.attrs = {"units": {name: unit for name, unit in found.items() if unit}}
     if schema:
         frame.attrs["meaning"] = {name: columns[name].meaning for name in map(str, frame) if name in columns}
@@ -118,7 +121,7 @@ def scatter(closure: Mapping) -> pd.DataFrame:
 
 
 def sensitivity(closure: Mapping) -> pd.DataFrame:
-    """Return a row per variable, level and target: the smallest effect that would have been found with 80 % chance."""
+    """Return a row per variable, level and target: the smallest effect to be found with 80 % chance."""
     return _listed(closure["sensitivity"], SENSITIVITY, ("smallest_N", "smallest_pct", "files_needed"))
 
 
@@ -134,12 +137,13 @@ def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
 
 # ---------------------------------------------------------------- fits
 def parameters(fits: Sequence[pd.DataFrame], before: Sequence[pd.DataFrame], config: Config) -> pd.DataFrame:
-    """Return a row per condition and parameter of Eqs. 1 to 14; unaged rubber has such rows in each of its series.
+    """Return a row per condition and parameter of Eqs. 1 to 14; unaged rubber has them in each of its series.
 
     Parameters
     ----------
     fits, before : sequence of DataFrame
-        Tables `steady_fit` and `dynamic_fit` of the answer, and the same without effects, for column `before`.
+        Tables `steady_fit` and `dynamic_fit` of the answer, and the same without effects, for column
+        `before`.
     config : Config
         Names the condition columns.
     """
@@ -182,7 +186,7 @@ def _with_before(rows: pd.DataFrame, before: pd.DataFrame, keys: list[str]) -> p
 
 
 def _starting_series(rows: pd.DataFrame, config: Config) -> pd.DataFrame:
-    """Return the rows with those of unaged rubber once in every series of that rubber, under the series' columns."""
+    """Return the rows, those of unaged rubber once in each of its series, under the series' columns."""
     days = rows["aging_days"].to_numpy(float)
     aged, unaged = rows[days > 0], rows[~(days > 0)]
     columns = [name for name in ("series", *config.series_columns, *config.rubber) if name in rows]

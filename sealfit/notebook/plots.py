@@ -42,7 +42,7 @@ class Plots:
         self._current = current  # gives the store if a step is current, else raises
 
     def before_after(self) -> Figure:
-        """Return the errors before and after with the noise floor, and how the errors of the run means are spread."""
+        """Return the errors before and after with the noise floor, and the spread of run means' errors."""
         return self._drawn("before_after")
 
     def effect_shapes(self) -> Figure:
@@ -62,11 +62,11 @@ class Plots:
         return self._drawn("force_speed")
 
     def aging(self) -> Figure:
-        """Return the coefficients over aging time, a panel per series: the law with its band, and each condition."""
+        """Return the coefficients over aging time, a panel per series: law with band, and each condition."""
         return self._drawn("aging")
 
     def master_curve(self) -> Figure:
-        """Return the values of all series over aging time at one temperature, with the law for all of them."""
+        """Return the values of all series over aging time at one temperature, with the law for them all."""
         return self._drawn("master_curve")
 
     def starts(self) -> Figure:
@@ -83,6 +83,7 @@ class Plots:
         plots = draw_all(tables, closure, store.config)
         if name not in plots:
             raise RequestError(
-                f"these results have nothing to draw in the figure '{name}'.", fix=f"They have: {', '.join(plots)}."
+                f"these results have nothing to draw in the figure '{name}'.",
+                fix=f"They have: {', '.join(plots)}.",
             )
         return compose(plots[name], ShownFigure)

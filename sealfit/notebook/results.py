@@ -91,9 +91,10 @@ def _path(given: str | Path | None) -> Path | None:
 class Results:
     """What sealfit found in a campaign: tables, plots, predictions and lifetimes.
 
-    Everything is read when it is asked for. If it is missing, or the campaign, the config or the program has changed
-    since, StaleError says which command brings it up to date. `attrs["units"]` of every table has the unit of a column.
-    Parameters and laws are those of the answer: with the loop's effects taken out, where it added some.
+    Everything is read when it is asked for. If it is missing, or the campaign, the config or the program has
+    changed since, StaleError says which command brings it up to date. `attrs["units"]` of every table has the
+    unit of a column. Parameters and laws are those of the answer: with the loop's effects taken out, where it
+    added some.
     """
 
     def __init__(self, out: str | Path, effects_folder: str | Path | None = None):
@@ -140,7 +141,7 @@ class Results:
 
     @property
     def sensitivity(self) -> pd.DataFrame:
-        """A row per variable, level and target: the smallest effect that would have been found with 80 % chance."""
+        """A row per variable, level and target: the smallest effect to be found with 80 % chance."""
         store, closure = self._closure()
         return frames.with_units(frames.sensitivity(closure), store.config.units)
 
@@ -158,7 +159,7 @@ class Results:
 
     @property
     def laws(self) -> pd.DataFrame:
-        """A row per series, quantity and parameter of the aging law (Eq. 15); empty where no rubber was aged."""
+        """A row per series, quantity and parameter of the aging law (Eq. 15); empty if no rubber was aged."""
         store = self._current(ANSWERED)
         fit, before = self._answer(store, "aging_fit"), store.read("aging_fit")
         return frames.with_units(frames.laws(fit, before, store.config), store.config.units)
@@ -193,7 +194,9 @@ class Results:
             If there is no such model.
         """
         if model not in commands.MODELS:
-            raise RequestError(f"there is no model '{model}'.", fix=f"Choose one of: {', '.join(commands.MODELS)}.")
+            raise RequestError(
+                f"there is no model '{model}'.", fix=f"Choose one of: {', '.join(commands.MODELS)}."
+            )
         return self.table(f"residuals_{model}")
 
     def traces(self, condition: str | None = None) -> pd.DataFrame:
@@ -207,7 +210,7 @@ class Results:
         return self._of_condition("traces", condition)
 
     def mean_traces(self, condition: str | None = None) -> pd.DataFrame:
-        """Return a row per run and displacement: the mean of the repeats; `condition` and errors as `traces`."""
+        """Return a row per run and displacement: the mean of repeats; `condition` and errors as `traces`."""
         return self._of_condition("traces_mean", condition)
 
     def table(self, name: str) -> pd.DataFrame:
@@ -229,12 +232,13 @@ class Results:
         return Plots(self._current)
 
     def predict(self, points: pd.DataFrame) -> pd.DataFrame:
-        """Return the points with the force at each, before and after, and 95 % intervals, as `sealfit predict` does.
+        """Return the points with the force, before and after, and 95 % intervals, as `sealfit predict` does.
 
         Parameters
         ----------
         points : DataFrame
-            The condition columns, signed `speed_mm_s`, and what else the model needs; a message says what is missing.
+            The condition columns, signed `speed_mm_s`, and what else the model needs; a message says what is
+            missing.
 
         Raises
         ------

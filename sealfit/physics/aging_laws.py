@@ -27,15 +27,16 @@ def aging_law(days, *, mu_0, a, b):
 
     .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b)
 
-    This is Eq. 15 with c = -a ln b, the only c for which mu(0) = mu_0. As printed, Eq. 15 is not identifiable: only
-    mu_0 - c is determined.
+    This is Eq. 15 with c = -a ln b, the only c for which mu(0) = mu_0. As printed, Eq. 15 is not
+    identifiable: only mu_0 - c is determined.
 
     Parameters
     ----------
     days : float or ndarray, shape (n,)
         Aging time t in days, at least 0.
     mu_0, a, b : float or ndarray
-        Value of the unaged rubber; loss per factor e of time, same unit; time at which the loss sets in, in days.
+        Value of the unaged rubber; loss per factor e of time, same unit; time at which the loss sets in, in
+        days.
 
     Raises
     ------
@@ -94,12 +95,13 @@ def aging_law_as_printed(days, *, mu_0, a, b, c):
 # All are :math:`\mu(t) = \mu_0 - a\, \varphi(t)` with :math:`\varphi(0) = 0`:
 #
 # - ``log``, Eq. 15: :math:`\ln(1 + t/b)`. Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102.
-# - ``stretched``: :math:`1 - e^{-(t/\tau)^\beta}`, with the limit :math:`\mu_0 - a`, as in the relaxation of glassy or
-#   cross-linked networks. Kohlrausch 1854, Ann. Phys. 167, 56-82, doi:10.1002/andp.18541670103.
+# - ``stretched``: :math:`1 - e^{-(t/\tau)^\beta}`, with the limit :math:`\mu_0 - a`, as in the relaxation of
+#   glassy or cross-linked networks. Kohlrausch 1854, Ann. Phys. 167, 56-82, doi:10.1002/andp.18541670103.
 # - ``power``: :math:`t^n` with t in days; n = 1/2 for diffusion. Findley, Lai & Onaran 1976, Creep and
 #   Relaxation of Nonlinear Viscoelastic Materials, chapter 2.
-# - ``induction``: :math:`\ln(1 + \max(t - t_i, 0)/b)`, no loss before the stabiliser is consumed. For induction periods
-#   of elastomers: Celina 2013, Polym. Degrad. Stab. 98(12), 2419-2429, doi:10.1016/j.polymdegradstab.2013.06.024.
+# - ``induction``: :math:`\ln(1 + \max(t - t_i, 0)/b)`, no loss before the stabiliser is consumed. For
+#   induction periods of elastomers: Celina 2013, Polym. Degrad. Stab. 98(12), 2419-2429,
+#   doi:10.1016/j.polymdegradstab.2013.06.024.
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,8 @@ class Loss:
     time : callable
         (phi, *parameters) -> days until the loss is phi; inf if it is not reached.
     slopes : callable
-        (days, *parameters) -> derivatives of phi with respect to ln t and the logarithm of each parameter, broadcast.
+        (days, *parameters) -> derivatives of phi with respect to ln t and the logarithm of each parameter,
+        broadcast.
     """
 
     name: str

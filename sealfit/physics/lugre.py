@@ -1,16 +1,16 @@
-r"""The dynamic LuGre model (Eqs. 1 to 7): friction force for any history of the speed and any pressure distribution.
+r"""The dynamic LuGre model (Eqs. 1 to 7): friction force for any speed history and any pressure distribution.
 
 .. math::
-    \dot z = v - \frac{|v|}{g(v)} z, \quad g(v) = \frac{N}{\sigma_0} [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}], \quad
-    F = \sigma_0 z + \sigma_1 \dot z + \sigma_2 v
+    \dot z = v - \frac{|v|}{g(v)} z, \quad g(v) = \frac{N}{\sigma_0} [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}],
+    \quad F = \sigma_0 z + \sigma_1 \dot z + \sigma_2 v
 
-Every element of the contact has the share :math:`f_n / F_n` of sigma_0 and sigma_1 (Eqs. 5 to 7). All elements then
-have the same deflection, and the distribution cancels. If friction depends on the local pressure, :math:`\mu \propto
-p^{n-1}`, elements under different pressure slide after different distances, and the force does not rise as one
-exponential.
+Every element of the contact has the share :math:`f_n / F_n` of sigma_0 and sigma_1 (Eqs. 5 to 7). All
+elements then have the same deflection, and the distribution cancels. If friction depends on the local
+pressure, :math:`\mu \propto p^{n-1}`, elements under different pressure slide after different distances, and
+the force does not rise as one exponential.
 
-Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10.1109/9.376053; Wu et al. 2020, Polymers
-12(1), 102, doi:10.3390/polym12010102.
+Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10.1109/9.376053; Wu et al.
+2020, Polymers 12(1), 102, doi:10.3390/polym12010102.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class LuGre:
     contact: Contact | None = None
 
     def limit_mm(self, speed_mm_s, load_N: float) -> np.ndarray:
-        """Return the elements' deflection in steady sliding in mm, shape (..., elements), by `bristle_limit`."""
+        """Return the deflections in steady sliding in mm, shape (..., elements), by `bristle_limit`."""
         numbers = {"mu_s": self.mu_s, "mu_c": self.mu_c, "v_s": self.v_s, "sigma_0": self.sigma_0}
         return np.asarray(bristle_limit(speed_mm_s, load_N, **numbers))[..., None] * self.elements(load_N)[1]
 
@@ -120,8 +120,8 @@ class LuGre:
 def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_mm: float = 0.0) -> Bristles:
     """Return the friction force of the dynamic LuGre model along a history of the speed (Eqs. 1 to 7), in N.
 
-    An array of speeds is constant between times, and each step is exact. A function of the time is integrated by a
-    stiff solver (LSODA).
+    An array of speeds is constant between times, and each step is exact. A function of the time is integrated
+    by a stiff solver (LSODA).
 
     Parameters
     ----------
@@ -148,13 +148,14 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
 
     Notes
     -----
-    The heat is not negative with sigma_1 = 0. With damping this is true for every history if and only if sigma_2 >=
-    sigma_1 (mu_s - mu_c) / mu_c (Barahanov & Ortega 2000, IEEE Trans. Automatic Control 45(4), 830-832,
-    doi:10.1109/9.847131).
+    The heat is not negative with sigma_1 = 0. With damping this is true for every history if and only if
+    sigma_2 >= sigma_1 (mu_s - mu_c) / mu_c (Barahanov & Ortega 2000, IEEE Trans. Automatic Control 45(4),
+    830-832, doi:10.1109/9.847131).
 
     Examples
     --------
-    From rest at 2 mm/s the force rises over a length of 0.25 mm; the first step reaches half of its final value.
+    From rest at 2 mm/s the force rises over a length of 0.25 mm; the first step reaches half of its final
+    value.
 
     >>> import numpy as np
     >>> model = LuGre(mu_s=0.5, mu_c=0.5, v_s=5.0, sigma_0=100.0)
@@ -168,7 +169,9 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
             "time_s must be one-dimensional and increasing.", fix="Sort the rows and drop repeated times."
         )
     if not (model.sigma_1 >= 0 and model.sigma_2 >= 0):
-        raise ParameterError(f"sigma_1 = {model.sigma_1:g}, sigma_2 = {model.sigma_2:g}: neither can be negative.")
+        raise ParameterError(
+            f"sigma_1 = {model.sigma_1:g}, sigma_2 = {model.sigma_2:g}: neither can be negative."
+        )
     share = model.elements(load_N)[0]
     limit = partial(model.limit_mm, load_N=load_N)
     start = np.full(share.size, float(deflection_mm))
@@ -178,7 +181,9 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
     else:
         speed = np.asarray(speed_mm_s, float)
         if speed.shape != time.shape:
-            raise ParameterError(f"speed_mm_s has shape {speed.shape}, time_s {time.shape}: give one speed a time.")
+            raise ParameterError(
+                f"speed_mm_s has shape {speed.shape}, time_s {time.shape}: give one speed a time."
+            )
         z = _stepped(time, speed, limit(speed), start)
     rate = speed[:, None] - np.abs(speed)[:, None] * z / limit(speed)
     force = (model.sigma_0 * z + model.sigma_1 * rate) @ share + model.sigma_2 * speed
@@ -186,13 +191,15 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
 
 
 def _stepped(time: np.ndarray, speed: np.ndarray, limit: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return every element's deflection, shape (n, elements), exact for a speed that is constant between times."""
+    """Return every element's deflection, shape (n, elements), exact for a speed constant between times."""
     slid = np.abs(speed) * np.diff(time, prepend=time[0])
     kept, end = np.exp(-slid[:, None] / limit), np.sign(speed)[:, None] * limit
     paths = []
     for ends, shares, begin in zip(end.T.tolist(), kept.T.tolist(), start.tolist(), strict=True):
         steps = accumulate(
-            zip(ends, shares, strict=True), lambda now, step: step[0] + (now - step[0]) * step[1], initial=begin
+            zip(ends, shares, strict=True),
+            lambda now, step: step[0] + (now - step[0]) * step[1],
+            initial=begin,
         )
         paths.append(list(steps)[1:])
     return np.array(paths).T

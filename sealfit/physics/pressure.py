@@ -9,7 +9,8 @@ import numpy as np
 
 from sealfit.errors import ParameterError
 
-# Gauss-Legendre nodes and weights. 64 are exact to rounding for all four distributions, up to a decay of about 50.
+# Gauss-Legendre nodes and weights. 64 are exact to rounding for all four distributions, up to a decay of
+# about 50.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
@@ -66,7 +67,8 @@ def exponential(zeta_mm, load_N, *, width_mm, decay=1.0):
 
     .. math:: f_n = \frac{\lambda F_n}{L (1 - e^{-\lambda})} e^{-\lambda\zeta/L}
 
-    Parameters and errors as `uniform`; `decay` is lambda, dimensionless. At 0 it is `uniform`; below 0 it increases.
+    Parameters and errors as `uniform`; `decay` is lambda, dimensionless. At 0 it is `uniform`; below 0 it
+    increases.
 
     Examples
     --------
@@ -80,7 +82,9 @@ def exponential(zeta_mm, load_N, *, width_mm, decay=1.0):
 
 
 def parabolic(zeta_mm, load_N, *, width_mm):
-    r"""Load per unit width, a parabola (Eq. 11), in N/mm: :math:`\frac{3F_n}{2L}[1 - (\frac{\zeta - L/2}{L/2})^2]`.
+    r"""Load per unit width, a parabola (Eq. 11), in N/mm.
+
+    .. math:: f_n = \frac{3F_n}{2L} [1 - (\frac{\zeta - L/2}{L/2})^2]
 
     Parameters and errors as `uniform`.
 
@@ -127,7 +131,7 @@ class Contact:
     shape: Mapping[str, float] = field(default_factory=dict)
 
     def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return each element's share of the load and its mu relative to the reference, shape (elements,) each.
+        """Return each element's share of the load and mu relative to the reference, shape (elements,) each.
 
         Raises
         ------

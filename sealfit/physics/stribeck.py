@@ -36,7 +36,9 @@ def stribeck_decay(speed_mm_s, v_s):
     """
     v_s = np.asarray(v_s, float)
     if not np.all(v_s > 0):
-        raise ParameterError(f"v_s = {np.min(v_s):g}: the Stribeck speed must be positive.", fix="Give v_s > 0.")
+        raise ParameterError(
+            f"v_s = {np.min(v_s):g}: the Stribeck speed must be positive.", fix="Give v_s > 0."
+        )
     return np.exp(-((np.asarray(speed_mm_s, float) / v_s) ** 2))
 
 
@@ -48,7 +50,8 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
     Parameters
     ----------
     speed_mm_s, load_N : float or ndarray, shape (n,)
-        Sliding speed v in mm/s, signed; normal load N in N. A load of 1 turns the coefficients into forces F_s, F_c.
+        Sliding speed v in mm/s, signed; normal load N in N. A load of 1 turns the coefficients into forces
+        F_s, F_c.
     mu_s, mu_c, v_s, sigma_2 : float or ndarray, shape (n,)
         Static and Coulomb coefficients; Stribeck speed in mm/s; viscous coefficient in N s/mm.
 

@@ -52,12 +52,17 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
     found = []
     for key, label, of in rows:
         before, after = closure["before"].get(key), closure["after"].get(key)
-        texts = together([before, after, closure.get("noise_floor_N") if key in ("rmse_N", "heldout_rmse_N") else None])
+        texts = together(
+            [before, after, closure.get("noise_floor_N") if key in ("rmse_N", "heldout_rmse_N") else None]
+        )
         change = _change(before, after) if known(before) and known(after) and before else NOTHING
         found.append({"label": label, "unit": of, "before": texts[0], "after": texts[1], "change": change})
     p = [closure[stage].get("lack_of_fit_p") for stage in ("before", "after")]
     texts = [p_value(value).removeprefix("= ") if known(value) else NOTHING for value in p]
-    return [*found, {"label": "lack of fit, p", "unit": "", "before": texts[0], "after": texts[1], "change": ""}]
+    return [
+        *found,
+        {"label": "lack of fit, p", "unit": "", "before": texts[0], "after": texts[1], "change": ""},
+    ]
 
 
 def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
@@ -67,8 +72,12 @@ def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
         {
             "variable": channel_label(entry["variable"], config.units),
             "level": level_words(entry["level"]),
-            "smallest": of_unit(number(entry["smallest_N"], 2), unit) if known(entry["smallest_N"]) else "none",
-            "share": of_unit(number(entry["smallest_pct"], 2), "%") if known(entry["smallest_pct"]) else NOTHING,
+            "smallest": of_unit(number(entry["smallest_N"], 2), unit)
+            if known(entry["smallest_N"])
+            else "none",
+            "share": of_unit(number(entry["smallest_pct"], 2), "%")
+            if known(entry["smallest_pct"])
+            else NOTHING,
             "files": f"{entry['files_needed']:,}" if known(entry["files_needed"]) else NOTHING,
         }
         for entry in closure.get("sensitivity") or ()
@@ -79,7 +88,8 @@ def refused_rows(closure: Mapping, config: Config) -> list[dict]:
     """Return the significant effects that were not accepted: label, p-value and reason."""
     return [
         {
-            "label": f"{entry['id']} along {joined([channel_label(c, config.units) for c in entry['channels']])}",
+            "label": f"{entry['id']} along "
+            f"{joined([channel_label(c, config.units) for c in entry['channels']])}",
             "p": p_value(entry["p_value"]),
             "reason": entry["reason"],
         }
@@ -108,7 +118,9 @@ def effect_cards(closure: Mapping, config: Config) -> list[dict]:
                 "candidate": effect["candidate"],
                 "note": effect.get("note") or "",
                 "acts": acts(effect, config),
-                "given": "factor minus one" if effect["operation"] == "multiply" else f"added {_added(effect, config)}",
+                "given": "factor minus one"
+                if effect["operation"] == "multiply"
+                else f"added {_added(effect, config)}",
                 "form": effect["form"],
                 "reference": effect.get("reference") or "",
                 "level": level_words(effect["level"]),
@@ -117,7 +129,9 @@ def effect_cards(closure: Mapping, config: Config) -> list[dict]:
                 "p": p_value(effect.get("p_value")),
                 "gain": of_unit(number(gain, 2), unit) if known(gain) else "",
                 "left": of_unit(number(left), unit) if known(left) else "",
-                "rivals": list(dict.fromkeys(_rival(rival, config) for rival in effect.get("alternatives") or [])),
+                "rivals": list(
+                    dict.fromkeys(_rival(rival, config) for rival in effect.get("alternatives") or [])
+                ),
             }
         )
     return cards
@@ -181,7 +195,7 @@ def scatter_rows(closure: Mapping, config: Config) -> list[dict]:
 
 
 def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config: Config) -> list[dict]:
-    """Return the part of the residual that each variable explains, before and after, the most significant first."""
+    """Return the part of the residual each variable explains, before and after, most significant first."""
     tested = levels[levels["channel"].notna()]
     if tested.empty:
         return []
@@ -210,7 +224,9 @@ def next_runs(closure: Mapping, config: Config) -> list[dict]:
         wanted = entry.get("conditions")
         wanted = wanted if isinstance(wanted, list) else [wanted] if wanted else []
         why = true_units(str(entry.get("why", "")), config.units)
-        found.append({"why": why[:1].upper() + why[1:], "conditions": [_wanted(one, names, config) for one in wanted]})
+        found.append(
+            {"why": why[:1].upper() + why[1:], "conditions": [_wanted(one, names, config) for one in wanted]}
+        )
     return found
 
 
@@ -220,7 +236,11 @@ def _wanted(one: object, names: ConditionNames, config: Config) -> str:
         return names(one)
     parts = []
     for name, value in one.items():
-        text = given(float(value)) if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
+        text = (
+            given(float(value))
+            if isinstance(value, int | float) and not isinstance(value, bool)
+            else str(value)
+        )
         if name == "direction" and text in ("1", "−1"):
             text = "forward" if text == "1" else "backward"
         unit = config.units.of(name)

@@ -79,7 +79,7 @@ def decimals(size: float, digits: int = 2) -> int:
 
 
 def measured(value: float | None, lo: float | None, hi: float | None, digits: int = 2) -> tuple[str, str]:
-    """Return a value and its interval, both rounded to `digits` significant digits of the interval's half-width.
+    """Return a value and its interval, rounded to `digits` significant digits of the interval's half-width.
 
     With `digits` 1, a half-width that begins with 1 keeps two: one would round it by up to a third.
 
@@ -97,7 +97,9 @@ def measured(value: float | None, lo: float | None, hi: float | None, digits: in
     if not known(value):
         return NOTHING, NOTHING
     if not (known(lo) and known(hi)):
-        return number(value), f"from {number(lo)}" if known(lo) else f"up to {number(hi)}" if known(hi) else NOTHING
+        return number(value), f"from {number(lo)}" if known(lo) else f"up to {number(hi)}" if known(
+            hi
+        ) else NOTHING
     if hi == lo:
         return number(value), f"[{number(lo)}, {number(hi)}]"
     power = _power(max(abs(value), abs(lo), abs(hi)))
@@ -111,7 +113,7 @@ def measured(value: float | None, lo: float | None, hi: float | None, digits: in
 
 
 def together(values: Sequence[float | None], digits: int = 2) -> list[str]:
-    """Return several numbers of one unit with the same decimals: the smallest shows `digits` significant ones.
+    """Return numbers of one unit with the same decimals: the smallest shows `digits` significant ones.
 
     Examples
     --------
@@ -201,22 +203,24 @@ def _fixed(value: float, places: int) -> str:
 # ---------------------------------------------------------------- symbols
 
 GREEK = {
-    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "zeta": "ζ", "eta": "η", "theta": "θ",
-    "kappa": "κ", "lambda": "λ", "mu": "μ", "nu": "ν", "xi": "ξ", "rho": "ρ", "sigma": "σ", "tau": "τ", "phi": "φ",
-    "chi": "χ", "psi": "ψ", "omega": "ω",
+    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "zeta": "ζ", "eta": "η",
+    "theta": "θ", "kappa": "κ", "lambda": "λ", "mu": "μ", "nu": "ν", "xi": "ξ", "rho": "ρ", "sigma": "σ",
+    "tau": "τ", "phi": "φ", "chi": "χ", "psi": "ψ", "omega": "ω",
 }  # fmt: skip
 _SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])(?:_?([0-9]+)|_([A-Za-z0-9]{{1,4}}))?")
 _SLOTS = ("speed_set_mm_s", "displacement_from_mm", "displacement_to_mm", "displacement_mm", "distance_mm",
           "speed_mm_s", "force_N", "load_N")  # fmt: skip
 _SLOT = re.compile(rf"\b(?:{'|'.join(_SLOTS)})\b")
-_STATISTICS = {"rmse_N": "rms error", "reduced_chi2": "χ² / df", "lack_of_fit_p": "lack of fit, p", "n_runs": "runs",
-               "n_files": "files", "n_speeds": "speeds", "n_days": "days tested", "last_day": "last day",
-               "rmse": "rms error", "max_error_pct": "largest error",
+_STATISTICS = {"rmse_N": "rms error", "reduced_chi2": "χ² / df", "lack_of_fit_p": "lack of fit, p",
+               "n_runs": "runs", "n_files": "files", "n_speeds": "speeds", "n_days": "days tested",
+               "last_day": "last day", "rmse": "rms error", "max_error_pct": "largest error",
                "specimen_sd_pct": "specimen scatter"}  # fmt: skip
 
 
 def symbol_html(name: str) -> Markup:
-    """Return a parameter's symbol as HTML: mu_s as an italic mu with an upright s below; other names as they are.
+    """Return a parameter's symbol as HTML: mu_s as an italic mu with an upright s below.
+
+    Other names stay as they are.
 
     Examples
     --------
@@ -286,12 +290,14 @@ def true_units(text: str, units: Units) -> str:
 
 
 def channel_label(name: str, units: Units) -> str:
-    """Return a channel with its unit, e.g. "sliding distance (mm)"; a column of the campaign's own keeps its name.
+    """Return a channel with its unit, e.g. "sliding distance (mm)"; a campaign's own column keeps its name.
 
     Examples
     --------
-    >>> channel_label("displacement_mm", Units({"displacement": ("angle", "turn")})), channel_label("batch", Units())
-    ('angle (turn)', 'batch')
+    >>> channel_label("displacement_mm", Units({"displacement": ("angle", "turn")}))
+    'angle (turn)'
+    >>> channel_label("batch", Units())
+    'batch'
     """
     quantity, unit = channel_words(name, units), units.of(name)
     return f"{quantity} ({unit})" if unit else quantity
@@ -340,7 +346,9 @@ def effect_label(effect: Mapping, units: Units) -> str:
     >>> effect_label(effect, Units())
     'ripple along displacement'
     """
-    label = re.sub(rf", (?:added to|factor on) {re.escape(str(effect.get('acts_on')))}$", "", str(effect["label"]))
+    label = re.sub(
+        rf", (?:added to|factor on) {re.escape(str(effect.get('acts_on')))}$", "", str(effect["label"])
+    )
     return _SLOT.sub(lambda found: channel_words(found[0], units), label)
 
 

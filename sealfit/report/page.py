@@ -27,7 +27,15 @@ from sealfit.report.loop_tables import (
     scatter_rows,
     sensitivity_rows,
 )
-from sealfit.report.notation import ConditionNames, channel_label, count, given, number, symbol_html, true_units
+from sealfit.report.notation import (
+    ConditionNames,
+    channel_label,
+    count,
+    given,
+    number,
+    symbol_html,
+    true_units,
+)
 from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter_tables
 from sealfit.report.style import Drawn, Plot, data_uri, draw
 from sealfit.report.words import left_over, verdict, with_left_channels
@@ -57,7 +65,11 @@ def campaign_facts(tables: Mapping[str, pd.DataFrame], config: Config) -> list[s
             if low == high
             else f"{low} to {high} repeats per run"
         )
-        speed = used["speed_set_mm_s"].where(used["speed_set_mm_s"].notna(), used["speed_mm_s"].abs()).astype(float)
+        speed = (
+            used["speed_set_mm_s"]
+            .where(used["speed_set_mm_s"].notna(), used["speed_mm_s"].abs())
+            .astype(float)
+        )
         facts.append(f"{units.quantity('speed')} {_range(speed)} {units.unit('speed')}")
         if used["direction"].nunique() > 1:
             facts[-1] += ", both directions"
@@ -125,7 +137,13 @@ def _finding(group: list[Fault], config: Config) -> dict:
     row["check"] = first.check.replace("_", " ")
     if len(group) > 1:
         reason = row["reason"] if one_reason(group) else ""
-        return {**row, "reason": reason, "file": how_many(group), "value": None, "place": "; ".join(examples(group))}
+        return {
+            **row,
+            "reason": reason,
+            "file": how_many(group),
+            "value": None,
+            "place": "; ".join(examples(group)),
+        }
     place = f"line {int(first.line)}" if first.line is not None else ""
     if first.stroke is not None:
         place = f"stroke {int(first.stroke)}{', ' + place if place else ''}"
@@ -168,7 +186,9 @@ def complete(tables: Mapping[str, pd.DataFrame], names: tuple[str, ...]) -> dict
     for name in names:
         frame = tables.get(name)
         if frame is None or not len(frame):
-            frame = pd.DataFrame({c.name: pd.Series(dtype=c.dtype.to_pandas_dtype()) for c in SCHEMAS[name].columns})
+            frame = pd.DataFrame(
+                {c.name: pd.Series(dtype=c.dtype.to_pandas_dtype()) for c in SCHEMAS[name].columns}
+            )
         found[name] = frame
     return found
 
@@ -180,7 +200,15 @@ TABLES = (
     "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves", "effects",
     "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves",
 )  # fmt: skip
-FITS = ("steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves")
+FITS = (
+    "steady_fit",
+    "aging_fit",
+    "aging_curves",
+    "aging_laws",
+    "master_curve",
+    "dynamic_fit",
+    "dynamic_curves",
+)
 BEFORE = "{}_before"  # name of such a table without the loop's effects
 VERDICTS = {
     "closed": "Closed",
@@ -267,7 +295,9 @@ def _content(
     fitted = parameter_tables(tables["steady_fit"], "condition", config, before["steady_fit"])
     fitted += parameter_tables(tables["aging_fit"], "series", config, before["aging_fit"])
     dynamic = tables["dynamic_fit"]
-    fitted += parameter_tables(dynamic[dynamic["quantity"] == "dynamic"], "condition", config, before["dynamic_fit"])
+    fitted += parameter_tables(
+        dynamic[dynamic["quantity"] == "dynamic"], "condition", config, before["dynamic_fit"]
+    )
     break_aways, break_aways_in_all = break_away_rows(dynamic, config)
     findings, in_all = page.quality_findings(tables["quality"], config)
     return {

@@ -31,7 +31,7 @@ MOST_LAWS = 4  # listed per quantity
 
 
 def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> list[dict]:
-    """Return the laws with the lowest BIC of each quantity, and the separate laws, as plain values for the page.
+    """Return each quantity's laws with the lowest BIC, and the separate laws, as plain values for the page.
 
     Parameters
     ----------
@@ -59,7 +59,9 @@ def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> li
                     "criterion": number(first["criterion"]) if rank > 1 else "0",
                     "energy": _with_interval(by, "E"),
                     "kappa": _with_interval(by, "kappa"),
-                    "heldout_series": number(first["heldout_series"]) if known(first["heldout_series"]) else NOTHING,
+                    "heldout_series": number(first["heldout_series"])
+                    if known(first["heldout_series"])
+                    else NOTHING,
                     "heldout_last_day": number(first["heldout_last_day"])
                     if known(first["heldout_last_day"])
                     else NOTHING,
@@ -69,7 +71,9 @@ def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> li
                 }
             )
             if rank == 1 and (rubber, quantity) in earlier:
-                found.append({**earlier[rubber, quantity], "criterion": NOTHING, "chosen": False, "before": True})
+                found.append(
+                    {**earlier[rubber, quantity], "criterion": NOTHING, "chosen": False, "before": True}
+                )
     return found
 
 
@@ -93,7 +97,8 @@ STATISTICS = (
 )  # fmt: skip
 ENDS = ("value", "lo95", "hi95")
 MOST_BREAK_AWAYS = 600
-HIDDEN = ("covariance", "sensor_shift", "effect_shift")  # not shown: for programs that read the Parquet tables
+# not shown: for programs that read the Parquet tables
+HIDDEN = ("covariance", "sensor_shift", "effect_shift")
 
 Rows = dict[tuple[str, str], dict]  # of one condition or series, by parameter and unit
 
@@ -171,8 +176,8 @@ def parameter_tables(
 ) -> list[ParameterTable]:
     """Return the tables of `steady_fit` (key "condition") or `aging_fit` (key "series").
 
-    Quantities with the same parameters share a table; units stand in the head, and where a parameter has another unit
-    than in the head's row it has a column of its own.
+    Quantities with the same parameters share a table; units stand in the head, and where a parameter has
+    another unit than in the head's row it has a column of its own.
 
     Parameters
     ----------
@@ -215,7 +220,13 @@ def _readable(fit: pd.DataFrame, key: str, names: ConditionNames) -> tuple[pd.Da
     every = sorted(fit[key].unique(), key=lambda name: _place(name, names))
     if len(every) <= MOST_ROWS:
         return fit, ""
-    stored = "aging_fit" if key == "series" else "dynamic_fit" if "dynamic" in set(fit["quantity"]) else "steady_fit"
+    stored = (
+        "aging_fit"
+        if key == "series"
+        else "dynamic_fit"
+        if "dynamic" in set(fit["quantity"])
+        else "steady_fit"
+    )
     note = f"{MOST_ROWS} of {count(len(every), key, key if key == 'series' else None)}, selected evenly; "
     return fit[fit[key].isin(spread(every, MOST_ROWS))], f"{note}{stored}.parquet has all."
 
@@ -258,13 +269,19 @@ def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Conf
         keys = (names(name), symbol_html(of)) if several else (names(name),)
         found.append((keys, cells, _note(lack, config, named=False)))
     groups = tuple((Markup("{}").format(quantity_words(p)), u) for p, u in shown)
-    title = "Goodness of fit, per condition" if key == "condition" else "Goodness of fit of the aging law, per series"
+    title = (
+        "Goodness of fit, per condition"
+        if key == "condition"
+        else "Goodness of fit of the aging law, per series"
+    )
     heads = (key, "quantity") if several else (key,)
     return ParameterTable(title, heads, groups, tuple(found), single=True)
 
 
-def _rows_of(fit: pd.DataFrame, key: str, second: str, names: ConditionNames) -> list[tuple[tuple[str, str], Rows]]:
-    """Return ((key, second), rows by parameter and unit): unaged rubber first, then by temperature, ..., days."""
+def _rows_of(
+    fit: pd.DataFrame, key: str, second: str, names: ConditionNames
+) -> list[tuple[tuple[str, str], Rows]]:
+    """Return ((key, second), rows by parameter and unit): unaged first, then by temperature, ..., days."""
     found: dict[tuple[str, str], Rows] = {}
     for row in _records(fit, key, second):
         found.setdefault((row[key], row[second]), {})[row["parameter"], row["unit"] or ""] = row
@@ -279,7 +296,9 @@ def _place(name: str, names: ConditionNames) -> tuple[bool, list]:
 
 def _records(rows: pd.DataFrame, *keys: str) -> list[dict]:
     """Return rows as dictionaries, with None for missing values."""
-    plain = rows[[*keys, "parameter", "unit", "value", "lo95", "hi95", "u_sys", "identified", "reason"]].astype(object)
+    plain = rows[
+        [*keys, "parameter", "unit", "value", "lo95", "hi95", "u_sys", "identified", "reason"]
+    ].astype(object)
     return plain.where(plain.notna(), None).to_dict("records")
 
 

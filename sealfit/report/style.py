@@ -77,7 +77,8 @@ def telling(
     third, picked, said = MOST_PANELS // 3, [], []
     for values, words in ((misfit, "with the largest misfit"), (heat, "hottest")):
         values = np.asarray(values, float)
-        order = [k for k in np.argsort(-values, kind="stable").tolist() if np.isfinite(values[k]) and k not in picked]
+        ranked = np.argsort(-values, kind="stable").tolist()
+        order = [k for k in ranked if np.isfinite(values[k]) and k not in picked]
         if len(set(values[np.isfinite(values)].tolist())) > 1:
             picked += order[:third]
             said.append(f"the {third} {words}")
@@ -89,7 +90,7 @@ def telling(
 
 
 def condition_misfits(tables: Mapping[str, pd.DataFrame]) -> dict[str, float]:
-    """Return the rms misfit of every condition: of the closed loop, or of its own steady fit where that was not run."""
+    """Return every condition's rms misfit: of the closed loop, or of its steady fit if that was not run."""
     residuals = tables["residuals_after"]
     if len(residuals):
         squares = residuals["residual_N"].astype(float) ** 2
@@ -114,7 +115,7 @@ TICK_APART = 0.11  # of the axis: closer ticks would write over each other
 
 
 def is_logarithmic(x: np.ndarray, span: float) -> bool:
-    """Return whether values that span more than a factor lie more evenly on a logarithmic axis than on a linear one."""
+    """Return whether values span more than a factor and are more even on a logarithmic than a linear axis."""
     x = np.unique(x[np.isfinite(x)])
     if len(x) < 3 or x[0] <= 0 or x[-1] / x[0] <= span:
         return False
@@ -175,7 +176,8 @@ def is_number(text: str) -> bool:
 def in_order(values: Iterable[str], key: Callable[[str], str] = str) -> list[str]:
     """Return texts in order, those that are numbers by their size and before the others."""
     return sorted(
-        values, key=lambda value: (0, float(key(value)), "") if is_number(key(value)) else (1, 0.0, key(value))
+        values,
+        key=lambda value: (0, float(key(value)), "") if is_number(key(value)) else (1, 0.0, key(value)),
     )
 
 
@@ -190,7 +192,7 @@ def capital(text: str) -> str:
 
 
 def evenly(count: int, wanted: int) -> list[int]:
-    """Return `wanted` places of `count`, spread evenly from the first to the last; some twice where there are fewer."""
+    """Return `wanted` places of `count`, spread evenly from first to last; some twice if there are fewer."""
     return [round(k * (count - 1) / max(wanted - 1, 1)) for k in range(wanted)]
 
 
@@ -298,7 +300,7 @@ def shades(n: int) -> list[str]:
 
 
 def compose(plot: Plot, kind: type[Figure] = Figure) -> Figure:
-    """Return all panels of a plot in one figure of a `kind`, up to four a row, below its title and its legend."""
+    """Return all panels of a plot in one figure of a `kind`, up to four a row, below its title and legend."""
     columns = min(len(plot.panels), 4 if len(plot.panels) > 6 else 3)
     rows = [plot.panels[k : k + columns] for k in range(0, len(plot.panels), columns)]
     heights = [max(panel.height for panel in row) for row in rows]
@@ -373,25 +375,23 @@ def _as_written(found: re.Match) -> str:
 def _legend_lines(legend: Sequence[Key], width: float) -> int:
     if not legend:
         return 0
-    widest = max(len(key.label) for key in legend) * 0.062 + 0.5  # inches; columns are as wide as their widest entry
+    # inches; columns are as wide as their widest entry
+    widest = max(len(key.label) for key in legend) * 0.062 + 0.5
     return math.ceil(len(legend) / max(1, int((width - 0.1) // widest)))
 
 
 def _handle(key: Key) -> Line2D | Patch:
-    # matplotlib leaves out labels that begin with an underscore
-    label = (
-        symbol_math(key.label)
-        if key.symbol
-        else plain(key.label).replace("_", " ", 1)
-        if key.label[:1] == "_"
-        else plain(key.label)
-    )
+    label = symbol_math(key.label) if key.symbol else plain(key.label)
+    if not key.symbol and key.label[:1] == "_":  # matplotlib leaves out labels that begin with an underscore
+        label = label.replace("_", " ", 1)
     if key.mark in ("band", "bar"):
         return Patch(color=key.colour, alpha=0.25 if key.mark == "band" else 1.0, label=label, linewidth=0)
     if key.mark in ("point", "open", "left"):
         marker = {"point": "o", "open": "o", "left": "<"}[key.mark]
         face = "white" if key.mark == "open" else key.colour
-        return Line2D([], [], color=key.colour, marker=marker, markerfacecolor=face, linestyle="", label=label)
+        return Line2D(
+            [], [], color=key.colour, marker=marker, markerfacecolor=face, linestyle="", label=label
+        )
     style = {"line": "-", "dotted": ":", "dashed": "--"}[key.mark]
     return Line2D([], [], color=key.colour, linestyle=style, label=label)
 
@@ -425,7 +425,8 @@ def draw(plot: Plot) -> Drawn:
     """Return a plot, drawn; equal plots give equal bytes."""
     whole = compose(plot)
     panels = tuple(
-        Image(_svg(panel_figure(panel)), round(CSS * WIDTH), round(CSS * panel.height)) for panel in plot.panels
+        Image(_svg(panel_figure(panel)), round(CSS * WIDTH), round(CSS * panel.height))
+        for panel in plot.panels
     )
     return Drawn(_svg(whole), _saved(whole, "png", {"Software": None}), panels)
 

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 # ---------------------------------------------------------------- summary
 # The main figures of each step as plain values, for --json; `summary_lines` puts them in words.
 
-NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift", "effect_shift")  # `quantity` of rows about the fit itself
+# `quantity` of rows about the fit itself
+NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift", "effect_shift")
 
 OF_INGEST = {  # columns that its summary counts
     "inputs": ["status"],
@@ -47,7 +48,9 @@ def of_steps(store: Store, steps: Iterable[str]) -> dict:
         "fit-steady": lambda: of_fit(store.read("steady_fit"), "condition"),
         "fit-aging": lambda: of_fit(store.read("aging_fit"), "series"),
         "fit-dynamic": lambda: of_dynamic(store.read("dynamic_fit")),
-        "close-loop": lambda: of_closure(store.read_json("closure"), store.config.units) | {"fits": of_after(store)},
+        "close-loop": lambda: (
+            of_closure(store.read_json("closure"), store.config.units) | {"fits": of_after(store)}
+        ),
         "report": lambda: {"file": str(store.out / "report.html")},
     }
     return {step.replace("-", "_"): make[step]() for step in steps}
@@ -65,7 +68,9 @@ def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
         },
         "rows_left_out": int((quality["action"] == "row left out").sum()),
         "strokes_left_out": int((quality["action"] == "stroke left out").sum()),
-        "faults": {severity: int((quality["severity"] == severity).sum()) for severity in ("error", "warning")},
+        "faults": {
+            severity: int((quality["severity"] == severity).sum()) for severity in ("error", "warning")
+        },
         "incomplete_columns": _incomplete(quality),
         "runs": int(runs["run_id"].nunique()),
         "conditions": int(steady["condition"].nunique()),
@@ -82,10 +87,12 @@ def _incomplete(quality: pd.DataFrame) -> list[dict]:
 
 
 def of_fit(fit: pd.DataFrame, of: str) -> dict:
-    """Return the range of every parameter over the conditions or series of `fit` in which it is identified."""
+    """Return the range of each parameter over the conditions or series of `fit` in which it is identified."""
     rows = fit[~fit["quantity"].isin(NOT_PARAMETERS)]
     ranges = []
-    for (quantity, parameter, unit), group in rows.groupby(["quantity", "parameter", "unit"], sort=False, dropna=False):
+    for (quantity, parameter, unit), group in rows.groupby(
+        ["quantity", "parameter", "unit"], sort=False, dropna=False
+    ):
         known = group.loc[group["identified"].astype(bool), "value"].dropna()
         why = group.loc[~group["identified"].astype(bool), "reason"].dropna().mode()
         ranges.append(
@@ -124,7 +131,11 @@ def of_closure(closure: Mapping, units: Units) -> dict:
         "heldout_unit", "left", "next_runs",
     )  # fmt: skip
     effects = [{key: effect[key] for key in EFFECT_KEYS} for effect in closure["effects"]]
-    return {**{key: closure[key] for key in kept}, "sentence": verdict_sentence(closure, units), "effects": effects}
+    return {
+        **{key: closure[key] for key in kept},
+        "sentence": verdict_sentence(closure, units),
+        "effects": effects,
+    }
 
 
 def of_after(store: Store) -> dict:
@@ -147,7 +158,10 @@ def verdict_sentence(closure: Mapping, units: Units) -> str:
         power = power_clause(closure, units)
         return "; ".join(filter(None, ["no effect beyond the declared model is significant", quality, power]))
     if closure["verdict"] == "cannot_tell":
-        return f"{quality}; these files do not decide whether an effect is missing: {untold_clause(closure, units)}"
+        return (
+            f"{quality}; these files do not decide whether an effect is missing: "
+            f"{untold_clause(closure, units)}"
+        )
     if closure["verdict"] == "closed":
         untold = untold_clause(closure, units)
         beside = f"; not decided by these files: {untold}" if untold else ""
@@ -180,7 +194,9 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
                 "form": effect.form,
                 "equation": effect.equation,
                 "reads": list(effect.reads),
-                "acts_on": [{"target": target, "operation": operation} for target, operation in effect.acts_on],
+                "acts_on": [
+                    {"target": target, "operation": operation} for target, operation in effect.acts_on
+                ],
                 "physical": effect.physical,
                 "source": effect.source,
                 "parameters": [
@@ -196,8 +212,9 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
 # Clauses that the summary and the report share: fit quality and sensitivity.
 
 LEVEL_WORDS = {
-    "trace": "along strokes", "sample": "along strokes", "stroke": "between strokes", "repeat": "between repeats",
-    "file": "between repeats", "run": "between runs", "condition": "between specimens", "specimen": "between specimens",
+    "trace": "along strokes", "sample": "along strokes", "stroke": "between strokes",
+    "repeat": "between repeats", "file": "between repeats", "run": "between runs",
+    "condition": "between specimens", "specimen": "between specimens",
 }  # fmt: skip
 """Words for the levels of closure.json and of table `levels`."""
 
@@ -224,12 +241,18 @@ def quality_clause(closure: Mapping) -> str:
 
 
 def power_clause(closure: Mapping, units: Units) -> str:
-    """Return the smallest detectable effects of the least sensitive variables, in a clause; empty if none is known."""
+    """Return the smallest detectable effects of the least sensitive variables, in a clause.
+
+    It is empty if none is known.
+    """
     known = [s for s in closure.get("sensitivity") or () if s["smallest_N"] is not None]
     if not known:
         return ""
     largest = sorted(known, key=lambda s: -s["smallest_N"])[:NAMED]
-    texts = [f"{s['smallest_pct']:.2g} % for {units.label(s['variable'])} {level_words(s['level'])}" for s in largest]
+    texts = [
+        f"{s['smallest_pct']:.2g} % for {units.label(s['variable'])} {level_words(s['level'])}"
+        for s in largest
+    ]
     return f"the largest detection limits, in percent of the force, are {', '.join(texts)}"
 
 
@@ -247,7 +270,11 @@ def untold_clause(closure: Mapping, units: Units) -> str:
     ][:NAMED]
     for entry in [s for s in closure.get("sensitivity") or () if s["cannot_tell"]][:NAMED]:
         name, smallest, files = entry["variable"], entry["smallest_pct"], entry["files_needed"]
-        size = "no effect is detectable" if smallest is None else f"detection limit {smallest:.2g} % of the force"
+        size = (
+            "no effect is detectable"
+            if smallest is None
+            else f"detection limit {smallest:.2g} % of the force"
+        )
         more = f"; 1 % needs about {files} files" if files and smallest is not None else ""
         more = f"; at least {files} files are needed" if files and smallest is None else more
         texts.append(f"{units.label(name)} ({size}{more})")

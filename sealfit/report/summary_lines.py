@@ -37,7 +37,9 @@ def ingest_lines(part: Mapping) -> list[str]:
     if files["not_matched"]:
         text += f", {files['not_matched']} not matched by the file-name pattern"
     found = [line("files", text)]
-    left_out = [_count(part[f"{what}s_left_out"], what) for what in ("stroke", "row") if part[f"{what}s_left_out"]]
+    left_out = [
+        _count(part[f"{what}s_left_out"], what) for what in ("stroke", "row") if part[f"{what}s_left_out"]
+    ]
     if sum(faults.values()):
         text = f"{_count(faults['error'], 'error')}, {_count(faults['warning'], 'warning')}"
         more = f"; left out: {', '.join(left_out)}" if left_out else ""
@@ -59,7 +61,9 @@ def _fit_lines(title: str, part: Mapping) -> list[str]:
         found.append(line(title if not found else "", name + ", ".join(texts)))
     lacking = [entry for entry in ranges if entry["identified"] < entry["of"]]
     if lacking:
-        names = [f"{e['quantity']} {e['parameter']}" if len(quantities) > 1 else e["parameter"] for e in lacking]
+        names = [
+            f"{e['quantity']} {e['parameter']}" if len(quantities) > 1 else e["parameter"] for e in lacking
+        ]
         texts = [
             f"{name} in {entry['of'] - entry['identified']} of {entry['of']}" if entry["of"] > 1 else name
             for name, entry in zip(names, lacking, strict=True)
@@ -74,8 +78,8 @@ def dynamic_lines(part: Mapping) -> list[str]:
     found = _fit_lines("pre-sliding", part)
     if part["above_sliding"]:
         more = f"{part['largest_ratio'] - 1:.1%} at most, {part['largest_at']}"
-        text = f"above the sliding force in {part['above_sliding']} of {part['break_aways']} cases of condition, speed "
-        text += f"and direction ({more})"
+        text = f"above the sliding force in {part['above_sliding']} of {part['break_aways']} cases "
+        text += f"of condition, speed and direction ({more})"
         found.append(line("break-away", text))
     return found
 
@@ -100,7 +104,12 @@ def closure_lines(part: Mapping) -> list[str]:
         found.append(line("", f"{status}{effect['label']}: {values}"))
         if not effect["candidate"]:
             found.append(line("", f"  reference state of the coefficients: {effect['reference']}"))
-    rows = (("rmse", "rmse_N"), ("held out", "heldout_rmse_N"), ("run means", "rmse_runs_N"), ("largest", "max_abs_N"))
+    rows = (
+        ("rmse", "rmse_N"),
+        ("held out", "heldout_rmse_N"),
+        ("run means", "rmse_runs_N"),
+        ("largest", "max_abs_N"),
+    )
     texts = [f"{name} {_number(before[key])} -> {_number(after[key])}" for name, key in rows]
     found.append(line(f"error ({unit})", "; ".join(texts)))
     if part["noise_floor_N"] is not None:
@@ -141,7 +150,9 @@ def effects_lines(listed: Mapping) -> list[str]:
         for p in effect["parameters"]:
             found.append(f"    {p['name']}{' [' + p['unit'] + ']' if p['unit'] else ''}: {p['meaning']}")
     if listed.get("added", ()) is None:
-        found.append("The loop of this OUT has not been run or is out of date, so its effects are not listed.")
+        found.append(
+            "The loop of this OUT has not been run or is out of date, so its effects are not listed."
+        )
     if listed.get("note"):
         found.append(f"note: {listed['note']}")
     return found
@@ -149,7 +160,9 @@ def effects_lines(listed: Mapping) -> list[str]:
 
 def predict_lines(part: Mapping) -> list[str]:
     """Return the lines of a prediction."""
-    text = f"{part['answered']} of {_count(part['rows'], 'row')} predicted, {part['extrapolated']} extrapolated"
+    text = (
+        f"{part['answered']} of {_count(part['rows'], 'row')} predicted, {part['extrapolated']} extrapolated"
+    )
     refused = part["rows"] - part["answered"]
     if refused:
         text += f"; {_count(refused, 'row')} not predicted (reason in column note)"
@@ -181,7 +194,9 @@ def lifetime_lines(part: Mapping) -> list[str]:
     if part.get("ci95_resampled"):
         found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
     if part.get("ci95_over_laws") and part["rivals"] and part["days"]:
-        found.append(line("", f"95 % interval over all laws, weighted: {_days_between(part['ci95_over_laws'])}"))
+        found.append(
+            line("", f"95 % interval over all laws, weighted: {_days_between(part['ci95_over_laws'])}")
+        )
     if part.get("before"):
         found.append(line("before", f"{_life(part['before'])}, without the effects"))
     for rival in part["rivals"]:
@@ -216,7 +231,10 @@ def _life(part: Mapping) -> str:
             return f"it lasts less than {years} at every temperature {span}"
         low, high = part["tested_C"]
         beyond = f" (extrapolated: tested from {low:g} to {high:g} degC)" if part["extrapolated"] else ""
-        return f"it lasts {years} at {part['temperature_C']:.1f} degC{_degrees(part['temperature_ci95'])}{beyond}"
+        return (
+            f"it lasts {years} at {part['temperature_C']:.1f} degC"
+            f"{_degrees(part['temperature_ci95'])}{beyond}"
+        )
     if part["days"] is None:
         return f"{part['threshold']:.4g} is not reached within 1e9 d"
     if part["days"] == 0:

@@ -27,8 +27,8 @@ from sealfit.report.notation import (
 )
 from sealfit.report.summary import level_words, power_clause, quality_clause, untold_clause
 
-# A shape that crosses zero by at most this share of its span counts as one of constant sign. 0.02 is about the
-# resolution of a plot.
+# A shape that crosses zero by at most this share of its span counts as one of constant sign. 0.02 is about
+# the resolution of a plot.
 FLAT = 0.02
 COUNTED = dict(enumerate(["two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"], start=2))
 # The verdict gives the sizes of at most this many effects; the sizes of more are in their cards.
@@ -72,11 +72,15 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
     return _sentences(lacked, left, *errors)
 
 
-def _missed_effects(added: Sequence[tuple[int, Mapping]], shapes: pd.DataFrame, config: Config) -> list[Markup]:
+def _missed_effects(
+    added: Sequence[tuple[int, Mapping]], shapes: pd.DataFrame, config: Config
+) -> list[Markup]:
     """Return each effect with its size; of more than `DETAILED` effects only the names, each once."""
     labels = [effect_label(effect, config.units) for _, effect in added]
     if len(added) <= DETAILED:
-        return [_missed(label, does(k, e, shapes, config)) for label, (k, e) in zip(labels, added, strict=True)]
+        return [
+            _missed(label, does(k, e, shapes, config)) for label, (k, e) in zip(labels, added, strict=True)
+        ]
     times = {label: labels.count(label) for label in labels}
     return [Markup("{}").format(label if n == 1 else f"{label} ({n} of them)") for label, n in times.items()]
 
@@ -102,7 +106,11 @@ def error_clause(closure: Mapping, config: Config) -> Markup:
     else:
         way = "falls" if after < before else "rises"
         change = f"the {what} {way} from {of_unit(texts[0], unit)} to {of_unit(texts[1], unit)}"
-    end = f"noise floor: {of_unit(texts[2], unit)}" if known(floor) else "noise floor unknown: there are no repeats"
+    end = (
+        f"noise floor: {of_unit(texts[2], unit)}"
+        if known(floor)
+        else "noise floor unknown: there are no repeats"
+    )
     return Markup("{} ({})").format(change, end)
 
 
@@ -117,17 +125,21 @@ def does(index: int, effect: Mapping, shapes: pd.DataFrame, config: Config) -> M
 def parameter(p: Mapping, effect: Mapping) -> Markup:
     """Return "time constant τ = 4.0 s [3.6, 4.5]", in words for an effect of the catalogue."""
     words = meaning(effect["id"], p["name"])
-    text = Markup("{} = {}").format(symbol_html(p["name"]), _measured(p["value"], p.get("ci95"), p.get("unit")))
+    text = Markup("{} = {}").format(
+        symbol_html(p["name"]), _measured(p["value"], p.get("ci95"), p.get("unit"))
+    )
     return Markup("{} {}").format(words, text) if words and len(words) <= 40 else text
 
 
 def _measured(value: float | None, ends: Sequence[float | None] | None, unit: str | None) -> str:
     text, interval = measured(value, *(ends or (None, None)), digits=1)
-    return of_unit(text, unit or "") + (f" {interval}".replace(", ", ",\u00a0") if interval != NOTHING else "")
+    return of_unit(text, unit or "") + (
+        f" {interval}".replace(", ", ",\u00a0") if interval != NOTHING else ""
+    )
 
 
 def _change(effect: Mapping, shape: pd.DataFrame, config: Config) -> Markup:
-    """Return the largest change of the target along the first variable, and where it occurs; empty for none."""
+    """Return the target's largest change along the first variable, and where it occurs; empty for none."""
     shape = shape[shape["x"].notna() & shape["value"].notna()]
     if len(shape) < 2:
         return Markup("")
@@ -138,32 +150,43 @@ def _change(effect: Mapping, shape: pd.DataFrame, config: Config) -> Markup:
     if not span > 0:
         return Markup("")
     factor = effect["operation"] == "multiply"
-    scale, unit = (100.0, "%") if factor else (1.0, next((u for u in shape["unit"] if isinstance(u, str) and u), ""))
+    scale, unit = (
+        (100.0, "%") if factor else (1.0, next((u for u in shape["unit"] if isinstance(u, str) and u), ""))
+    )
     what = target_html(effect["acts_on"], config)
     if channel == "direction":
-        return Markup("{} differs by {} between directions").format(what, of_unit(number(scale * span, 2), unit))
+        return Markup("{} differs by {} between directions").format(
+            what, of_unit(number(scale * span, 2), unit)
+        )
     if max(-value.min(), 0.0) > FLAT * span and max(value.max(), 0.0) > FLAT * span:
         size = of_unit(number(scale * span, 2), unit)
         return Markup("{} varies by {} along {}").format(what, size, channel_words(channel, config.units))
-    k = int(np.argmax(np.abs(value)))  # constant sign: the largest change against the model without the effect
+    # constant sign: the largest change against the model without the effect
+    k = int(np.argmax(np.abs(value)))
     sign = 1.0 if value[k] > 0 else -1.0
     ends = sorted((scale * sign * lo[k], scale * sign * hi[k]))
     way = "rises" if sign > 0 else "falls"
     size = _measured(scale * abs(value[k]), ends, unit)
     place = of_unit(given(float(shape["x"].iloc[k])), config.units.of(channel) or "")
-    return Markup("{} {} by up to {} at {} {}").format(what, way, size, channel_words(channel, config.units), place)
+    return Markup("{} {} by up to {} at {} {}").format(
+        what, way, size, channel_words(channel, config.units), place
+    )
 
 
 def target_html(target: str, config: Config) -> Markup:
     """Return the target of an effect: a symbol, or the name of the measured force."""
-    return Markup("the {}").format(config.units.quantity("force")) if target == "force" else symbol_html(target)
+    return (
+        Markup("the {}").format(config.units.quantity("force")) if target == "force" else symbol_html(target)
+    )
 
 
 def acts(effect: Mapping, config: Config) -> Markup:
     """Return how an effect enters the model, in a clause."""
     if effect["acts_on"] == "force":
         force = config.units.quantity("force")
-        return Markup("scales the whole {}" if effect["operation"] == "multiply" else "adds to the {}").format(force)
+        return Markup(
+            "scales the whole {}" if effect["operation"] == "multiply" else "adds to the {}"
+        ).format(force)
     name = {"mu": Markup("the friction coefficient {}").format(symbol_html("mu"))}.get(effect["acts_on"])
     name = name or symbol_html(effect["acts_on"])
     return Markup("scales {}" if effect["operation"] == "multiply" else "adds to {}").format(name)
@@ -174,7 +197,11 @@ def meaning(effect_id: str, name: str) -> str:
     from sealfit.effects import EFFECTS
 
     effect = EFFECTS.get(effect_id)
-    return next((p.meaning for p in effect.parameters if p.name.rstrip("_") == name.rstrip("_")), "") if effect else ""
+    return (
+        next((p.meaning for p in effect.parameters if p.name.rstrip("_") == name.rstrip("_")), "")
+        if effect
+        else ""
+    )
 
 
 def _amplitudes(effect: Mapping) -> set[str]:
@@ -195,7 +222,9 @@ def left_over(closure: Mapping, config: Config) -> Markup:
         said.append(f"the rms error of all bins is {of_unit(size, unit)}{beside}")
         if known(floor) and known(left.get("rmse_N")) and 0 < left["rmse_N"] < rmse:
             excess = of_unit(number(left["rmse_N"], 2), unit)
-            said.append(f"the excess over the noise floor is {excess} (root of the difference of the squares)")
+            said.append(
+                f"the excess over the noise floor is {excess} (root of the difference of the squares)"
+            )
     if closure["verdict"] == "unexplained":
         said.append(f"a significant residual remains: {_where(left, config)}")
     elif left.get("channels") and any(effect["candidate"] for effect in closure["effects"]):

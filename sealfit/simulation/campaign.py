@@ -65,11 +65,15 @@ def load_truth(path: Path) -> dict:
     try:
         document = json.loads(Path(path).read_text("utf-8"))
     except OSError as error:
-        raise RequestError(f"cannot be read ({error.strerror}).", file=path, fix="Simulate the campaign.") from error
+        raise RequestError(
+            f"cannot be read ({error.strerror}).", file=path, fix="Simulate the campaign."
+        ) from error
     except ValueError as error:
         document = error
     if not isinstance(document, dict) or document.get("made_by") != MADE_BY:
-        raise RequestError("is not the truth of a simulated campaign.", file=path, fix="Simulate the campaign anew.")
+        raise RequestError(
+            "is not the truth of a simulated campaign.", file=path, fix="Simulate the campaign anew."
+        )
     return document
 
 
@@ -81,8 +85,9 @@ def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
     truth : mapping
         The document of `load_truth`.
     points : DataFrame
-        `speed_mm_s` (signed), the condition columns that the design has, and the channels that its effects read, in the
-        names of sealfit's tables. `load_N` may be left out where the design has one load, `direction` always.
+        `speed_mm_s` (signed), the condition columns that the design has, and the channels that its effects
+        read, in the names of sealfit's tables. `load_N` may be left out where the design has one load,
+        `direction` always.
 
     Returns
     -------
@@ -105,7 +110,9 @@ def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
     needed = dict.fromkeys(["speed_mm_s", *own, *(name for e in law.effects for name in e.channels)])
     for name in needed:
         if name not in table:
-            raise RequestError("the points lack a column.", column=name, fix="Add it; the truth depends on it.")
+            raise RequestError(
+                "the points lack a column.", column=name, fix="Add it; the truth depends on it."
+            )
         if table[name].isna().any():
             raise RequestError(
                 f"the points have {int(table[name].isna().sum())} empty cells.", column=name, fix="Fill them."
@@ -122,14 +129,27 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
     spec : Spec
         What was simulated.
     files : DataFrame
-        One row per file and direction: `file`, `run_id`, `direction`, `speed_mm_s` (real, signed), `mean_force_N`
-        (noise-free, over the steady rows), `gain`, `offset_N`, `outlier`, `defect`, and the condition columns.
+        One row per file and direction: `file`, `run_id`, `direction`, `speed_mm_s` (real, signed),
+        `mean_force_N` (noise-free, over the steady rows), `gain`, `offset_N`, `outlier`, `defect`, and the
+        condition columns.
     effect_rms_N : ndarray, shape (effects,)
         RMS over all steady rows of what each effect adds to the force.
     """
     conditions = [name for name in CONDITIONS if name in files]
-    per_file = ["file", "run_id", "direction", "speed_mm_s", "mean_force_N", "gain", "offset_N", "outlier", "defect"]
-    runs = files.groupby(["run_id", "direction"], sort=False)["mean_force_N"].mean().round(DIGITS).reset_index()
+    per_file = [
+        "file",
+        "run_id",
+        "direction",
+        "speed_mm_s",
+        "mean_force_N",
+        "gain",
+        "offset_N",
+        "outlier",
+        "defect",
+    ]
+    runs = (
+        files.groupby(["run_id", "direction"], sort=False)["mean_force_N"].mean().round(DIGITS).reset_index()
+    )
     both = spec.design.strokes_per_file > 1
     sign = runs["direction"].map({1: "+", -1: "-"})
     runs["run_id"] = runs["run_id"] + sign if both else runs["run_id"]
@@ -157,7 +177,8 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
         "noise": [kind.model_dump(mode="json") for kind in spec.noise],
         "runs": runs.to_dict("records"),
         "files": [
-            {**row, "defect": row["defect"] if isinstance(row["defect"], str) else None}  # pandas makes NaN of None
+            # pandas makes NaN of None
+            {**row, "defect": row["defect"] if isinstance(row["defect"], str) else None}
             for row in files[per_file].round(DIGITS).to_dict("records")
         ],
     }
@@ -170,7 +191,8 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
 DISPLACEMENT_DECIMALS = 5
 # Keys and derived channels that ingest computes.
 NOT_IN_RUNS = ["condition", "direction", "run_order", "elapsed_h"]
-# Smallest speed at which effects are evaluated, as a share of the set speed. A law in log speed is not defined at 0.
+# Smallest speed at which effects are evaluated, as a share of the set speed. A law in log speed is not
+# defined at 0.
 CRAWL = 1e-3
 # Number of rows per file for the RMS of an effect. It gives two digits.
 RMS_ROWS = 64
@@ -213,7 +235,9 @@ def simulate(spec: Spec, out: Path) -> None:
             os.replace(part / "truth.json", truth_path(out))
         except OSError as error:
             raise OutError(
-                f"cannot be written ({error.strerror}).", file=out, fix="Check the disk and the folder's permissions."
+                f"cannot be written ({error.strerror}).",
+                file=out,
+                fix="Check the disk and the folder's permissions.",
             ) from error
     finally:
         if (part / "old").exists() and not out.exists():
@@ -247,14 +271,18 @@ def _write(spec: Spec, folder: Path) -> dict:
     spec = spec.risen()
     files = add_channels(plan_files(spec.design, draws.stream("order")), spec.channels, draws)
     scatter = draw_scatter(spec.noise, files, draws)
-    starts = spec.design.start_mm + spec.design.start_scatter_mm * draws.stream("start").standard_normal(len(files))
+    starts = spec.design.start_mm + spec.design.start_scatter_mm * draws.stream("start").standard_normal(
+        len(files)
+    )
     defects = draw_defects(spec.noise, len(files), draws)
     squares, weights, known = np.zeros(len(law.effects)), 0, []
     records = files.to_dict("records")
     for number, record in enumerate(records):
         speed = record["speed_mm_s"] * scatter.speed[number]
         motion = move(spec.design, speed, record["direction"], starts[number])
-        along = {c.name: _along(c, motion, number, draws) for c in spec.channels if isinstance(c, TraceChannel)}
+        along = {
+            c.name: _along(c, motion, number, draws) for c in spec.channels if isinstance(c, TraceChannel)
+        }
         channels = _channels(record, motion, along)
         setup = SetUp(number, speed, scatter.gain[number], scatter.offset_N[number])
         force = _force(spec, law, motion, channels, setup, draws)
@@ -297,7 +325,7 @@ def _along(channel: TraceChannel, motion: Motion, number: int, draws: Draws) -> 
 
 
 def _channels(record: dict, motion: Motion, along: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return a file's channels in the names of sealfit's tables: those of the file of shape (1,), the others (n,)."""
+    """Return a file's channels as sealfit's tables name them: shape (1,) for those of the file, else (n,)."""
     return {
         **{name: np.array([value]) for name, value in record.items()},
         **along,
@@ -327,10 +355,13 @@ def _force(
     limit, viscous, added = (np.broadcast_to(part, motion.time_s.shape) for part in parts)
     if not (np.isfinite(limit + viscous).all() and np.isfinite(added).all()):
         raise ConfigError(
-            f"the effects give no number in {channels['file'][0]}.", fix="Check their parameters and formulas."
+            f"the effects give no number in {channels['file'][0]}.",
+            fix="Check their parameters and formulas.",
         )
     if spec.physics.sigma_0 is None:  # all that friction is comes up over one length
-        friction = with_presliding(limit + viscous, motion, np.full(motion.time_s.size, spec.design.stiffness_mm))
+        friction = with_presliding(
+            limit + viscous, motion, np.full(motion.time_s.size, spec.design.stiffness_mm)
+        )
     else:
         friction = _dynamic(spec, law, motion, channels, setup.speed_mm_s) + viscous
     clean = setup.gain * friction + added + setup.offset_N
@@ -339,8 +370,10 @@ def _force(
     return np.round(quantised(spec.noise, noisy), spec.force_decimals)
 
 
-def _dynamic(spec: Spec, law: SteadyLaw, motion: Motion, channels: dict[str, np.ndarray], speed: float) -> np.ndarray:
-    """Return the bristles' force in N, shape (n,), followed through the ramps in steps finer than the file's rows."""
+def _dynamic(
+    spec: Spec, law: SteadyLaw, motion: Motion, channels: dict[str, np.ndarray], speed: float
+) -> np.ndarray:
+    """Return the bristles' force in N, (n,), followed through the ramps in finer steps than the file's."""
     time = finer(motion, spec.design, speed)
     between = {
         name: np.interp(time, motion.time_s, values) if len(values) == motion.time_s.size else values
@@ -358,8 +391,9 @@ def _dynamic(spec: Spec, law: SteadyLaw, motion: Motion, channels: dict[str, np.
 def _begun(spec: Spec, motion: Motion, speed: float) -> dict[str, np.ndarray]:
     """Return the channels by which a rest is the beginning of motion.
 
-    At rest the bristles keep the last direction: a crawl stands for it, at which the law gives the break-away force.
-    Within a bristle's length nothing has slid yet, nor at the clock's zero: a law in their logarithm starts after.
+    At rest the bristles keep the last direction: a crawl stands for it, at which the law gives the break-away
+    force. Within a bristle's length nothing has slid yet, nor at the clock's zero: a law in their logarithm
+    starts after.
     """
     return {
         "speed_mm_s": motion.direction * np.maximum(np.abs(motion.speed_mm_s), CRAWL * speed),

@@ -29,7 +29,10 @@ class NumericChannel(Strict):
 
 
 class SlowChannel(Strict):
-    """A number per file that varies slowly, as a laboratory temperature: Ornstein-Uhlenbeck process and daily sine."""
+    """A number per file that varies slowly, as a laboratory temperature.
+
+    It is an Ornstein-Uhlenbeck process with a daily sine added.
+    """
 
     kind: Literal["slow"]
     name: str
@@ -100,7 +103,9 @@ Channel = Annotated[
 
 
 def add_channels(files: pd.DataFrame, channels: tuple[Channel, ...], draws: Draws) -> pd.DataFrame:
-    """Return `files` with every channel that is logged once per file; those within the trace come from `trace_channel`.
+    """Return `files` with every channel that is logged once per file.
+
+    Channels within the trace come from `trace_channel`.
 
     Raises
     ------

@@ -34,8 +34,12 @@ class Growth(Strict):
     """The dependence of `a` on temperature and compression, for series that are not listed."""
 
     reference_temperature_C: float = Field(60.0, description="temperature at which `a` is as declared")
-    doubling_C: float = Field(40.0, gt=0, description="degrees that double `a`; ten is van 't Hoff's rule for a rate")
-    reference_compression_pct: float = Field(80.0, description="compression ratio at which `a` is as declared")
+    doubling_C: float = Field(
+        40.0, gt=0, description="degrees that double `a`; ten is van 't Hoff's rule for a rate"
+    )
+    reference_compression_pct: float = Field(
+        80.0, description="compression ratio at which `a` is as declared"
+    )
     per_pct: float = Field(0.005, description="relative growth of `a` per percent of height taken away")
 
     def factor(self, temperature_C, compression_pct):
@@ -64,22 +68,26 @@ class Physics(Strict):
     mu_c: Law = Law(mu_0=0.609, a=0.03307, b=0.1324)
     v_s: float = Field(5.0, gt=0, description="mm/s")
     sigma_2: float = Field(0.05, description="N s/mm")
-    sigma_0: float | None = Field(None, gt=0, description="N/mm; none: every rise is design.stiffness_mm long")
+    sigma_0: float | None = Field(
+        None, gt=0, description="N/mm; none: every rise is design.stiffness_mm long"
+    )
     sigma_1: float = Field(0.0, ge=0, description="N s/mm; only with sigma_0")
     growth: Growth | None = Field(None, description="none: one law for all series")
     series: tuple[SeriesLaw, ...] = ()
 
 
 def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the parameters of the declared model without effects at given conditions: `QUANTITIES`, shape (n,) each.
+    """Return the parameters of the declared model without effects at given conditions.
+
+    They are `QUANTITIES`, shape (n,) each.
 
     Parameters
     ----------
     physics : Physics
         The SPEC's.
     conditions : mapping of str to ndarray, shape (n,)
-        `temperature_C`, `compression_ratio_pct` and `aging_days`, those that the design has. Unaged rubber (day 0) has
-        v_s and sigma_2 of `physics` itself, whatever its temperature cell says.
+        `temperature_C`, `compression_ratio_pct` and `aging_days`, those that the design has. Unaged rubber
+        (day 0) has v_s and sigma_2 of `physics` itself, whatever its temperature cell says.
     """
     n = len(next(iter(conditions.values()))) if conditions else 1
     temperature = conditions.get("temperature_C")
@@ -102,7 +110,10 @@ def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) 
         values["a_s"], values["a_c"] = values["a_s"] * factor, values["a_c"] * factor
     for series in physics.series:
         own = np.asarray(days) > 0
-        for wanted, found in ((series.temperature_C, temperature), (series.compression_ratio_pct, compression)):
+        for wanted, found in (
+            (series.temperature_C, temperature),
+            (series.compression_ratio_pct, compression),
+        ):
             if wanted is not None:
                 own = own & (found == wanted if found is not None else False)
         for name in ("a_s", "b_s", "a_c", "b_c", "v_s", "sigma_2"):
@@ -123,10 +134,16 @@ class EffectEntry(Strict):
 
     id: str
     channels: tuple[str, ...] = Field((), description="in the order in which the effect reads them")
-    acts_on: Target | None = Field(None, description="default: the catalogue's likeliest; force for an expression")
-    operation: Operation | None = Field(None, description="default: the catalogue's likeliest; add for an expression")
+    acts_on: Target | None = Field(
+        None, description="default: the catalogue's likeliest; force for an expression"
+    )
+    operation: Operation | None = Field(
+        None, description="default: the catalogue's likeliest; add for an expression"
+    )
     parameters: dict[str, float] = Field(default_factory=dict)
-    reference: dict[str, float] = Field(default_factory=dict, description="where it is zero or one, e.g. load_N_ref")
+    reference: dict[str, float] = Field(
+        default_factory=dict, description="where it is zero or one, e.g. load_N_ref"
+    )
     knots: tuple[float, ...] = Field((), description="of a smooth shape")
     formula: str | None = Field(None, description="of an expression")
 
@@ -136,7 +153,11 @@ class EffectEntry(Strict):
             raise ValueError("id = 'expression' and formula belong together")
         if self.formula is not None:
             try:
-                unknown = [n for n in sorted(parse(self.formula).names) if n not in (*self.channels, *self.parameters)]
+                unknown = [
+                    n
+                    for n in sorted(parse(self.formula).names)
+                    if n not in (*self.channels, *self.parameters)
+                ]
             except ConfigError as error:
                 raise ValueError(str(error)) from None
             if self.channels and unknown:
@@ -156,7 +177,8 @@ class BoundEffect:
     operation: Operation
     form: str
     parameters: Mapping[str, float]
-    shape: Callable[[Mapping[str, np.ndarray]], np.ndarray]  # channels -> added force, factor minus one or change
+    # channels -> added force, factor minus one or change
+    shape: Callable[[Mapping[str, np.ndarray]], np.ndarray]
 
 
 def resolve_effects(entries: Sequence[EffectEntry]) -> tuple[BoundEffect, ...]:
@@ -165,7 +187,8 @@ def resolve_effects(entries: Sequence[EffectEntry]) -> tuple[BoundEffect, ...]:
     Raises
     ------
     ConfigError
-        If an id, a parameter or the number of channels is not the catalogue's, or an effect cannot act on a target.
+        If an id, a parameter or the number of channels is not the catalogue's, or an effect cannot act on a
+        target.
     """
     return tuple(_resolve(entry, f"effects.{number} ({entry.id})") for number, entry in enumerate(entries))
 
@@ -226,14 +249,17 @@ def _check_parameters(entry: EffectEntry, effect: Effect, place: str) -> None:
     wanted = {p.name: p for p in effect.parameters}
     for name in entry.parameters:
         if name not in wanted:
-            raise ConfigError(f"{place}: has no parameter '{name}'.", fix=f"Its parameters: {', '.join(wanted)}.")
+            raise ConfigError(
+                f"{place}: has no parameter '{name}'.", fix=f"Its parameters: {', '.join(wanted)}."
+            )
     for name, parameter in wanted.items():
         if name not in entry.parameters:
             raise ConfigError(f"{place}: parameter '{name}' is missing.", fix=f"{name}: {parameter.meaning}.")
         low, high = parameter.bounds
         if not parameter.linear and not low <= entry.parameters[name] <= high:
             raise ConfigError(
-                f"{place}: parameter '{name}' is {entry.parameters[name]:g}.", fix=f"Give {low:g} to {high:g}."
+                f"{place}: parameter '{name}' is {entry.parameters[name]:g}.",
+                fix=f"Give {low:g} to {high:g}.",
             )
 
 
@@ -247,7 +273,9 @@ def _target(entry: EffectEntry, effect: Effect, place: str) -> tuple[Target, Ope
         return pairs[0]
     known = ", ".join(f"{target} by {operation}" for target, operation in effect.acts_on)
     wanted = " by ".join(part for part in (entry.acts_on, entry.operation) if part)
-    raise ConfigError(f"{place}: cannot act on {wanted}.", fix=f"It acts on {known}; write an expression for others.")
+    raise ConfigError(
+        f"{place}: cannot act on {wanted}.", fix=f"It acts on {known}; write an expression for others."
+    )
 
 
 def _expression(entry: EffectEntry) -> BoundEffect:
@@ -275,7 +303,9 @@ def _levels(entry: EffectEntry) -> BoundEffect:
         return np.where(labels[place] == found, values[place], 0.0)  # 0 for a category without a value
 
     target, operation = entry.acts_on or "force", entry.operation or "add"
-    return BoundEffect(LEVELS, (channel,), target, operation, "value of the level", dict(entry.parameters), shape)
+    return BoundEffect(
+        LEVELS, (channel,), target, operation, "value of the level", dict(entry.parameters), shape
+    )
 
 
 def _as_label(values: np.ndarray) -> np.ndarray:

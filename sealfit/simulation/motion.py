@@ -27,7 +27,8 @@ class Motion:
     """The sampled motion of one file, and the mask of steady sliding; arrays of shape (n,)."""
 
     time_s: np.ndarray  # from the start of the file
-    stroke_time_s: np.ndarray  # `time_s` of sealfit's tables: from the start of the stroke if there are several
+    # `time_s` of sealfit's tables: from the start of the stroke if there are several
+    stroke_time_s: np.ndarray
     displacement_mm: np.ndarray
     distance_mm: np.ndarray
     speed_mm_s: np.ndarray  # signed; zero at rest
@@ -55,7 +56,9 @@ def move(design: Design, speed_mm_s: float, direction: int, start_mm: float) -> 
     total = design.strokes_per_file * period + 0.5 * rest
     step = max(1.0 / design.sampling_Hz, total / (design.max_rows - 1))
     step = np.ceil(np.round(step / TICK_S, 6)) * TICK_S
-    return move_at(design, speed_mm_s, direction, start_mm, np.round(np.arange(int(total / step) + 1) * step, 5))
+    return move_at(
+        design, speed_mm_s, direction, start_mm, np.round(np.arange(int(total / step) + 1) * step, 5)
+    )
 
 
 def move_at(design: Design, speed_mm_s: float, direction: int, start_mm: float, time: np.ndarray) -> Motion:
@@ -83,7 +86,7 @@ def move_at(design: Design, speed_mm_s: float, direction: int, start_mm: float, 
 
 
 def _phases(design: Design, speed_mm_s: float) -> tuple[float, float, float, float]:
-    """Return the durations in s of a ramp, of the rest before a stroke, of constant speed, and of their sum."""
+    """Return the durations in s of a ramp, the rest before a stroke, constant speed, and their sum."""
     ramp = min(design.ramp_s, 0.1 * design.stroke_mm / speed_mm_s)
     rest = min(design.dwell_s, 0.1 * design.stroke_mm / speed_mm_s)
     cruise = design.stroke_mm / speed_mm_s - ramp
@@ -109,7 +112,9 @@ def _trapezoid(
     up, down = since < ramp, remaining < ramp
     rate = speed / ramp if ramp > 0.0 else 0.0
     distance = np.where(
-        up, 0.5 * rate * since**2, np.where(down, length - 0.5 * rate * remaining**2, speed * (since - 0.5 * ramp))
+        up,
+        0.5 * rate * since**2,
+        np.where(down, length - 0.5 * rate * remaining**2, speed * (since - 0.5 * ramp)),
     )
     moving = (since > 0.0) & (remaining > 0.0)
     distance = np.where(moving, distance, np.where(since > 0.0, length, 0.0))
@@ -117,13 +122,15 @@ def _trapezoid(
     return distance, np.where(moving, now, 0.0)
 
 
-def with_presliding(limit_N: np.ndarray, motion: Motion, rise_mm: np.ndarray, damping_s: float = 0.0) -> np.ndarray:
+def with_presliding(
+    limit_N: np.ndarray, motion: Motion, rise_mm: np.ndarray, damping_s: float = 0.0
+) -> np.ndarray:
     r"""Return the bristle force sigma_0 z + sigma_1 dz/dt in N, shape (n,).
 
     .. math:: dF/dx = (F_{limit} - F) / x_0
 
-    This is Eq. 2 over the distance x for F = sigma_0 z, with x_0 = g, the length of the rise. At constant speed only
-    the initial difference decays, so that the force of steady sliding has no lag.
+    This is Eq. 2 over the distance x for F = sigma_0 z, with x_0 = g, the length of the rise. At constant
+    speed only the initial difference decays, so that the force of steady sliding has no lag.
 
     Parameters
     ----------
@@ -136,7 +143,9 @@ def with_presliding(limit_N: np.ndarray, motion: Motion, rise_mm: np.ndarray, da
     damping_s : float
         sigma_1 / sigma_0 in s.
     """
-    decay = np.exp(-np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0])) / rise_mm).tolist()
+    decay = np.exp(
+        -np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0])) / rise_mm
+    ).tolist()
     result = limit_N.astype(float)
     phase = 2 * motion.stroke + motion.cruising
     edges = np.flatnonzero(np.diff(phase, prepend=-1, append=-1))
@@ -170,8 +179,9 @@ CONDITIONS = ("temperature_C", "compression_ratio_pct", "aging_days")
 class SteadyLaw:
     """The force of steady sliding as a function of the channels.
 
-    Effects are applied in this order: on mu_0, a, b, v_s and sigma_2; on mu_s and mu_c; factors on mu, then terms added
-    to mu; factors on the friction force, viscous term included; added forces, signed as in the file.
+    Effects are applied in this order: on mu_0, a, b, v_s and sigma_2; on mu_s and mu_c; factors on mu, then
+    terms added to mu; factors on the friction force, viscous term included; added forces, signed as in the
+    file.
     """
 
     physics: Physics
@@ -182,13 +192,13 @@ class SteadyLaw:
         return replace(self, effects=tuple(e for k, e in enumerate(self.effects) if k != number))
 
     def parts(self, channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the steady bristle force, the viscous part and the added forces, in N, broadcast over the channels.
+        """Return the steady bristle force, viscous part and added forces, in N, broadcast over the channels.
 
         Parameters
         ----------
         channels : mapping of str to ndarray
-            `speed_mm_s` (signed), the condition columns and `load_N` of the design, and all channels that the effects
-            read; shape (n,) or (1,) each.
+            `speed_mm_s` (signed), the condition columns and `load_N` of the design, and all channels that the
+            effects read; shape (n,) or (1,) each.
 
         Raises
         ------
@@ -226,7 +236,12 @@ class SteadyLaw:
         return [e for e in self.effects if (e.acts_on, e.operation) == (target, operation)]
 
     def _changed(
-        self, target: str, value: np.ndarray, channels: Mapping[str, np.ndarray], *, factors_first: bool = False
+        self,
+        target: str,
+        value: np.ndarray,
+        channels: Mapping[str, np.ndarray],
+        *,
+        factors_first: bool = False,
     ) -> np.ndarray:
         own = [e for e in self.effects if e.acts_on == target]
         if factors_first:
@@ -249,7 +264,7 @@ def steady_law(spec: Spec) -> SteadyLaw:
 
 
 def law_of_condition(physics: Physics, condition: Mapping[str, float]) -> dict[str, float]:
-    """Return the parameters of the declared model at one condition without effects, mu_s and mu_c included."""
+    """Return the declared model's parameters at one condition without effects, mu_s and mu_c included."""
     given = {name: np.array([condition[name]], dtype=float) for name in CONDITIONS if name in condition}
     values = {name: float(value[0]) for name, value in declared_parameters(physics, given).items()}
     days = float(condition.get("aging_days", 0.0))

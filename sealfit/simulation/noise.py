@@ -15,8 +15,8 @@ from scipy.signal import lfilter
 from sealfit.config import Strict
 
 # ---------------------------------------------------------------- draws
-# Random numbers depend only on the seed and their purpose. Adding a kind of noise or a channel to a SPEC changes no
-# other draw, so that campaigns can be compared draw by draw.
+# Random numbers depend only on the seed and their purpose. Adding a kind of noise or a channel to a SPEC
+# changes no other draw, so that campaigns can be compared draw by draw.
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Draws:
 
 
 def remembering(kicks: np.ndarray, memory: float) -> np.ndarray:
-    """Return unit noise with correlation `memory` between neighbours, from independent unit `kicks`, shape (n,).
+    """Return unit noise with correlation `memory` of neighbours, from independent unit `kicks`, shape (n,).
 
     It is the exact discretisation of a stationary Ornstein-Uhlenbeck process at equal steps.
     """
@@ -76,7 +76,7 @@ class RepeatGain(Strict):
 
 
 class RunSetup(Strict):
-    """A random factor on the friction and a random offset of the force of every run, common to its repeats."""
+    """A random factor on friction and a random offset of the force of every run, common to its repeats."""
 
     kind: Literal["run_setup"]
     sd_rel: float = Field(0.0, ge=0)
@@ -193,7 +193,12 @@ def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, draws: Draws) -> S
 
 
 def sample_noise_N(
-    noise: Sequence[Noise], force_N: np.ndarray, time_s: np.ndarray, speed_mm_s: float, file: int, draws: Draws
+    noise: Sequence[Noise],
+    force_N: np.ndarray,
+    time_s: np.ndarray,
+    speed_mm_s: float,
+    file: int,
+    draws: Draws,
 ) -> np.ndarray:
     """Return the noise of one trace's samples in N, shape (n,): white, autocorrelated and proportional.
 
@@ -216,9 +221,11 @@ def sample_noise_N(
             case Proportional():
                 total += kind.sd_rel * np.abs(force_N) * random.standard_normal(n)
             case Autocorrelated():
-                step = {"samples": 1.0, "s": time_s[1] - time_s[0], "mm": (time_s[1] - time_s[0]) * speed_mm_s}[
-                    kind.unit
-                ]
+                step = {
+                    "samples": 1.0,
+                    "s": time_s[1] - time_s[0],
+                    "mm": (time_s[1] - time_s[0]) * speed_mm_s,
+                }[kind.unit]
                 total += kind.sd_N * remembering(random.standard_normal(n), np.exp(-step / kind.length))
     return total
 

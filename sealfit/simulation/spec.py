@@ -1,4 +1,4 @@
-"""What a SPEC says: rubber, rig, design, effects and scatter, checked on load; and the files that it plans."""
+"""What a SPEC says: rubber, rig, design, effects and scatter, checked on load; and the files it plans."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from sealfit.simulation.noise import Noise
 # ---------------------------------------------------------------- design
 # The design of a SPEC and the table of files that it plans, in the order in which they are measured.
 
-# Number of rise lengths after which sliding counts as steady: the force has reached 1 - exp(-9) = 0.9999 of its limit.
+# Number of rise lengths after which sliding counts as steady: the force has reached 1 - exp(-9) = 0.9999 of
+# its limit.
 STEADY_LENGTHS = 9.0
 
 
@@ -32,8 +33,12 @@ class Design(Strict):
     """The runs of a campaign, the rig, and the order of tests."""
 
     temperatures_C: tuple[float, ...] = Field((60.0,), description="empty: no such column")
-    compressions_pct: tuple[Annotated[float, Field(gt=0)], ...] = Field((80.0,), description="empty: no such column")
-    days: tuple[Annotated[float, Field(gt=0)], ...] = Field((1.0, 2.0, 4.0, 8.0), description="days of the aged rubber")
+    compressions_pct: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        (80.0,), description="empty: no such column"
+    )
+    days: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        (1.0, 2.0, 4.0, 8.0), description="days of the aged rubber"
+    )
     unaged: bool = Field(True, description="unaged rubber too, as day 0; false and no days: no such column")
     unaged_temperature_C: float = 23.0
     unaged_compression_pct: float = Field(100.0, gt=0)
@@ -51,12 +56,16 @@ class Design(Strict):
     sampling_Hz: float = Field(1000.0, gt=0, description="slower where a file would have more than max_rows")
     max_rows: int = Field(1000, ge=40)
     stiffness_mm: float = Field(0.3, gt=0, description="length of the pre-sliding rise")
-    ramp_s: float = Field(0.2, ge=0, description="speed ramp at start and stop; at most a tenth of the sliding time")
-    dwell_s: float = Field(0.5, ge=0, description="rest before every stroke; at most a tenth of the sliding time")
+    ramp_s: float = Field(
+        0.2, ge=0, description="speed ramp at start and stop; at most a tenth of the sliding time"
+    )
+    dwell_s: float = Field(
+        0.5, ge=0, description="rest before every stroke; at most a tenth of the sliding time"
+    )
     order: Literal["calendar", "randomised", "listed", "undated"] = Field(
         "calendar",
-        description="calendar: day by day as the rubber ages, runs of a day at random; randomised: all runs at random; "
-        "listed: as written here; undated: no started_at",
+        description="calendar: day by day as the rubber ages, runs of a day at random; "
+        "randomised: all runs at random; listed: as written here; undated: no started_at",
     )
     first_start: datetime = datetime(2024, 1, 8, 8, 0, 0)
     minutes_per_file: float = Field(4.0, gt=0)
@@ -98,7 +107,9 @@ class Design(Strict):
             raise ValueError(f"max_rows must be at least {40 * self.strokes_per_file}: 40 per stroke")
         fastest = self.stroke_mm / max(self.speeds_mm_s) * self.sampling_Hz
         if fastest < 40:
-            raise ValueError(f"only {fastest:.0f} samples in the fastest stroke: raise sampling_Hz or stroke_mm")
+            raise ValueError(
+                f"only {fastest:.0f} samples in the fastest stroke: raise sampling_Hz or stroke_mm"
+            )
         return self
 
 
@@ -115,22 +126,30 @@ def plan_files(design: Design, random: np.random.Generator) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        The columns of runs.csv without channels, and `condition`, `direction`, `run_order` (from 1) and `elapsed_h`.
-        A run's repeats follow each other. Columns that the design does not have are missing.
+        The columns of runs.csv without channels, and `condition`, `direction`, `run_order` (from 1) and
+        `elapsed_h`. A run's repeats follow each other. Columns that the design does not have are missing.
     """
     rows = []
-    for (temperature, compression, days), specimen in product(_conditions(design), range(1, design.specimens + 1)):
+    for (temperature, compression, days), specimen in product(
+        _conditions(design), range(1, design.specimens + 1)
+    ):
         parts = [f"{days:g}d" if days else "unaged"] if days is not None else []
         if days != 0:
             parts += [f"{temperature:g}C"] if temperature is not None else []
             parts += [f"{compression:g}pct"] if compression is not None else []
         condition = "_".join(parts) or "rubber"
         specimen_id = f"{condition}_s{specimen}"
-        for load, speed, direction in product(design.loads_N or (None,), design.speeds_mm_s, _directions(design)):
+        for load, speed, direction in product(
+            design.loads_N or (None,), design.speeds_mm_s, _directions(design)
+        ):
             words = [specimen_id if design.specimens > 1 else condition]
             words += [f"{load:g}N"] if len(design.loads_N) > 1 else []
             words += [f"{speed:g}mms"]
-            words += [{1: "fwd", -1: "back"}[direction]] if len(design.directions) > 1 and not _both(design) else []
+            words += (
+                [{1: "fwd", -1: "back"}[direction]]
+                if len(design.directions) > 1 and not _both(design)
+                else []
+            )
             run_id = "_".join(words)
             for repeat in range(1, design.repeats + 1):
                 rows.append(
@@ -182,14 +201,17 @@ def _dated(files: pd.DataFrame, design: Design, random: np.random.Generator) -> 
     order = np.lexsort([files["repeat"], files["run_id"].map(place), block])
     minutes, elapsed = 0.0, np.zeros(len(files))
     for index in order:
-        minutes = max(minutes, 24 * 60 * float(block[index]))  # a day's tests wait for the rubber, and for the rig
+        # a day's tests wait for the rubber, and for the rig
+        minutes = max(minutes, 24 * 60 * float(block[index]))
         elapsed[index] = minutes / 60
         minutes += design.minutes_per_file
     elapsed -= elapsed.min()
     run_order = np.empty(len(files))
     run_order[order] = np.arange(1, len(files) + 1)
     seconds = np.round(elapsed * 3600).astype(int)  # started_at is written to the second
-    started = [(design.first_start + timedelta(seconds=s)).isoformat(timespec="seconds") for s in seconds.tolist()]
+    started = [
+        (design.first_start + timedelta(seconds=s)).isoformat(timespec="seconds") for s in seconds.tolist()
+    ]
     return files.assign(started_at=started, run_order=run_order, elapsed_h=seconds / 3600)
 
 
@@ -242,7 +264,9 @@ class Spec(Strict):
         return (*along, "repeat", "specimen_id", *own, *dated, *(c.name for c in self.channels))
 
     def risen(self) -> Spec:
-        """Return the SPEC whose `design.stiffness_mm` is the longest rise that `physics.sigma_0` makes, if it is given.
+        """Return the SPEC whose `design.stiffness_mm` is the longest rise that `physics.sigma_0` makes.
+
+        It is unchanged if `physics.sigma_0` is not given.
 
         Raises
         ------
@@ -265,15 +289,21 @@ class Spec(Strict):
         seen: set[str] = set()
         for channel in self.channels:
             if channel.name in TAKEN or channel.name in seen or not NAME.fullmatch(channel.name):
-                raise ValueError(f"channel name '{channel.name}' is taken, given twice, or not letters, digits and _")
+                raise ValueError(
+                    f"channel name '{channel.name}' is taken, given twice, or not letters, digits and _"
+                )
             seen.add(channel.name)
             if channel.kind == "slow" and not self.design.dated:
-                raise ValueError(f"channel '{channel.name}' drifts with the calendar: design.order must not be undated")
+                raise ValueError(
+                    f"channel '{channel.name}' drifts with the calendar: design.order must not be undated"
+                )
         labels = {c.name: c.labels for c in self.channels if c.kind == "category" and c.labels}
         for number, effect in enumerate(self.effects):
             for category in effect.parameters if effect.id == LEVELS and effect.channels[0] in labels else ():
                 if category not in labels[effect.channels[0]]:
-                    raise ValueError(f"effects.{number} (levels): '{category}' is no label of {effect.channels[0]}")
+                    raise ValueError(
+                        f"effects.{number} (levels): '{category}' is no label of {effect.channels[0]}"
+                    )
             read = sorted(parse(effect.formula).names) if effect.formula is not None else ()
             for name in (*effect.channels, *(n for n in read if n not in effect.parameters)):
                 if name not in self.channel_names:
@@ -290,13 +320,15 @@ def load_spec(path: Path) -> Spec:
     Raises
     ------
     ConfigError
-        If the file is missing, is not TOML, has a key or value that is not allowed, or names an effect, parameter or
-        channel that does not exist; one sentence per fault.
+        If the file is missing, is not TOML, has a key or value that is not allowed, or names an effect,
+        parameter or channel that does not exist; one sentence per fault.
     """
     try:
         text = Path(path).read_text("utf-8-sig")  # Windows editors begin with a byte-order mark
     except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, fix="Check the path of SPEC.") from error
+        raise ConfigError(
+            f"cannot be read ({error.strerror}).", file=path, fix="Check the path of SPEC."
+        ) from error
     except UnicodeDecodeError as error:
         raise ConfigError("is not UTF-8.", file=path, fix="Save it as UTF-8.") from error
     try:
@@ -306,7 +338,9 @@ def load_spec(path: Path) -> Spec:
             f"is not TOML: {error}.", file=path, fix="See sample_data/simulated.spec.toml for an example."
         ) from error
     except ValidationError as error:
-        raise ConfigError(explain(error, Spec), file=path, fix="sample_data/README.md lists every key.") from error
+        raise ConfigError(
+            explain(error, Spec), file=path, fix="sample_data/README.md lists every key."
+        ) from error
     try:
         resolve_effects(spec.effects)
     except ConfigError as error:

@@ -52,13 +52,15 @@ LOCK = ".lock"
 def only_writer(folder: Path) -> Iterator[None]:
     """Hold `folder` for writing while the block runs.
 
-    The kernel drops the lock with the process that held it, however that ended, so the lock of a dead process of this
-    host is taken over at once. Another host's lock is never taken over: what runs there cannot be seen from here.
+    The kernel drops the lock with the process that held it, however that ended, so the lock of a dead process
+    of this host is taken over at once. Another host's lock is never taken over: what runs there cannot be
+    seen from here.
 
     Raises
     ------
     OutError
-        If another process holds the folder (its host and process id are named), or if the lock cannot be written.
+        If another process holds the folder (its host and process id are named), or if the lock cannot be
+        written.
     """
     path = folder / LOCK
     handle = _take(path)
@@ -144,7 +146,9 @@ def _sign(handle: int, path: Path) -> None:
         os.pwrite(handle, owner, 0)
         os.fsync(handle)
     except OSError as error:
-        raise OutError(f"cannot be written ({error.strerror}).", file=path.parent, fix="Free some space.") from error
+        raise OutError(
+            f"cannot be written ({error.strerror}).", file=path.parent, fix="Free some space."
+        ) from error
 
 
 # ---------------------------------------------------------------- own folder
@@ -153,12 +157,15 @@ def _sign(handle: int, path: Path) -> None:
 
 @contextlib.contextmanager
 def held(out: Path) -> Iterator[None]:
-    """Hold `out` as its only writer. It is created if missing, cleared of staged files, and removed if it stays empty.
+    """Hold `out` as its only writer.
+
+    It is created if missing, cleared of staged files, and removed if it stays empty.
 
     Raises
     ------
     OutError
-        If `out` is a file, a folder that sealfit did not make, in use by another process, or cannot be written.
+        If `out` is a file, a folder that sealfit did not make, in use by another process, or cannot be
+        written.
     """
     made = _make(out)
     try:
@@ -173,7 +180,7 @@ def held(out: Path) -> Iterator[None]:
 
 
 def _make(out: Path) -> bool:
-    """Create `out` if it is missing, and return whether it was created; refuse a folder not made by sealfit."""
+    """Create `out` if missing, and return whether it was created; refuse a folder not made by sealfit."""
     if out.exists() and not out.is_dir():
         raise OutError("is a file.", file=out, fix="Give --out a folder.")
     if out.is_dir():

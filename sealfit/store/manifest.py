@@ -21,8 +21,8 @@ from sealfit.errors import OutError
 # ---------------------------------------------------------------- fingerprint
 # A fingerprint per input, and one key per step.
 #
-# A step is current if its stored key equals the key computed now. The key depends on the program's version, the part of
-# the config that the step uses, its inputs, and the step before it.
+# A step is current if its stored key equals the key computed now. The key depends on the program's version,
+# the part of the config that the step uses, its inputs, and the step before it.
 
 STEPS = ("ingest", "fit-steady", "fit-aging", "fit-dynamic", "close-loop", "report")
 """The steps in order; each reads the tables of those before it."""
@@ -36,11 +36,11 @@ UNSEEN = {
     "fit-aging": {"loop": Loop()},
     "fit-dynamic": {"loop": Loop()},
 }
-"""Parts of the config that a step does not use, with their defaults; a change of them does not make it stale."""
+"""Parts of the config that a step does not use, with defaults; a change of them does not make it stale."""
 
 
 class Fingerprint(NamedTuple):
-    """Size in bytes, time of last change in ns, and SHA-256 of one file; all None for a file that is not there."""
+    """Size in bytes, time of last change in ns, and SHA-256 of one file; all None for a missing file."""
 
     size: int | None = None
     mtime_ns: int | None = None
@@ -67,7 +67,7 @@ def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
 
 
 def changes(folder: Path, known: Fingerprints, config: Config) -> dict[str, Fingerprint]:
-    """Return the fingerprints, now, of what is new or not as it is `known` among the trace files of a campaign.
+    """Return the current fingerprints of a campaign's trace files that are new or differ from those `known`.
 
     A file is read only if its size or time differ from those known.
     """
@@ -97,7 +97,9 @@ def seen_config(step: str, config: Config) -> Config:
     return config.model_copy(update=UNSEEN.get(step, {}))
 
 
-def step_keys(inputs: Fingerprints, config: Config, effects: Mapping[str, str | None] | None = None) -> dict[str, str]:
+def step_keys(
+    inputs: Fingerprints, config: Config, effects: Mapping[str, str | None] | None = None
+) -> dict[str, str]:
     """Return the key of every step, in order, for these inputs, this config and this version of the program.
 
     `effects` are the hashes of the user's own effects; where their folder lies does not matter.
@@ -204,7 +206,7 @@ class ConfigCopy:
         return parse_config(self.text, str(self.path or DEFAULT))
 
     def effects_folder(self) -> Path | None:
-        """Return the folder that `loop.effects_folder` names, relative to the config's own folder; None without it.
+        """Return the folder named by `loop.effects_folder`, relative to the config's folder; None without it.
 
         Only a config that the command line names may lead to its being run: see `own_effects_folder`.
         """
@@ -230,7 +232,8 @@ class State:
     campaign: Path
     config: ConfigCopy
     inputs: Fingerprints = field(default_factory=dict)
-    effects: dict[str, str | None] = field(default_factory=dict)  # SHA-256 of the user's own effects, by file name
+    # SHA-256 of the user's own effects, by file name
+    effects: dict[str, str | None] = field(default_factory=dict)
     steps: dict[str, Done] = field(default_factory=dict)
 
     def as_dict(self) -> dict:
@@ -275,7 +278,9 @@ class State:
             raise OutError(f"cannot be read ({error.strerror}).", file=path, fix="Fix its rights.") from error
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise OutError(
-                "is not a state that this version of sealfit can read.", file=path, fix="Choose another --out."
+                "is not a state that this version of sealfit can read.",
+                file=path,
+                fix="Choose another --out.",
             ) from error
 
 

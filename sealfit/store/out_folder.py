@@ -43,10 +43,13 @@ PROVENANCE = "provenance.json"
 class Store:
     """One OUT folder with the campaign and the config it belongs to; `known` if it holds results already.
 
-    `effects` is the folder of the user's own effects that the command line names; the config has it, and no other.
+    `effects` is the folder of the user's own effects that the command line names; the config has it, and no
+    other.
     """
 
-    def __init__(self, out: Path, state: State, *, known: bool, kept: State | None = None, effects: Path | None = None):
+    def __init__(
+        self, out: Path, state: State, *, known: bool, kept: State | None = None, effects: Path | None = None
+    ):
         self.out, self.state = out, state
         self._kept = kept  # the state as stored in `out`
         self.effects = effects
@@ -61,7 +64,9 @@ class Store:
         if state.campaign.is_dir():
             self._changed = changes(state.campaign, state.inputs, self.config)
         elif known:
-            self.warnings.append(f"the campaign folder {state.campaign} is missing, so changes cannot be detected.")
+            self.warnings.append(
+                f"the campaign folder {state.campaign} is missing, so changes cannot be detected."
+            )
         self.marks = state.inputs | self._changed  # the present files of the campaign
 
     # ------------------------------------------------------------ opening
@@ -79,11 +84,15 @@ class Store:
         state = State.read(out)
         if state is None:
             what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
-            raise OutError(what, file=out, fix=f"Make them with: sealfit run CAMPAIGN --out {shlex.quote(str(out))}")
+            raise OutError(
+                what, file=out, fix=f"Make them with: sealfit run CAMPAIGN --out {shlex.quote(str(out))}"
+            )
         effects = own_effects_folder(effects, None, out, state.campaign)
         config = state.config.now()
         hashes = effects_seen(effects, state.effects, state.config, config)
-        return cls(out, replace(state, config=config, effects=hashes), known=True, kept=state, effects=effects)
+        return cls(
+            out, replace(state, config=config, effects=hashes), known=True, kept=state, effects=effects
+        )
 
     @classmethod
     @contextlib.contextmanager
@@ -94,15 +103,15 @@ class Store:
         source: ConfigCopy | None = None,
         effects: Path | None = None,
     ) -> Iterator[Store]:
-        """Hold `out` as its only writer and give the store; without `campaign`, one that holds results already.
+        """Hold `out` as its only writer and give the store; without `campaign`, one that already has results.
 
         `source` is the config that the command line names, `effects` the folder that --effects-folder names.
 
         Raises
         ------
         OutError
-            If `out` is a file, a folder that sealfit did not make, the results of another campaign, in use by another
-            process, or cannot be written.
+            If `out` is a file, a folder that sealfit did not make, the results of another campaign, in use by
+            another process, or cannot be written.
         """
         if campaign is None or source is None:
             cls.open(out, effects)  # raises if there are no results
@@ -184,7 +193,9 @@ class Store:
         if done.version != __version__:
             return f"it was made by sealfit {done.version}, this is {__version__}"
         known = self.state.inputs
-        changed = sorted(n for n, mark in self._changed.items() if n not in known or mark.sha256 != known[n].sha256)
+        changed = sorted(
+            n for n, mark in self._changed.items() if n not in known or mark.sha256 != known[n].sha256
+        )
         if changed:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             return f"inputs changed ({', '.join(changed[:3])}{more})"
@@ -201,7 +212,7 @@ class Store:
                 raise StaleError(f"{why}.", file=self.out, fix=f"Run: {self.command(name)}")
 
     def require_effects(self) -> None:
-        """Raise RequestError if the loop is to be closed with the user's own effects and no folder of them is given."""
+        """Raise RequestError if the loop needs the user's own effects and no folder of them is given."""
         if self.effects is None and (self._names_effects or self.state.effects):
             raise needed("the loop is closed with", self.state.effects)
 
@@ -254,7 +265,9 @@ class Store:
     # ------------------------------------------------------------ writing
     @contextlib.contextmanager
     def step(self, name: str) -> Iterator[Staged]:
-        """Give a place for the files of step `name`; they all take their places when the block ends without an error.
+        """Give a place for the files of step `name`.
+
+        They all take their places when the block ends without an error.
 
         Parameters
         ----------
@@ -285,8 +298,11 @@ class Store:
             files,
         )
         # The step counts as not done until every file is moved, so that a killed run leaves no mixture of old
-        # and new tables as current. All is on the disk before the first move, so a full disk changes nothing in OUT.
-        earlier = {step: self.state.steps[step] for step in STEPS[: STEPS.index(name)] if step in self.state.steps}
+        # and new tables as current. All is on the disk before the first move, so a full disk changes nothing
+        # in OUT.
+        earlier = {
+            step: self.state.steps[step] for step in STEPS[: STEPS.index(name)] if step in self.state.steps
+        }
         known = inputs if earlier else {}  # none are known of steps not done
         begun = replace(self.state, inputs=known, steps=earlier)
         ended = replace(begun, inputs=inputs, steps={**earlier, name: done})

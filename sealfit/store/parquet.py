@@ -22,24 +22,29 @@ Columns = Mapping[str, pd.Series | np.ndarray | pa.Array]  # of equal length, or
 
 
 def to_arrow(frame: pd.DataFrame | Columns, schema: Schema, units: Units) -> pa.Table:
-    """Return `frame` as a table of `schema`: its columns first, in order and type; then, if it is open, all others.
+    """Return `frame` as a table of `schema`.
 
-    Each field's metadata holds `unit` (the true one) and `meaning`; the table's holds `sealfit` (version and table)
-    and `units` (true unit by column). NaN becomes null; words may come as dictionaries (`as_dictionary`).
+    The schema's columns are first, in its order and types; if it is open, all others follow. Each field's
+    metadata holds `unit` (the true one) and `meaning`; the table's holds `sealfit` (version and table) and
+    `units` (true unit by column). NaN becomes null; words may come as dictionaries (`as_dictionary`).
 
     Raises
     ------
     ValueError
-        If a column is missing, doubled, of the wrong type, or not in a closed schema: a fault of the step, not of the
-        user's data.
+        If a column is missing, doubled, of the wrong type, or not in a closed schema: a fault of the step,
+        not of the user's data.
     """
     names = [str(name) for name in frame]
     if len(set(names)) != len(names):
-        raise ValueError(f"table {schema.name}: doubled columns {sorted({n for n in names if names.count(n) > 1})}")
+        raise ValueError(
+            f"table {schema.name}: doubled columns {sorted({n for n in names if names.count(n) > 1})}"
+        )
     missing = [name for name in schema.names() if name not in names]
     others = [name for name in names if name not in set(schema.names())]
     if missing or (others and not schema.open_):
-        raise ValueError(f"table {schema.name}: missing columns {missing}, columns that it does not know {others}")
+        raise ValueError(
+            f"table {schema.name}: missing columns {missing}, columns that it does not know {others}"
+        )
 
     arrays, fields = [], []
     for column in (*schema.columns, *(Column(name, "", None, CHANNEL) for name in others)):
@@ -72,7 +77,9 @@ def with_columns(table: pa.Table, columns: Mapping[str, str], units: Units) -> p
         if wanted == TEXT and pa.types.is_dictionary(values.type):
             wanted = values.type
         elif wanted == TEXT and values.type != TEXT:
-            values = pa.array(values.to_pandas().map(str, na_action="ignore").astype(object), TEXT, from_pandas=True)
+            values = pa.array(
+                values.to_pandas().map(str, na_action="ignore").astype(object), TEXT, from_pandas=True
+            )
         arrays.append(values.cast(wanted))
         fields.append(table.schema.field(at).with_type(wanted))
     return _table(arrays, fields, table.schema.metadata[b"sealfit"])
@@ -89,7 +96,7 @@ def write(frame: pd.DataFrame, schema: Schema, units: Units, path: Path) -> None
 
 
 def as_dictionary(words: pa.Array, row: np.ndarray) -> pa.Array:
-    """Return the word of every row, of those in `words`, as a dictionary: no word is spelled out for every row."""
+    """Return every row's word, of those in `words`, as a dictionary: no word is spelled out for every row."""
     codes = words.cast(TEXT).dictionary_encode()
     return pa.DictionaryArray.from_arrays(codes.indices.take(pa.array(row)), codes.dictionary)
 
@@ -97,7 +104,8 @@ def as_dictionary(words: pa.Array, row: np.ndarray) -> pa.Array:
 def spelled_out(schema: pa.Schema) -> pa.Schema:
     """Return the schema of the same table without dictionaries, as it is read from the disk."""
     return pa.schema(
-        [f.with_type(f.type.value_type) if pa.types.is_dictionary(f.type) else f for f in schema], schema.metadata
+        [f.with_type(f.type.value_type) if pa.types.is_dictionary(f.type) else f for f in schema],
+        schema.metadata,
     )
 
 
@@ -138,10 +146,10 @@ def read(
     coded: Sequence[str] = (),
     where: Mapping[str, Sequence[str]] | None = None,
 ) -> pd.DataFrame:
-    """Return the table at `path`, a file or its parts in their order, or those columns of it, or some of its rows.
+    """Return the table at `path`, a file or its parts in order, or those columns of it, or some of its rows.
 
-    Columns of words in `coded` come as categories: no word is spelled out for every row. `where` names columns that are
-    read, and the values of the rows that are kept.
+    Columns of words in `coded` come as categories: no word is spelled out for every row. `where` names
+    columns that are read, and the values of the rows that are kept.
     """
     paths = [path] if isinstance(path, Path) else path
     parts = []

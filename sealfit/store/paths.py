@@ -17,13 +17,15 @@ RUNS_TABLES = (RUNS, "runs.xlsx", "runs.parquet")
 
 
 def possible_tables(config: Config) -> tuple[str, ...]:
-    """Return where the table of runs may stand in a campaign folder: where the config says, or under a usual name."""
+    """Return where the table of runs may be in a campaign: where the config says, or under a usual name."""
     return RUNS_TABLES if config.files.runs_table is None else (config.files.runs_table,)
 
 
 def runs_tables(folder: Path, config: Config) -> list[str]:
     """Return those of `possible_tables` that a campaign folder holds."""
-    return [name for name in possible_tables(config) if (folder / name).exists() or (folder / name).is_symlink()]
+    return [
+        name for name in possible_tables(config) if (folder / name).exists() or (folder / name).is_symlink()
+    ]
 
 
 def campaign_folder(path: Path, config: Config) -> Path:
@@ -32,7 +34,8 @@ def campaign_folder(path: Path, config: Config) -> Path:
     Raises
     ------
     CampaignError
-        If there is no such folder, or no table of runs in it where the config needs one; the fix names the likeliest.
+        If there is no such folder, or no table of runs in it where the config needs one; the fix names the
+        likeliest.
     """
     if path.is_file():
         fix = (
@@ -45,7 +48,10 @@ def campaign_folder(path: Path, config: Config) -> Path:
         raise CampaignError([Fault("campaign_folder", f"there is no folder {path}.", fix=did_you_mean(path))])
     if config.files.glob is None and config.files.runs_table is None and not runs_tables(path, config):
         below = sorted(child.parent for child in path.glob(f"*/{RUNS}"))
-        fix = f"It lists the trace files; or set files.glob in a config (--config). Files here: {_some_files(path)}"
+        fix = (
+            "It lists the trace files; or set files.glob in a config (--config). "
+            f"Files here: {_some_files(path)}"
+        )
         if below:
             fix = "Did you mean " + " or ".join(quoted(folder) for folder in below[:3]) + "?"
         raise CampaignError([Fault("runs_csv", f"{path} has no {RUNS}.", file=RUNS, fix=fix)])
@@ -63,7 +69,9 @@ def existing_out(out: Path) -> Path:
     if out.is_dir():
         return out
     fix = did_you_mean(out, lambda folder: (folder / STATE).is_file())
-    raise RequestError(f"there is no folder {out}.", fix=fix or f"Make it: sealfit run CAMPAIGN --out {quoted(out)}")
+    raise RequestError(
+        f"there is no folder {out}.", fix=fix or f"Make it: sealfit run CAMPAIGN --out {quoted(out)}"
+    )
 
 
 def existing_file(path: Path, what: str) -> Path:
@@ -85,16 +93,16 @@ def _some_files(folder: Path) -> str:
 # ---------------------------------------------------------------- own effects
 # The folder of the user's own effects, the only place from which Python is run.
 #
-# A campaign and a folder of results may come from somebody else, so Python is never run from them or from a path
-# stored in them. The user names the folder, by --effects-folder or in the config given with --config. OUT keeps the
-# hashes of the files to detect changes.
+# A campaign and a folder of results may come from somebody else, so Python is never run from them or from a
+# path stored in them. The user names the folder, by --effects-folder or in the config given with --config.
+# OUT keeps the hashes of the files to detect changes.
 
 OPTION = "--effects-folder"
 KEY = "key 'loop.effects_folder'"
 
 
 def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Path) -> Path | None:
-    """Return the folder from which the user's own effects are read, without symbolic links; None if none is named.
+    """Return the folder of the user's own effects, without symbolic links; None if none is named.
 
     Parameters
     ----------
@@ -108,7 +116,8 @@ def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Pat
     Raises
     ------
     ConfigError
-        If there is no such folder, if it or one of its files lies in `data`, or if a config that lies there names it.
+        If there is no such folder, if it or one of its files lies in `data`, or if a config that lies there
+        names it.
     """
     folder, said = given, OPTION
     if given is None and config is not None:
@@ -122,7 +131,9 @@ def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Pat
             fix=f"Name the folder by {OPTION}, or move the config.",
         )
     if not folder.is_dir():
-        raise ConfigError(f"{said}: there is no folder {folder}.", fix=did_you_mean(folder) or "Fix the path.")
+        raise ConfigError(
+            f"{said}: there is no folder {folder}.", fix=did_you_mean(folder) or "Fix the path."
+        )
     for path in (folder, *sorted(folder.glob("*.py"))):
         if place := _place_of(path, data):
             raise ConfigError(

@@ -35,7 +35,7 @@ class Staged:
         self.inputs: Fingerprints | None = None  # set by ingest: the files read
 
     def table(self, name: str, frame: pd.DataFrame) -> None:
-        """Write table `name` of `tables.SCHEMAS`; ValueError if the frame does not have its columns and types."""
+        """Write table `name` of `tables.SCHEMAS`; ValueError if the frame lacks its columns or types."""
         from sealfit.store import parquet
 
         self._write(f"{name}{PARQUET}", lambda path: parquet.write(frame, SCHEMAS[name], self._units, path))
@@ -60,7 +60,7 @@ class Staged:
         return self._folder
 
     def adopt(self, files: Mapping[str, int]) -> None:
-        """Add files with their sizes to this step: those written into `folder` by other processes, and those in OUT."""
+        """Add files with sizes to this step: those other processes wrote into `folder`, and those in OUT."""
         self.files |= files
 
     def _write(self, name: str, write: Callable[[Path], object]) -> None:

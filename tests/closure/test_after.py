@@ -6,7 +6,15 @@ import pandas as pd
 import pytest
 from bins_helpers import TRUE, make_bins, make_traces, warm
 
-from sealfit.closure.after import KEPT, after_fits, after_laws, at_reference, law_df, reference_of, without_effects
+from sealfit.closure.after import (
+    KEPT,
+    after_fits,
+    after_laws,
+    at_reference,
+    law_df,
+    reference_of,
+    without_effects,
+)
 from sealfit.closure.intervals import t_quantile
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -59,7 +67,9 @@ def test_the_forces_are_those_of_rubber_that_does_not_warm(warmed):
     assert (cold["force_N"] - steady["force_N"])[slow].mean() > 1.2
     left = tables["steady_after"]["force_N"] - cold["force_N"]
     assert np.abs(left[slow]).max() < 0.05
-    npt.assert_allclose(left + tables["steady_after"]["effects_N"], steady["force_N"] - cold["force_N"], atol=1e-9)
+    npt.assert_allclose(
+        left + tables["steady_after"]["effects_N"], steady["force_N"] - cold["force_N"], atol=1e-9
+    )
 
 
 def test_the_shifts_hold_the_covariance_that_the_effects_give_the_forces(warmed):
@@ -80,7 +90,10 @@ def test_the_law_of_a_series_is_that_of_the_joint_fit(warmed):
     declared = after.model.declared
     place = next(k for k, p in enumerate(declared.parameters) if (p.quantity, p.owner) == ("mu_0s", "rubber"))
     error = np.sqrt(after.covariance[place, place])
-    for series in ("temperature_C=60, compression_ratio_pct=80", "temperature_C=80, compression_ratio_pct=80"):
+    for series in (
+        "temperature_C=60, compression_ratio_pct=80",
+        "temperature_C=80, compression_ratio_pct=80",
+    ):
         row = law.loc[(series, "mu_s", "mu_0")]
         assert row["value"] == after.model.theta[place]
         assert row["hi95"] - row["value"] == pytest.approx(t_quantile(4.0) * error)
@@ -138,7 +151,9 @@ def test_an_offset_is_taken_out_of_both_directions():
     shift = free[shifts_of(free)].to_numpy()[:, 0] * free["direction"].to_numpy()
     npt.assert_allclose(shift, shift[0])  # along the motion it has the sign of the direction
     one = fit_conditions(free, Config())
-    unaged = one[(one["condition"] == "unaged") & (one["parameter"] == "mu_s") & (one["quantity"] == "steady")].iloc[0]
+    unaged = one[
+        (one["condition"] == "unaged") & (one["parameter"] == "mu_s") & (one["quantity"] == "steady")
+    ].iloc[0]
     assert unaged["value"] == pytest.approx(TRUE["mu_s0"], rel=0.015)
 
 
@@ -146,9 +161,23 @@ def test_starts_are_fitted_to_forces_without_the_offset():
     """A straight rise over 1 mm to 30 N, and 2 N more shown by the sensor."""
     distance = np.linspace(0.0, 10.0, 400)
     force = 30.0 * np.minimum(distance, 1.0) + 2.0
-    keys = {"file": "a.csv", "repeat": 1, "stroke": 1, "specimen_id": "s", "condition": "unaged", "direction": 1}
+    keys = {
+        "file": "a.csv",
+        "repeat": 1,
+        "stroke": 1,
+        "specimen_id": "s",
+        "condition": "unaged",
+        "direction": 1,
+    }
     trace = pd.DataFrame({**keys, "time_s": distance, "displacement_mm": distance, "force_N": force})
-    steady = {**keys, "series": "unaged", "rubber": "rubber", "run_id": "r", "speed_mm_s": 1.0, "speed_set_mm_s": 1.0}
+    steady = {
+        **keys,
+        "series": "unaged",
+        "rubber": "rubber",
+        "run_id": "r",
+        "speed_mm_s": 1.0,
+        "speed_set_mm_s": 1.0,
+    }
     steady = pd.DataFrame([{**steady, "load_N": 50.0, "force_N": 30.0, "effects_start_N": 2.0, "used": True}])
     asked = trace.assign(steady=distance > 3.0), steady, pd.DataFrame(columns=STEADY_FIT.names()), Config()
     curve = fit_dynamic(*asked).curves
@@ -197,7 +226,9 @@ def test_the_reference_is_said_in_words(id, channels, fixed, values, words):
     assert reference_of(term, values, Config()) == words
 
 
-@pytest.mark.parametrize("columns", [["temperature_C", "compression_ratio_pct"], None], ids=["no aging", "two days"])
+@pytest.mark.parametrize(
+    "columns", [["temperature_C", "compression_ratio_pct"], None], ids=["no aging", "two days"]
+)
 def test_without_a_law_there_are_still_conditions(columns):
     bins = make_bins(3, effect=warm, days=(2.0,), temperatures=(60.0,), bins=3)
     config = Config() if columns is None else Config(condition=columns)

@@ -45,17 +45,19 @@ def test_the_one_load_of_a_campaign_has_no_settings_whatever_its_rounding(jitter
     assert {(name, number) for _, name, number in known} == {("speed_mm_s", k) for k in range(3)}
 
 
-def test_a_share_lost_along_strokes_is_held_out_about_their_means_however_much_friction_differs_between_runs():
+def test_a_share_lost_along_strokes_is_held_out_about_their_means_however_much_friction_differs_between_runs():  # noqa: E501
     bins = make_bins(0, temperatures=(60.0,), days=(4.0,), bins=6, speeds=(0.1, 1.0, 100.0))
     rows = make_rows(bins, has_aging=True)
     lost = Term(EFFECTS["exponential_approach"], ("distance_mm",), "mu", "multiply")
     model = fit_declared(rows).model.with_term(lost, {"A": -0.004, "tau": 3.0})
-    assert varies_within(SimpleNamespace(term=lost, fitted=SimpleNamespace(rows=rows, model=model))) == "stroke"
+    assert (
+        varies_within(SimpleNamespace(term=lost, fitted=SimpleNamespace(rows=rows, model=model))) == "stroke"
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 3])
 def test_a_gain_is_weighed_by_the_scatter_that_is_left_with_the_effect_in(seed):
-    """Aging with a floor stands in the scatter of specimens without it, and each would count for next to nothing."""
+    """Aging with a floor is in the scatter of specimens without it, and each counts for next to nothing."""
 
     def floor(table, force):
         return force * (1 + 0.05 * np.log(np.maximum(table["aging_days"].to_numpy() / 4, 1)))
@@ -92,14 +94,16 @@ def proposal(effect="smooth", channels=("run_order",), acts_on="mu", p_value=1e-
 
 @pytest.fixture
 def decide(monkeypatch):
-    """Decide on proposals whose gains are given: held out by groups and by settings, and the force they add."""
+    """Decide on proposals with given gains: held out by groups and by settings, and the force they add."""
 
     def decided(proposals, gains, settings=(), added=1.0, samples=SAMPLES, **more):
         held = dict(zip(map(id, proposals), gains, strict=True))
         monkeypatch.setattr("sealfit.closure.confirm.heldout_gain", lambda before, p, *args: held[id(p)])
         monkeypatch.setattr("sealfit.closure.confirm.gain_between_settings", lambda *args: settings)
         monkeypatch.setattr("sealfit.closure.confirm.added_force", lambda p: np.full(3, added))
-        monkeypatch.setattr("sealfit.closure.confirm.rivals", lambda chosen, found: [p for p in found if p != chosen])
+        monkeypatch.setattr(
+            "sealfit.closure.confirm.rivals", lambda chosen, found: [p for p in found if p != chosen]
+        )
         refused, said = [], []
         context = Context(Config(), EFFECTS, **{"compare": False, "say": said.append} | more)
         return confirmed(FORCE, proposals, samples, context, 2, refused), refused, said
@@ -204,7 +208,9 @@ def test_what_just_suffices_is_accepted(decide, given):
         ("asymmetry", ("direction",), "sigma_2", 1e-4, True),
     ],
 )
-def test_a_free_shape_that_bends_the_curve_wants_more_evidence(decide, effect, channels, acts_on, p_value, claimed):
+def test_a_free_shape_that_bends_the_curve_wants_more_evidence(
+    decide, effect, channels, acts_on, p_value, claimed
+):
     made = proposal(effect, channels, acts_on, p_value, physical=effect == "asymmetry")
     found, refused, _ = decide([made], [GOOD])
     assert (found is not None) == claimed
@@ -222,7 +228,9 @@ def test_a_recorder_hides_what_is_less_than_the_rounding_of_its_steps():
 
 
 def test_means_are_taken_in_groups_and_directions():
-    rows = SimpleNamespace(codes=lambda level: np.array([0, 0, 0, 1, 1, 1]), speed=np.array([1, 1, -1, 1, -1, -1]))
+    rows = SimpleNamespace(
+        codes=lambda level: np.array([0, 0, 0, 1, 1, 1]), speed=np.array([1, 1, -1, 1, -1, -1])
+    )
     values = np.array([1.0, 3.0, 5.0, 7.0, 2.0, 6.0])
     assert about_means(values, rows, "run").tolist() == [-1.0, 1.0, 0.0, 0.0, -2.0, 2.0]
     assert about_means(values, rows, None) is values

@@ -10,7 +10,13 @@ from sealfit.closure.channels import find_channels, level_values, scatter_level,
 from sealfit.closure.loop import close_loop
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search, search_pairs
-from sealfit.closure.small_sample_test import ContrastTest, contrast_test, log_p_of_t, slope_log_p, specimens_agree
+from sealfit.closure.small_sample_test import (
+    ContrastTest,
+    contrast_test,
+    log_p_of_t,
+    slope_log_p,
+    specimens_agree,
+)
 from sealfit.config import Config
 from sealfit.fit.joint.estimate import fit_declared
 from sealfit.fit.joint.rows import make_rows
@@ -24,7 +30,8 @@ def strongest(bins):
     tests, channels, rng = ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0)
     singles = search(tests, channels, rng)
     return min(
-        (c.p_value for c in (*singles, *search_pairs(tests, channels, singles, rng)) if c.claimable), default=1.0
+        (c.p_value for c in (*singles, *search_pairs(tests, channels, singles, rng)) if c.claimable),
+        default=1.0,
     )
 
 
@@ -46,28 +53,38 @@ def tilted(level, size_N, seed):
 )
 def test_slopes_that_specimens_or_runs_have_at_random_are_no_effect(days, level):
     smallest = [
-        strongest(make_bins(seed, days=days, speeds=FEW_SPEEDS, repeats=2, bins=8, effect=tilted(level, 0.5, seed)))
+        strongest(
+            make_bins(seed, days=days, speeds=FEW_SPEEDS, repeats=2, bins=8, effect=tilted(level, 0.5, seed))
+        )
         for seed in range(8)
     ]
     assert min(smallest) > 0.0005  # the least of 8 uniform numbers is smaller in 4 of 1,000
-    assert sum(p < 0.05 for p in smallest) <= 2  # more in 6 of 1,000; of p-values below 0.05 half the time, in 86 %
+    assert (
+        sum(p < 0.05 for p in smallest) <= 2
+    )  # more in 6 of 1,000; of p-values below 0.05 half the time, in 86 %
 
 
 def test_the_same_slope_in_a_few_specimens_is_an_effect():
     def warmer(table, force):
         return force * (1 - 0.03 * (1 - np.exp(-table["distance_mm"].to_numpy() / 10)))
 
-    bins = make_bins(3, days=(1.0, 4.0), temperatures=(60.0,), speeds=FEW_SPEEDS, repeats=2, bins=8, effect=warmer)
+    bins = make_bins(
+        3, days=(1.0, 4.0), temperatures=(60.0,), speeds=FEW_SPEEDS, repeats=2, bins=8, effect=warmer
+    )
     assert strongest(bins) < 1e-4
 
 
 @pytest.mark.parametrize(("share", "claimed"), [(0.1, True), (0.01, False)])
 @pytest.mark.parametrize("temperatures", [(), (60.0,)], ids=["one specimen", "two specimens"])
-def test_one_or_two_specimens_show_an_effect_only_if_it_is_larger_than_their_own_slopes(share, claimed, temperatures):
+def test_one_or_two_specimens_show_an_effect_only_if_it_is_larger_than_their_own_slopes(
+    share, claimed, temperatures
+):
     def warmer(table, force):
         return force * (1 - share * (1 - np.exp(-table["distance_mm"].to_numpy() / 10)))
 
-    bins = make_bins(3, days=(4.0,), temperatures=temperatures, speeds=FEW_SPEEDS, repeats=3, bins=8, effect=warmer)
+    bins = make_bins(
+        3, days=(4.0,), temperatures=temperatures, speeds=FEW_SPEEDS, repeats=3, bins=8, effect=warmer
+    )
     assert (strongest(bins) < 1e-4) == claimed
 
 
@@ -99,29 +116,38 @@ def test_moderated_p_values_are_uniform_where_every_unit_has_its_own_slope():
     rng = np.random.default_rng(5)
     units, contrasts, found = 8, 40, []
     for _ in range(400):
-        own = rng.normal(size=(units, 1)) * rng.uniform(0, 3) * rng.choice([-1, 1], contrasts)  # shared by all
+        own = (
+            rng.normal(size=(units, 1)) * rng.uniform(0, 3) * rng.choice([-1, 1], contrasts)
+        )  # shared by all
         scores = (own + rng.normal(size=(units, contrasts))) / np.sqrt(units)
         slope = scores.sum(axis=0)
         deviations = (scores - slope / units) / np.sqrt(1 - 1 / units)
         test = ContrastTest(
-            "run", slope, (deviations**2).sum(axis=0), np.full(contrasts, units - 1.0), np.ones(contrasts, bool),
-            deviations, np.ones(contrasts, bool),
+            "run", slope, (deviations**2).sum(axis=0), np.full(contrasts, units - 1.0),
+            np.ones(contrasts, bool), deviations, np.ones(contrasts, bool),
         )  # fmt: skip
         found.append(slope_log_p([test])[0][0])
     assert np.mean(np.array(found) < np.log(0.01)) < 0.025
 
 
 def test_log_p_of_students_t_far_out():
-    npt.assert_allclose(log_p_of_t(np.array([12.0]), np.array([9.0])), np.log(2 * stats.t.sf(12.0, 9.0)), rtol=1e-9)
+    npt.assert_allclose(
+        log_p_of_t(np.array([12.0]), np.array([9.0])), np.log(2 * stats.t.sf(12.0, 9.0)), rtol=1e-9
+    )
 
 
 def test_jitter_moves_no_channel_to_another_level():
     bins = make_bins(repeats=3, bins=8)
-    clean = {c.name: (c.unit, np.unique(c.values).size) for c in find_channels(make_rows(bins, has_aging=True))}
+    clean = {
+        c.name: (c.unit, np.unique(c.values).size) for c in find_channels(make_rows(bins, has_aging=True))
+    }
     rng = np.random.default_rng(2)
     for size in (1e-6, 1e-4, 1e-3):
         noisy = bins.assign(speed_mm_s=bins["speed_mm_s"] * (1 + size * rng.normal(size=len(bins))))
-        found = {c.name: (c.unit, np.unique(c.values).size) for c in find_channels(make_rows(noisy, has_aging=True))}
+        found = {
+            c.name: (c.unit, np.unique(c.values).size)
+            for c in find_channels(make_rows(noisy, has_aging=True))
+        }
         assert found["speed_mm_s"] == clean["speed_mm_s"] == ("run", 8)
 
 
@@ -139,7 +165,9 @@ def test_what_specimens_differ_in_is_judged_between_specimens():
     bins = make_bins(repeats=2, bins=4, run_channels={"oil_ppm": lambda rng: rng.normal()})
     rows = make_rows(bins, has_aging=True)
     channels = {c.name: c for c in find_channels(rows)}
-    assert {name: scatter_level([channels[name]], rows) for name in ("displacement_mm", "speed_mm_s", "oil_ppm")} == {
+    assert {
+        name: scatter_level([channels[name]], rows) for name in ("displacement_mm", "speed_mm_s", "oil_ppm")
+    } == {
         "displacement_mm": "specimen", "speed_mm_s": "specimen", "oil_ppm": "run",
     }  # fmt: skip
     assert scatter_level([channels["oil_ppm"], channels["temperature_C"]], rows) == "specimen"
@@ -177,7 +205,9 @@ def test_what_two_specimens_show_is_a_candidate_and_the_verdict_cannot_tell():
 
 
 def test_what_one_specimen_of_two_holds_alone_is_not_said_to_differ_between_them():
-    rows = make_rows(make_bins(2, days=(4.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, bins=8), has_aging=True)
+    rows = make_rows(
+        make_bins(2, days=(4.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, bins=8), has_aging=True
+    )
     fitted = fit_declared(rows)
     column = np.where(rows.codes("specimen") == 0, 1.0, 0.0)
     column *= np.where(rows.codes("stroke") % 2, 1.0, -1.0)  # constant in strokes

@@ -20,6 +20,7 @@ def test_repeats_show_a_slope_along_strokes_that_the_model_lacks():
 def test_without_a_misfit_p_values_are_not_small_more_often_than_by_chance():
     """One specimen at eight speeds, three times each.
 
-    Of 40 p-values more than 8 are below 0.1 in 1.5 % of draws; were each below it twice as often as it may be, in 41 %.
+    Of 40 p-values more than 8 are below 0.1 in 1.5 % of draws; were each below it twice as often as it may
+    be, in 41 %.
     """
     assert sum(p_value(seed) < 0.1 for seed in range(40)) <= 8

@@ -31,7 +31,14 @@ def campaign(tmp_path_factory):
         "speeds_mm_s": SPEEDS,
     }
     simulate(
-        Spec(seed=4, physics={"growth": {}}, design=design, effects=(oil,), channels=(COLUMN, GRADES), noise=RIG),
+        Spec(
+            seed=4,
+            physics={"growth": {}},
+            design=design,
+            effects=(oil,),
+            channels=(COLUMN, GRADES),
+            noise=RIG,
+        ),
         folder,
     )
     return folder
@@ -66,7 +73,9 @@ def test_a_column_that_a_few_files_lack_is_searched_and_said(campaign, tmp_path)
     ]
     said = f"4 of {files} files have no value: the search for effects takes them at the mean of their run"
     quality = Store.open(tmp_path / "out").read("quality")
-    assert quality.loc[quality["check"] == "incomplete_column", "reason"].str.startswith(said).tolist() == [True]
+    assert quality.loc[quality["check"] == "incomplete_column", "reason"].str.startswith(said).tolist() == [
+        True
+    ]
     assert any(line.startswith(f"column      oil_ppm: {said}") for line in lines(made))
 
 
@@ -85,8 +94,9 @@ def test_a_column_that_many_files_lack_is_left_out_and_said(campaign, tmp_path):
 def bins(**columns):
     file = np.repeat([f"f{k}" for k in range(6)], 2)
     table = {
-        "file": file, "run_id": np.repeat(["a", "b", "c"], 4), "repeat": np.tile([1, 1, 2, 2], 3), "stroke": 1,
-        "specimen_id": "s", "condition": "c", "series": "", "rubber": "", "force_N": 1.0, "speed_mm_s": 1.0,
+        "file": file, "run_id": np.repeat(["a", "b", "c"], 4), "repeat": np.tile([1, 1, 2, 2], 3),
+        "stroke": 1, "specimen_id": "s", "condition": "c", "series": "", "rubber": "", "force_N": 1.0,
+        "speed_mm_s": 1.0,
         "load_N": 2.0, "n": 9, "displacement_mm": 1.0,
     }  # fmt: skip
     return pd.DataFrame({**table, **{name: np.repeat(values, 2) for name, values in columns.items()}})
@@ -109,7 +119,9 @@ def test_a_missing_category_is_a_level_of_its_own():
 
 
 def test_each_column_that_some_files_lack_is_said_once():
-    steady = bins(oil=[1.0, np.nan, 7.0, 7.0, 7.0, 7.0], grade=["K", None, None, "L", "K", "K"], idle=[1.0] * 6)
+    steady = bins(
+        oil=[1.0, np.nan, 7.0, 7.0, 7.0, 7.0], grade=["K", None, None, "L", "K", "K"], idle=[1.0] * 6
+    )
     steady = steady.assign(
         used=True, load_N=np.where(steady["file"] == "f3", np.nan, 2.0), run_order=[np.nan] + [1.0] * 11
     )

@@ -14,7 +14,10 @@ from sealfit.fit.joint.estimate import fit_declared
 from sealfit.fit.joint.rows import make_rows
 from sealfit.tables import RESIDUALS_AFTER, SCHEMAS
 
-CHANNELS = {"lab_temperature_C": lambda rng: 22 + rng.normal(), "batch": lambda rng: str(rng.choice(list("ABC")))}
+CHANNELS = {
+    "lab_temperature_C": lambda rng: 22 + rng.normal(),
+    "batch": lambda rng: str(rng.choice(list("ABC"))),
+}
 SCATTER = {"setup": 0.005, "specimen": 0.01, "run_channels": CHANNELS}
 
 
@@ -105,7 +108,8 @@ def test_predict_carries_the_effect_and_agrees_with_the_fit(warming):
     npt.assert_allclose(answer["force_after_N"], after["model_N"], rtol=1e-3)  # there the mean over a bin
     assert (answer["force_after_lo95_N"] < answer["force_after_N"]).all()
     assert (
-        answer["meas_hi95_N"] - answer["meas_lo95_N"] > answer["force_after_hi95_N"] - answer["force_after_lo95_N"]
+        answer["meas_hi95_N"] - answer["meas_lo95_N"]
+        > answer["force_after_hi95_N"] - answer["force_after_lo95_N"]
     ).all()
     assert not answer["extrapolated"].any()
     assert (answer["note"] == "").all()
@@ -138,7 +142,8 @@ def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
     bins["hardness_ShA"] = bins["specimen_id"].map(hardness)
     speed, slower = bins["speed_mm_s"], 1 + 0.04 * (bins["hardness_ShA"] - 70)  # v_s follows the hardness
     bins["force_N"] += 15 * (np.exp(-((speed / (15 * slower)) ** 2)) - np.exp(-((speed / 15) ** 2)))
-    # Three degrees of freedom are left: however strong, F says no more than 0.004 to 0.009 after all that is searched.
+    # Three degrees of freedom are left: however strong, F says no more than 0.004 to 0.009 after all that is
+    # searched.
     made = close_loop(bins, make_traces(bins), Config(loop={"family_error": 0.02}))
     document = made.document
     assert document["verdict"] == "cannot_tell"
@@ -153,7 +158,12 @@ def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
 def test_an_effect_of_sliding_power_is_found_and_predicted_from_load_and_speed():
     def warm_when_hard_driven(table, force):
         load = 50.0 * 2.0 ** (table["repeat"].to_numpy() - 2.0)
-        return force * load / 49.03 * (1 - 0.1 * np.exp(-((np.log(load * table["speed_mm_s"].abs() / 400) / 0.7) ** 2)))
+        return (
+            force
+            * load
+            / 49.03
+            * (1 - 0.1 * np.exp(-((np.log(load * table["speed_mm_s"].abs() / 400) / 0.7) ** 2)))
+        )
 
     bins = make_bins(3, temperatures=(60.0,), effect=warm_when_hard_driven, bins=2, setup=0.003, noise_N=0.1)
     bins["load_N"] = 50.0 * 2.0 ** (bins["repeat"] - 2.0)
@@ -201,7 +211,9 @@ def test_weak_evidence_needs_a_lower_error_on_what_was_held_out():
     noise = np.random.default_rng(0).normal(0, 1, rows.force.size)
 
     def ends(left):
-        return BeforeAfter(fitted, fitted, rows.force - noise, rows.force - left * noise, np.ones(noise.size, bool))
+        return BeforeAfter(
+            fitted, fitted, rows.force - noise, rows.force - left * noise, np.ones(noise.size, bool)
+        )
 
     assert ends(1.0).gains(None, weak=False)
     assert not ends(1.0).gains(None, weak=True)

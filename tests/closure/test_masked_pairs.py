@@ -36,7 +36,10 @@ def test_a_slope_along_strokes_and_its_change_with_pressure_hide_each_other():
 
     bins = make_bins(0, speeds=FOUR, repeats=1, run_channels=PRESSURE, effect=tilt, **ONE)
     first, *_ = hidden(bins)
-    assert first.keys == ((("displacement_mm",), "force", "add"), (("displacement_mm", "pressure_bar"), "force", "add"))
+    assert first.keys == (
+        (("displacement_mm",), "force", "add"),
+        (("displacement_mm", "pressure_bar"), "force", "add"),
+    )
 
 
 def test_pairs_of_chance_are_not_found_too_often():
@@ -48,7 +51,9 @@ def test_pairs_of_chance_are_not_found_too_often():
 def test_growth_in_one_direction_is_found_and_named():
     bins = make_bins(1, repeats=1, effect=one_way, **ONE)
     effects = close_loop(bins, make_traces(bins), Config()).document["effects"]
-    (effect,) = [e for e in effects if e["channels"] != ["direction"]]  # from one direction to the other, mu may differ
+    (effect,) = [
+        e for e in effects if e["channels"] != ["direction"]
+    ]  # from one direction to the other, mu may differ
     assert (effect["id"], effect["channels"][1]) == ("linear_each_way", "direction")
     forward, backward = effect["parameters"]
     assert forward["value"] == pytest.approx(0.003, rel=0.2)
@@ -58,7 +63,8 @@ def test_growth_in_one_direction_is_found_and_named():
 def test_a_wrong_piston_area_is_an_offset_that_changes_with_pressure():
     bins = make_bins(
         0, speeds=FOUR, temperatures=(60.0,), days=(1.0, 4.0, 16.0), directions=(1, -1), repeats=1, bins=8,
-        run_channels=PRESSURE, effect=lambda table, force: force + 0.35 * (table["pressure_bar"].to_numpy() - 4),
+        run_channels=PRESSURE,
+        effect=lambda table, force: force + 0.35 * (table["pressure_bar"].to_numpy() - 4),
     )  # fmt: skip
     (effect,) = close_loop(bins, make_traces(bins), Config()).document["effects"]
     assert effect["id"] in ("linear", "offset_slope")  # the offset is zero near the mean pressure

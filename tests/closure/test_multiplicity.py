@@ -28,7 +28,9 @@ def scored(scores):
     total = scores.sum(axis=0)
     units, df = scores.shape
     t = float(score_statistic(total[None, :], scores)[0])
-    return ScoreTestResult(float(total @ total), df, units, float(log_p_of(np.array([t]), df, units)[0]), scores=scores)
+    return ScoreTestResult(
+        float(total @ total), df, units, float(log_p_of(np.array([t]), df, units)[0]), scores=scores
+    )
 
 
 def alike(units):
@@ -55,7 +57,9 @@ def test_a_test_that_is_made_twice_counts_once():
     """Of eight units 2 of the 256 flips agree on all; on either of two patterns 4 do."""
     one = alike(8)
     other = scored(np.array([[1.0], [-1.0]] * 4))  # says nothing by itself, but is looked at
-    alone, twice, two = (adjust(k, np.random.default_rng(0), 20_000) for k in ([one], [one, one], [one, other]))
+    alone, twice, two = (
+        adjust(k, np.random.default_rng(0), 20_000) for k in ([one], [one, one], [one, other])
+    )
     assert twice[0] == twice[1] == pytest.approx(alone[0], abs=1e-12)
     assert alone[0] == pytest.approx(1 / 128, abs=0.0025)
     assert two[0] == pytest.approx(1 / 64, abs=0.004)
@@ -112,10 +116,13 @@ class FourNumbers:
 
 def test_tests_on_few_specimens_are_adjusted_by_draws_and_never_by_more_than_their_number():
     own = np.log(0.02)
-    results = [ScoreTestResult(1.0, 1, 4, NOWHERE, small_sample=test) for test in (along(own, 0), along(NOWHERE, 1))]
+    results = [
+        ScoreTestResult(1.0, 1, 4, NOWHERE, small_sample=test) for test in (along(own, 0), along(NOWHERE, 1))
+    ]
     plain = ScoreTestResult(1.0, 1, 4, NOWHERE)
     found = adjust_small_sample(FourNumbers, [*results, plain], np.random.default_rng(0), 20_000)
-    # Squares of four numbers share one sum, so that two of them are seldom large together: 1 - 0.98^2 or a bit more.
+    # Squares of four numbers share one sum, so that two of them are seldom large together: 1 - 0.98^2 or a
+    # bit more.
     assert found[0] == pytest.approx(0.04, abs=0.004)
     assert found[1] > 0.5
     assert found[2] == 1.0
@@ -168,9 +175,13 @@ def candidate(name, result):
 
 def test_a_search_says_the_strongest_evidence_first_with_p_values_for_two_searches():
     given = [candidate("idle", scored(np.array([[1.0], [-1.0]] * 4))), candidate("oil", alike(8))]
-    found = adjust_all(SimpleNamespace(cluster_tests={"specimen": FourNumbers}), given, np.random.default_rng(0))
+    found = adjust_all(
+        SimpleNamespace(cluster_tests={"specimen": FourNumbers}), given, np.random.default_rng(0)
+    )
     assert [c.channels for c in found] == [("oil",), ("idle",)]
-    assert found[0].p_value == pytest.approx(2 / 64, abs=0.012)  # 4 of 256 flips say as much of either; two searches
+    assert found[0].p_value == pytest.approx(
+        2 / 64, abs=0.012
+    )  # 4 of 256 flips say as much of either; two searches
     assert found[1].p_value == 1.0
 
 
@@ -178,12 +189,16 @@ def test_two_ways_to_test_have_half_of_the_error_each():
     """The jackknife over 40 units, times the candidates; and F with contrasts, in few units."""
     strong = alike(40)._replace(log_p_jackknife=-20.0)
     found = adjust_all(
-        SimpleNamespace(cluster_tests={"specimen": FourNumbers}), [candidate("a", strong)], np.random.default_rng(0)
+        SimpleNamespace(cluster_tests={"specimen": FourNumbers}),
+        [candidate("a", strong)],
+        np.random.default_rng(0),
     )
     assert found[0].p_value == pytest.approx(2 * 2 * np.exp(-20.0))
     both = ScoreTestResult(1.0, 1, 8, NOWHERE, small_sample=along(-30.0, 0), slopes=(slopes_of(0.1),))
     found = adjust_all(
-        SimpleNamespace(cluster_tests={"specimen": FourNumbers}), [candidate("a", both)], np.random.default_rng(0)
+        SimpleNamespace(cluster_tests={"specimen": FourNumbers}),
+        [candidate("a", both)],
+        np.random.default_rng(0),
     )
     assert found[0].p_value == pytest.approx(2 * 2 * np.exp(-30.0))
 
@@ -195,6 +210,8 @@ def test_a_claim_needs_enough_specimens_and_that_they_agree():
     assert not candidate(
         "a", shown._replace(small_sample=along(-9.0, 0)._replace(error_df=3))
     ).claimable  # of specimens: four
-    assert candidate("a", shown._replace(small_sample=along(-9.0, 0)._replace(error_df=3, level="run"))).claimable
+    assert candidate(
+        "a", shown._replace(small_sample=along(-9.0, 0)._replace(error_df=3, level="run"))
+    ).claimable
     differ = slopes_of(3.0, 1.0)._replace(consistent=np.array([False, True]))  # the stronger of the two does
     assert not candidate("a", shown._replace(slopes=(differ,))).claimable

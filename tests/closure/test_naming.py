@@ -1,4 +1,4 @@
-"""Which of several proposals is reported: equals by their rank, and only equals; and which are said to be rivals."""
+"""Which of several proposals is reported: equals by rank, and only equals; which are said to be rivals."""
 
 from types import SimpleNamespace
 
@@ -27,12 +27,14 @@ ALONG, ACROSS = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 
 
 class HandFit:
-    """What naming reads of a joint fit: its effects' values with standard errors, each number told by one run."""
+    """What naming reads of a joint fit: its effects' values with standard errors, each told by one run."""
 
     def __init__(self, deviance, terms, values, errors, left=0.0):
         ends = np.cumsum([0, *(len(term.effect.parameters) for term in terms)])
         self.deviance = deviance
-        self.model = SimpleNamespace(terms=terms, values=values, term_slice=lambda k: slice(ends[k], ends[k + 1]))
+        self.model = SimpleNamespace(
+            terms=terms, values=values, term_slice=lambda k: slice(ends[k], ends[k + 1])
+        )
         self.covariance = np.diag(np.square(np.asarray(errors, dtype=float)))
         self.white_jacobian = Tangent.dense(np.eye(ends[-1]))
         self.rows = SimpleNamespace(groups=Groups.of({"run": np.arange(ends[-1])}))
@@ -43,8 +45,10 @@ def numbers_of(effect):
     return {p.name: 1.0 for p in effect.parameters}
 
 
-def proposal(effect, acts_on="mu", operation="multiply", *, behind=0.0, error=0.1, left=0.0, earlier=(), **more):
-    """A refitted proposal whose BIC is `behind` that of 0; `error` and `left` are those of each of its numbers."""
+def proposal(
+    effect, acts_on="mu", operation="multiply", *, behind=0.0, error=0.1, left=0.0, earlier=(), **more
+):
+    """A refitted proposal whose BIC is `behind` that of 0; `error` and `left` are those of each number."""
     effect = EFFECTS[effect] if isinstance(effect, str) else effect
     term = Term(effect, more.pop("channels", CHANNELS.get(effect.id, ("oil_ppm",))), acts_on, operation)
     deviance = behind - len(effect.parameters) * np.log(UNITS)
@@ -61,7 +65,9 @@ def first_of(monkeypatch):
     monkeypatch.setattr(naming, "_refitted", lambda fitted, found: list(found))
 
     def first(*found, before=()):
-        fitted = SimpleNamespace(model=SimpleNamespace(terms=[t for t, _ in before], values=[v for _, v in before]))
+        fitted = SimpleNamespace(
+            model=SimpleNamespace(terms=[t for t, _ in before], values=[v for _, v in before])
+        )
         named = named_among(fitted, found)
         assert sorted(map(id, named)) == sorted(map(id, found))  # none is lost, none comes twice
         assert [p.bic for p in named[1:]] == sorted(p.bic for p in named[1:])
@@ -74,7 +80,9 @@ def test_a_proposal_costs_the_logarithm_of_the_units_for_each_number():
     made = proposal("warming_distance", behind=7.0)
     assert made.bic_penalty == pytest.approx(2 * np.log(100))
     assert made.bic == pytest.approx(7.0)
-    assert proposal("product", channels=("oil_ppm", "dust_mg")).bic_penalty == pytest.approx(np.log(100) + 10.0)
+    assert proposal("product", channels=("oil_ppm", "dust_mg")).bic_penalty == pytest.approx(
+        np.log(100) + 10.0
+    )
 
 
 def test_of_none_none_is_named():
@@ -92,7 +100,9 @@ def test_a_closed_form_comes_before_a_free_shape_that_is_hardly_better(first_of,
 
 
 @pytest.mark.parametrize(("behind", "named"), [(7.5, "warming_distance"), (7.7, "log")])
-def test_a_mechanism_of_just_these_channels_need_not_pay_for_its_number_where_it_is_as_likely(first_of, behind, named):
+def test_a_mechanism_of_just_these_channels_need_not_pay_for_its_number_where_it_is_as_likely(
+    first_of, behind, named
+):
     """By hand: its second number costs log 100 = 4.6, and likelihoods are equal up to a deviance of 3."""
     log = proposal("log", channels=("distance_mm",), column=ACROSS)
     assert first_of(log, proposal("warming_distance", behind=behind)).term.effect.id == named
@@ -129,12 +139,15 @@ def test_of_equals_the_one_that_leaves_earlier_effects_alone_is_named(first_of, 
 
 
 def test_of_equals_friction_as_a_whole_comes_before_one_coefficient(first_of):
-    found = [proposal("linear", name, behind=k / 10) for k, name in enumerate(("sigma_2", "mu_s", "force", "mu"))]
+    found = [
+        proposal("linear", name, behind=k / 10) for k, name in enumerate(("sigma_2", "mu_s", "force", "mu"))
+    ]
     assert first_of(*found).term.acts_on == "mu"
 
 
 @pytest.mark.parametrize(
-    ("behind", "column", "acts_on"), [(5.0, ALONG, "mu"), (7.0, ALONG, "force"), (5.0, ALONG + ACROSS, "force")]
+    ("behind", "column", "acts_on"),
+    [(5.0, ALONG, "mu"), (7.0, ALONG, "force"), (5.0, ALONG + ACROSS, "force")],
 )
 def test_a_factor_on_friction_comes_before_a_gain_of_the_whole_force_where_both_add_the_same(
     first_of, behind, column, acts_on
@@ -157,7 +170,7 @@ def test_where_no_equal_is_determined_the_next_that_is_comes_first(first_of):
 
 @pytest.mark.parametrize(("behind", "first"), [(1.0, "mu"), (10.0, "force")])
 def test_a_mechanism_acts_on_what_the_strokes_say_where_they_say_it(first_of, behind, first):
-    """A logarithm with a number less is as good as both: what it saves does not make them equals of each other."""
+    """A logarithm with a number less is as good as both: what it saves does not make the two equals."""
     saved = np.log(UNITS)
     found = [
         proposal("log", "force", channels=("distance_mm",), column=ACROSS),
@@ -194,7 +207,7 @@ def test_one_equation_under_two_names_is_no_rival_of_itself():
 
 
 def test_rivals_are_told_apart_under_the_noise_that_the_effect_leaves():
-    """The friction of these strokes differs by a third, so a ripple that is an added force is no factor on it.
+    """The friction of these strokes differs by a third, so a ripple as an added force is no factor on it.
 
     Strokes start at places of their own: the ripple stands in the noise of the rows while it is missing.
     """

@@ -18,7 +18,9 @@ def bound(fitted, effect, channel, **values):
     """The declared fit with one effect as a factor on mu, its numbers given."""
     term = Term(EFFECTS[effect], (channel,), "mu", "multiply", fixed={"x_ref": 0.0})
     after = fitted_at(fitted.model.with_term(term, values), fitted.rows, fitted.scatter)
-    return Proposal(term, values, "run", 10, 1.0, 0.001, np.zeros(fitted.force.size), ((channel,),), fitted=after)
+    return Proposal(
+        term, values, "run", 10, 1.0, 0.001, np.zeros(fitted.force.size), ((channel,),), fitted=after
+    )
 
 
 def between(chosen, rival):
@@ -35,7 +37,8 @@ def test_channels_that_always_went_together_are_taken_apart():
     where, apart = between(chosen, rival)
     hours = bins["elapsed_h"]
     assert {"humidity_pct", "elapsed_h"} <= where.keys()
-    # Dry at the end, or humid at the start: by the whole range, and half of it beyond, of the factor on some 45 N.
+    # Dry at the end, or humid at the start: by the whole range, and half of it beyond, of the factor on some
+    # 45 N.
     assert abs((where["humidity_pct"] - 30.0) / 2.0 - where["elapsed_h"]) > np.ptp(hours)
     assert apart > 0.02 * np.ptp(hours) * 40.0
 
@@ -52,7 +55,9 @@ def test_forms_of_one_channel_differ_most_beyond_what_was_tested():
 
 def test_an_offset_is_friction_where_all_runs_go_one_way():
     fitted = fit_declared(make_rows(make_bins(bins=4, repeats=2, noise_N=0.05), has_aging=True))
-    alias = next(a for a in find_aliases(fitted, EFFECTS, ("temperature_C",)) if a.term.effect.id == "zero_offset")
+    alias = next(
+        a for a in find_aliases(fitted, EFFECTS, ("temperature_C",)) if a.term.effect.id == "zero_offset"
+    )
     force = 49.03 * 0.6
     assert alias.size_N == pytest.approx(0.01 * force, rel=0.3)
     where, apart = largest_difference(alias.holding, alias.lacking, fitted.rows, ("direction",), Config())
@@ -62,12 +67,14 @@ def test_an_offset_is_friction_where_all_runs_go_one_way():
 
 def test_an_offset_is_no_alias_where_runs_go_both_ways():
     fitted = fit_declared(make_rows(make_bins(bins=4, repeats=1, directions=(1, -1)), has_aging=True))
-    found = {a.term.effect.id for a in find_aliases(fitted, EFFECTS, ("temperature_C", "compression_ratio_pct"))}
+    found = {
+        a.term.effect.id for a in find_aliases(fitted, EFFECTS, ("temperature_C", "compression_ratio_pct"))
+    }
     assert not found & {"zero_offset", "asymmetry", "drift", "warming_time"}
 
 
 def test_an_effect_on_what_does_not_act_where_it_is_there_is_no_alias():
-    """mu_s is no part of friction far above v_s, so a change of it there adds nothing that could be scaled."""
+    """mu_s is no part of friction far above v_s, so a change of it there adds nothing that can be scaled."""
     fitted = fit_declared(
         make_rows(make_bins(speeds=(1.0, 4.0, 8.0, 16.0, 32.0, 1000.0), bins=4, repeats=1), has_aging=True)
     )

@@ -44,7 +44,9 @@ def test_product_of_two_columns_is_found_and_predicted():
 
 def test_slope_in_one_batch_only_is_found():
     def in_b(table, force):
-        return force * (1 + 0.006 * (table["oil_ppm"] - 50) * np.where(table["batch"] == "B", 1, -1)).to_numpy()
+        return (
+            force * (1 + 0.006 * (table["oil_ppm"] - 50) * np.where(table["batch"] == "B", 1, -1)).to_numpy()
+        )
 
     effects = close(in_b)[1].document["effects"]
     assert [(e["id"], set(e["channels"])) for e in effects] == [("slopes", {"oil_ppm", "batch"})]
@@ -72,7 +74,9 @@ def test_products_of_logarithms_are_tried_where_a_channel_spans_enough():
     assert best == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("speeds", "alone"), [((1.0, 8.0, 32.0, 100.0), False), ((1.0, 4.0, 16.0, 32.0, 64.0), True)])
+@pytest.mark.parametrize(
+    ("speeds", "alone"), [((1.0, 8.0, 32.0, 100.0), False), ((1.0, 4.0, 16.0, 32.0, 64.0), True)]
+)
 def test_a_product_holds_the_speed_alone_only_where_the_curve_leaves_room(speeds, alone):
     fitted = fit_declared(make_rows(make_bins(1, speeds=speeds, repeats=1, bins=6), has_aging=True))
     channels = {c.name: c for c in find_channels(fitted.rows)}
@@ -82,4 +86,7 @@ def test_a_product_holds_the_speed_alone_only_where_the_curve_leaves_room(speeds
     )
     terms = [term for term, _ in terms_of(candidate, channels, fitted, EFFECTS)]
     assert any(term.effect.id == "product" for term in terms)
-    assert any(len(term.effect.linear) > 1 and not term.effect.id.startswith("surface") for term in terms) == alone
+    assert (
+        any(len(term.effect.linear) > 1 and not term.effect.id.startswith("surface") for term in terms)
+        == alone
+    )

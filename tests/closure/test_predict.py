@@ -14,5 +14,7 @@ def test_between_three_speeds_the_force_is_not_known():
     assert not tested["extrapolated"].any()
     between = predict(model, points.assign(speed_mm_s=20.0))
     assert between["extrapolated"].all()
-    assert between["note"].str.contains("too few speeds for the friction between them; tested: 1, 8, 64").all()
+    assert (
+        between["note"].str.contains("too few speeds for the friction between them; tested: 1, 8, 64").all()
+    )
     assert np.isfinite(between["force_after_N"]).all()

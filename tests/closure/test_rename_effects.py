@@ -92,7 +92,12 @@ def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
     fitted = fit(model, rows, turns=2)
     added = [
         AcceptedEffect(
-            Proposal(t, v, "run", 72, 1e3, 1e-3, np.empty(0), (t.channels, "force", "multiply")), 1.0, 1.0, (), (), 1
+            Proposal(t, v, "run", 72, 1e3, 1e-3, np.empty(0), (t.channels, "force", "multiply")),
+            1.0,
+            1.0,
+            (),
+            (),
+            1,
         )
         for t, v in zip(fitted.model.terms, fitted.model.values, strict=True)
     ]
@@ -139,7 +144,9 @@ def test_an_asymmetry_of_mu_told_as_two_of_its_ends_is_one_effect():
         return force * (1 + 0.02 * table["direction"].to_numpy())
 
     bins = make_bins(3, directions=(1, -1), repeats=2, bins=4, noise_N=0.1, effect=asymmetric)
-    ends = [(Term(EFFECTS["asymmetry"], ("direction",), q, "multiply"), {"A": 0.04}) for q in ("mu_s", "mu_c")]
+    ends = [
+        (Term(EFFECTS["asymmetry"], ("direction",), q, "multiply"), {"A": 0.04}) for q in ("mu_s", "mu_c")
+    ]
     (term,) = in_place_of_two(bins, *ends)
     assert (term.effect.id, term.acts_on) == ("asymmetry", "mu")
 
@@ -150,7 +157,9 @@ def test_an_offset_and_an_asymmetry_that_are_both_there_stay_two():
 
     bins = make_bins(3, directions=(1, -1), repeats=2, bins=4, noise_N=0.1, effect=both)
     offset = Term(EFFECTS["zero_offset"], ("direction",), "force", "add"), {"A": 0.5}
-    terms = in_place_of_two(bins, offset, (Term(EFFECTS["asymmetry"], ("direction",), "mu", "multiply"), {"A": 0.04}))
+    terms = in_place_of_two(
+        bins, offset, (Term(EFFECTS["asymmetry"], ("direction",), "mu", "multiply"), {"A": 0.04})
+    )
     assert [t.effect.id for t in terms] == ["zero_offset", "asymmetry"]
 
 
@@ -175,21 +184,30 @@ def test_a_product_told_as_a_sum_of_two_is_one_effect():
     two = [(Term(EFFECTS["linear"], (n,), "mu", "multiply", {"x_ref": 5.0}), {"A": 0.01}) for n in channels]
     (term,) = in_place_of_two(bins, *two)
     assert set(term.channels) == set(channels)
-    assert len(in_place_of_two(bins, *two, pending=True)) == 2  # a third is to come, beside which alone one shows
+    assert (
+        len(in_place_of_two(bins, *two, pending=True)) == 2
+    )  # a third is to come, beside which alone one shows
 
 
 def test_an_effect_that_gains_nothing_beside_the_others_goes():
     def oil_only(table, force):
         return force * (1 + 1e-3 * (table["oil_ppm"].to_numpy() - 50))
 
-    rows = make_rows(numbered(make_bins(5, repeats=2, bins=4, effect=oil_only, run_channels=OIL)), has_aging=True)
+    rows = make_rows(
+        numbered(make_bins(5, repeats=2, bins=4, effect=oil_only, run_channels=OIL)), has_aging=True
+    )
     slow = Term(EFFECTS["linear"], ("time_s",), "mu", "multiply", {"x_ref": 10.0})
     oil = Term(EFFECTS["linear"], ("oil_ppm",), "mu", "multiply", {"x_ref": 50.0})
     model = fit_declared(rows).model.with_term(slow, {"A": 1e-3}).with_term(oil, {"A": 1e-3})
     fitted = fit(model, rows, turns=2)
     added = [
         AcceptedEffect(
-            Proposal(t, v, "run", 72, 1e3, 1e-9, np.empty(0), (t.channels, "mu", "multiply")), 1.0, 1.0, (), (), k
+            Proposal(t, v, "run", 72, 1e3, 1e-9, np.empty(0), (t.channels, "mu", "multiply")),
+            1.0,
+            1.0,
+            (),
+            (),
+            k,
         )
         for k, (t, v) in enumerate(zip(fitted.model.terms, fitted.model.values, strict=True))
     ]

@@ -31,7 +31,9 @@ from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 from sealfit.units import Units
 
-TORQUE = Units({"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")})
+TORQUE = Units(
+    {"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")}
+)
 WARMING = Term(EFFECTS["warming_distance"], ("distance_mm",), "mu", "multiply")
 PEAK = Peak("time_s", 0.3, True, True, 9.0, 1e-4, 0.1, 1.0)
 
@@ -40,7 +42,8 @@ PEAK = Peak("time_s", 0.3, True, True, 9.0, 1e-4, 0.1, 1.0)
 def fitted():
     """The declared model on one specimen: five speeds both ways, each made twice."""
     bins = make_bins(
-        2, temperatures=(), days=(), speeds=(1.0, 4.0, 16.0, 64.0, 100.0), directions=(1, -1), repeats=2, bins=4,
+        2, temperatures=(), days=(), speeds=(1.0, 4.0, 16.0, 64.0, 100.0), directions=(1, -1), repeats=2,
+        bins=4,
         run_channels={"oil_ppm": lambda rng: rng.normal(50.0, 5.0)},
     )  # fmt: skip
     return fit_declared(make_rows(bins, has_aging=True))
@@ -64,7 +67,9 @@ def accepted(fitted, term=WARMING, values=(-0.05, 10.0), p_value=1e-8, rivals=()
 
 
 def candidate(*channels, p_value=1e-3, log_p=-9.0, chi2=20.0, unit="run"):
-    return Candidate(channels, "mu", "multiply", unit, np.ones((4, 1)), ScoreTestResult(chi2, 1, 10, log_p), p_value)
+    return Candidate(
+        channels, "mu", "multiply", unit, np.ones((4, 1)), ScoreTestResult(chi2, 1, 10, log_p), p_value
+    )
 
 
 # ---------------------------------------------------------------- errors held out
@@ -174,7 +179,11 @@ def test_what_is_still_significant_is_named_at_its_level(selection):
     assert left(candidate("direction", "oil_ppm")) == ("run", "direction oil_ppm", 1e-3)
     assert left(candidate("condition", unit="specimen")) == ("condition", "condition", 1e-3)
     assert left(None) == (None, None, None)
-    assert left(None, last=(candidate("oil_ppm", p_value=0.3), candidate("time_s", p_value=0.9))) == (None, None, 0.3)
+    assert left(None, last=(candidate("oil_ppm", p_value=0.3), candidate("time_s", p_value=0.9))) == (
+        None,
+        None,
+        0.3,
+    )
 
 
 def test_an_effect_that_lowered_no_error_is_left(selection):
@@ -204,7 +213,11 @@ def test_an_unsigned_force_along_a_channel_of_runs_is_told_by_the_direction_too(
         (Term(EFFECTS["linear"], ("displacement_mm",), "sigma_2", "add"), "{y}", "mN m/(rpm)"),
         (Term(EFFECTS["linear"], ("displacement_mm",), "v_s", "add"), "{y}", "rpm"),
         (Term(EFFECTS["linear"], ("displacement_mm",), "mu_s", "add"), "{y}", ""),
-        (Term(EFFECTS["product"], ("speed_mm_s", "displacement_mm"), "mu", "multiply"), "1/({x} {z})", "1/(rpm turn)"),
+        (
+            Term(EFFECTS["product"], ("speed_mm_s", "displacement_mm"), "mu", "multiply"),
+            "1/({x} {z})",
+            "1/(rpm turn)",
+        ),
     ],
 )
 def test_units_of_parameters_are_those_of_the_rig(term, unit, expected):

@@ -35,8 +35,8 @@ def test_an_induction_time_is_found_though_the_declared_law_bends_towards_it():
 def test_specimens_that_scatter_show_no_law():
     few = {"speeds": (1.0, 4.0, 16.0, 64.0), "bins": 2, "specimen": 0.02}
     smallest = [min(c.p_value for c, _ in laws_of(seed + 40, **few)) for seed in range(12)]
-    # Adjusted for two laws, a third of the error: 1 in 60 below 0.05; three of 12 would have p 0.001. Were half of the
-    # p-values below 0.05, three of 12 would be in 98 % of draws.
+    # Adjusted for two laws, a third of the error: 1 in 60 below 0.05; three of 12 would have p 0.001. Were
+    # half of the p-values below 0.05, three of 12 would be in 98 % of draws.
     assert sum(p < 0.05 for p in smallest) <= 2
     assert min(smallest) > 0.001
 
@@ -45,7 +45,9 @@ def test_too_few_specimens_are_never_sure():
     few = make_rows(make_bins(1, days=(1.0, 4.0, 8.0, 16.0), repeats=1, bins=3, effect=lag), has_aging=True)
     found = richer_laws(fit_declared(few), {c.name: c for c in find_channels(few)}, EFFECTS)
     assert found
-    assert not any(c.claimable for c, _ in found)  # nine specimens, five numbers of the law, two more: two are left
+    assert not any(
+        c.claimable for c, _ in found
+    )  # nine specimens, five numbers of the law, two more: two are left
 
 
 def test_no_law_is_asked_for_without_days():

@@ -6,7 +6,14 @@ from sealfit.closure.ripples import find_ripple
 
 
 def make_samples(
-    seed=0, files=12, amplitude=0.0, wavelength=3.0, phase="common", directions=(1, -1), noise_N=0.2, along="x"
+    seed=0,
+    files=12,
+    amplitude=0.0,
+    wavelength=3.0,
+    phase="common",
+    directions=(1, -1),
+    noise_N=0.2,
+    along="x",
 ):
     rng = np.random.default_rng(seed)
     tables = []
@@ -19,7 +26,9 @@ def make_samples(
             x = 5.0 + direction * speed * t + (0 if direction > 0 else 40)
             place = x if along == "x" else t * 10
             force = (
-                5.0 * direction + amplitude * np.sin(2 * np.pi * place / wavelength + own) + rng.normal(0, noise_N, n)
+                5.0 * direction
+                + amplitude * np.sin(2 * np.pi * place / wavelength + own)
+                + rng.normal(0, noise_N, n)
             )
             tables.append(
                 pd.DataFrame(

@@ -8,11 +8,16 @@ from sealfit.closure.search import search
 from sealfit.fit.joint.estimate import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
-CHANNELS = {"lab_temperature_C": lambda rng: 22 + rng.normal(), "batch": lambda rng: str(rng.choice(list("ABC")))}
+CHANNELS = {
+    "lab_temperature_C": lambda rng: 22 + rng.normal(),
+    "batch": lambda rng: str(rng.choice(list("ABC"))),
+}
 
 
 def rows_of(seed=0, **options):
-    return make_rows(make_bins(seed, run_channels=CHANNELS, setup=0.01, specimen=0.02, **options), has_aging=True)
+    return make_rows(
+        make_bins(seed, run_channels=CHANNELS, setup=0.01, specimen=0.02, **options), has_aging=True
+    )
 
 
 def test_units_of_evidence():
@@ -27,7 +32,10 @@ def test_units_of_evidence():
 def test_a_text_of_more_than_a_hundred_values_is_no_channel():
     bins = make_bins(days=(1.0, 2.0, 4.0, 8.0, 16.0, 32.0), bins=2)
     number = bins["file"].factorize()[0]
-    bins["noted_at"], bins["tray"] = (number % 150).astype(str), (number % 90).astype(str)  # neither is a file's own
+    bins["noted_at"], bins["tray"] = (
+        (number % 150).astype(str),
+        (number % 90).astype(str),
+    )  # neither is a file's own
     names = {c.name for c in find_channels(make_rows(bins, has_aging=True))}
     assert "tray" in names
     assert "noted_at" not in names
@@ -83,7 +91,8 @@ def test_p_values_of_nulls_are_not_too_small():
         rows = rows_of(seed + 100, temperatures=(60.0,), bins=4, autocorrelation=0.5 * (seed % 2))
         found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(seed))
         smallest.append(min(c.p_value for c in found))
-    # Each campaign's smallest adjusted p is uniform: of 24, two below 0.1 on average, and more than seven with p 0.003.
+    # Each campaign's smallest adjusted p is uniform: of 24, two below 0.1 on average, and more than seven
+    # with p 0.003.
     assert sum(p < 0.1 for p in smallest) <= 7
     assert min(smallest) > 0.001
 
@@ -115,7 +124,9 @@ def test_a_channel_may_change_how_soon_a_rubber_ages():
 def test_sliding_power_is_a_channel_where_loads_differ():
     bins = make_bins(repeats=1, bins=4)
     assert "power" not in make_rows(bins, has_aging=True).channels
-    rounded = bins.assign(load_N=bins["load_N"] * (1 + 1e-12 * (np.arange(len(bins)) % 2)))  # as means of rows are
+    rounded = bins.assign(
+        load_N=bins["load_N"] * (1 + 1e-12 * (np.arange(len(bins)) % 2))
+    )  # as means of rows are
     assert "power" not in make_rows(rounded, has_aging=True).channels
     bins["load_N"] = np.where(bins["aging_days"] > 4, 25.0, 50.0)
     rows = make_rows(bins, has_aging=True)

@@ -19,7 +19,9 @@ class Model:
 
 
 def fit(model, *given, **options):
-    return SimpleNamespace(model=model, deviance=DEVIANCE[model.terms], rows=None, scatter=None, friction=None)
+    return SimpleNamespace(
+        model=model, deviance=DEVIANCE[model.terms], rows=None, scatter=None, friction=None
+    )
 
 
 def wald_statistic(fitted, number):

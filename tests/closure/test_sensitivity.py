@@ -42,7 +42,9 @@ def p_with(bins, size_pct):
 def test_half_the_stated_effect_is_missed_and_twice_as_much_is_found(repeats):
     bins = make_bins(4, repeats=repeats, run_channels=OIL, **SMALL)
     smallest = entries(searched(bins))["oil_ppm", "run"]["smallest_pct"]
-    fresh = [make_bins(4, repeats=repeats, run_channels=OIL, **{**SMALL, "noise_N": n}) for n in (0.1001, 0.0999)]
+    fresh = [
+        make_bins(4, repeats=repeats, run_channels=OIL, **{**SMALL, "noise_N": n}) for n in (0.1001, 0.0999)
+    ]
     assert all(p_with(b, smallest / 2) > 0.005 for b in fresh)
     assert all(p_with(b, 2 * smallest) < 0.005 for b in fresh)
 

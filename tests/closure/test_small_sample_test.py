@@ -22,10 +22,14 @@ def test_one_column_is_students_t_of_a_slope():
     rng = np.random.default_rng(3)
     x, y = rng.normal(size=9), rng.normal(size=9)
     x, y = x - x.mean(), y - y.mean()
-    centred = np.linalg.qr(np.column_stack([np.ones(9), np.eye(9)[:, :8]]))[0][:, 1:]  # 8 numbers free of the mean
+    centred = np.linalg.qr(np.column_stack([np.ones(9), np.eye(9)[:, :8]]))[0][
+        :, 1:
+    ]  # 8 numbers free of the mean
     basis = (centred.T @ x)[:, None] / np.linalg.norm(x)
     expected = stats.linregress(x, y).pvalue  # nine points less the mean less the slope: 7 degrees of freedom
-    assert np.exp(log_p_of((centred.T @ y)[None, :], basis, known=0.0)[0]) == pytest.approx(expected, rel=1e-9)
+    assert np.exp(log_p_of((centred.T @ y)[None, :], basis, known=0.0)[0]) == pytest.approx(
+        expected, rel=1e-9
+    )
 
 
 def test_draws_have_the_covariance_of_the_numbers():
@@ -42,7 +46,9 @@ def test_draws_have_the_covariance_of_the_numbers():
 def test_many_units_are_made_independent_as_few_are():
     rng = np.random.default_rng(5)
     moved = np.arange(40) != 7
-    taken = np.linalg.qr(rng.normal(size=(40, 6)))[0] * np.array([1.0, 1.0, 0.9, 0.5, 1e-3, 0.0]) * moved[:, None]
+    taken = (
+        np.linalg.qr(rng.normal(size=(40, 6)))[0] * np.array([1.0, 1.0, 0.9, 0.5, 1e-3, 0.0]) * moved[:, None]
+    )
     numbers = rng.normal(size=(40, 3))
     few, many = small_root(Tangent.dense(taken), moved), Root(Tangent.dense(taken), moved)
     assert many.df == few.shape[0]
@@ -58,18 +64,23 @@ def test_p_values_along_a_dozen_specimens_are_not_too_small():
         days = [c for c in find_channels(rows) if c.name == "aging_days"]
         found = search(ScoreTests(fit_declared(rows)), days, np.random.default_rng(seed))
         smallest.append(min(c.p_value for c in found))
-    # The smallest adjusted p is doubled for the two searches: a tenth below 0.2; more than 7 of 24 with p 0.003.
+    # The smallest adjusted p is doubled for the two searches: a tenth below 0.2; more than 7 of 24 with p
+    # 0.003.
     assert sum(p < 0.2 for p in smallest) <= 7
     assert min(smallest) > 0.001
 
 
 def test_an_aging_that_stops_is_found_on_nineteen_specimens():
     def floor(table, force):
-        return force * (1 + 0.12 * np.maximum(np.log(np.maximum(table["aging_days"].to_numpy(), 1e-9) / 4.0), 0.0))
+        return force * (
+            1 + 0.12 * np.maximum(np.log(np.maximum(table["aging_days"].to_numpy(), 1e-9) / 4.0), 0.0)
+        )
 
     rows = rows_of(1, specimen=0.003, temperatures=(40.0, 60.0, 80.0), effect=floor)
     days = [c for c in find_channels(rows) if c.name == "aging_days"]
-    best = min(search(ScoreTests(fit_declared(rows)), days, np.random.default_rng(0)), key=lambda c: c.p_value)
+    best = min(
+        search(ScoreTests(fit_declared(rows)), days, np.random.default_rng(0)), key=lambda c: c.p_value
+    )
     assert best.unit == "specimen"
     assert best.p_value < 0.005
 
@@ -83,12 +94,21 @@ def test_an_asymmetry_of_viscous_friction_is_found_in_sixteen_runs_without_repea
     found = []
     for seed in range(6):
         bins = make_bins(
-            seed, temperatures=(), days=(), directions=(1, -1), repeats=1, bins=4, setup=0.003, effect=softer_forward
+            seed,
+            temperatures=(),
+            days=(),
+            directions=(1, -1),
+            repeats=1,
+            bins=4,
+            setup=0.003,
+            effect=softer_forward,
         )
         rows = make_rows(bins, has_aging=True)
         candidates = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
         best = min(candidates, key=lambda c: c.p_value)
-        found.append(best.key == (("direction",), "sigma_2", "add") and best.p_value < 0.005 and best.claimable)
+        found.append(
+            best.key == (("direction",), "sigma_2", "add") and best.p_value < 0.005 and best.claimable
+        )
     assert sum(found) >= 5
 
 

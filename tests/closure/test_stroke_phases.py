@@ -45,7 +45,9 @@ def test_phase_of_each_pass_is_found_about_its_middle():
 
 def test_strokes_split_into_files_keep_the_passes_of_their_record():
     """Whatever files are left: the first of a record may be among those held out."""
-    bins = make_bins(temperatures=(60.0,), days=(4.0,), speeds=(1.0, 2.0), directions=(1, -1), repeats=2, bins=3)
+    bins = make_bins(
+        temperatures=(60.0,), days=(4.0,), speeds=(1.0, 2.0), directions=(1, -1), repeats=2, bins=3
+    )
     way = np.where(bins["direction"] > 0, "+", "-")
     bins["stroke"] = 2 * bins["repeat"] - (bins["direction"] > 0)
     run = bins["run_id"].str.replace("-", "")

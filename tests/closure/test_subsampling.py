@@ -9,7 +9,15 @@ from bins_helpers import TRUE, make_bins, make_traces, warm
 from sealfit.closure.confirm import Context
 from sealfit.closure.loop import close_loop
 from sealfit.closure.selection import numbered, select_effects, steady_samples
-from sealfit.closure.subsampling import FURTHER, MOST_ROWS, PER_STROKE, ROWS, merged_bins, reselect_on_all, subsamples
+from sealfit.closure.subsampling import (
+    FURTHER,
+    MOST_ROWS,
+    PER_STROKE,
+    ROWS,
+    merged_bins,
+    reselect_on_all,
+    subsamples,
+)
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.declared import declare
@@ -25,7 +33,9 @@ def test_the_search_works_on_few_rows_but_not_on_too_few_of_a_stroke(bins, repea
     rest = strokes  # what is over in each stroke when whole numbers of bins are merged makes a row of its own
     assert len(left) <= max(ROWS, min(PER_STROKE * strokes, MOST_ROWS)) + rest
     assert len(left) == len(table) or len(left) > 0.4 * min(ROWS, PER_STROKE * strokes)
-    together = np.ceil(len(table) / np.clip(PER_STROKE * strokes, ROWS, MOST_ROWS))  # bins merged into one row
+    together = np.ceil(
+        len(table) / np.clip(PER_STROKE * strokes, ROWS, MOST_ROWS)
+    )  # bins merged into one row
     assert len(left) == np.ceil(table.groupby("stroke_id").size() / together).sum()
     assert left["n"].sum() == table["n"].sum()
     whole, merged = (np.average(rows["force_N"], weights=rows["n"]) for rows in (table, left))
@@ -125,7 +135,9 @@ def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatc
         viscous = TRUE["sigma_2"] * table["speed_mm_s"] if acts_on == "mu" else 0.0
         return force + 0.1 * -np.expm1(-table["distance_mm"] / 10.0) * (force - viscous)
 
-    bins = numbered(make_bins(seed, effect=stiffer, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, noise_N=0.1))
+    bins = numbered(
+        make_bins(seed, effect=stiffer, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, noise_N=0.1)
+    )
     part = next(subsamples(make_rows(bins, has_aging=True), 1))
     samples = steady_samples(make_traces(bins), part.rows)
     selection = select_effects(part.coarse, samples, Context(Config(), EFFECTS))
@@ -134,7 +146,9 @@ def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatc
     def on(quantity):
         term = replace(found.proposal.term, acts_on=quantity)
         model = selection.before.model.with_term(term, found.proposal.fitted.model.values[-1])
-        return replace(found.proposal, term=term, fitted=fit(model, part.coarse, selection.after.scatter, turns=0))
+        return replace(
+            found.proposal, term=term, fitted=fit(model, part.coarse, selection.after.scatter, turns=0)
+        )
 
     for first, second in ((other, acts_on), (acts_on, other)):
         chosen, rival = on(first), on(second)

@@ -1,7 +1,8 @@
-"""Campaigns written in the manner of other people's exports: one small generator for each data acquisition program.
+"""Campaigns written in the manner of other people's exports: one small generator per acquisition program.
 
-Each generator writes trace files into a folder and returns, by file, the record that the file holds. The form of the
-files (encoding, separators, header, units, names) follows what the programs write; the numbers are simulated.
+Each generator writes trace files into a folder and returns, by file, the record that the file holds. The form
+of the files (encoding, separators, header, units, names) follows what the programs write; the numbers are
+simulated.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ class Record:
 Written = dict[str, Record]
 
 
-def motion(speed: float, strokes: int = 1, rows: int = 260, travel: float = 30.0) -> tuple[np.ndarray, np.ndarray]:
+def motion(
+    speed: float, strokes: int = 1, rows: int = 260, travel: float = 30.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return time and speed of strokes to and fro with rests, ramps and a plateau, shape (rows,)."""
     duration = travel / speed / 0.85  # the plateau and its ramps take 85 % of the time of a stroke
     step = float(f"{strokes * duration / rows:.2g}")
@@ -71,14 +74,25 @@ def records(
     """Yield the records of a campaign, in order."""
     design = product(temperatures, days, speeds, repeats)
     for number, (temperature, day, speed, repeat) in enumerate(design, start=1):
-        settings = {"temperature": temperature, "compression": 80, "days": day, "speed": speed, "repeat": repeat}
+        settings = {
+            "temperature": temperature,
+            "compression": 80,
+            "days": day,
+            "speed": speed,
+            "repeat": repeat,
+        }
         yield record(settings, number, strokes, start_mm)
 
 
-def table(columns: list[np.ndarray], delimiter: str, decimals: int, comma: bool = False, quote: bool = False) -> str:
+def table(
+    columns: list[np.ndarray], delimiter: str, decimals: int, comma: bool = False, quote: bool = False
+) -> str:
     """Return lines of numbers."""
     mark = '"' if quote else ""
-    lines = [delimiter.join(f"{mark}{value:.{decimals}f}{mark}" for value in row) for row in zip(*columns, strict=True)]
+    lines = [
+        delimiter.join(f"{mark}{value:.{decimals}f}{mark}" for value in row)
+        for row in zip(*columns, strict=True)
+    ]
     text = "\n".join(lines) + "\n"
     return text.replace(".", ",") if comma else text
 
@@ -104,7 +118,11 @@ def german_daq(folder: Path, dates: str = "header") -> Written:
         day = f"{one.started:%Y%m%d_%H%M%S}_" if dates == "names" else ""
         speed = f"{one.speed:g}".replace(".", ",")
         file = f"{day}NBR_{one.temperature}C_{one.compression}pct_{one.days}d_{speed}mms_{one.repeat}.txt"
-        date = f"Datum:;{one.started:%d.%m.%Y}\nUhrzeit:;{one.started:%H:%M:%S}\n" if dates == "header" else "\n\n"
+        date = (
+            f"Datum:;{one.started:%d.%m.%Y}\nUhrzeit:;{one.started:%H:%M:%S}\n"
+            if dates == "header"
+            else "\n\n"
+        )
         head = f"Messprotokoll Reibprüfstand\n{date}Prüfer:;Müller\nNormalkraft:;50,0;N\n\n"
         names = "Zeit;Weg;Reibkraft;Temperatur\ns;mm;N;°C\n"
         body = table([*slots(one), one.further["temperature"]], ";", 4, comma=True)
@@ -133,11 +151,14 @@ def labview(folder: Path) -> Written:
         file = f"T{one.temperature}_{one.compression}pct_{one.days}d_v{one.speed:g}_{one.repeat:03d}.lvm"
         day, hour = f"{one.started:%Y/%m/%d}", f"{one.started:%H:%M:%S}.9389457702636719"
         head = (
-            "LabVIEW Measurement\t\nWriter_Version\t2\nReader_Version\t2\nSeparator\tTab\nDecimal_Separator\t.\n"
+            "LabVIEW Measurement\t\nWriter_Version\t2\nReader_Version\t2\n"
+            "Separator\tTab\nDecimal_Separator\t.\n"
             "Multi_Headings\tNo\nX_Columns\tOne\nTime_Pref\tRelative\nOperator\tlab\n"
             f"Date\t{day}\nTime\t{hour}\n***End_of_Header***\t\n\t\n"
-            f"Channels\t2\t\nSamples\t260\t260\t\nDate\t{day}\t{day}\nTime\t{hour}\t{hour}\nY_Unit_Label\tmm\tN\n"
-            "X_Dimension\tTime\tTime\nX0\t0.0000000000000000E+0\t0.0000000000000000E+0\nDelta_X\t0.010000\t0.010000\n"
+            f"Channels\t2\t\nSamples\t260\t260\t\nDate\t{day}\t{day}\nTime\t{hour}\t{hour}\n"
+            "Y_Unit_Label\tmm\tN\n"
+            "X_Dimension\tTime\tTime\nX0\t0.0000000000000000E+0\t0.0000000000000000E+0\n"
+            "Delta_X\t0.010000\t0.010000\n"
             "***End_of_Header***\t\t\nX_Value\tPosition\tFriction\tComment\n"
         )
         write(folder, file, head + table(slots(one), "\t", 6), newline="\r\n")
@@ -149,7 +170,10 @@ def catman(folder: Path) -> Written:
     """Catman ASCII: five lines for each channel above the data, names first."""
     written = {}
     for one in records():
-        file = f"Reibversuch_T{one.temperature}_H{one.compression}_Tag{one.days}_{one.speed:g}mms_W{one.repeat}.ASC"
+        file = (
+            f"Reibversuch_T{one.temperature}_H{one.compression}_Tag{one.days}_"
+            f"{one.speed:g}mms_W{one.repeat}.ASC"
+        )
         head = (
             f"HBM catmanEasy\nDatei: {file}\nStart: {one.started:%d.%m.%Y %H:%M:%S}\n"
             "Zeit  1 - Standardmessrate\tWegaufnehmer\tKraftaufnehmer\ns\tmm\tN\n"
@@ -161,7 +185,7 @@ def catman(folder: Path) -> Written:
 
 
 def dasylab(folder: Path) -> Written:
-    """DASYLab: every line of data and the names end in a separator; strokes to and fro, force of the other sign."""
+    """DASYLab: data lines and the names end in a separator; strokes to and fro, force of the other sign."""
     written = {}
     for one in records(strokes=4):
         file = f"Alterung {one.days} Tage/{one.temperature} Grad/v={one.speed:g} mm_s Wdh {one.repeat}.asc"
@@ -189,10 +213,12 @@ def hbm(folder: Path) -> Written:
 
 
 def instron(folder: Path) -> Written:
-    """Instron Bluehill: a table of results above the raw data, every cell in quotes, a folder for each sample."""
+    """Instron Bluehill: a table of results above the raw data, every cell in quotes, a folder per sample."""
     written = {}
     for one in records():
-        sample = f"{one.temperature}C_{one.compression}pct_{one.days}d_{one.speed * 60:g}mmmin.is_tens_RawData"
+        sample = (
+            f"{one.temperature}C_{one.compression}pct_{one.days}d_{one.speed * 60:g}mmmin.is_tens_RawData"
+        )
         file = f"{sample}/Specimen_RawData_{one.repeat}.csv"
         head = (
             f'"Results Table 1"\n"","Maximum Load","Extension at Maximum Load"\n"","(N)","(mm)"\n'
@@ -209,7 +235,8 @@ def zwick(folder: Path) -> Written:
     written = {}
     for one in records():
         file = (
-            f"NBR70/{one.temperature}C/{one.compression}%/Probe{one.repeat}_{one.days}Tage_{one.speed * 60:g}mmmin.TRA"
+            f"NBR70/{one.temperature}C/{one.compression}%/"
+            f"Probe{one.repeat}_{one.days}Tage_{one.speed * 60:g}mmmin.TRA"
         )
         head = '"Prüfzeit";"Standardkraft";"Traversenweg"\n"s";"N";"mm"\n'
         body = table([one.time_s, one.force_N, one.displacement_mm], ";", 4, comma=True)
@@ -253,7 +280,10 @@ def benchvue(folder: Path) -> Written:
     """Keysight BenchVue: what was connected, then a number and a time of day beside the elapsed time."""
     written = {}
     for one in records():
-        file = f"DAQ970A_{one.temperature}C_{one.compression}pct_{one.days}days_{one.speed:g}mmps_run{one.repeat}.csv"
+        file = (
+            f"DAQ970A_{one.temperature}C_{one.compression}pct_{one.days}days_"
+            f"{one.speed:g}mmps_run{one.repeat}.csv"
+        )
         head = (
             f"Instrument,DAQ970A\nSerial Number,MY58001234\nStart Time,{one.started:%m/%d/%Y %H:%M:%S}\n"
             "Sweep Interval,0.02\n\nScan,Timestamp,Elapsed Time (s),Position (mm),Friction Force (N)\n"
@@ -261,7 +291,9 @@ def benchvue(folder: Path) -> Written:
         lines = []
         for number, row in enumerate(zip(*slots(one), strict=True), start=1):
             clock = one.started + timedelta(seconds=float(row[0]))
-            lines.append(f"{number},{clock:%m/%d/%Y %H:%M:%S.%f}," + ",".join(f"{value:.5f}" for value in row))
+            lines.append(
+                f"{number},{clock:%m/%d/%Y %H:%M:%S.%f}," + ",".join(f"{value:.5f}" for value in row)
+            )
         write(folder, file, head + "\n".join(lines) + "\n", newline="\r\n")
         written[file] = one
     return written
@@ -274,7 +306,9 @@ def matlab(folder: Path) -> Written:
         file = f"run_{one.number:03d}.csv"
         body = "\n".join(",".join(f"{value:.15g}" for value in row) for row in zip(*slots(one), strict=True))
         write(folder, file, f"Time_s,Pos_mm,Force_N\n{body}\n")
-        rows.append(f"{file},{one.temperature},{one.compression},{one.days},{one.speed:g},{one.repeat},{one.started}")
+        rows.append(
+            f"{file},{one.temperature},{one.compression},{one.days},{one.speed:g},{one.repeat},{one.started}"
+        )
         written[file] = one
     head = "FileName,Temp_C,Height_pct,AgingTime_d,Speed_mm_s,Rep,StartTime"
     write(folder, "testplan.csv", "\n".join([head, *rows]) + "\n")
@@ -290,10 +324,20 @@ def excel_german(folder: Path) -> Written:
         body = table(slots(one), ";", 3, comma=True).replace("\n", ";;\n")
         write(folder, file, head + body + ";;;;\n", "utf-8-sig", "\r\n")
         start = f"{one.started:%Y-%m-%d %H:%M:%S}"
-        rows.append(f"{file};{one.temperature};{one.compression};{one.days};{one.speed:g};{one.repeat};50,0;{start}")
+        rows.append(
+            f"{file};{one.temperature};{one.compression};{one.days};{one.speed:g};{one.repeat};50,0;{start}"
+        )
         written[file] = one
-    head = "Datei;Temperatur;Verpressung auf %;Alterungstage;Geschwindigkeit;Wiederholung;Normalkraft;Startzeit"
-    write(folder, "runs.csv", "\n".join([head, *rows]).replace(".", ",").replace(",csv", ".csv"), "utf-8-sig", "\r\n")
+    head = (
+        "Datei;Temperatur;Verpressung auf %;Alterungstage;Geschwindigkeit;Wiederholung;Normalkraft;Startzeit"
+    )
+    write(
+        folder,
+        "runs.csv",
+        "\n".join([head, *rows]).replace(".", ",").replace(",csv", ".csv"),
+        "utf-8-sig",
+        "\r\n",
+    )
     return written
 
 

@@ -55,7 +55,9 @@ def test_a_counter_without_a_name_is_no_time(tmp_path):
 
 
 def test_the_raw_signal_of_a_sensor_is_left_for_the_scaled_one(tmp_path):
-    made = campaign(tmp_path, lambda one: [one.time_s, 1.2 + one.displacement_mm / 20, *exports.slots(one)[1:]])
+    made = campaign(
+        tmp_path, lambda one: [one.time_s, 1.2 + one.displacement_mm / 20, *exports.slots(one)[1:]]
+    )
     assert slots(made) == {"time_s": 1, "displacement_mm": 3, "force_N": 4}
     assert "column 2, the same signal as column 3" in made.text
 
@@ -101,14 +103,19 @@ def test_a_displacement_is_integrated_from_a_speed(tmp_path):
 
 def test_a_time_of_day_is_a_doubt_with_its_fix(tmp_path):
     for one in exports.records(days=(4,), repeats=(1,)):
-        lines = [f"10:12:{i % 60:02d},{x:.4f},{f:.4f}" for i, (_, x, f) in enumerate(zip(*exports.slots(one)))]  # noqa: B905
+        lines = [
+            f"10:12:{i % 60:02d},{x:.4f},{f:.4f}"
+            for i, (_, x, f) in enumerate(zip(*exports.slots(one)))  # noqa: B905
+        ]
         exports.write(tmp_path, f"d4_v{one.speed:g}.csv", "\n".join(["Clock,Position,Force", *lines]))
     (doubt,) = [doubt for doubt in draft(tmp_path).doubts if "there is no time" in doubt.reason]
     assert "exported as seconds" in doubt.fix
 
 
 def test_a_time_in_no_unit_that_would_last_for_hours_is_in_ms(tmp_path):
-    made = campaign(tmp_path, lambda one: [one.time_s * 1000, *exports.slots(one)[1:]], "Time,Position,Force\n")
+    made = campaign(
+        tmp_path, lambda one: [one.time_s * 1000, *exports.slots(one)[1:]], "Time,Position,Force\n"
+    )
     trace = parse_config(made.text, "rig.toml").trace
     assert trace.compute == {"time_s": "time_ms / 1000"}
     assert any("taken as ms" in doubt.reason for doubt in made.doubts)
@@ -117,7 +124,9 @@ def test_a_time_in_no_unit_that_would_last_for_hours_is_in_ms(tmp_path):
 def test_a_speed_of_names_in_mm_per_minute_is_seen_in_the_displacement(tmp_path):
     for one in exports.records(days=(4,), repeats=(1,)):
         header = "Time_s,Position_mm,Force_N\n"
-        exports.write(tmp_path, f"d4_v{60 * one.speed:g}.csv", header + exports.table(exports.slots(one), ",", 4))
+        exports.write(
+            tmp_path, f"d4_v{60 * one.speed:g}.csv", header + exports.table(exports.slots(one), ",", 4)
+        )
     config = parse_config(draft(tmp_path).text, "rig.toml")
     assert config.files.compute == {"speed_mm_s": "_speed / 60"}
 
@@ -156,7 +165,8 @@ def test_strokes_are_counted(strokes, sign):
         ("Prüfzeit", "time"), ("Elapsed Time", "time"), ("t", "time"), ("Messzeit", "time"),
         ("Traversenweg", "displacement"), ("Crosshead", "displacement"), ("Verfahrweg", "displacement"),
         ("x", "displacement"), ("Standardkraft", "force"), ("Fx", "force"), ("Reibkraft", "force"),
-        ("Load Cell", "force"), ("Normalkraft", "load"), ("Fz", "load"), ("Reibungszahl", "none"), ("COF", "none"),
+        ("Load Cell", "force"), ("Normalkraft", "load"), ("Fz", "load"), ("Reibungszahl", "none"),
+        ("COF", "none"),
         ("Probentemperatur", "temperature"), ("Geschwindigkeit", "speed"), ("Drehmoment", "torque"),
         ("MX440B_CH 1", ""),
     ],
@@ -203,13 +213,17 @@ def test_a_measured_load_goes_before_that_of_the_header(tmp_path):
 
 
 def test_names_with_blanks_above_columns_of_blanks_go_by_position(tmp_path):
-    made = campaign(tmp_path, exports.slots, "Elapsed Time (s)   Slide Position (mm)   Force (N)\n", delimiter="   ")
+    made = campaign(
+        tmp_path, exports.slots, "Elapsed Time (s)   Slide Position (mm)   Force (N)\n", delimiter="   "
+    )
     assert slots(made) == {"time_s": 1, "displacement_mm": 2, "force_N": 3}
     assert parse_config(made.text, "rig.toml").trace.header_lines == 1
     assert [doubt.key for doubt in made.doubts] == ["condition"]  # names say the days only
 
 
-@pytest.mark.parametrize("header", ["# t x F\n", "#t[s] x[mm] F[N]\n", "# made by numpy\n# time position force\n"])
+@pytest.mark.parametrize(
+    "header", ["# t x F\n", "#t[s] x[mm] F[N]\n", "# made by numpy\n# time position force\n"]
+)
 def test_names_behind_a_mark_of_comment(header, tmp_path):
     made = campaign(tmp_path, exports.slots, header.replace(" ", "\t"), delimiter="\t")
     config = parse_config(made.text, "rig.toml")

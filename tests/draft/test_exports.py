@@ -1,4 +1,4 @@
-"""The draft of a config reads what other people's programs export, with at most one edit; each edit is stated."""
+"""The draft of a config reads what others' programs export, with at most one edit; each edit is stated."""
 
 import shutil
 from pathlib import Path
@@ -100,7 +100,10 @@ def test_lines_below_the_data_are_a_doubt_as_no_config_can_name_them(name, tmp_p
     exports.EXPORTS[name](tmp_path)
     made, _, ingested = read(tmp_path)
     assert any("end in lines that are no data" in doubt.reason for doubt in made.doubts)
-    assert {fault.line for fault in ingested.faults} <= {263, 264}  # one line in each file, below the 260 rows
+    assert {fault.line for fault in ingested.faults} <= {
+        263,
+        264,
+    }  # one line in each file, below the 260 rows
 
 
 # ---------------------------------------------------------------- what single exports need
@@ -191,7 +194,8 @@ def test_settings_and_dates_in_the_header_are_enough(tmp_path):
     for one in exports.records(temperatures=(60, 80)):
         head = (
             f"Test: friction\nDate: {one.started}\nAging temperature: {one.temperature} °C\n"
-            f"Aging time: {24 * one.days} h\nCompression: {one.compression} %\nSpeed: {60 * one.speed:g} mm/min\n"
+            f"Aging time: {24 * one.days} h\nCompression: {one.compression} %\n"
+            f"Speed: {60 * one.speed:g} mm/min\n"
             "Normal load: 50 N\n\nt [s]\tx [mm]\tF [N]\n"
         )
         file = f"test{one.number:04d}.txt"
@@ -211,7 +215,9 @@ def test_rubbers_directions_and_decimal_commas_in_names(tmp_path):
             speed = f"{one.speed:g}".replace(".", ",")
             file = f"{rubber}/{one.days} Tage/{one.temperature}C_v{speed}_{word}_{one.repeat}.txt"
             columns = [one.time_s, sign * one.displacement_mm, sign * one.force_N]
-            exports.write(tmp_path, file, "Zeit s;Weg mm;Kraft N\n" + exports.table(columns, ";", 4, comma=True))
+            exports.write(
+                tmp_path, file, "Zeit s;Weg mm;Kraft N\n" + exports.table(columns, ";", 4, comma=True)
+            )
             written[file] = one
     _, config, ingested = read(tmp_path)
     assert config.rubber == ["rubber"]

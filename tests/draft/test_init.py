@@ -84,7 +84,9 @@ def test_a_file_that_is_there_is_kept_unless_forced(sealfit, campaign):
     Path("rig.toml").write_text("mine")
     code, _, err = sealfit("init", campaign)
     assert code == 1
-    assert err == "sealfit: rig.toml: is there already. Choose another --output, or replace it with --force.\n"
+    assert (
+        err == "sealfit: rig.toml: is there already. Choose another --output, or replace it with --force.\n"
+    )
     assert Path("rig.toml").read_text() == "mine"
     assert sealfit("init", campaign, "--force")[0] == 0
     assert load_config("rig.toml")
@@ -152,7 +154,9 @@ def empty_files(folder):
 
 
 def values_over_days(folder):
-    exports.write(folder, "strength.csv", "TempC,TimeH,Response\n" + "50,0,100\n50,72,93.1\n60,0,99\n60,24,95\n" * 5)
+    exports.write(
+        folder, "strength.csv", "TempC,TimeH,Response\n" + "50,0,100\n50,72,93.1\n60,0,99\n60,24,95\n" * 5
+    )
 
 
 def only_a_table_of_runs(folder):
@@ -212,7 +216,10 @@ def test_files_with_further_columns_are_read_by_the_names_that_all_have(tmp_path
     for one in exports.records():
         columns, header = exports.slots(one), "t [s];x [mm];F [N]\n"
         if one.repeat == 2 and one.days == 4:
-            columns, header = [one.time_s, one.further["temperature"], *columns[1:]], "t [s];T [°C];x [mm];F [N]\n"
+            columns, header = (
+                [one.time_s, one.further["temperature"], *columns[1:]],
+                "t [s];T [°C];x [mm];F [N]\n",
+            )
         file = f"d{one.days}_v{one.speed:g}_r{one.repeat}.csv"
         exports.write(tmp_path, file, header + exports.table(columns, ";", 4))
     made = draft(tmp_path)
@@ -289,7 +296,14 @@ def test_files_that_nothing_tells_apart_are_one_condition(tmp_path):
 
 
 def test_a_repeat_that_does_not_tell_files_apart_is_not_used(tmp_path):
-    for batch, day, repeat in [("a1", 1, 1), ("a2", 1, 1), ("a1", 4, 1), ("a2", 4, 1), ("a1", 1, 2), ("a2", 1, 2)]:
+    for batch, day, repeat in [
+        ("a1", 1, 1),
+        ("a2", 1, 1),
+        ("a1", 4, 1),
+        ("a2", 4, 1),
+        ("a1", 1, 2),
+        ("a2", 1, 2),
+    ]:
         (one,) = exports.records(days=(day,), speeds=(5.0,), repeats=(1,))
         exports.write(tmp_path, f"{batch}/d{day}_r{repeat}.csv", plain(one))
     made = draft(tmp_path)

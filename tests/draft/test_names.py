@@ -9,7 +9,9 @@ from sealfit.ingest.file_names import name_parts
 
 def told(files, which=0):
     names = read_names(files)
-    settings = Files(name_pattern=names.pattern, values=names.values, compute=names.compute, columns=names.columns)
+    settings = Files(
+        name_pattern=names.pattern, values=names.values, compute=names.compute, columns=names.columns
+    )
     return name_parts(files[which], settings).channels
 
 

@@ -1,4 +1,4 @@
-"""The draft of the campaigns in sample_data: what it finds by itself, and the one edit that a measured rig needs."""
+"""The draft of the campaigns in sample_data: what it finds itself, and the one edit a measured rig needs."""
 
 from pathlib import Path
 
@@ -17,7 +17,11 @@ SAMPLES = ROOT / "sample_data"
 def both(campaign, config, edit=lambda text: text):
     """Return the draft's config, edited, and the one that is kept for the rig."""
     made = draft(SAMPLES / campaign)
-    return made, parse_config(edit(made.text), "rig.toml"), load_config(ROOT / "configs" / config if config else None)
+    return (
+        made,
+        parse_config(edit(made.text), "rig.toml"),
+        load_config(ROOT / "configs" / config if config else None),
+    )
 
 
 def read(campaign, config, file):
@@ -68,7 +72,9 @@ def test_the_screw_drives_need_the_torque_in_mN_m():
     assert [fault for fault in faults if fault.severity == "error"] == []
     assert {ref.file for ref in listing} == {ref.file for ref in expected}
     for name in ("speed_set_mm_s", "started_at"):
-        assert {ref.file: ref.channels[name] for ref in listing} == {ref.file: ref.channels[name] for ref in expected}
+        assert {ref.file: ref.channels[name] for ref in listing} == {
+            ref.file: ref.channels[name] for ref in expected
+        }
     found, wanted = read(campaign, ours, file), read(campaign, theirs, file)
     last = len(wanted)  # that config drops the first 50 rows
     npt.assert_allclose(found["time_s"][-last:], wanted["time_s"])

@@ -55,7 +55,10 @@ def inputs_of(effect: Effect) -> dict:
     if effect.id == "levels":
         return {CHANNEL: np.array(["batch C", "batch A", "batch B", "batch A"])}
     channels = {name: CAMPAIGN[name] for name in effect.reads}
-    return {**channels, **{f"{name}_ref": float(np.mean(np.abs(values))) for name, values in channels.items()}}
+    return {
+        **channels,
+        **{f"{name}_ref": float(np.mean(np.abs(values))) for name, values in channels.items()},
+    }
 
 
 def nonzero(effect: Effect) -> dict[str, float]:
@@ -105,7 +108,9 @@ def test_is_linear_in_its_amplitudes(effect, values):
     doubled = {name: 2 * one[name] for name in effect.linear}
     shape = effect.shape(inputs, **{**start, **one})
     scale = max(1.0, float(np.abs(shape).max()))
-    npt.assert_allclose(effect.shape(inputs, **{**start, **doubled}), 2 * shape, rtol=1e-12, atol=1e-12 * scale)
+    npt.assert_allclose(
+        effect.shape(inputs, **{**start, **doubled}), 2 * shape, rtol=1e-12, atol=1e-12 * scale
+    )
     sum_ = shape + effect.shape(inputs, **{**start, **other})
     npt.assert_allclose(effect.shape(inputs, **{**start, **together}), sum_, rtol=1e-9, atol=1e-9 * scale)
 
@@ -211,12 +216,16 @@ def test_the_reference_is_said(effect):
 
 
 @pytest.mark.parametrize(
-    "effect", [e for e in EVERY.values() if e.reference in ZERO_AT or "_ref}" in e.reference], ids=lambda e: e.id
+    "effect",
+    [e for e in EVERY.values() if e.reference in ZERO_AT or "_ref}" in e.reference],
+    ids=lambda e: e.id,
 )
 def test_the_shape_is_zero_at_the_reference_that_is_said(effect):
     """Others say a mean, a limit, or a place that parameters or categories tell."""
     named = re.findall(r"\{(\w+)_ref\}", effect.reference)
-    at = ZERO_AT.get(effect.reference) or dict.fromkeys(named[:1] if " or " in effect.reference else named, 1.5)
+    at = ZERO_AT.get(effect.reference) or dict.fromkeys(
+        named[:1] if " or " in effect.reference else named, 1.5
+    )
     inputs = {name: np.array([at.get(name, 2.0)]) for name in effect.reads}
     fixed = {f"{name}_ref": 1.5 for name in effect.reads}
     values = {p.name: p.start for p in effect.parameters} | dict.fromkeys(effect.linear, 0.3)

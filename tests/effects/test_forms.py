@@ -72,7 +72,12 @@ def test_conduction_follows_the_root_of_time_at_one_speed():
     # v s = v^2 t: at one speed the surface warms as the root of the time, Carslaw & Jaeger's half-space.
     time = np.array([1.0, 4.0, 9.0])
     shape = EFFECTS["warming_conduction"].shape(
-        {"distance_mm": 5.0 * time, "distance_mm_ref": 5.0, "speed_mm_s": np.full(3, 5.0), "speed_mm_s_ref": 5.0},
+        {
+            "distance_mm": 5.0 * time,
+            "distance_mm_ref": 5.0,
+            "speed_mm_s": np.full(3, 5.0),
+            "speed_mm_s_ref": 5.0,
+        },
         A=0.05,
     )
     npt.assert_allclose(shape, [-0.05, -0.10, -0.15], rtol=1e-14)
@@ -92,8 +97,11 @@ def test_first_repeat_and_first_stroke_are_the_reference():
 
 @given(ratio=st.floats(0.5, 2.0), exponent=st.floats(2 / 3, 1.0))
 def test_load_exponent_is_the_power_law_to_first_order(ratio, exponent):
-    # What is left out of (N / N_ref)^(n - 1) - 1 is at most half the square of its logarithm (n < 1: one sign apart).
-    first = EFFECTS["load_exponent"].shape({"load_N": np.array([50.0 * ratio]), "load_N_ref": 50.0}, A=exponent - 1)
+    # What is left out of (N / N_ref)^(n - 1) - 1 is at most half the square of its logarithm (n < 1: one sign
+    # apart).
+    first = EFFECTS["load_exponent"].shape(
+        {"load_N": np.array([50.0 * ratio]), "load_N_ref": 50.0}, A=exponent - 1
+    )
     exact = ratio ** (exponent - 1) - 1
     logarithm = (exponent - 1) * np.log(ratio)
     assert abs(exact - first[0]) <= 0.5 * logarithm**2 * np.exp(abs(logarithm)) + 1e-12
@@ -103,7 +111,9 @@ def test_a_floor_stops_the_logarithmic_fall():
     # mu_0 - a ln(1 + t / b) with A = a: beyond t_f the sum is -a ln(t_f / b) up to a b / t.
     days = np.array([100.0, 1e3, 1e4])
     given_back = EFFECTS["aging_floor"].shape({"aging_days": days}, A=0.03, t_f=50.0)
-    npt.assert_allclose(-0.03 * np.log1p(days / 0.1) + given_back, -0.03 * np.log(500.0), atol=0.03 * 0.1 / 100)
+    npt.assert_allclose(
+        -0.03 * np.log1p(days / 0.1) + given_back, -0.03 * np.log(500.0), atol=0.03 * 0.1 / 100
+    )
 
 
 def test_an_induction_lag_is_largest_at_its_day_and_gone_at_day_0():
@@ -135,7 +145,9 @@ def test_the_declared_curve_with_its_exponent_changed_is_the_curve_of_that_expon
 @given(n=st.floats(0.2, 10.0))
 def test_a_stribeck_exponent_changes_nothing_at_rest_at_the_stribeck_speed_and_far_above(n):
     shape = EFFECTS["stribeck_exponent"].shape
-    npt.assert_allclose(shape({"speed_mm_s": np.array([0.0, 5.0, 5e19])}, A=0.3, v_s=5.0, n=n), 0.0, atol=1e-15)
+    npt.assert_allclose(
+        shape({"speed_mm_s": np.array([0.0, 5.0, 5e19])}, A=0.3, v_s=5.0, n=n), 0.0, atol=1e-15
+    )
 
 
 def test_a_stribeck_exponent_of_2_is_the_declared_curve_and_near_2_only_a_product_shows():

@@ -8,7 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sealfit.effects.free import free_effect, levels_effect, roughness, slopes_effect, smooth_effect, surface_effect
+from sealfit.effects.free import (
+    free_effect,
+    levels_effect,
+    roughness,
+    slopes_effect,
+    smooth_effect,
+    surface_effect,
+)
 from sealfit.errors import ParameterError
 
 
@@ -31,9 +38,11 @@ def test_smooth_holds_straight_lines_inside_its_knots_and_its_last_values_beyond
 
 
 def test_smooth_against_a_natural_spline_solved_by_hand():
-    # Knots 0, 1, 2 with values 0, 1, 0: the middle second derivative m solves 4 m = 6 (0 - 2 + 0), m = -3, so at 1/2
-    # h = 1/2 - m/6 (1/2 - 1/8) = 1/2 + 3/16 = 11/16.
-    npt.assert_allclose(smooth_effect([0, 1, 2]).shape({"x": np.array([0.5])}, c_2=1.0, c_3=0.0), [11 / 16], rtol=1e-14)
+    # Knots 0, 1, 2 with values 0, 1, 0: the middle second derivative m solves 4 m = 6 (0 - 2 + 0), m = -3, so
+    # at 1/2 h = 1/2 - m/6 (1/2 - 1/8) = 1/2 + 3/16 = 11/16.
+    npt.assert_allclose(
+        smooth_effect([0, 1, 2]).shape({"x": np.array([0.5])}, c_2=1.0, c_3=0.0), [11 / 16], rtol=1e-14
+    )
 
 
 def test_roughness_is_the_integral_of_the_squared_second_derivative():
@@ -43,7 +52,9 @@ def test_roughness_is_the_integral_of_the_squared_second_derivative():
 
 @pytest.mark.parametrize("knots", [(0.0, 1.0, 4.0, 5.0, 9.0), (0.5, 2.0, 9.0, 40.0)])
 def test_a_straight_line_is_not_rough(knots):
-    line = np.log(knots) if knots[0] > 0 else np.array(knots)  # over a factor of 20: straight in the logarithm
+    line = (
+        np.log(knots) if knots[0] > 0 else np.array(knots)
+    )  # over a factor of 20: straight in the logarithm
     value = (line - line[0])[1:]
     npt.assert_allclose(roughness(knots) @ value, 0.0, atol=1e-10)
     assert np.linalg.matrix_rank(roughness(knots), tol=1e-8) == len(knots) - 2
@@ -60,7 +71,11 @@ def test_a_category_that_was_not_fitted_gets_no_value():
     [("smooth", {"knots": [0.0, 2.0, 5.0], "x_ref": 2.1}), ("levels", {"categories": ["A", "B", "C"]})],
 )
 def test_free_shapes_are_rebuilt_from_plain_data(id_, fixed):
-    direct = smooth_effect(fixed["knots"], fixed["x_ref"]) if id_ == "smooth" else levels_effect(fixed["categories"])
+    direct = (
+        smooth_effect(fixed["knots"], fixed["x_ref"])
+        if id_ == "smooth"
+        else levels_effect(fixed["categories"])
+    )
     rebuilt = free_effect(id_, json.loads(json.dumps(fixed)))
     assert rebuilt.parameters == direct.parameters
     assert (rebuilt.id, rebuilt.form) == (id_, direct.form)

@@ -56,7 +56,9 @@ def test_the_catalogue_is_left_as_it_was(tmp_path):
 def test_a_file_is_read_anew_each_time(tmp_path):
     path = write(tmp_path, "patch.py", WORN_PATCH)
     assert load_user_effects(tmp_path)["worn_patch"].label == "worn patch of the track"
-    path.write_text(WORN_PATCH.replace('label="worn patch', 'label="torn patch'))  # the same size, within a second
+    path.write_text(
+        WORN_PATCH.replace('label="worn patch', 'label="torn patch')
+    )  # the same size, within a second
     assert load_user_effects(tmp_path)["worn_patch"].label == "torn patch of the track"
     assert [p.name for p in tmp_path.iterdir()] == ["patch.py"]
 
@@ -70,7 +72,10 @@ def test_a_worker_process_that_never_loaded_the_folder_gets_the_effect(tmp_path)
         "print(effect.id, float(effect.shape({'displacement_mm': np.array([4.0])}, A=-0.2, x_0=3.0)[0]))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "effect.pickle")], capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, str(tmp_path / "effect.pickle")],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.split() == ["worn_patch", "-0.1"]
 

@@ -37,7 +37,7 @@ def test_the_published_series_give_back_a_b_and_c(published):
 
 
 def test_the_published_measurements_are_met_by_the_law():
-    """The source's measured values, checks 1 and 2: three numbers through three points, so no error is left."""
+    """The source's measured values, checks 1 and 2: three numbers through three points leave no error."""
     days = np.array([[0.0, 4, 16]])
     for measured in ([0.93513, 0.75859, 0.70319], [0.609, 0.48429, 0.44781]):
         fit = solve_law(days, np.array([measured]), np.ones((1, 3)))
@@ -49,12 +49,16 @@ def test_many_curves_at_once_each_at_their_global_minimum():
     rng = np.random.default_rng(4)
     k = 300
     mu_0, a, b = rng.uniform(0.5, 1, k), rng.uniform(0.01, 0.08, k), np.exp(rng.uniform(-4, 2, k))
-    value = np.stack([aging_law(DAYS, mu_0=mu_0[i], a=a[i], b=b[i]) for i in range(k)]) + rng.normal(0, 0.01, (k, 7))
+    value = np.stack([aging_law(DAYS, mu_0=mu_0[i], a=a[i], b=b[i]) for i in range(k)]) + rng.normal(
+        0, 0.01, (k, 7)
+    )
     fit = solve_law(DAYS, value, np.ones_like(value))
     for i in range(0, k, 30):
         found = [
             least_squares(
-                lambda x, i=i: x[0] - x[1] * np.log1p(DAYS * np.exp(-x[2])) - value[i], [0.8, 0.04, u], max_nfev=2000
+                lambda x, i=i: x[0] - x[1] * np.log1p(DAYS * np.exp(-x[2])) - value[i],
+                [0.8, 0.04, u],
+                max_nfev=2000,
             ).cost
             for u in (-3.0, 0.0, 2.0)
         ]
@@ -78,7 +82,9 @@ def test_the_shared_unaged_value_is_counted_once():
 
     def residual(x):
         a, u = np.where(values.curve == 1, x[3], x[1]), np.where(values.curve == 1, x[4], x[2])
-        return (x[0] - np.where(values.curve < 0, 0, a * np.log1p(values.days * np.exp(-u))) - values.value) / 0.004
+        return (
+            x[0] - np.where(values.curve < 0, 0, a * np.log1p(values.days * np.exp(-u))) - values.value
+        ) / 0.004
 
     other = least_squares(residual, [0.9, 0.05, -2, 0.03, -1], xtol=1e-14, ftol=1e-14, gtol=1e-14)
     fit = fit_law(values)
@@ -88,11 +94,13 @@ def test_the_shared_unaged_value_is_counted_once():
     expected = np.linalg.inv(other.jac.T @ other.jac)
     order = [0, 1, 3, 2, 4]
     npt.assert_allclose(fit.covariance[np.ix_(order, order)], expected, rtol=1e-3, atol=1e-3 * expected.max())
-    assert abs(expected[2, 4]) > 0.02 * expected[2, 2]  # through mu_0 the b of one series hangs on the other's days
+    assert (
+        abs(expected[2, 4]) > 0.02 * expected[2, 2]
+    )  # through mu_0 the b of one series hangs on the other's days
 
 
 def test_profile_of_b_is_that_of_the_whole_problem():
-    """The rest of the campaign enters a curve's profile as a Gaussian on mu_0: compare with refitting everything."""
+    """The rest of the campaign enters a curve's profile as a Gaussian on mu_0: compare with a full refit."""
     values, _ = two_curves(seed=3)
     fit = fit_law(values)
     interval = curve_intervals(fit, np.array([3.84]))[0]
@@ -100,7 +108,9 @@ def test_profile_of_b_is_that_of_the_whole_problem():
 
         def residual(x, end=end):
             a, u = np.where(values.curve == 1, x[2], x[1]), np.where(values.curve == 1, x[3], np.log(end))
-            return (x[0] - np.where(values.curve < 0, 0, a * np.log1p(values.days * np.exp(-u))) - values.value) / 0.004
+            return (
+                x[0] - np.where(values.curve < 0, 0, a * np.log1p(values.days * np.exp(-u))) - values.value
+            ) / 0.004
 
         refitted = least_squares(residual, [0.93, 0.045, 0.03, -1], xtol=1e-12, ftol=1e-12)
         npt.assert_allclose(2 * refitted.cost - fit.chi2, 3.84, rtol=0.01)
@@ -142,19 +152,30 @@ def test_b_below_the_first_day_is_remarked(aged):
 
 def test_the_sensor_moves_mu_0_and_leaves_a_and_b(aged):
     row = law(aged, "mu_s", "mu_0")
-    npt.assert_allclose(row.u_sys, 0.2 / np.sqrt(3) / 49.03, rtol=1e-4)  # one offset of every force: all of mu_0
+    npt.assert_allclose(
+        row.u_sys, 0.2 / np.sqrt(3) / 49.03, rtol=1e-4
+    )  # one offset of every force: all of mu_0
     assert law(aged, "mu_s", "a").u_sys < 1e-6
     assert law(aged, "mu_s", "b").u_sys < 1e-4
 
 
 def test_intervals_cover_with_scatter_between_specimens(campaign):
-    """24 campaigns of two series with 2 % between specimens: 48 intervals, 0.95 less 3 standard errors is 0.855."""
+    """24 campaigns of two series with 2 % between specimens make 48 intervals.
+
+    0.95 less 3 standard errors is 0.855.
+    """
     other = "temperature_C=80, compression_ratio_pct=80"
     series = ((60.0, 80.0), (80.0, 80.0))
     hits, total = {}, 24
     for seed in range(total):
         table = campaign(
-            seed=seed, days=DAYS, noise=0.005, specimen=0.02, series=series, speeds=(0.5, 2, 5, 12, 60), ways=(1,)
+            seed=seed,
+            days=DAYS,
+            noise=0.005,
+            specimen=0.02,
+            series=series,
+            speeds=(0.5, 2, 5, 12, 60),
+            ways=(1,),
         )
         fit = fit_series(fit_conditions(table, Config()), Config())
         for quantity, published in (("mu_s", MU_S), ("mu_c", MU_C)):

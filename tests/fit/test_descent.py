@@ -24,7 +24,9 @@ from sealfit.fit.joint.search import (
 from sealfit.fit.joint.whitening import Component, Scatter
 
 SCATTER = Scatter(
-    0.1, 0.0, (Component("file", "offset", 0.01), Component("run", "gain", 1e-5), Component("specimen", "gain", 1e-5))
+    0.1,
+    0.0,
+    (Component("file", "offset", 0.01), Component("run", "gain", 1e-5), Component("specimen", "gain", 1e-5)),
 )
 
 
@@ -49,7 +51,9 @@ def test_series_that_lost_their_stribeck_speed_find_it(one_specimen, aging):
     model, rows, curved = astray(one_specimen, aging)
     found = search_nonlinear(model, rows, SCATTER)
     assert np.abs(found.vector()[curved] - model.vector()[curved]).max() > 0.3
-    npt.assert_allclose(np.exp(found.vector()[curved]), bins_helpers.TRUE["v_s"], rtol=0.4)  # a grid of twelve
+    npt.assert_allclose(
+        np.exp(found.vector()[curved]), bins_helpers.TRUE["v_s"], rtol=0.4
+    )  # a grid of twelve
 
 
 @pytest.mark.parametrize(("gained", "moves"), [(0.1, False), (50.0, True)])

@@ -1,4 +1,4 @@
-"""sigma_0, sigma_1 and the break-away from simulated starts with known truth, and from a micro-tribometer's."""
+"""sigma_0, sigma_1 and the break-away from simulated starts with known truth and a micro-tribometer's."""
 
 import os
 from pathlib import Path
@@ -84,7 +84,9 @@ def made(tmp_path, *, physics=(), noise=NOISE, seed=1, effects=(), **design):
     simulate(Spec(seed=seed, physics=physics, design=design, noise=noise, effects=effects), tmp_path / "c")
     config = load_config()
     tables = ingest_campaign(tmp_path / "c", config, workers=1).tables
-    return tables, fit_dynamic(tables["traces"], tables["steady"], fit_conditions(tables["steady"], config), config)
+    return tables, fit_dynamic(
+        tables["traces"], tables["steady"], fit_conditions(tables["steady"], config), config
+    )
 
 
 def dynamic(fit):
@@ -139,7 +141,9 @@ def test_a_peak_of_the_ramp_is_a_break_away_and_noise_is_none(tmp_path):
     slow = {"ramp_s": 2.0, "speeds_mm_s": (8.0, 16.0), "sampling_Hz": 400.0, "max_rows": 4000}
     _, found = made(tmp_path, **slow)
     ratio = found.fit[found.fit["parameter"] == "F_ba/F"].set_index("speed_set_mm_s")
-    assert ratio.loc[8.0, "lo95"] < 1.0801 < ratio.loc[8.0, "hi95"]  # without noise it is 1.0801, and 1.0000 at 16 mm/s
+    assert (
+        ratio.loc[8.0, "lo95"] < 1.0801 < ratio.loc[8.0, "hi95"]
+    )  # without noise it is 1.0801, and 1.0000 at 16 mm/s
     assert ratio.loc[8.0, "lo95"] > 1.0
     assert ratio.loc[8.0, "reason"] == ""
     assert "without passing above" in ratio.loc[16.0, "reason"]
@@ -162,14 +166,26 @@ def test_traces_that_begin_in_steady_sliding_say_so(tmp_path):
 
 
 def test_a_sliding_force_along_the_motion_is_said(tmp_path):
-    design = {"directions": (1, -1), "strokes_per_file": 4, "max_rows": 2000, "speeds_mm_s": (5.0,), "repeats": 2}
+    design = {
+        "directions": (1, -1),
+        "strokes_per_file": 4,
+        "max_rows": 2000,
+        "speeds_mm_s": (5.0,),
+        "repeats": 2,
+    }
     tables, _ = made(tmp_path, **design)
-    shifted = {name: tables[name].assign(force_N=tables[name]["force_N"] + 60.0) for name in ("traces", "steady")}
+    shifted = {
+        name: tables[name].assign(force_N=tables[name]["force_N"] + 60.0) for name in ("traces", "steady")
+    }
     config = load_config()
-    fit = fit_dynamic(shifted["traces"], shifted["steady"], fit_conditions(shifted["steady"], config), config).fit
+    fit = fit_dynamic(
+        shifted["traces"], shifted["steady"], fit_conditions(shifted["steady"], config), config
+    ).fit
     found = dynamic(fit)
     assert not found["identified"].any()
-    assert found["reason"].str.contains("lies along the motion: check the offset between the directions").all()
+    assert (
+        found["reason"].str.contains("lies along the motion: check the offset between the directions").all()
+    )
 
 
 def test_a_ramp_of_another_shape_is_followed_by_its_own_speed(tmp_path):
@@ -200,12 +216,19 @@ def test_micro_tribometer(tmp_path):
     largest = found.fit[found.fit["parameter"] == "F_max/F"].set_index("direction")
     assert largest.loc[1, "value"] == pytest.approx(1.067, abs=0.01)
     assert largest.loc[-1, "value"] == pytest.approx(1.013, abs=0.005)
-    assert largest.loc[1, "reason"] == "0.227 mm into strokes of 0.227 mm"  # at the end forward: no break-away
+    assert (
+        largest.loc[1, "reason"] == "0.227 mm into strokes of 0.227 mm"
+    )  # at the end forward: no break-away
     assert not found.fit.loc[found.fit["quantity"] == "break_away", "identified"].any()
 
 
 def test_warming_along_the_stroke_is_no_break_away(tmp_path):
-    warm = {"id": "warming_distance", "acts_on": "mu", "operation": "multiply", "parameters": {"A": 0.06, "s_0": 10.0}}
+    warm = {
+        "id": "warming_distance",
+        "acts_on": "mu",
+        "operation": "multiply",
+        "parameters": {"A": 0.06, "s_0": 10.0},
+    }
     _, found = made(tmp_path, effects=(warm,))
     ratio = found.fit[found.fit["parameter"] == "F_ba/F"]
     assert len(ratio) > 3

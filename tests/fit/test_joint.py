@@ -57,7 +57,12 @@ def test_recovers_the_law_without_noise():
     fitted = fit_declared(rows)
     true = bins_helpers.TRUE
     expected = {"mu_0s": true["mu_s0"], "mu_0c": true["mu_c0"], "a_s": true["a_s"], "a_c": true["a_c"]}
-    expected |= {"b_s": np.log(true["b_s"]), "b_c": np.log(true["b_c"]), "v_s": np.log(true["v_s"]), "sigma_2": 0.02}
+    expected |= {
+        "b_s": np.log(true["b_s"]),
+        "b_c": np.log(true["b_c"]),
+        "v_s": np.log(true["v_s"]),
+        "sigma_2": 0.02,
+    }
     for parameter, value in zip(fitted.model.declared.parameters, fitted.model.theta, strict=True):
         assert value == pytest.approx(expected[parameter.quantity], rel=1e-3), parameter
     assert np.abs(fitted.residual).max() < 1e-3
@@ -66,7 +71,9 @@ def test_recovers_the_law_without_noise():
 def test_standard_errors_match_the_scatter_of_estimates():
     values, errors = [], []
     for seed in range(40):
-        fitted = fit_declared(rows_of(seed=seed, temperatures=(60.0,), gain=0.01, setup=0.01, specimen=0.01, bins=8))
+        fitted = fit_declared(
+            rows_of(seed=seed, temperatures=(60.0,), gain=0.01, setup=0.01, specimen=0.01, bins=8)
+        )
         values.append(fitted.model.theta)
         errors.append(np.sqrt(np.diag(fitted.covariance)))
     names = [p.quantity for p in fitted.model.declared.parameters]
@@ -79,23 +86,34 @@ def test_standard_errors_match_the_scatter_of_estimates():
 def test_fewer_speeds_carry_fewer_parameters():
     speeds = (1.0, 64.0, 8.0, 32.0)
     forms = {n: declare(rows_of(speeds=speeds[:n], repeats=1, bins=4)).stribeck for n in (1, 2, 3, 4)}
-    assert [set(own.values()) for own in forms.values()] == [{"constant"}, {"viscous"}, {"interpolated"}, {"full"}]
+    assert [set(own.values()) for own in forms.values()] == [
+        {"constant"},
+        {"viscous"},
+        {"interpolated"},
+        {"full"},
+    ]
 
 
 def test_through_three_speeds_goes_a_curve_with_no_number_below_zero():
     fitted = fit_declared(rows_of(speeds=(1.0, 8.0, 64.0), repeats=2, bins=4, gain=0.002))
     assert np.sqrt(np.mean(fitted.residual**2)) < 0.01 * np.abs(fitted.force).mean()
-    values = dict(zip([p.quantity for p in fitted.model.declared.parameters], fitted.model.theta, strict=True))
+    values = dict(
+        zip([p.quantity for p in fitted.model.declared.parameters], fitted.model.theta, strict=True)
+    )
     assert min(values["mu_0s"], values["mu_0c"], values["sigma_2"]) >= 0
 
 
 def test_a_straight_line_through_three_speeds_is_mostly_left_one():
     rows, forms = rows_of(speeds=(1.0, 8.0, 64.0), repeats=2, bins=4), []
     for seed in range(10):
-        files = np.random.default_rng(seed).normal(1, 0.01, rows.groups.starts["file"].size)[rows.codes("file")]
+        files = np.random.default_rng(seed).normal(1, 0.01, rows.groups.starts["file"].size)[
+            rows.codes("file")
+        ]
         line = rows.load * (0.5 + 0.002 * np.abs(rows.speed)) * np.sign(rows.speed) * files
         forms += declare(replace(rows, force=line)).stribeck.values()
-    assert forms.count("viscous") > 0.7 * len(forms)  # Akaike's criterion prefers a needless number one time in six
+    assert forms.count("viscous") > 0.7 * len(
+        forms
+    )  # Akaike's criterion prefers a needless number one time in six
 
 
 def test_law_needs_three_days():
@@ -194,7 +212,9 @@ def test_a_wave_is_smaller_in_bins_of_many_samples_than_in_bins_of_few(n, waves)
     term = Term(EFFECTS["ripple"], ("displacement_mm",), "force", "add", fixed={"x_ref": 0.0})
     found = shape_of(term, {"A": 1.0, "lambda_": length, "phi": 0.0}, rows)
     samples = rows.values("displacement_mm")[:, None] + width * ((np.arange(n) + 0.5) / n - 0.5)
-    exact = term.effect.shape({"displacement_mm": samples, "x_ref": 0.0}, A=1.0, lambda_=length, phi=0.0).mean(axis=1)
+    exact = term.effect.shape(
+        {"displacement_mm": samples, "x_ref": 0.0}, A=1.0, lambda_=length, phi=0.0
+    ).mean(axis=1)
     npt.assert_allclose(found, exact, atol=1e-9)
 
 
@@ -204,7 +224,9 @@ def test_the_force_depends_on_the_speed_of_the_bin_and_the_channel_stays_that_of
     rows = make_rows(bins.assign(speed_bin_mm_s=bins["speed_mm_s"] * factor), has_aging=True)
     as_if = make_rows(bins.assign(speed_mm_s=bins["speed_mm_s"] * factor), has_aging=True)
     model = start_model(rows)
-    npt.assert_array_equal(evaluate(model, rows, jacobian=False)[0], evaluate(model, as_if, jacobian=False)[0])
+    npt.assert_array_equal(
+        evaluate(model, rows, jacobian=False)[0], evaluate(model, as_if, jacobian=False)[0]
+    )
     npt.assert_array_equal(rows.values("speed_mm_s"), make_rows(bins, has_aging=True).speed)
     assert "speed_bin_mm_s" not in rows.channels
     npt.assert_array_equal(rows.subset(rows.days > 0).pace, rows.pace[rows.days > 0])

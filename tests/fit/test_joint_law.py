@@ -30,11 +30,15 @@ R = 8.314462618e-3
 DAYS = (1.0, 2.0, 4.0, 8.0, 12.0, 16.0)
 
 
-def campaign(loss="log", own=(0.1,), *, energy=80.0, kappa=0.02, way="rate", a=0.05, scatter=0.005, seed=1, repeats=1):
+def campaign(
+    loss="log", own=(0.1,), *, energy=80.0, kappa=0.02, way="rate", a=0.05, scatter=0.005, seed=1, repeats=1
+):
     """Values of one quantity over three temperatures and two compressions, and the unaged rubber."""
     rng = np.random.default_rng(seed)
     rows = [(0.0, 23.0, 100.0)] * repeats
-    rows += [(t, T, C) for T in (40.0, 60.0, 80.0) for C in (80.0, 90.0) for t in DAYS for _ in range(repeats)]
+    rows += [
+        (t, T, C) for T in (40.0, 60.0, 80.0) for C in (80.0, 90.0) for t in DAYS for _ in range(repeats)
+    ]
     days, celsius, percent = np.array(rows).T
     k = np.exp(energy / R * (1 / 333.15 - 1 / (celsius + 273.15)) + kappa * (85.0 - percent))
     phi = LOSSES[loss].value
@@ -44,14 +48,17 @@ def campaign(loss="log", own=(0.1,), *, energy=80.0, kappa=0.02, way="rate", a=0
 
 
 @pytest.mark.parametrize(
-    ("loss", "own"), [("log", (0.1,)), ("stretched", (4.0, 0.6)), ("power", (0.4,)), ("induction", (0.3, 2.0))]
+    ("loss", "own"),
+    [("log", (0.1,)), ("stretched", (4.0, 0.6)), ("power", (0.4,)), ("induction", (0.3, 2.0))],
 )
 def test_exact_values_give_the_law_back(loss, own):
     a = {"stretched": 0.3, "power": 0.05}.get(loss, 0.05)
     law = fit_joint_law(campaign(loss, own, a=a, scatter=0.0), loss, "rate")
     found = {name: value for name, value, *_ in law.parameters()}
     assert found["mu_0"] == pytest.approx(0.93, rel=1e-5)
-    if loss != "power":  # a power of k t is a power of k times one of t: a takes what the rate at the reference leaves
+    if (
+        loss != "power"
+    ):  # a power of k t is a power of k times one of t: a takes what the rate at the reference leaves
         assert found["a"] == pytest.approx(a, rel=1e-3)
     for name, value in zip(LOSSES[loss].parameters, own, strict=True):
         assert found[name] == pytest.approx(value, rel=1e-2)
@@ -136,7 +143,9 @@ def test_the_interval_over_one_law_is_its_own():
 
 def test_the_interval_over_laws_reaches_over_rivals_that_cannot_be_told_apart():
     series = campaign(scatter=0.02, seed=3)
-    laws = fit_laws(series.part((series.days == 0) | ((series.temperature_C > 50) & (series.compression_pct == 80))))
+    laws = fit_laws(
+        series.part((series.days == 0) | ((series.temperature_C > 50) & (series.compression_pct == 80)))
+    )
     goal = Goal(0.55)  # beyond the tests, where the laws part
     own = lifetime(laws[0], goal, 60.0)
     low, high = over_laws(laws, goal, 60.0)
@@ -157,7 +166,12 @@ def alone(law, covariance, values, keep=slice(None)):
     """The parameters by scipy, of some values by themselves."""
     white = whitened(covariance[keep][:, keep])
     return least_squares(
-        lambda x: white @ (law.at(law.aged, x) - values)[keep], law.x, x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15
+        lambda x: white @ (law.at(law.aged, x) - values)[keep],
+        law.x,
+        x_scale="jac",
+        ftol=1e-15,
+        xtol=1e-15,
+        gtol=1e-15,
     ).x
 
 
@@ -188,7 +202,9 @@ def test_a_decomposed_covariance_is_the_covariance(scatter):
     covariance, residual = aged.covariance(scatter), np.sin(np.arange(aged.value.size))
     white = aged.spread.whitening(scatter)
     assert white @ covariance @ white.T == pytest.approx(np.eye(aged.value.size), abs=1e-9)
-    assert aged.spread.chi2(residual, scatter) == pytest.approx(residual @ np.linalg.solve(covariance, residual))
+    assert aged.spread.chi2(residual, scatter) == pytest.approx(
+        residual @ np.linalg.solve(covariance, residual)
+    )
     assert aged.spread.log_determinant(scatter) == pytest.approx(np.linalg.slogdet(covariance)[1])
 
 
@@ -204,7 +220,7 @@ def test_the_slope_of_a_law_is_that_of_its_values(loss, acts_on):
 
 
 def test_correlated_values_weigh_as_their_covariance_says():
-    """Half of the values measured with a common error: the same law as on their differences and the other half."""
+    """Half of the values measured with a common error: the same law as on differences and the other half."""
     law = fit_joint_law(campaign(scatter=0.0), "log", "rate")
     known = law.aged
     spread = np.diag(np.full(known.days.size, 1e-8))
@@ -304,7 +320,7 @@ def test_a_temperature_is_refused_where_the_tests_had_one():
             goal_of(threshold, None)
 
 
-# ---------------------------------------------------------------- measured: strength of an adhesive and a polymer
+# --------------------------------------------------------- measured: strength of an adhesive and a polymer
 @pytest.mark.skipif(MEASURED is None, reason="SEALFIT_MEASURED names no folder of measured data")
 @pytest.mark.parametrize(
     ("table", "loss", "energy"),
@@ -312,7 +328,9 @@ def test_a_temperature_is_refused_where_the_tests_had_one():
 )
 def test_strength_by_temperature(table, loss, energy):
     rows = pd.read_csv(Path(MEASURED) / "aging-strength" / "csv" / f"{table}.csv")
-    laws = fit_laws(Aged(rows["TimeH"].to_numpy() / 24, rows["Response"].to_numpy(float), rows["TempC"].to_numpy()))
+    laws = fit_laws(
+        Aged(rows["TimeH"].to_numpy() / 24, rows["Response"].to_numpy(float), rows["TempC"].to_numpy())
+    )
     assert (laws[0].loss.name, laws[0].acts_on) == (loss, "rate")
     found = {name: (low, high) for name, _, low, high, _ in laws[0].parameters()}
     assert energy[0] < found["E"][0] < found["E"][1] < energy[1]

@@ -1,4 +1,4 @@
-"""Many least squares at once: each ends where scipy's ends, within its bounds, and one that is lost hurts no other."""
+"""Many least squares at once: each ends where scipy's ends, within bounds, and a lost one hurts no other."""
 
 import numpy as np
 import numpy.testing as npt
@@ -32,7 +32,11 @@ def test_each_ends_where_one_alone_ends():
     x, rss = levenberg_marquardt(problems(values), np.ones((4, 2)), LOW, HIGH)
     for k, own in enumerate(values):
         alone = least_squares(
-            lambda p, own=own: p[0] * np.exp(-p[1] * T) - own, [1.0, 0.5], bounds=(LOW, HIGH), xtol=1e-15, ftol=1e-15
+            lambda p, own=own: p[0] * np.exp(-p[1] * T) - own,
+            [1.0, 0.5],
+            bounds=(LOW, HIGH),
+            xtol=1e-15,
+            ftol=1e-15,
         )
         npt.assert_allclose(x[k], alone.x, rtol=1e-6, atol=1e-9)
         npt.assert_allclose(rss[k], 2 * alone.cost, rtol=1e-9)

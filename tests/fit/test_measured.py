@@ -17,9 +17,9 @@ MEASURED = os.environ.get("SEALFIT_MEASURED")
 pytestmark = pytest.mark.skipif(MEASURED is None, reason="SEALFIT_MEASURED names no folder of measured data")
 
 
-# ---------------------------------------------------------------- screw drives: Eq. 14 with 16 and 23 speeds each way
+# ------------------------------------------------------ screw drives: Eq. 14 with 16 and 23 speeds each way
 def drive(number):
-    """Mean speed (rpm) and torque (mN m) of each file, the first 50 samples dropped; the authors' own conversion."""
+    """Mean speed (rpm) and torque (mN m) of each file less its first 50 samples; the authors' conversion."""
     folder = Path(MEASURED) / "screwdrive" / "raw" / f"driveNo{number}" / "steady_state" / "0.096kg"
     means = []
     for path in sorted(folder.glob("*.csv")):
@@ -32,7 +32,8 @@ def drive(number):
     return np.sign(speed), np.abs(speed), torque
 
 
-# drive, files, RMS of the symmetric fit, RMS with offset, (F_c, F_s, v_s, sigma_2, offset): README of the data
+# drive, files, RMS of the symmetric fit, RMS with offset, (F_c, F_s, v_s, sigma_2, offset): README of the
+# data
 DRIVES = [
     (1, 32, 0.357, 0.047, (2.60, 3.11, 33.0, 0.0046, -0.354)),
     (3, 46, 0.482, 0.079, (1.36, 1.51, 3.07, 0.0015, -0.475)),
@@ -75,7 +76,9 @@ AGEING = [
 @pytest.mark.parametrize(("name", "temperature", "a", "b", "rms", "pure", "p"), AGEING)
 def test_ageing_strength(name, temperature, a, b, rms, pure, p):
     table = pd.read_csv(Path(MEASURED) / "aging-strength" / "csv" / f"{name}.csv")
-    own = table[(table.TempC == temperature) | (table.TimeH == 0)]  # fresh specimens are shared by all temperatures
+    own = table[
+        (table.TempC == temperature) | (table.TimeH == 0)
+    ]  # fresh specimens are shared by all temperatures
     days, value = own.TimeH.to_numpy(float) / 24, own.Response.to_numpy(float)
     fit = solve_law(days[None], value[None], np.ones((1, len(own))))
     npt.assert_allclose(fit.coefficients[0, 1], a, atol=0.06)

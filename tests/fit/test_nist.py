@@ -23,7 +23,8 @@ class Certified:
 
     @property
     def df(self):
-        # not from the file: Rat43's header prints 9, its certified residual standard deviation is of 15 - 4 = 11
+        # not from the file: Rat43's header prints 9, its certified residual standard deviation is of 15 - 4 =
+        # 11
         return self.y.size - self.values.size
 
 
@@ -44,7 +45,11 @@ def read(name):
 
 
 def gauss(b, x):
-    return b[0] * exp(-b[1] * x) + b[2] * exp(-(((x - b[3]) / b[4]) ** 2)) + b[5] * exp(-(((x - b[6]) / b[7]) ** 2))
+    return (
+        b[0] * exp(-b[1] * x)
+        + b[2] * exp(-(((x - b[3]) / b[4]) ** 2))
+        + b[5] * exp(-(((x - b[6]) / b[7]) ** 2))
+    )
 
 
 def lanczos(b, x):
@@ -105,7 +110,9 @@ MODELS = {
 
 EXACT = "Lanczos1"
 ENOUGH = 8  # digits of parameters and standard deviations
-FLAT = {"Lanczos3": 6}  # three nearly equal decays: moving along the valley by 1e-6 changes no digit of the rss
+FLAT = {
+    "Lanczos3": 6
+}  # three nearly equal decays: moving along the valley by 1e-6 changes no digit of the rss
 
 
 def digits(found, certified):
@@ -114,7 +121,8 @@ def digits(found, certified):
         return np.min(np.minimum(11, -np.log10(np.abs(np.asarray(found) / certified - 1))))
 
 
-# From these starting points Levenberg-Marquardt ends elsewhere; nothing in the program starts from a guess like them.
+# From these starting points Levenberg-Marquardt ends elsewhere; nothing in the program starts from a guess
+# like them.
 ASTRAY = {("BoxBOD", 0), ("MGH10", 0), ("MGH17", 0)}
 
 

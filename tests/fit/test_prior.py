@@ -1,4 +1,4 @@
-"""Free shapes held smooth: how smooth, how many numbers they are worth, and what the joint fit makes of them."""
+"""Free shapes held smooth: how smooth, how many numbers they are worth, what the joint fit makes of them."""
 
 from dataclasses import replace
 

@@ -59,7 +59,9 @@ def test_reml_recovers_scatter_of_files_runs_and_specimens():
         tangent = np.column_stack([np.ones(force.size), force])
         kinds = [("file", "gain"), ("run", "offset"), ("specimen", "gain")]
         parts = reml(
-            GroupMeans(residual, np.full(force.size, 0.05**2), force, Groups.of(codes)), Tangent.dense(tangent), kinds
+            GroupMeans(residual, np.full(force.size, 0.05**2), force, Groups.of(codes)),
+            Tangent.dense(tangent),
+            kinds,
         )
         found.append([np.sqrt(p.variance) for p in parts])
     npt.assert_allclose(np.mean(found, axis=0), [0.01, 0.2, 0.02], rtol=0.15)
@@ -97,7 +99,9 @@ def test_rounding_moves_no_variance_and_scatter_that_is_not_there_is_nothing():
             np.array(
                 [
                     p.variance
-                    for p in reml(GroupMeans(r, np.full(600, 0.05**2), force, Groups.of(codes)), tangent, kinds)
+                    for p in reml(
+                        GroupMeans(r, np.full(600, 0.05**2), force, Groups.of(codes)), tangent, kinds
+                    )
                 ]
             )
             for r in (residual, near)
@@ -117,5 +121,7 @@ def test_next_to_no_noise_beside_the_scatter_of_files_with_one_stroke_is_no_erro
     kinds = [("file", "offset"), ("file", "gain"), ("specimen", "gain")]
     for _ in range(20):
         residual = force * rng.normal(0, 0.05, 96)
-        parts = reml(GroupMeans(residual, np.full(96, 2e-8), force, Groups.of(codes)), Tangent.dense(tangent), kinds)
+        parts = reml(
+            GroupMeans(residual, np.full(96, 2e-8), force, Groups.of(codes)), Tangent.dense(tangent), kinds
+        )
         assert all(np.isfinite(part.variance) for part in parts)

@@ -1,4 +1,4 @@
-"""The bristles followed along strokes, against a loop and against differences; ramps against the motion they were."""
+"""Bristles followed along strokes, against a loop and differences; ramps against their true motion."""
 
 import numpy as np
 import numpy.testing as npt
@@ -48,7 +48,11 @@ def ramped(begin, ramp, speed, lagging, rows=150):
         share = 1 - np.exp(-since / ramp)
         return time, 5.0 + speed * (since - ramp * share), speed * share
     share = np.clip(since / ramp, 0.0, 1.0)
-    return time, 5.0 + speed * np.where(since < ramp, 0.5 * ramp * share**2, since - 0.5 * ramp), speed * share
+    return (
+        time,
+        5.0 + speed * np.where(since < ramp, 0.5 * ramp * share**2, since - 0.5 * ramp),
+        speed * share,
+    )
 
 
 PACES = [2.0 + k for k in range(5)]
@@ -56,7 +60,9 @@ MADE = [ramped(0.3 + 0.05 * k, 0.1 * 1.5**k, 2.0 + k, k % 2 == 1, rows=120 + 30 
 
 
 def test_ramps_of_both_shapes_are_found():
-    for (_, along, speed), ramp in zip(MADE, fit_ramps(*zip(*[m[:2] for m in MADE], strict=True), PACES), strict=True):
+    for (_, along, speed), ramp in zip(
+        MADE, fit_ramps(*zip(*[m[:2] for m in MADE], strict=True), PACES), strict=True
+    ):
         npt.assert_allclose(ramp.speed_mm_s, speed, atol=1e-6)
         npt.assert_allclose(ramp.distance_mm - ramp.distance_mm[0], along - along[0], atol=1e-6)
         assert ramp.rms_mm < 1e-7

@@ -1,4 +1,4 @@
-"""mu_s and mu_c from the forces with what the days of a series share: exact, surer, and free where days disagree."""
+"""mu_s and mu_c from forces with what a series' days share: exact, surer, and free where days disagree."""
 
 import numpy as np
 import pandas.testing as pdt
@@ -34,7 +34,9 @@ def arrhenius(energy=80.0, what="rate"):
     for place in SERIES:
         k = pace(*place, energy)
         own = {"b": 1 / k, "a": 1.0} if what == "rate" else {"b": 1.0, "a": k}
-        laws[place] = tuple({**law, "a": law["a"] * own["a"], "b": law["b"] * own["b"]} for law in (MU_S, MU_C))
+        laws[place] = tuple(
+            {**law, "a": law["a"] * own["a"], "b": law["b"] * own["b"]} for law in (MU_S, MU_C)
+        )
     return laws
 
 
@@ -71,7 +73,9 @@ def test_values_and_covariance_are_those_of_one_fit_to_all_forces(campaign):
 
     direct = least_squares(residual, [0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 5.0, 0.02], x_scale="jac", xtol=1e-14)
     covariance = np.linalg.inv(direct.jac.T @ direct.jac)
-    order = [(0, 2, 8).index(row.aging_days) + 3 * (row.quantity == "mu_c") for row in found.table.itertuples()]
+    order = [
+        (0, 2, 8).index(row.aging_days) + 3 * (row.quantity == "mu_c") for row in found.table.itertuples()
+    ]
     se, own = np.sqrt(np.diag(covariance))[order], np.sqrt(np.diag(found.covariance))
     assert np.abs(found.table["value"].to_numpy() - direct.x[order]).max() < 0.15 * se.min()
     assert own == pytest.approx(se, rel=0.15)
@@ -103,7 +107,9 @@ def test_days_that_do_not_agree_on_the_stribeck_speed_keep_their_free_fits(campa
     table = campaign(noise=0.003, days=(0, 2, 4))
     late = table["aging_days"] == 4
     other = stribeck_force(table["speed_mm_s"], 49.03, mu_s=0.76, mu_c=0.49, v_s=15.0, sigma_2=0.02)
-    table.loc[late, "force_N"] = other[late] * (1 + 0.003 * np.random.default_rng(3).standard_normal(int(late.sum())))
+    table.loc[late, "force_N"] = other[late] * (
+        1 + 0.003 * np.random.default_rng(3).standard_normal(int(late.sum()))
+    )
     fits = fit_conditions(table, Config())
     found = shared_levels(table, fits)
     free = fits[fits["quantity"] == "steady"].set_index(["condition", "parameter"])["value"]
@@ -117,11 +123,15 @@ def test_a_law_of_the_levels_is_the_law_of_the_forces(campaign, quantity):
     table = campaign(noise=0.01, series=SERIES, laws=arrhenius(), days=DAYS, ways=(1,))
     law = fit_joint_law(aged_values(levels(table), "rubber", quantity), "log", "rate")
     runs = run_means(table).merge(
-        table[["run_id", "temperature_C", "compression_ratio_pct", "aging_days"]].drop_duplicates(), on="run_id"
+        table[["run_id", "temperature_C", "compression_ratio_pct", "aging_days"]].drop_duplicates(),
+        on="run_id",
     )
     aged = runs["aging_days"].to_numpy() > 0
     place = np.array(
-        [SERIES.index(pair) for pair in zip(runs["temperature_C"], runs["compression_ratio_pct"], strict=True)]
+        [
+            SERIES.index(pair)
+            for pair in zip(runs["temperature_C"], runs["compression_ratio_pct"], strict=True)
+        ]
     )
     place = np.where(aged, place, len(SERIES))
     inverse = np.where(aged, 1 / R * (1 / 333.15 - 1 / (runs["temperature_C"] + 273.15)), 0.0)

@@ -1,4 +1,4 @@
-"""The solver of many steady and aging fits against others: never a worse sum of squares, whatever the problem."""
+"""The solver of many steady and aging fits against others: no worse sum of squares, whatever the problem."""
 
 import numpy as np
 import numpy.testing as npt
@@ -28,7 +28,9 @@ def draw(kind, rng):
             rng.uniform(0.05, 1, PROBLEMS),
             rng.uniform(0.05, 1, PROBLEMS),
             np.exp(rng.uniform(*np.log(np.array([slowest, fastest]) * beyond), PROBLEMS)),
-            rng.uniform(-1 if kind == "falling" else 0, 0 if kind == "falling" else 1, PROBLEMS) * 2 / fastest,
+            rng.uniform(-1 if kind == "falling" else 0, 0 if kind == "falling" else 1, PROBLEMS)
+            * 2
+            / fastest,
         ],
         axis=1,
     )

@@ -1,4 +1,4 @@
-"""The start's least squares of two numbers per condition and one shared, against the whole problem as one matrix."""
+"""The start's least squares of two numbers per condition and one shared, against the whole as one matrix."""
 
 import bins_helpers
 import numpy as np
@@ -50,7 +50,9 @@ def test_series_that_start_together_are_solved_once(monkeypatch):
     whole = search._per_condition
     monkeypatch.setattr(search, "_per_condition", lambda *given: solved.append(given[3]) or whole(*given))
     together = start_model(rows, together=True)
-    assert [np.unique(conditions).size for conditions in solved] == [13]  # unaged, and three series of four days
+    assert [np.unique(conditions).size for conditions in solved] == [
+        13
+    ]  # unaged, and three series of four days
     own, shared = (
         {p: m.theta[k] for k, p in enumerate(m.declared.parameters) if p.quantity == "v_s"}
         for m in (one_by_one, together)

@@ -59,11 +59,14 @@ def test_standard_errors_and_covariance_agree_with_another_solver(campaign):
     def model(speed, mu_s, mu_c, v_s, sigma_2):
         return 49.03 * (mu_c + (mu_s - mu_c) * np.exp(-((speed / v_s) ** 2))) + sigma_2 * speed
 
-    # equal relative scatter in every run: sd of a mean is g F / sqrt 3, with g from the pooled relative deviations
+    # equal relative scatter in every run: sd of a mean is g F / sqrt 3, with g from the pooled relative
+    # deviations
     relative = table.force_N / table.groupby("run_id").force_N.transform("mean") - 1
     g = np.sqrt((relative**2).sum() / (2 * len(runs)))
     sd = g * runs.force / np.sqrt(3)
-    values, covariance = curve_fit(model, runs.speed, runs.force, p0=[0.6, 0.5, 4, 0.01], sigma=sd, absolute_sigma=True)
+    values, covariance = curve_fit(
+        model, runs.speed, runs.force, p0=[0.6, 0.5, 4, 0.01], sigma=sd, absolute_sigma=True
+    )
     for k, name in enumerate(TRUTH):
         row = steady(fits, name)
         npt.assert_allclose(row.value, values[k], atol=0.1 * row.se)
@@ -77,7 +80,8 @@ def test_standard_errors_and_covariance_agree_with_another_solver(campaign):
 def test_repeats_are_not_evidence_of_their_own(campaign):
     """With all scatter between set-ups, ten times the repeats must not shrink the intervals."""
     few, many = (
-        fit_conditions(campaign(noise=1e-4, setup=0.03, repeats=n, seed=2, **UNAGED), Config()) for n in (2, 20)
+        fit_conditions(campaign(noise=1e-4, setup=0.03, repeats=n, seed=2, **UNAGED), Config())
+        for n in (2, 20)
     )
     for name in TRUTH:
         assert steady(many, name).se > 0.5 * steady(few, name).se
@@ -214,7 +218,10 @@ def test_an_offset_between_the_directions_is_remarked(campaign):
 # ---------------------------------------------------------------- units, load, sensor, repeats
 def test_without_load_forces_are_fitted_in_the_true_unit(campaign):
     config = Config(
-        quantities={"force": Quantity(quantity="torque", unit="mN m"), "speed": Quantity(quantity="speed", unit="rpm")}
+        quantities={
+            "force": Quantity(quantity="torque", unit="mN m"),
+            "speed": Quantity(quantity="speed", unit="rpm"),
+        }
     )
     model = {"mu_s": 3.11, "mu_c": 2.6, "v_s": 33.0, "sigma_2": 0.0046}
     table = campaign(days=(0,), model=model, load=None, speeds=(2, 5, 10, 20, 40, 80, 200), noise=1e-4)
@@ -257,10 +264,15 @@ def test_without_repeats_the_residual_is_the_scatter_and_lack_of_fit_is_null(cam
 
 @pytest.mark.parametrize(("noise", "constant"), [(0.01, 0.0), (0.0, 0.3)], ids=["relative", "constant"])
 def test_without_repeats_the_residuals_say_how_scatter_goes_with_force(campaign, noise, constant):
-    """mu_s is seen where the force is largest: were 1 % taken for a constant, its error would be a third too small."""
+    """mu_s is seen where the force is largest.
+
+    Were 1 % taken for a constant, its error would be a third too small.
+    """
     errors, stated = [], []
     for seed in range(40):
-        table = campaign(seed=seed, repeats=1, noise=noise, constant=constant, days=(0, 1, 2), model=TRUTH, ways=(1,))
+        table = campaign(
+            seed=seed, repeats=1, noise=noise, constant=constant, days=(0, 1, 2), model=TRUTH, ways=(1,)
+        )
         row = steady(fit_conditions(table, Config()), "mu_s")
         errors.append(row.value - 0.7)
         stated.append(row.se)
@@ -269,7 +281,7 @@ def test_without_repeats_the_residuals_say_how_scatter_goes_with_force(campaign,
 
 
 def one_file_each_way(forces):
-    """Table `steady` of one file a condition, a slow way out and a fast way back, without repeats or loads."""
+    """Table `steady` of one file a condition, a slow way out, a fast way back, without repeats or loads."""
     rows = [
         {
             "condition": f"c{k}", "series": "", "rubber": "", "run_id": f"c{k}{way:+}", "repeat": 1,

@@ -63,7 +63,9 @@ def test_the_covariances_of_a_law_say_of_which_quantity(made, tmp_path):
     assert set(tables["aging_covariance_after"]["quantity"]) == {"mu_s", "mu_c"}
     assert set(tables["aging_covariance_after"]["other"]) == {"mu_0", "a", "ln b"}
     assert not tables["aging_fit_after"].duplicated(["series", "quantity", "parameter"]).any()
-    parquet.write(tables["aging_covariance_after"], SCHEMAS["aging_covariance_after"], Units(), tmp_path / "law")
+    parquet.write(
+        tables["aging_covariance_after"], SCHEMAS["aging_covariance_after"], Units(), tmp_path / "law"
+    )
 
 
 def test_a_fit_without_rows_gives_tables_without_rows():

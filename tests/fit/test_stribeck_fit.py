@@ -86,7 +86,10 @@ def test_a_thousand_conditions_at_once_are_each_at_their_global_minimum():
         npt.assert_allclose(cost(near), fit.rss[k], rtol=1e-9)
         tries = [near, [0.7, 0.4, 1.0, 0.01], [0.7, 0.4, 3.0, 0.01]]
         with np.errstate(all="ignore"):
-            others = [minimize(cost, t, method="Nelder-Mead", options={"maxiter": 3000, "xatol": 1e-9}) for t in tries]
+            others = [
+                minimize(cost, t, method="Nelder-Mead", options={"maxiter": 3000, "xatol": 1e-9})
+                for t in tries
+            ]
         assert fit.rss[k] <= min(o.fun for o in others) + 1e-6
 
 
@@ -135,7 +138,7 @@ def test_refuses_empty_cells():
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_ends_are_where_a_constrained_solver_says_the_limit_is_reached(seed):
-    """Second way: Lawson-Hanson with c_j fixed must give exactly the limit just inside, and more just outside."""
+    """Second way: Lawson-Hanson with c_j fixed gives exactly the limit just inside, and more just outside."""
     rng = np.random.default_rng(seed)
     columns, y = np.abs(rng.normal(size=(8, 3))), rng.normal(size=8) + 0.7
     best = nnls(columns, y)[1] ** 2
@@ -163,11 +166,14 @@ def test_intervals_are_those_of_the_curvature_where_the_data_are_good():
     low, high = stribeck_intervals(speed, load, force, weight, fit, np.array([1.96**2]))
     step = 1e-6 * true
     moved = [
-        [curve(SPEEDS, **dict(zip(("mu_s", "mu_c", "v_s", "sigma_2"), true + s * np.eye(4)[k] * step, strict=True)))
+        [curve(SPEEDS, **dict(zip(
+             ("mu_s", "mu_c", "v_s", "sigma_2"), true + s * np.eye(4)[k] * step, strict=True)))
          for s in (1, -1)]
         for k in range(4)
     ]  # fmt: skip
-    tangent = np.stack([(up - down) / (2 * h) for (up, down), h in zip(moved, step, strict=True)], axis=1) / 0.01
+    tangent = (
+        np.stack([(up - down) / (2 * h) for (up, down), h in zip(moved, step, strict=True)], axis=1) / 0.01
+    )
     se = np.sqrt(np.diag(np.linalg.inv(tangent.T @ tangent)))
     npt.assert_allclose((high - low)[0] / (2 * 1.96 * se), 1.0, rtol=5e-3)
 

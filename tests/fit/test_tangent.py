@@ -9,7 +9,13 @@ from sealfit.fit.joint.tangent import Layout, OwnColumns, Tangent, blocks_of
 from sealfit.fit.joint.variance_components import GroupMeans, RestrictedLikelihood, orthonormal
 from sealfit.fit.joint.whitening import Component, Scatter, Whitening
 
-SETS = [frozenset({0, 2, 3}), frozenset({0}), frozenset({0, 1, 4, 5}), frozenset({0, 6, 7, 8}), frozenset({0, 4, 5})]
+SETS = [
+    frozenset({0, 2, 3}),
+    frozenset({0}),
+    frozenset({0, 1, 4, 5}),
+    frozenset({0, 6, 7, 8}),
+    frozenset({0, 4, 5}),
+]
 SPECIMENS = np.array([0, 2, 1, 3, 4, 0, 3, 2])  # which set each specimen depends on
 
 
@@ -52,7 +58,9 @@ def test_products_are_those_of_the_whole_matrix():
     npt.assert_array_equal(tangent.columns(mask).toarray(), dense[:, mask])
     npt.assert_array_equal(tangent.append(some).toarray(), np.column_stack([dense, some]))
     npt.assert_allclose(
-        tangent.sums(groups(), "run", some[:, 0]).toarray(), groups().sums(dense * some[:, :1], "run"), atol=1e-12
+        tangent.sums(groups(), "run", some[:, 0]).toarray(),
+        groups().sums(dense * some[:, :1], "run"),
+        atol=1e-12,
     )
 
 
@@ -78,7 +86,11 @@ def test_whitening_and_restricted_likelihood_by_blocks_are_those_of_the_whole():
     rng = np.random.default_rng(3)
     tangent, dense = blocked(rng)
     force = rng.normal(30.0, 5.0, len(dense))
-    parts = (Component("stroke", "offset", 0.1), Component("run", "gain", 0.01), Component("specimen", "gain", 0.02))
+    parts = (
+        Component("stroke", "offset", 0.1),
+        Component("run", "gain", 0.01),
+        Component("specimen", "gain", 0.02),
+    )
     whitening = Whitening(Scatter(0.3, 0.01, parts, 1.5, 2.0), force, groups())
     residual = whitening(rng.normal(size=(len(dense), 1)))[:, 0]
     for found, expected in zip(
@@ -87,7 +99,13 @@ def test_whitening_and_restricted_likelihood_by_blocks_are_those_of_the_whole():
         npt.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
     npt.assert_allclose(whitening.of(tangent).toarray(), whitening(dense), atol=1e-12)
     means, number = tangent.means(groups(), "stroke"), groups().starts["stroke"].size
-    kinds = [("stroke", "offset"), ("stroke", "gain"), ("run", "offset"), ("run", "gain"), ("specimen", "gain")]
+    kinds = [
+        ("stroke", "offset"),
+        ("stroke", "gain"),
+        ("run", "offset"),
+        ("run", "gain"),
+        ("specimen", "gain"),
+    ]
     given = (rng.normal(size=number), rng.uniform(0.1, 0.3, number), groups().means(force, "stroke"))
     at = np.array([0.1, 1e-4, 0.2, 1e-4, 2e-4])
     answers = []

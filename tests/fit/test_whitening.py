@@ -17,7 +17,7 @@ CODES = {
 
 
 def covariance(scatter, force):
-    """The model's covariance as a dense matrix: rows about their stroke's weighted mean, and the components."""
+    """The model's covariance as a dense matrix: rows about their stroke's weighted mean, and components."""
     sd = np.sqrt(scatter.design_effect * (scatter.s0**2 + (scatter.g * force) ** 2))
     load = {"offset": np.ones_like(force), "gain": force}
     found = np.zeros((force.size, force.size))
@@ -33,7 +33,14 @@ def covariance(scatter, force):
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.integers(0, 10_000), st.floats(0, 2), st.floats(0, 0.5), st.floats(0, 3), st.floats(1, 9), st.floats(1, 4))
+@given(
+    st.integers(0, 10_000),
+    st.floats(0, 2),
+    st.floats(0, 0.5),
+    st.floats(0, 3),
+    st.floats(1, 9),
+    st.floats(1, 4),
+)
 def test_whitening_is_a_root_of_the_inverse_covariance(seed, offset, gain, run, shape, alike):
     force = np.random.default_rng(seed).normal(5, 2, 30)
     parts = (

@@ -2,7 +2,8 @@
 
     python tests/golden/golden.py [NAME ...]       record anew, after a change that is meant to move a number
 
-Fitted numbers may differ by a hundredth of their standard errors; verdicts, effects and findings are compared exactly.
+Fitted numbers may differ by a hundredth of their standard errors; verdicts, effects and findings are compared
+exactly.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ CAMPAIGNS: Mapping[str, Callable[[Path], list[str]]] = {
 
 
 def record(name: str) -> dict:
-    """Return what sealfit says of a campaign: numbers with standard errors, effects, findings and predictions."""
+    """Return what sealfit says of a campaign: numbers and standard errors, effects, findings, predictions."""
     with tempfile.TemporaryDirectory() as home:
         folder = Path(home)
         out = folder / "out"
@@ -92,11 +93,18 @@ def record(name: str) -> dict:
     return {
         "rows": {table: len(rows) for table, rows in tables.items()},
         "fits": _some(
-            [pair for table in tables if table.removesuffix("_after") in FITS for pair in _fits(tables, table)]
+            [
+                pair
+                for table in tables
+                if table.removesuffix("_after") in FITS
+                for pair in _fits(tables, table)
+            ]
         ),
         "verdict": closure["verdict"],
         "fit_quality": closure["fit_quality"]["state"],
-        "errors": {f"{end} {key}": value for end in ("before", "after") for key, value in closure[end].items()},
+        "errors": {
+            f"{end} {key}": value for end in ("before", "after") for key, value in closure[end].items()
+        },
         "effects": [{key: effect[key] for key in EXACT} for effect in closure["effects"]],
         "parameters": {
             f"{k} {p['name']}": _with_se(p["value"], p["ci95"])
@@ -151,16 +159,33 @@ def _findings(quality: pd.DataFrame) -> list[list]:
 
 
 def _predicted(out: Path, bins: pd.DataFrame) -> list[list]:
-    """Return the answers of `predict` at bins spread over the campaign: before, after, standard error, extrapolated."""
-    ordered = bins.sort_values(["file", "stroke", "bin"])  # which of its files a table was stored in does not matter
+    """Return the answers of `predict` at bins spread over the campaign.
+
+    Each has the force before and after, the standard error, and whether it is extrapolated.
+    """
+    ordered = bins.sort_values(
+        ["file", "stroke", "bin"]
+    )  # which of its files a table was stored in does not matter
     chosen = ordered.iloc[np.linspace(0, len(bins) - 1, POINTS).round().astype(int)]
     points = chosen.drop(columns=[c for c in chosen if c.startswith("force") or c == "presliding_N"])
     points.to_csv(out.parent / "points.csv", index=False)
-    _sealfit("predict", str(out), "--points", str(out.parent / "points.csv"), "--output", str(out.parent / "said.csv"))
+    _sealfit(
+        "predict",
+        str(out),
+        "--points",
+        str(out.parent / "points.csv"),
+        "--output",
+        str(out.parent / "said.csv"),
+    )
     said = pd.read_csv(out.parent / "said.csv")
     error = (said["force_after_hi95_N"] - said["force_after_lo95_N"]) / (2 * Z95)
     table = pd.DataFrame(
-        {"before": said["force_before_N"], "after": said["force_after_N"], "se": error, "outside": said["extrapolated"]}
+        {
+            "before": said["force_before_N"],
+            "after": said["force_after_N"],
+            "se": error,
+            "outside": said["extrapolated"],
+        }
     )
     return table.astype(object).where(table.notna(), None).to_numpy().tolist()
 
@@ -191,7 +216,10 @@ def _exact(key: str) -> bool:
 
 
 def _same(old: list, new: list) -> bool:
-    """Whether a value is the same within a share of its standard error; without one, within `RELATIVE` of itself."""
+    """Whether a value is the same within a share of its standard error.
+
+    A value without one has to be the same within `RELATIVE` of itself.
+    """
     if (old[1] is None) != (new[1] is None):
         return False
     if old[1] is None:

@@ -19,6 +19,11 @@ def test_differences_are_seen():
         "predictions": [[1.0, 1.0, 0.1, False]],
     }  # fmt: skip
     assert differences(old, old) == []
-    moved = {**old, "fits": {"mu": [1.002, 0.1]}, "verdict": "unexplained", "predictions": [[1.0, 1.1, 0.1, False]]}
+    moved = {
+        **old,
+        "fits": {"mu": [1.002, 0.1]},
+        "verdict": "unexplained",
+        "predictions": [[1.0, 1.1, 0.1, False]],
+    }
     assert len(differences(old, moved)) == 3
     assert differences(old, {**old, "fits": {"mu": [1.0005, 0.1]}}) == []

@@ -63,9 +63,12 @@ def test_bins_of_repeats_share_their_edges_and_hold_their_own_means():
     x = np.linspace(0.0, 40.0, 401)
     made = binned(samples((x, 2 * x), (x[37:], -x[37:])), strokes(run_id=["a", "a"]), Bins(per_stroke=4))
     assert made.groupby("row")["bin"].apply(list).tolist() == [[0, 1, 2, 3], [0, 1, 2, 3]]
-    # Bins of 10 mm: 100 samples each (the last has the end too), and 63 of the first are left in the second stroke.
+    # Bins of 10 mm: 100 samples each (the last has the end too), and 63 of the first are left in the second
+    # stroke.
     assert made["n"].tolist() == [100, 100, 100, 101, 63, 100, 100, 101]
-    npt.assert_allclose(made["displacement_mm"], [4.95, 14.95, 24.95, 35.0, (3.7 + 9.9) / 2, 14.95, 24.95, 35.0])
+    npt.assert_allclose(
+        made["displacement_mm"], [4.95, 14.95, 24.95, 35.0, (3.7 + 9.9) / 2, 14.95, 24.95, 35.0]
+    )
     npt.assert_allclose(made["force_N"][:4], 2 * made["displacement_mm"][:4])
     npt.assert_allclose(made["force_N"][4:], -made["displacement_mm"][4:])
     # SD of 100 values 0.2 apart: 0.2 sqrt(n (n + 1) / 12).

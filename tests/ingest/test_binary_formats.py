@@ -1,4 +1,4 @@
-"""Excel, TDMS, MATLAB and Parquet files give what the same numbers give as CSV; their faults are faults of a file."""
+"""Excel, TDMS, MATLAB and Parquet give what the same numbers give as CSV; faults are faults of a file."""
 
 import sys
 from datetime import datetime, timedelta
@@ -121,7 +121,9 @@ def test_header_fields_come_from_rows_properties_scalars_and_metadata(tmp_path):
     as_xlsx(tmp_path / "t.xlsx", wanted, header=[["Specimen", "S 12"], ["Load [N]", None, 49.03], []])
     as_mat(tmp_path / "t.mat", wanted, specimen="S 12", rig={"load": 49.03})
     as_mat73(tmp_path / "u.mat", wanted, specimen="S 12", load=49.03)
-    as_tdms(tmp_path / "t.tdms", wanted, root={"specimen": "S 12"}, own={"load": 49.03}, channels={"unit": "N"})
+    as_tdms(
+        tmp_path / "t.tdms", wanted, root={"specimen": "S 12"}, own={"load": 49.03}, channels={"unit": "N"}
+    )
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -155,7 +157,8 @@ def test_the_ending_in_capitals_counts_and_the_config_may_say_it(tmp_path):
 def test_a_sheet_has_header_units_rows_dates_and_decimal_commas(tmp_path):
     wanted = table(digits=15)
     rows = [
-        (timedelta(seconds=round(t, 3)), x, f"{f!r}".replace(".", ",")) for t, x, f in wanted.itertuples(index=False)
+        (timedelta(seconds=round(t, 3)), x, f"{f!r}".replace(".", ","))
+        for t, x, f in wanted.itertuples(index=False)
     ]
     head = [["Test of", datetime(2024, 3, 1, 9, 30)], [], ["t", 'x "in"', "F\nmean"], ["s", "mm", "N"]]
     book(tmp_path / "t.xlsx", [*head, *rows])
@@ -222,7 +225,10 @@ def test_saved_values_of_formulas_are_read(tmp_path):
         [list(wanted), *wanted.itertuples(index=False)],
         change=lambda sheet: sheet.__setitem__("C7", "=2*15"),
     )
-    with zipfile.ZipFile(tmp_path / "t.xlsx") as packed, zipfile.ZipFile(tmp_path / "saved.xlsx", "w") as saved:
+    with (
+        zipfile.ZipFile(tmp_path / "t.xlsx") as packed,
+        zipfile.ZipFile(tmp_path / "saved.xlsx", "w") as saved,
+    ):
         for name in packed.namelist():
             saved.writestr(name, packed.read(name).replace(b"<f>2*15</f><v />", b"<f>2*15</f><v>30</v>"))
     force = read(tmp_path, "saved.xlsx").columns["force_N"]
@@ -266,7 +272,9 @@ def test_the_group_is_the_only_one_that_fits_or_the_one_named(tmp_path):
     assert "Did you mean 'down'?" in refused(tmp_path, "t.tdms", '[trace]\ngroup = "Down"').fix
     with TdmsWriter(tmp_path / "u.tdms") as writer:
         writer.write_segment([ChannelObject("up", name, first[name].to_numpy()) for name in first])
-        writer.write_segment([ChannelObject("up", "slow_C", np.arange(3.0)), ChannelObject("log", "oil_C", np.ones(3))])
+        writer.write_segment(
+            [ChannelObject("up", "slow_C", np.arange(3.0)), ChannelObject("log", "oil_C", np.ones(3))]
+        )
     trace = read(tmp_path, "u.tdms")
     npt.assert_array_equal(trace.columns["force_N"], first["force_N"])
     assert [(fault.column, fault.severity) for fault in trace.faults] == [("slow_C", "info")]

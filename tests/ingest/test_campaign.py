@@ -18,7 +18,7 @@ MEASURED = os.environ.get("SEALFIT_MEASURED")
 
 
 def write_trace(path, *, level=30.0, speed=5.0, sign=1, n=500, seed=0, way=40.0, both=False, **columns):
-    """One stroke, or one there and one back, of `way` mm at `speed`, with a rise over 0.3 mm and noise of 0.1 N."""
+    """One stroke, or one there and back, of `way` mm at `speed`, with a rise over 0.3 mm and 0.1 N noise."""
     rng = np.random.default_rng(seed)
     time = np.linspace(0.0, way / speed, n)
     x = speed * time
@@ -36,7 +36,13 @@ def write_trace(path, *, level=30.0, speed=5.0, sign=1, n=500, seed=0, way=40.0,
 
 
 def row(file, run_id, repeat, days=4, speed=5.0, load=49.03, **more):
-    cells = {"file": file, "run_id": run_id, "repeat": repeat, "temperature_C": 60, "compression_ratio_pct": 80}
+    cells = {
+        "file": file,
+        "run_id": run_id,
+        "repeat": repeat,
+        "temperature_C": 60,
+        "compression_ratio_pct": 80,
+    }
     return {**cells, "aging_days": days, "load_N": load, "speed_mm_s": speed, **more}
 
 
@@ -55,7 +61,9 @@ def campaign(tmp_path):
             file = f"traces/{run}_{repeat}.csv"
             level = 30.0 - 5 * run + 0.2 * repeat
             write_trace(tmp_path / "c" / file, level=level, speed=speed, seed=10 * run + repeat)
-            rows.append(row(file, f"run{run}", repeat, days, speed, oil="abc"[repeat - 1], humidity_pct=40 + repeat))
+            rows.append(
+                row(file, f"run{run}", repeat, days, speed, oil="abc"[repeat - 1], humidity_pct=40 + repeat)
+            )
     return write_campaign(tmp_path / "c", rows)
 
 
@@ -125,7 +133,9 @@ def test_traces_hold_every_sample_and_nothing_else(campaign):
 def test_repeats_are_averaged_with_the_standard_error_of_the_repeats(campaign):
     mean = ingest_campaign(campaign, Config()).tables["traces_mean"]
     inside = mean[mean["steady"] & (mean["run_id"] == "run0")]
-    assert (inside["n"] == 3).mean() > 0.97  # the windows of the three end within a few samples of one another
+    assert (
+        inside["n"] == 3
+    ).mean() > 0.97  # the windows of the three end within a few samples of one another
     inside = inside[inside["n"] == 3]
     assert inside["force_N"].mean() == pytest.approx(30.4, abs=0.02)
     # Levels 0.2 N apart and noise of 0.1 N: SE = sqrt((0.04 + 0.01) / 3).
@@ -162,7 +172,9 @@ def test_a_record_split_into_files_of_one_stroke_is_one_record(tmp_path, numbere
         for stroke, part in enumerate((both[:500], both[499:]), start=1):
             file = f"{repeat}_{stroke}.csv"
             (tmp_path / "split").mkdir(exist_ok=True)
-            part.assign(time_s=part["time_s"] - part["time_s"].iloc[0]).to_csv(tmp_path / "split" / file, index=False)
+            part.assign(time_s=part["time_s"] - part["time_s"].iloc[0]).to_csv(
+                tmp_path / "split" / file, index=False
+            )
             split.append(row(file, "a", repeat, stroke=stroke))
     found = []
     for name, rows in (("whole", whole), ("split", split)):
@@ -183,7 +195,9 @@ def test_runs_of_one_direction_keep_their_names(campaign):
 def test_a_load_measured_while_sliding_is_used_and_compared_with_the_declared_one(tmp_path):
     rng = np.random.default_rng(0)
     for repeat in (1, 2):
-        write_trace(tmp_path / f"{repeat}.csv", load_N=60.0 + rng.normal(0, 0.1, 500), oil_C=np.linspace(20, 30, 500))
+        write_trace(
+            tmp_path / f"{repeat}.csv", load_N=60.0 + rng.normal(0, 0.1, 500), oil_C=np.linspace(20, 30, 500)
+        )
     write_campaign(tmp_path, [row("1.csv", "r", 1, load=49.03), row("2.csv", "r", 2, load=49.03)])
     made = ingest_campaign(tmp_path, Config())
     npt.assert_allclose(made.tables["steady"]["load_N"], 60.0, atol=0.05)
@@ -313,7 +327,8 @@ def test_a_channel_that_only_some_files_have_is_null_in_the_others(tmp_path):
 # ---------------------------------------------------------------- measured data
 @pytest.mark.skipif(MEASURED is None, reason="SEALFIT_MEASURED names no folder of measured data")
 def test_half_loop_and_offset_of_the_pneumatic_cylinder():
-    # Means over the middle of the stroke, by hand from the raw files (README of the data set): half loop, offset.
+    # Means over the middle of the stroke, by hand from the raw files (README of the data set): half loop,
+    # offset.
     known = {
         "rerun/1": [(4.95, 1.9), (4.79, 3.4), (5.16, 4.3), (8.81, 4.4)],
         "rerun/2": [(4.79, 1.9), (5.94, 3.4), (5.87, 4.3), (6.29, 4.4)],
@@ -322,10 +337,17 @@ def test_half_loop_and_offset_of_the_pneumatic_cylinder():
         "reconnected/3": [(6.38, 2.3), (7.36, 3.6), (8.01, 4.2), (7.82, 4.0)],
     }
     root = Path(__file__).parents[2]
-    made = ingest_campaign(Path(MEASURED) / "pneuseal-repeats", load_config(root / "configs" / "pneuseal.toml"))
+    made = ingest_campaign(
+        Path(MEASURED) / "pneuseal-repeats", load_config(root / "configs" / "pneuseal.toml")
+    )
     bins = made.tables["bins"]
     middle = bins[bins["displacement_mm"].between(7.0, 27.0)]
-    mean = middle.groupby(["file", "stroke", "direction"])["force_N"].mean().groupby(["file", "direction"]).mean()
+    mean = (
+        middle.groupby(["file", "stroke", "direction"])["force_N"]
+        .mean()
+        .groupby(["file", "direction"])
+        .mean()
+    )
     mean = mean.unstack()
     for name, values in known.items():
         for bar, (half, offset) in zip((1, 3, 5, 7), values, strict=True):

@@ -36,7 +36,9 @@ def test_arithmetic_is_that_of_paper(text, expected):
 def test_pressure_force_of_the_piston_by_hand():
     # 1 bar on 518.7476 mm2 is 51.87476 N
     force = value(
-        "force - pressure * 1e5 * pi * (0.0257 / 2) ** 2", force=np.array([60.0, 55.0]), pressure=np.array([1.0, 1.0])
+        "force - pressure * 1e5 * pi * (0.0257 / 2) ** 2",
+        force=np.array([60.0, 55.0]),
+        pressure=np.array([1.0, 1.0]),
     )
     npt.assert_allclose(force, [8.12524, 3.12524], atol=1e-4)
 
@@ -160,7 +162,9 @@ def test_unknown_and_text_names_are_told_with_what_is_known():
 numbers = st.floats(-1e3, 1e3).map(lambda x: round(x, 3))
 trees = st.recursive(
     numbers.map(lambda x: f"({x!r})") | st.sampled_from(["a", "b"]),
-    lambda part: st.tuples(part, st.sampled_from(["+", "-", "*"]), part).map(lambda t: f"({t[0]} {t[1]} {t[2]})"),
+    lambda part: st.tuples(part, st.sampled_from(["+", "-", "*"]), part).map(
+        lambda t: f"({t[0]} {t[1]} {t[2]})"
+    ),
     max_leaves=12,
 )
 
@@ -182,7 +186,11 @@ def test_any_text_is_either_safe_or_refused(text):
 
 @pytest.mark.parametrize(
     "line",
-    ["trace.compute.force_N = 'open(1)'", "files.compute.speed_mm_s = 'open(1)'", "trace.keep = 'open(1) > 2'"],
+    [
+        "trace.compute.force_N = 'open(1)'",
+        "files.compute.speed_mm_s = 'open(1)'",
+        "trace.keep = 'open(1) > 2'",
+    ],
 )
 def test_a_config_is_refused_on_load_with_the_place_of_its_unsafe_expression(line):
     with pytest.raises(ConfigError, match=line.split(" = ")[0] + ".*'open.1.' is not allowed"):

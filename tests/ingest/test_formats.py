@@ -81,12 +81,15 @@ def test_displacement_integrates_a_speed_in_turns_per_minute(tmp_path):
     npt.assert_allclose(trace.table["displacement_mm"], -(0.5 * t + 0.05 * t**2), atol=1e-9)
     rows[50] = "5.0,x,1.0"  # the integral spans the gap that a bad row leaves
     trace = read(tmp_path, csv_of(rows, "time_s,rpm,force_N"), rig)
-    npt.assert_allclose(trace.table["displacement_mm"].iloc[-1], -(0.5 * t[-1] + 0.05 * t[-1] ** 2), atol=1e-3)
+    npt.assert_allclose(
+        trace.table["displacement_mm"].iloc[-1], -(0.5 * t[-1] + 0.05 * t[-1] ** 2), atol=1e-3
+    )
 
 
 def test_channels_are_numbers_or_labels_and_remarks_are_named(tmp_path):
     extra = [
-        f"{row},{20 + i % 3},{'up' if i < 50 else 'down'},{'noise here' if i == 7 else ''},{i if i != 9 else ''},,"
+        f"{row},{20 + i % 3},{'up' if i < 50 else 'down'},"
+        f"{'noise here' if i == 7 else ''},{i if i != 9 else ''},,"
         for i, row in enumerate(ROWS)
     ]
     trace = read(tmp_path, csv_of(extra, HEADER + ",humidity_pct,phase,note,stroke,empty,"))
@@ -112,7 +115,9 @@ def test_slips_in_a_channel_with_decimal_commas(tmp_path):
 
 
 def test_what_cannot_be_computed_is_a_fault_that_json_can_hold(tmp_path):
-    trace = read(tmp_path, csv_of(ROWS), 'trace.compute.force_N = "1 / displacement_mm"')  # 1/0 on the first row
+    trace = read(
+        tmp_path, csv_of(ROWS), 'trace.compute.force_N = "1 / displacement_mm"'
+    )  # 1/0 on the first row
     (fault,) = trace.faults
     assert (fault.check, fault.line, fault.value) == ("not_finite", 2, "inf")
 
@@ -136,9 +141,13 @@ def test_a_sparse_channel_is_left_out_and_not_the_file(tmp_path):
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16", "utf-16-le", "utf-16-be", "cp1252"])
+@pytest.mark.parametrize(
+    "encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16", "utf-16-le", "utf-16-be", "cp1252"]
+)
 def test_encodings_and_line_ends_are_recognised(tmp_path, encoding, end):
-    content = csv_of([row + ",20" for row in ROWS], HEADER + ",Öltemperatur °C").replace("\n", end).encode(encoding)
+    content = (
+        csv_of([row + ",20" for row in ROWS], HEADER + ",Öltemperatur °C").replace("\n", end).encode(encoding)
+    )
     trace = read(tmp_path, content)
     npt.assert_allclose(trace.table["Öltemperatur °C"], 20.0)
     assert trace.line[-1] == 101
@@ -178,8 +187,13 @@ def test_a_table_reads_back_the_same_however_it_is_written(tmp_path_factory, row
         return f'"{text}"' if quoted and delimiter != "whitespace" else text
 
     names = ["time_s", "displacement_mm", "force_N", "µ"]
-    lines = [mark.join(write(cell) for cell in line) + mark * (2 * trailing) for line in [names, *table.tolist()]]
-    rig = f'[trace]\ndelimiter = "{delimiter}"\ndecimal = "{decimal}"\ntrailing_separator = {str(trailing).lower()}'
+    lines = [
+        mark.join(write(cell) for cell in line) + mark * (2 * trailing) for line in [names, *table.tolist()]
+    ]
+    rig = (
+        f'[trace]\ndelimiter = "{delimiter}"\ndecimal = "{decimal}"\n'
+        f"trailing_separator = {str(trailing).lower()}"
+    )
     trace = read(tmp_path_factory.mktemp("t"), end.join([*lines, ""]).encode(encoding), rig)
     npt.assert_allclose(trace.table[names].to_numpy(), table, rtol=1e-8)
     assert trace.faults == ()

@@ -1,4 +1,4 @@
-"""The measured campaigns that ship read as their READMEs say; expected numbers were taken from the raw text by hand."""
+"""Shipped measured campaigns read as their READMEs say; expected numbers were taken from raw text by hand."""
 
 import hashlib
 from pathlib import Path
@@ -47,8 +47,12 @@ def test_pneuseal_reads_whole(pneuseal):
     assert sum(trace.rows_read for trace in traces.values()) == 133_546
     assert sum(len(trace.table) for trace in traces.values()) == 133_546 - 20 * 15
     assert all(trace.faults == () for trace in traces.values())
-    assert all(list(t.table) == ["time_s", "displacement_mm", "force_N", "pressure_bar"] for t in traces.values())
-    assert len({trace.ref.channels["run_id"] for trace in traces.values()}) == 12  # three mountings at four pressures
+    assert all(
+        list(t.table) == ["time_s", "displacement_mm", "force_N", "pressure_bar"] for t in traces.values()
+    )
+    assert (
+        len({trace.ref.channels["run_id"] for trace in traces.values()}) == 12
+    )  # three mountings at four pressures
     rerun = traces["raw/rerun/2_O-ring257_5bar.csv"].ref.channels
     assert (rerun["mounting"], rerun["repeat"], rerun["set_pressure_bar"]) == ("rerun", 2, 5.0)
     again = traces["raw/reconnected/3_O-ring257_5bar.csv"].ref.channels
@@ -64,9 +68,12 @@ def test_pneuseal_force_is_that_of_the_author(pneuseal):
 
 
 def test_pneuseal_half_loops_are_those_of_its_description(pneuseal):
-    # Half the distance between the mean forces of the two directions, mid-stroke, in N. Over whole strokes these
-    # are 4.95 (rerun 1, 1 bar) and 8.81 (rerun 1, 7 bar); here only by the sign of a smoothed speed.
-    for file, expected in (("raw/rerun/1_O-ring257_1bar.csv", 4.95), ("raw/rerun/1_O-ring257_7bar.csv", 8.81)):
+    # Half the distance between the mean forces of the two directions, mid-stroke, in N. Over whole strokes
+    # these are 4.95 (rerun 1, 1 bar) and 8.81 (rerun 1, 7 bar); here only by the sign of a smoothed speed.
+    for file, expected in (
+        ("raw/rerun/1_O-ring257_1bar.csv", 4.95),
+        ("raw/rerun/1_O-ring257_7bar.csv", 8.81),
+    ):
         table = pneuseal[0][file].table
         x, force = table["displacement_mm"].to_numpy(), table["force_N"].to_numpy()
         speed = np.gradient(np.convolve(x, np.ones(9) / 9, "same"))

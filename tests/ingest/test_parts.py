@@ -51,7 +51,11 @@ def test_a_condition_lies_in_no_part_but_those_whose_names_span_it():
 
 
 def test_large_files_make_parts_of_few():
-    assert [len(partitions) for partitions in plan_parts(["a"] * 6, list("112233"), [50_000_000] * 6)] == [2, 2, 2]
+    assert [len(partitions) for partitions in plan_parts(["a"] * 6, list("112233"), [50_000_000] * 6)] == [
+        2,
+        2,
+        2,
+    ]
 
 
 def test_files_added_to_one_condition_change_one_part_in_a_hundred():
@@ -59,7 +63,9 @@ def test_files_added_to_one_condition_change_one_part_in_a_hundred():
     before, _ = plan_of(conditions)
     after, _ = plan_of([*conditions, "day 500"])
     assert len(before) > 80
-    assert len({tuple(partitions) for partitions in after} - {tuple(partitions) for partitions in before}) <= 3
+    assert (
+        len({tuple(partitions) for partitions in after} - {tuple(partitions) for partitions in before}) <= 3
+    )
 
 
 # ---------------------------------------------------------------- stored
@@ -223,7 +229,9 @@ def test_a_stroke_that_other_parts_rule_out_is_in_no_table_of_samples(campaign, 
     assert dead == [f"day7_r{repeat}.csv" for repeat in (1, 2, 3)]
     assert not found["bins"]["file"].isin(dead).any()
     assert not found["traces"].loc[found["traces"]["file"].isin(dead), "steady"].any()
-    assert not (found["traces_mean"]["condition"] == "temperature_C=60, compression_ratio_pct=80, aging_days=7").any()
+    assert not (
+        found["traces_mean"]["condition"] == "temperature_C=60, compression_ratio_pct=80, aging_days=7"
+    ).any()
     add(campaign, write(campaign, 20, 1))  # judged again, from what is stored of the parts
     ingest(campaign, out)
     ingest(campaign, tmp_path / "anew")

@@ -1,4 +1,4 @@
-"""Strokes of 3 to 300 bristle lengths: what is left of the rise in the steady window is known, and taken out."""
+"""Strokes of 3 to 300 bristle lengths: the rest of the rise in the steady window is known, and taken out."""
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,9 @@ from sealfit.ingest.strokes import find_strokes
 LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
 
 
-def bristle_trace(ratio, *, hertz=100.0, ramp=0.2, blur=0.002, begin=0.0, damping=0.0, seed=1, shape="straight"):
+def bristle_trace(
+    ratio, *, hertz=100.0, ramp=0.2, blur=0.002, begin=0.0, damping=0.0, seed=1, shape="straight"
+):
     """Return time, displacement and force of a stroke `ratio` bristle lengths long, after a rest of a second.
 
     At constant G the force is an exponential of the distance whatever the speed does: Eq. 2 divided by v.
@@ -30,7 +32,7 @@ def bristle_trace(ratio, *, hertz=100.0, ramp=0.2, blur=0.002, begin=0.0, dampin
 
 
 def steady_forces(ratio, many=12, **more):
-    """Return the mean force of the steady windows of several strokes, as measured and with the rise taken out."""
+    """Return the mean force of several strokes' steady windows, as measured and with the rise taken out."""
     made = []
     for seed in range(many):
         time, place, force = bristle_trace(ratio, seed=seed, **more)
@@ -43,7 +45,14 @@ def steady_forces(ratio, many=12, **more):
 @pytest.mark.parametrize("ratio", [3.0, 6.0, 11.0, 30.0, 100.0, 300.0])
 @pytest.mark.parametrize(
     "more",
-    [{}, {"hertz": 500.0}, {"begin": -LEVEL}, {"begin": 0.3 * LEVEL}, {"ramp": 0.4}, {"ramp": 0.1, "shape": "lag"}],
+    [
+        {},
+        {"hertz": 500.0},
+        {"begin": -LEVEL},
+        {"begin": 0.3 * LEVEL},
+        {"ramp": 0.4},
+        {"ramp": 0.1, "shape": "lag"},
+    ],
     ids=str,
 )
 def test_the_steady_force_does_not_depend_on_where_the_window_begins(ratio, more):
@@ -86,7 +95,9 @@ def test_a_stroke_that_ends_before_it_is_steady_says_so_and_is_used(tmp_path):
     for name, ratio in (("short.csv", 3.0), ("long.csv", 40.0)):
         columns = dict(zip(("time_s", "displacement_mm", "force_N"), bristle_trace(ratio), strict=True))
         pd.DataFrame(columns).to_csv(tmp_path / name, index=False)
-    runs = pd.DataFrame({"file": ["short.csv", "long.csv"], "aging_days": 0.0, "load_N": 49.0, "speed_mm_s": SPEED})
+    runs = pd.DataFrame(
+        {"file": ["short.csv", "long.csv"], "aging_days": 0.0, "load_N": 49.0, "speed_mm_s": SPEED}
+    )
     runs.to_csv(tmp_path / "runs.csv", index=False)
     tables = ingest_campaign(tmp_path, Config(condition=["aging_days"])).tables
     said = tables["quality"].set_index("file")["check"]

@@ -23,7 +23,9 @@ def trace(n=1000, noise=0.1, step=0.0, seed=0, ripple=0.0):
     rng = np.random.default_rng(seed)
     time = np.linspace(0.0, 8.0, n)
     x = 5.0 * time
-    force = (30.0 + ripple * np.sin(2 * np.pi * x / 6.0)) * (1.0 - np.exp(-x / 0.3)) + rng.normal(0.0, noise, n)
+    force = (30.0 + ripple * np.sin(2 * np.pi * x / 6.0)) * (1.0 - np.exp(-x / 0.3)) + rng.normal(
+        0.0, noise, n
+    )
     return time, x, np.round(force / step) * step if step else force
 
 
@@ -55,7 +57,12 @@ def test_a_sound_stroke_is_not_blamed_however_fine_or_coarse_its_sensor(noise, s
 def test_clipping_at_the_sensor_s_end_is_named_with_value_and_line():
     time, x, force = trace(step=0.01)
     (fault,) = checks(time, x, np.minimum(force, 30.05))
-    assert (fault.check, fault.value, fault.action, fault.column) == ("saturated", 30.05, "stroke left out", "force_N")
+    assert (fault.check, fault.value, fault.action, fault.column) == (
+        "saturated",
+        30.05,
+        "stroke left out",
+        "force_N",
+    )
     # 30 N with an SD of 0.1 N: 31 % of the samples lie above 30.05 N.
     assert 0.26 < float(fault.reason.split("%")[0]) / 100 < 0.36
     assert force[fault.line - 2] >= 30.05
@@ -133,7 +140,12 @@ def test_a_single_wrong_sample_is_left_out_wherever_it_stands(place):
     force[place] = -1200.0
     keep, (fault,) = spikes(time, x, force)
     assert np.flatnonzero(~keep).tolist() == [place]
-    assert (fault.check, fault.line, fault.value, fault.action) == ("spike", place + 2, -1200.0, "row left out")
+    assert (fault.check, fault.line, fault.value, fault.action) == (
+        "spike",
+        place + 2,
+        -1200.0,
+        "row left out",
+    )
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -182,7 +194,14 @@ def test_resolution_is_the_smallest_step():
 def strokes(force, **columns):
     n = len(force)
     flags = {"several": False, "extreme": False, "used": True}
-    base = {"file": [f"f{i}" for i in range(n)], "stroke": 1, "run": "r", "direction": 1, "equal": 0.1, **flags}
+    base = {
+        "file": [f"f{i}" for i in range(n)],
+        "stroke": 1,
+        "run": "r",
+        "direction": 1,
+        "equal": 0.1,
+        **flags,
+    }
     return pd.DataFrame({**base, "force_N": force, **columns})
 
 
@@ -211,7 +230,9 @@ def test_a_constant_force_is_a_dead_sensor_only_where_others_show_noise():
     dead, (fault,) = constant_strokes(strokes([20.0, 21.0, 22.0], equal=[1.0, 0.05, 0.1]))
     assert dead.tolist() == [False, True, True]
     assert (fault.check, fault.action) == ("stuck", "stroke left out")
-    _, (fault,) = constant_strokes(strokes([20.0, 21.0, 22.0], equal=[1.0, 0.05, 0.1], extreme=[True, False, False]))
+    _, (fault,) = constant_strokes(
+        strokes([20.0, 21.0, 22.0], equal=[1.0, 0.05, 0.1], extreme=[True, False, False])
+    )
     assert fault.check == "saturated"
     coarse, (fault,) = constant_strokes(strokes([20.0, 21.0, 22.0], equal=[1.0, 0.95, 0.8]))
     assert coarse.all()
@@ -222,8 +243,8 @@ def test_a_constant_force_is_a_dead_sensor_only_where_others_show_noise():
 def repeats(force, used=True):
     runs = np.repeat([f"r{i}" for i in range(len(force) // 3)], 3)
     return pd.DataFrame(
-        {"file": [f"f{i}" for i in range(len(force))], "run_id": runs, "repeat": np.tile([1, 2, 3], len(force) // 3),
-         "force_N": force, "used": used}
+        {"file": [f"f{i}" for i in range(len(force))], "run_id": runs,
+         "repeat": np.tile([1, 2, 3], len(force) // 3), "force_N": force, "used": used}
     )  # fmt: skip
 
 
@@ -277,7 +298,12 @@ def steady_of(load, force=47.07, **more):
 )
 def test_a_load_in_kg_or_g_is_a_warning(load, said, fix):
     (fault,) = improbable_loads(steady_of(load), Config())
-    assert (fault.check, fault.severity, fault.action, fault.column) == ("improbable_load", "warning", "kept", "load_N")
+    assert (fault.check, fault.severity, fault.action, fault.column) == (
+        "improbable_load",
+        "warning",
+        "kept",
+        "load_N",
+    )
     assert said in fault.reason
     assert f'unit = "{fix}"' in fault.fix
 

@@ -40,7 +40,9 @@ def test_plain_file_reads_as_written(tmp_path):
         ("99.0,5.0,2.1", "time_order", "time_s", 99.0, "clock"),
     ],
 )
-def test_a_bad_cell_costs_its_row_and_is_named_with_line_value_and_fix(tmp_path, row, check, column, value, fix):
+def test_a_bad_cell_costs_its_row_and_is_named_with_line_value_and_fix(
+    tmp_path, row, check, column, value, fix
+):
     trace = read(tmp_path, changed(10, row))
     (fault,) = trace.faults
     assert (fault.check, fault.line, fault.column, fault.value) == (check, 12, column, value)
@@ -60,7 +62,11 @@ def test_five_percent_of_bad_rows_are_left_out_and_six_leave_the_file_out(tmp_pa
     assert fault.check == "too_many_bad_rows"
     assert "6 of 100 rows are bad, more than 5 %" in fault.reason
     assert (
-        len(read(tmp_path, csv_of([bad.get(i, r) for i, r in enumerate(ROWS)]), "quality.max_bad_rows = 0.06").table)
+        len(
+            read(
+                tmp_path, csv_of([bad.get(i, r) for i, r in enumerate(ROWS)]), "quality.max_bad_rows = 0.06"
+            ).table
+        )
         == 94
     )
 
@@ -91,8 +97,16 @@ def test_one_wrong_time_far_ahead_costs_one_row_and_a_restarted_clock_the_file(t
         (b"PK\x03\x04" + bytes(range(200)), "binary_file", "xlsx"),
         (csv_of(ROWS).encode().replace(b"0.5,2.01", b"0.5\x00,2.01"), "binary_file", "byte 0x0"),
         (bytes(range(256)) * 20, "binary_file", "not text"),
-        (csv_of(ROWS, "time_s,Displacement_mm,force_N").encode(), "missing_column", "Did you mean 'Displacement_mm'"),
-        (csv_of(ROWS, "time_s,displacment_mm,force_N").encode(), "missing_column", "Did you mean 'displacment_mm'"),
+        (
+            csv_of(ROWS, "time_s,Displacement_mm,force_N").encode(),
+            "missing_column",
+            "Did you mean 'Displacement_mm'",
+        ),
+        (
+            csv_of(ROWS, "time_s,displacment_mm,force_N").encode(),
+            "missing_column",
+            "Did you mean 'displacment_mm'",
+        ),
         (csv_of(ROWS, "time_s,force_N,force_N").encode(), "missing_column", "displacement_mm"),
         (csv_of(ROWS, "force_N,displacement_mm,force_N").encode(), "duplicate_column", "2 times"),
         (csv_of(ROWS).replace(",", ";").encode(), "missing_column", 'delimiter = ";"'),
@@ -110,7 +124,9 @@ def test_decimal_commas_everywhere_name_the_config_key(tmp_path):
     rows = [row.replace(",", ";").replace(".", ",") for row in ROWS]
     fault = refused(tmp_path, csv_of(rows, HEADER.replace(",", ";")), 'trace.delimiter = ";"')
     assert 'decimal = ","' in fault.fix
-    trace = read(tmp_path, csv_of(rows, HEADER.replace(",", ";")), 'trace.delimiter = ";"\ntrace.decimal = ","')
+    trace = read(
+        tmp_path, csv_of(rows, HEADER.replace(",", ";")), 'trace.delimiter = ";"\ntrace.decimal = ","'
+    )
     npt.assert_allclose(trace.table["displacement_mm"], 0.5 * np.arange(100))
 
 
@@ -168,7 +184,9 @@ def test_units_rows_and_clocks_are_recognised_for_what_they_are(tmp_path):
 def test_many_short_strokes_with_rests_have_the_speed_of_their_plateaus(tmp_path):
     t = np.arange(0, 200, 0.02)
     phase = t % 4  # 1 s forth, 1 s rest, 1 s back, 1 s rest at 0.25 mm/s
-    x = 0.25 * (np.clip(phase, 0, 1) - np.clip(phase - 2, 0, 1)) + np.random.default_rng(0).normal(0, 2e-4, len(t))
+    x = 0.25 * (np.clip(phase, 0, 1) - np.clip(phase - 2, 0, 1)) + np.random.default_rng(0).normal(
+        0, 2e-4, len(t)
+    )
     rows = [f"{a:.2f},{b:.6f},2.0" for a, b in zip(t, x, strict=True)]
     assert read(tmp_path, csv_of(rows), speed_set_mm_s=0.25).faults == ()
     assert refused(tmp_path, csv_of(rows), speed_set_mm_s=0.5).check == "speed_disagreement"

@@ -20,7 +20,13 @@ columns = {run_id = "{drive} {_sign}x{_rpm}", repeat = "1"}
 
 
 def test_names_of_files_say_what_runs_csv_would(tmp_path):
-    for file in ("raw/no1/n20.csv", "raw/no1/100.csv", "raw/no3/20_warm.csv", "raw/no1/steps/5.csv", "raw/no1/x.csv"):
+    for file in (
+        "raw/no1/n20.csv",
+        "raw/no1/100.csv",
+        "raw/no3/20_warm.csv",
+        "raw/no1/steps/5.csv",
+        "raw/no1/x.csv",
+    ):
         trace(tmp_path, file)
     refs, found = list_traces(tmp_path, config(NAMED))
     by_file = {ref.file: ref.channels for ref in refs}
@@ -109,7 +115,9 @@ def test_a_folder_in_which_nothing_fits_stops_the_run(tmp_path):
     assert [fault.check for fault in faults(tmp_path, only_excluded)] == ["excluded", "nothing_left"]
     (tmp_path / "runs.csv").write_text("file\nraw/no1/5.csv\n")
     trace(tmp_path, "raw/no1/5.csv")
-    (tmp_path / "raw/no1/5.csv").write_text(HEADER)  # the condition should stand in the trace, and there is none
+    (tmp_path / "raw/no1/5.csv").write_text(
+        HEADER
+    )  # the condition should stand in the trace, and there is none
     assert [fault.check for fault in faults(tmp_path, DAYS)] == ["no_rows", "nothing_left"]
 
 
@@ -134,7 +142,11 @@ name_pattern = 'T(?P<temperature_C>\d+)_C(?P<c>\d+)_d(?P<aging_days>\d+)_v(?P<sp
 @pytest.mark.parametrize(
     ("files", "nearest", "said"),
     [
-        (["T80_C20_day4_v5.csv", "notes.csv"], "T80_C20_day4_v5.csv", "'T80_C20_d', then the pattern has '(?P<aging_"),
+        (
+            ["T80_C20_day4_v5.csv", "notes.csv"],
+            "T80_C20_day4_v5.csv",
+            "'T80_C20_d', then the pattern has '(?P<aging_",
+        ),
         (
             ["T80_C20_d4_v5_r2.csv"],
             "T80_C20_d4_v5_r2.csv",

@@ -55,7 +55,10 @@ def test_blank_lines_count(tmp_path):
 
 def test_semicolons_decimal_commas_and_other_names_of_columns(tmp_path):
     table = FULL.strip().replace(".csv", "·csv").replace("49.03", "49,03").replace("42.5", "42,5")
-    lines = [line.replace(",", ";").replace("49;03", "49,03").replace("42;5", "42,5") for line in table.splitlines()]
+    lines = [
+        line.replace(",", ";").replace("49;03", "49,03").replace("42;5", "42,5")
+        for line in table.splitlines()
+    ]
     folder = campaign(tmp_path, "\n".join(lines).replace("·csv", ".csv").replace("load_N", "Last"))
     found = channels(folder, '[files.runs_columns]\nload_N = "Last"')
     assert found["a.csv"]["load_N"] == 49.03
@@ -95,7 +98,9 @@ def test_runs_without_a_commanded_speed_are_told_apart_by_the_measured_one(tmp_p
     [((1, 2, 3), 1), ((1, 3, 2), 2), ((1, 1, 2), 2), (("", 2, 3), 2)],
     ids=["there and back", "both speeds one way", "a stroke twice", "a stroke without a number"],
 )
-def test_strokes_there_and_back_of_one_record_share_a_run_though_the_rig_is_faster_one_way(tmp_path, strokes, runs):
+def test_strokes_there_and_back_of_one_record_share_a_run_though_the_rig_is_faster_one_way(
+    tmp_path, strokes, runs
+):
     cells = "\n".join(f"{file}.csv,4,{stroke}" for file, stroke in zip("abc", strokes, strict=True))
     folder = campaign(tmp_path, f"file,aging_days,stroke\n{cells}")
     trace(folder, "b.csv", speed=5.5)
@@ -106,7 +111,9 @@ def test_strokes_there_and_back_of_one_record_share_a_run_though_the_rig_is_fast
 
 
 def test_named_specimens_and_opposite_speeds_are_runs_of_their_own(tmp_path):
-    folder = campaign(tmp_path, "file,aging_days,specimen_id,speed_mm_s\na.csv,4,S1,5\nb.csv,4,S2,5\nc.csv,4,S1,-5")
+    folder = campaign(
+        tmp_path, "file,aging_days,specimen_id,speed_mm_s\na.csv,4,S1,5\nb.csv,4,S2,5\nc.csv,4,S1,-5"
+    )
     found = channels(folder, DAYS)
     assert len({row["run_id"] for row in found.values()}) == 3
     assert found["c.csv"]["speed_set_mm_s"] == 5.0
@@ -126,7 +133,10 @@ def test_settings_that_differ_by_rounding_are_one(tmp_path):
 
 
 def test_without_run_id_settings_that_differ_by_rounding_are_one_run(tmp_path):
-    table = "file,temperature_C,compression_ratio_pct,aging_days,speed_mm_s\na.csv,60,80,4,5\nb.csv,60,80,4,5.00001\n"
+    table = (
+        "file,temperature_C,compression_ratio_pct,aging_days,speed_mm_s\n"
+        "a.csv,60,80,4,5\nb.csv,60,80,4,5.00001\n"
+    )
     refs, _ = list_traces(campaign(tmp_path, table), config())
     assert len({ref.channels["run_id"] for ref in refs}) == 1
     assert sorted(ref.channels["repeat"] for ref in refs) == [1, 2]
@@ -143,7 +153,8 @@ def test_repeats_follow_the_clock_and_fill_gaps(tmp_path):
 
 def test_unaged_rows_are_one_condition_whatever_their_other_cells_say(tmp_path):
     table = (
-        "file,temperature_C,compression_ratio_pct,aging_days,speed_mm_s\na.csv,60,80,0,5\nb.csv,,,0,5\nc.csv,40,90,0,5"
+        "file,temperature_C,compression_ratio_pct,aging_days,speed_mm_s\n"
+        "a.csv,60,80,0,5\nb.csv,,,0,5\nc.csv,40,90,0,5"
     )
     found = channels(campaign(tmp_path, table))
     assert {row["run_id"] for row in found.values()} == {"unaged, 5 mm/s"}
@@ -161,7 +172,14 @@ def test_unaged_rubbers_are_told_apart():
 @pytest.mark.parametrize(
     ("old", "new", "check", "line", "column", "words"),
     [
-        ("60,80,4,49.03,5,2024-03-01T09", "6O,80,4,49.03,5,2024-03-01T09", "not_a_number", 2, "temperature_C", "6O"),
+        (
+            "60,80,4,49.03,5,2024-03-01T09",
+            "6O,80,4,49.03,5,2024-03-01T09",
+            "not_a_number",
+            2,
+            "temperature_C",
+            "6O",
+        ),
         ("60,80,8", "60,80,", "empty_cell", 4, "aging_days", "Fill it"),
         ("60,80,8", "60,80,-8", "out_of_range", 4, "aging_days", "below 0"),
         ("8,49.03", "8,0", "out_of_range", 4, "load_N", "above 0"),
@@ -177,7 +195,14 @@ def test_unaged_rubbers_are_told_apart():
         ("4,49.03,5,2024-03-01T10", "4,30,5,2024-03-01T10", "run_disagrees", 3, "load_N", "line 2"),
         ("4,49.03,5,2024-03-01T10", "4,,5,2024-03-01T10", "run_disagrees", 3, "load_N", "line 2"),
         ("4,49.03,5,2024-03-01T10", "8,49.03,5,2024-03-01T10", "run_disagrees", 3, "condition", "line 2"),
-        ("2024-03-01T10:30:00", "1.3.2024 10:30", "not_a_time", 3, "started_at", "date_format = '%d.%m.%Y %H:%M'"),
+        (
+            "2024-03-01T10:30:00",
+            "1.3.2024 10:30",
+            "not_a_time",
+            3,
+            "started_at",
+            "date_format = '%d.%m.%Y %H:%M'",
+        ),
         ("b.csv,r1,2", "../b.csv,r1,2", "path_outside", 3, "file", "outside"),
         ("b.csv,r1,2", "/etc/hostname,r1,2", "path_outside", 3, "file", "outside"),
         ("b.csv,r1,2", "C:\\b.csv,r1,2", "path_outside", 3, "file", "outside"),
@@ -245,7 +270,9 @@ def test_one_missing_trace_is_left_to_reading_and_unlisted_ones_are_told(tmp_pat
     folder = campaign(tmp_path, FULL, files=("a.csv", "c.csv", "forgotten.csv"))
     refs, found = list_traces(folder, config())
     assert [ref.file for ref in refs] == ["a.csv", "b.csv", "c.csv"]
-    assert [(fault.check, fault.file, fault.severity) for fault in found] == [("not_listed", "forgotten.csv", "info")]
+    assert [(fault.check, fault.file, fault.severity) for fault in found] == [
+        ("not_listed", "forgotten.csv", "info")
+    ]
 
 
 def test_misspelt_channels_and_slips_in_them_are_warned_of(tmp_path):
@@ -261,7 +288,9 @@ def test_misspelt_channels_and_slips_in_them_are_warned_of(tmp_path):
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.lists(st.tuples(st.integers(1, 3), st.sampled_from([5, 10]), st.booleans()), min_size=1, max_size=12))
+@given(
+    st.lists(st.tuples(st.integers(1, 3), st.sampled_from([5, 10]), st.booleans()), min_size=1, max_size=12)
+)
 def test_every_file_has_a_run_and_a_repeat_that_no_other_has(tmp_path_factory, rows):
     folder = tmp_path_factory.mktemp("c")
     table = ["file,aging_days,speed_mm_s,repeat"]

@@ -39,7 +39,8 @@ def test_a_computed_value_that_is_no_number_is_a_fault_of_its_row(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [("mass * 2", "there is no column 'mass'"), ("hanger * 2", "'hanger' is text, not a number")]
+    ("text", "said"),
+    [("mass * 2", "there is no column 'mass'"), ("hanger * 2", "'hanger' is text, not a number")],
 )
 def test_an_expression_that_cannot_be_meant_stops_the_run(tmp_path, text, said):
     (fault,) = faults(campaign(tmp_path, LOG), DAYS + f"[runs]\ncompute = {{load_N = '{text}'}}\n")
@@ -78,4 +79,8 @@ def test_aged_rubber_needs_its_temperature_and_a_medium_may_be_fresh(tmp_path):
     assert (fault.line, fault.column, fault.value) == (2, "temperature_C", "RT")
     folder = campaign(tmp_path, "file,oil,aging_days\na.csv,fresh,4\nb.csv,used,4\nc.csv,used,0")
     found = channels(folder, 'condition = ["oil", "aging_days"]\n')
-    assert [(ref["oil"], ref["aging_days"]) for ref in found.values()] == [("fresh", 4.0), ("used", 4.0), ("used", 0.0)]
+    assert [(ref["oil"], ref["aging_days"]) for ref in found.values()] == [
+        ("fresh", 4.0),
+        ("used", 4.0),
+        ("used", 0.0),
+    ]

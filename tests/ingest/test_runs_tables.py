@@ -1,4 +1,4 @@
-"""Tables of runs that are not CSV: an Excel log or Parquet gives what runs.csv gives, and only one of them counts."""
+"""Tables of runs that are not CSV: an Excel log or Parquet gives what runs.csv gives, and only one counts."""
 
 from datetime import datetime
 

@@ -11,7 +11,7 @@ S0, G = 0.1, 0.01
 
 
 def campaign(runs, rng, repeats=3, pattern=(0.02, 0.0, -0.015), shift=0.0):
-    """Repeats of runs from 5 to 50 N, sd^2 = S0^2 + (G F)^2; the first repeat of run r0 is off by `shift` SDs."""
+    """Repeats of runs from 5 to 50 N, sd^2 = S0^2 + (G F)^2; the first of run r0 is off by `shift` SDs."""
     level = rng.uniform(5.0, 50.0, runs)[:, None]
     sd = np.sqrt(S0**2 + (G * level) ** 2)
     force = level * (1.0 + np.array(pattern[:repeats])) + sd * rng.normal(size=(runs, repeats))
@@ -33,7 +33,9 @@ def test_scatter_and_pattern_of_repeats_are_recovered():
     assert np.sqrt(np.mean([s.g**2 for s in found])) == pytest.approx(G, rel=0.05)
     # 200 runs of three have 400 degrees of freedom; the common pattern of three numbers takes two.
     assert found[0].df == 398
-    npt.assert_allclose([found[0].pattern[k] for k in (1, 2, 3)], np.array([0.02, 0.0, -0.015]) - 0.005 / 3, atol=0.003)
+    npt.assert_allclose(
+        [found[0].pattern[k] for k in (1, 2, 3)], np.array([0.02, 0.0, -0.015]) - 0.005 / 3, atol=0.003
+    )
     npt.assert_allclose(found[0].sd_N([0.0, 30.0]), [found[0].s0_N, np.hypot(found[0].s0_N, 30 * found[0].g)])
 
 
@@ -63,8 +65,8 @@ def test_without_repeats_there_is_no_scatter_to_know():
 
 def test_strokes_of_one_file_count_once_and_unused_rows_not_at_all():
     steady = pd.DataFrame(
-        {"file": ["a", "a", "b", "b"], "run_id": "x", "repeat": [1, 1, 2, 2], "force_N": [-1.0, -3.0, -5.0, -70.0],
-         "used": [True, True, True, False]}
+        {"file": ["a", "a", "b", "b"], "run_id": "x", "repeat": [1, 1, 2, 2],
+         "force_N": [-1.0, -3.0, -5.0, -70.0], "used": [True, True, True, False]}
     )  # fmt: skip
     means = repeat_means(steady)
     assert means["force_N"].tolist() == [2.0, 5.0]
@@ -79,8 +81,8 @@ def test_false_flags_keep_to_the_family_wise_level(runs):
 
 
 def test_a_shifted_repeat_is_found_as_often_as_the_best_possible_test_finds_it():
-    # A shift of d SDs stands d sqrt(2/3) SDs of a residual off its run; of 180 repeats at 0.001 the limit is about 4.6.
-    # d = 6 leaves it at 4.9 (power about 0.6), d = 8 at 6.5 (0.97).
+    # A shift of d SDs stands d sqrt(2/3) SDs of a residual off its run; of 180 repeats at 0.001 the limit is
+    # about 4.6. d = 6 leaves it at 4.9 (power about 0.6), d = 8 at 6.5 (0.97).
     rng = np.random.default_rng(8)
     found = {}
     for shift in (6.0, 8.0):
@@ -121,7 +123,8 @@ def test_two_coefficients_that_are_not_negative(spread):
         assert a >= 0
         assert b >= 0
         rss = float(weight @ (y - a - b * size**2) ** 2)
-        # No worse than a constant, nor than what a general solver finds, which refuses columns that are alike.
+        # No worse than a constant, nor than what a general solver finds, which refuses columns that are
+        # alike.
         assert rss <= float(weight @ (y - weight @ y / weight.sum()) ** 2) * (1 + 1e-9)
         if spread >= 1e-3:
             root = np.sqrt(weight)

@@ -23,5 +23,7 @@ def test_slope_of_displacement_over_time_in_the_speed_s_unit(displacement, time,
 
 
 def test_units_that_do_not_fit_together_are_refused():
-    with pytest.raises(ConfigError, match=r"displacement in 'turn' over time in 's' does not give a speed in 'mm/s'"):
+    with pytest.raises(
+        ConfigError, match=r"displacement in 'turn' over time in 's' does not give a speed in 'mm/s'"
+    ):
         speed_factor(Units({"displacement": ("angle", "turn")}))

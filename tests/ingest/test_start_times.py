@@ -22,7 +22,10 @@ def started(folder, rig=""):
     ("cells", "rig"),
     [
         (GERMAN, 'date_format = "%d.%m.%Y %H:%M"'),
-        (["03/01/2024 9:30 AM", "03/01/2024 11:00 AM", "03/02/2024 8:00 AM"], 'date_format = "%m/%d/%Y %I:%M %p"'),
+        (
+            ["03/01/2024 9:30 AM", "03/01/2024 11:00 AM", "03/02/2024 8:00 AM"],
+            'date_format = "%m/%d/%Y %I:%M %p"',
+        ),
         ([GERMAN[0], "2024/03/01 11:00:00", ISO[2]], 'date_format = ["%d.%m.%Y %H:%M", "%Y/%m/%d %H:%M:%S"]'),
         # Serial numbers of Excel: 45352 is 1 March 2024, 9:30 is 9.5 / 24 of a day.
         (["45352.3958333333", "45352,4583333333", "45353.3333333333"], ""),
@@ -83,7 +86,9 @@ header_fields = {started_day = 'Datum: (\S+)', started_clock = 'Zeit: (\S+)'}
 
 def test_times_with_zones_are_instants(tmp_path):
     rig = '[files]\ndate_format = "%d.%m.%Y %H:%M %z"\n'
-    times, hours = started(log(tmp_path, ["01.03.2024 09:30 +0100", "01.03.2024 09:30 +0000", ISO[1] + "Z"]), rig)
+    times, hours = started(
+        log(tmp_path, ["01.03.2024 09:30 +0100", "01.03.2024 09:30 +0000", ISO[1] + "Z"]), rig
+    )
     assert hours == [0.0, 1.0, 2.5]
     assert times == ["2024-03-01T09:30:00+01:00", "2024-03-01T09:30:00+00:00", "2024-03-01T11:00:00+00:00"]
 

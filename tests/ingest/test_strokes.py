@@ -11,15 +11,28 @@ from sealfit.ingest.window import slope
 
 
 def stroke(
-    v=5.0, length=40.0, n=1000, *, rise=0.3, force=30.0, lag=0.05, lead=0.0, noise=0.1, blur=0.002, seed=0, **more
+    v=5.0,
+    length=40.0,
+    n=1000,
+    *,
+    rise=0.3,
+    force=30.0,
+    lag=0.05,
+    lead=0.0,
+    noise=0.1,
+    blur=0.002,
+    seed=0,
+    **more,
 ):
-    """A stroke of a rig whose speed lags by `lag` s: time, displacement, force; and force without rise and noise."""
+    """A stroke whose speed lags by `lag` s: time, displacement, force; and force without rise and noise."""
     rng = np.random.default_rng(seed)
     time = np.linspace(0.0, length / v + lead, n)
     since = np.maximum(time - lead, 0.0)
     x = v * (since - lag * (1.0 - np.exp(-since / lag))) if lag else v * since
     level = force * (1.0 + more.get("warm", 0.0) * np.exp(-since / more.get("tau", 3.0)))
-    level += more.get("ripple", 0.0) * np.sin(2.0 * np.pi * x / more.get("wavelength", 7.0) + more.get("phase", 0.0))
+    level += more.get("ripple", 0.0) * np.sin(
+        2.0 * np.pi * x / more.get("wavelength", 7.0) + more.get("phase", 0.0)
+    )
     level += more.get("drift", 0.0) * since
     measured = level * (1.0 - np.exp(-x / rise)) + rng.normal(0.0, noise, n)
     return time, x + rng.normal(0.0, blur, n), measured, level
@@ -33,7 +46,7 @@ def only(time, x, force, **settings):
 
 
 def there_and_back(turns=4, v=5.0, length=40.0, rest=0.0, dt=0.01, noise=0.05, blur=0.002, seed=1):
-    """Strokes to and fro at +-v with a rest of `rest` s at each turn; the force swings over within about 1 mm."""
+    """Strokes to and fro at +-v with a rest of `rest` s at each turn; the force swings over in about 1 mm."""
     rng = np.random.default_rng(seed)
     x, force, onsets = [0.0], [0.0], []
     for i in range(turns):
@@ -60,7 +73,9 @@ def test_a_speed_that_sags_along_the_stroke_is_that_of_its_bins(blur):
     rng = np.random.default_rng(2)
     time = np.linspace(0.0, 8.0, 1600)
     x = 5.0 * time + 0.08 * 5.0 * 1.5 * (1.0 - np.exp(-time / 1.5))
-    speed, steady = speeds_along(time, x + rng.normal(0.0, blur, 1600), np.full(1600, 30.0) + rng.normal(0, 0.1, 1600))
+    speed, steady = speeds_along(
+        time, x + rng.normal(0.0, blur, 1600), np.full(1600, 30.0) + rng.normal(0, 0.1, 1600)
+    )
     true = (5.0 * (1.0 + 0.08 * np.exp(-time / 1.5)))[steady]
     assert np.abs(speed / true - 1.0).max() < 0.02
     assert np.abs(speed / true - 1.0).mean() < 0.003
@@ -250,7 +265,9 @@ def test_a_whole_file_is_one_steady_stroke_when_the_config_says_so():
     sign=st.sampled_from([-1, 1]),
 )
 def test_the_window_does_not_depend_on_the_rig_s_origin_or_direction(v, length, n, origin, sign):
-    time, x, force, _ = stroke(v, length, n, rise=length / 100, lag=0.005 * length / v, noise=0.1, blur=1e-5 * length)
+    time, x, force, _ = stroke(
+        v, length, n, rise=length / 100, lag=0.005 * length / v, noise=0.1, blur=1e-5 * length
+    )
     one = find_strokes(time, x, force, Strokes())
     two = find_strokes(time, np.round(origin) + sign * x, sign * force, Strokes())
     assert len(one) == len(two) == 1
@@ -285,11 +302,15 @@ def test_no_rise_is_found_in_a_force_that_falls_or_begins_within_its_later_band(
 
 
 def test_a_stroke_hardly_longer_than_its_rise_keeps_its_plateau():
-    # As a fretting stroke swings over: along a straight line for half of the way, then a plateau that climbs a little.
+    # As a fretting stroke swings over: along a straight line for half of the way, then a plateau that climbs
+    # a little.
     time = np.linspace(0.0, 1.0, 200)
     x = 0.23 * time
-    force = np.minimum(-2.2 + 4.4 * x / 0.1, 2.2 + 0.5 * (x - 0.1)) + np.random.default_rng(0).normal(0.0, 0.005, 200)
+    force = np.minimum(-2.2 + 4.4 * x / 0.1, 2.2 + 0.5 * (x - 0.1)) + np.random.default_rng(0).normal(
+        0.0, 0.005, 200
+    )
     found = only(time, x, force)
-    # Past the bend at 0.1 mm, and no later than where the late plateau begins: 60 % of the way, 0.138 mm, and a margin.
+    # Past the bend at 0.1 mm, and no later than where the late plateau begins: 60 % of the way, 0.138 mm, and
+    # a margin.
     assert 0.1 < x[found.rows[0]] < 0.147
     assert found.rows[-1] == 198

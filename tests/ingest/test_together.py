@@ -67,5 +67,9 @@ def test_files_read_together_are_as_each_is_read_alone(tmp_path, text):
 
 def test_whole_numbers_of_any_size_are_a_channel(tmp_path):
     big = 2**60 + 1
-    (tmp_path / "t.csv").write_text(csv_of([f"{row},{big + i}" for i, row in enumerate(ROWS)], HEADER + ",count"))
-    npt.assert_array_equal(read_trace(tmp_path, TraceRef("t.csv", {}), config()).columns["count"], np.float64(big))
+    (tmp_path / "t.csv").write_text(
+        csv_of([f"{row},{big + i}" for i, row in enumerate(ROWS)], HEADER + ",count")
+    )
+    npt.assert_array_equal(
+        read_trace(tmp_path, TraceRef("t.csv", {}), config()).columns["count"], np.float64(big)
+    )

@@ -63,10 +63,20 @@ def refs(tmp_path):
 
 def test_files_read_together_give_what_each_gives_alone(tmp_path, refs):
     found = read_strokes(refs, Folder(tmp_path), config())
-    assert {fault.check for made in found for fault in made.faults} >= {"spike", "stuck", "no_motion", "empty_file"}
+    assert {fault.check for made in found for fault in made.faults} >= {
+        "spike",
+        "stuck",
+        "no_motion",
+        "empty_file",
+    }
     for ref, made in zip(refs, found, strict=True):
         (alone,) = read_strokes([ref], Folder(tmp_path), config())
-        assert (made.file, made.mark, made.rows, made.faults) == (alone.file, alone.mark, alone.rows, alone.faults)
+        assert (made.file, made.mark, made.rows, made.faults) == (
+            alone.file,
+            alone.mark,
+            alone.rows,
+            alone.faults,
+        )
         assert len(made.strokes) == len(alone.strokes)
         for ours, theirs in zip(made.strokes, alone.strokes, strict=True):
             assert list(ours) == list(theirs)

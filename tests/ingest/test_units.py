@@ -41,7 +41,9 @@ oil = {name = "p", unit = "psi"}
     np.testing.assert_allclose(found["displacement_mm"], 2.54 * np.arange(100), atol=1e-9)
     np.testing.assert_allclose(found["force_N"], 9.80665 * (2 + 0.01 * np.arange(100)), rtol=1e-12)
     np.testing.assert_allclose(found["oven_C"], 60.0, rtol=1e-12)
-    np.testing.assert_array_equal(found["oil"], 10.0 + np.arange(100))  # the campaign's own: it keeps its unit
+    np.testing.assert_array_equal(
+        found["oil"], 10.0 + np.arange(100)
+    )  # the campaign's own: it keeps its unit
     units = config(rig).units
     assert (units.label("force_N"), units.label("oil")) == ("friction force (N)", "oil (psi)")
 
@@ -59,7 +61,10 @@ force_N = {unit = "N*m"}
 
 
 def test_a_column_of_words_has_no_unit(tmp_path):
-    rig = '[trace.columns]\ntime_s = 1\ndisplacement_mm = 2\nforce_N = 3\noil_bar = {name = "p", unit = "psi"}\n'
+    rig = (
+        "[trace.columns]\ntime_s = 1\ndisplacement_mm = 2\nforce_N = 3\n"
+        'oil_bar = {name = "p", unit = "psi"}\n'
+    )
     fault = refused(tmp_path, csv_of([f"{row},low" for row in ROWS], f"{HEADER},p"), rig)
     assert (fault.line, fault.column) == (1, "oil_bar")
     assert "holds no numbers" in fault.reason
@@ -95,7 +100,8 @@ def test_a_cell_that_is_no_number_is_told_as_it_stands(tmp_path):
         'units = {temperature_C = "degF", aging_days = "h"}',
         'name_pattern = "T(?P<_T>\\\\d+)_(?P<_t>\\\\d+)h[.]csv"\nunits = {_T = "degF", _t = "h"}\n'
         'columns = {temperature_C = "{_T}"}\ncompute = {aging_days = "_t"}',
-        'name_pattern = "T(?P<_T>\\\\d+)_(?P<_t>\\\\d+)h[.]csv"\nunits = {temperature_C = "degF", aging_days = "h"}\n'
+        'name_pattern = "T(?P<_T>\\\\d+)_(?P<_t>\\\\d+)h[.]csv"\n'
+        'units = {temperature_C = "degF", aging_days = "h"}\n'
         'columns = {temperature_C = "{_T}"}\ncompute = {aging_days = "_t + 0"}',
     ],
     ids=["parts", "copies", "columns"],
@@ -110,7 +116,11 @@ def test_parts_of_file_names(tmp_path, rest):
 @pytest.mark.parametrize(
     ("column", "unit", "said"),
     [
-        ("force_N", "kg", r"trace.columns.force_N: the unit 'kg' is one of mass; force \(N\) .* mean 'kgf'\?"),
+        (
+            "force_N",
+            "kg",
+            r"trace.columns.force_N: the unit 'kg' is one of mass; force \(N\) .* mean 'kgf'\?",
+        ),
         ("force_N", "g", r"one of mass; force \(N\) is expected. Did you mean 'gf'\?"),
         ("displacement_mm", "mm/s", r"one of speed; length \(mm\) is expected. Did you mean 'mm'\?"),
         ("oven_C", "C", r"temperature \(°C\) is expected. Did you mean 'degC'\?"),
@@ -126,7 +136,9 @@ def test_units_that_cannot_be_meant_are_refused(column, unit, said):
 
 
 def test_a_torque_is_no_force():
-    with pytest.raises(ConfigError, match=r"files.units.load_N: the unit 'N\*m' is one of torque; force \(N\)"):
+    with pytest.raises(
+        ConfigError, match=r"files.units.load_N: the unit 'N\*m' is one of torque; force \(N\)"
+    ):
         config('[files.units]\nload_N = "N*m"\n')
 
 

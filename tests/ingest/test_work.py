@@ -1,4 +1,4 @@
-"""Work that must grow with the campaign and not with its square, counted; and that less of it gives the same."""
+"""Work that must grow with the campaign and not with its square, counted; less of it gives the same."""
 
 import numpy as np
 import pandas as pd
@@ -15,7 +15,9 @@ HEAD = "file,run_id,repeat,temperature_C,compression_ratio_pct,aging_days,load_N
 def counted(monkeypatch, module, name):
     """Count the calls of a module's function from here on."""
     calls, function = [], getattr(module, name)
-    monkeypatch.setattr(module, name, lambda *given, **named: (calls.append(given), function(*given, **named))[1])
+    monkeypatch.setattr(
+        module, name, lambda *given, **named: (calls.append(given), function(*given, **named))[1]
+    )
     return calls
 
 
@@ -64,7 +66,9 @@ def repeats(runs, seed, far):
     force[off, 0] += rng.uniform(8, 20, far) * sd[off, 0]
     force[off[::7], 1] -= 15 * sd[off[::7], 0]
     names = pd.DataFrame({"file": [f"{r}/{k}" for r in range(runs) for k in range(3)]})
-    return names.assign(run_id=np.repeat(np.arange(runs), 3), repeat=np.tile([1, 2, 3], runs), force_N=force.ravel())
+    return names.assign(
+        run_id=np.repeat(np.arange(runs), 3), repeat=np.tile([1, 2, 3], runs), force_N=force.ravel()
+    )
 
 
 def test_fits_of_the_scatter_do_not_grow_with_the_number_of_far_repeats(monkeypatch):
@@ -100,7 +104,14 @@ def test_strokes_with_turned_signs_are_not_each_compared_with_all(monkeypatch):
 
 
 def test_a_turned_stroke_is_held_against_the_median_of_its_mates():
-    forces = [20.0, 22.0, -21.0, 24.0, 30.0, -9.0]  # of the second run two: held against all others of the direction
+    forces = [
+        20.0,
+        22.0,
+        -21.0,
+        24.0,
+        30.0,
+        -9.0,
+    ]  # of the second run two: held against all others of the direction
     strokes = pd.DataFrame(
         {"file": list("abcdef"), "stroke": 1, "several": False, "run": ["x"] * 4 + ["y"] * 2, "direction": 1,
          "force_N": forces, "used": True}

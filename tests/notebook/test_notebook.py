@@ -26,7 +26,9 @@ from sealfit.store.out_folder import Store
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = ROOT / "docs" / "tutorial.ipynb"
 CONDITION = "temperature_C=60, compression_ratio_pct=80, aging_days=4"
-FIGURES = sorted(name for name, _ in inspect.getmembers(Plots, inspect.isfunction) if not name.startswith("_"))
+FIGURES = sorted(
+    name for name, _ in inspect.getmembers(Plots, inspect.isfunction) if not name.startswith("_")
+)
 KEYS = {
     "errors": ["error"],
     "effects": ["effect"],
@@ -97,7 +99,9 @@ def test_the_tutorial_shows_it(tutorial):
     lines = "".join(output.text for output in run).splitlines()
     assert "reading trace files: 162 of 162" in lines
     assert lines[-1] == "drawing the report"
-    pictures = [source for source, outputs in code.items() if any("image/png" in o.get("data", ()) for o in outputs)]
+    pictures = [
+        source for source, outputs in code.items() if any("image/png" in o.get("data", ()) for o in outputs)
+    ]
     assert sum("results.plot." in source for source in pictures) == 3
     assert len(pictures) == 5
 
@@ -132,7 +136,14 @@ def test_a_table_has_one_row_per_key(results, name):
 
 def test_parameters_hold_parameters_and_nothing_else(results):
     p = results.parameters
-    assert p["parameter"].drop_duplicates().tolist() == ["mu_s", "mu_c", "v_s", "sigma_2", "sigma_0", "sigma_1"]
+    assert p["parameter"].drop_duplicates().tolist() == [
+        "mu_s",
+        "mu_c",
+        "v_s",
+        "sigma_2",
+        "sigma_0",
+        "sigma_1",
+    ]
     assert p[p.parameter == "mu_s"]["condition"].nunique() == 9
     assert (p.groupby(["series", "condition"]).size() == 6).all()
 
@@ -151,7 +162,9 @@ def test_unaged_rubber_starts_every_series(results):
 
 def test_parameters_are_those_of_the_answer_beside_those_before(results, out):
     stored = {
-        model: pd.read_parquet(out / f"steady_fit{ending}.parquet").set_index(["condition", "parameter"])["value"]
+        model: pd.read_parquet(out / f"steady_fit{ending}.parquet").set_index(["condition", "parameter"])[
+            "value"
+        ]
         for model, ending in (("value", "_after"), ("before", ""))
     }
     p = results.parameters
@@ -202,7 +215,10 @@ def test_residuals_of_both_models(results):
         ),
         (lambda r: r.table("steady_fits"), r"there is no table 'steady_fits'\. Did you mean 'steady_fit'\?"),
         (lambda r: r.residuals("both"), r"there is no model 'both'\. Choose one of: after, before\."),
-        (lambda r: r.predict(POINTS.drop(columns="distance_mm")), r"'distance_mm': is missing.*Add the column in mm"),
+        (
+            lambda r: r.predict(POINTS.drop(columns="distance_mm")),
+            r"'distance_mm': is missing.*Add the column in mm",
+        ),
         (lambda r: r.predict(POINTS.iloc[:0]), "has no rows"),
         (lambda r: r.predict(POINTS.assign(note="mine")), r"'note': is a column of the answer\. Rename it\."),
         (lambda r: r.lifetime("mu_x", threshold=0.7), "mu_x"),
@@ -256,8 +272,12 @@ def test_a_plot_is_a_figure_that_a_notebook_shows(results, name):
 
 
 def test_a_figure_without_data_says_so(results, monkeypatch):
-    monkeypatch.setattr("sealfit.notebook.plots.draw_all", lambda tables, closure, config: {"force_speed": None})
-    with pytest.raises(RequestError, match=r"nothing to draw in the figure 'aging'\. They have: force_speed\."):
+    monkeypatch.setattr(
+        "sealfit.notebook.plots.draw_all", lambda tables, closure, config: {"force_speed": None}
+    )
+    with pytest.raises(
+        RequestError, match=r"nothing to draw in the figure 'aging'\. They have: force_speed\."
+    ):
         results.plot.aging()
 
 

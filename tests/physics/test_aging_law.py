@@ -33,13 +33,19 @@ def test_check_3_the_printed_c_is_minus_a_ln_b(printed):
 
 
 @given(
-    mu_0=st.floats(0, 2), a=st.floats(-0.5, 0.5), b=st.floats(1e-4, 1e3), shift=st.floats(-1, 1), day=st.floats(0, 100)
+    mu_0=st.floats(0, 2),
+    a=st.floats(-0.5, 0.5),
+    b=st.floats(1e-4, 1e3),
+    shift=st.floats(-1, 1),
+    day=st.floats(0, 100),
 )
 def test_check_3_only_mu_0_minus_c_is_determined(mu_0, a, b, shift, day):
     c = aging_constant(a, b)
     plain = aging_law(day, mu_0=mu_0, a=a, b=b)
     npt.assert_allclose(aging_law_as_printed(day, mu_0=mu_0, a=a, b=b, c=c), plain, atol=1e-10)
-    npt.assert_allclose(aging_law_as_printed(day, mu_0=mu_0 + shift, a=a, b=b, c=c + shift), plain, atol=1e-10)
+    npt.assert_allclose(
+        aging_law_as_printed(day, mu_0=mu_0 + shift, a=a, b=b, c=c + shift), plain, atol=1e-10
+    )
 
 
 @given(mu_0=st.floats(0, 2), a=st.floats(-0.5, 0.5), b=st.floats(1e-6, 1e6))

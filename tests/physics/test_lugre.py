@@ -24,7 +24,9 @@ def slide(distance_mm, speed=2.0, **more):
 def test_long_sliding_ends_in_the_steady_state(speed):
     found = lugre_force([0.0, 60.0 / abs(speed)], [speed, speed], LOAD, LuGre(**MODEL))
     npt.assert_allclose(found.force_N[-1], stribeck_force(speed, LOAD, **STATIC, sigma_2=0.2), rtol=1e-12)
-    npt.assert_allclose(found.deflection_mm[-1], np.sign(speed) * bristle_limit(speed, LOAD, **STATIC, sigma_0=60.0))
+    npt.assert_allclose(
+        found.deflection_mm[-1], np.sign(speed) * bristle_limit(speed, LOAD, **STATIC, sigma_0=60.0)
+    )
 
 
 def test_dahl_limit():
@@ -46,7 +48,9 @@ def test_presliding_stiffness_is_sigma_0():
 
 def test_damping_adds_at_the_start_and_a_rest_holds_the_force():
     found = lugre_force([0.0, 1e-9, 0.05, 5.0], [3.0, 3.0, 3.0, 0.0], LOAD, LuGre(**MODEL))
-    npt.assert_allclose(found.force_N[1], (0.3 + 0.2) * 3.0, rtol=1e-6)  # z = 0: all of v goes into the bristles
+    npt.assert_allclose(
+        found.force_N[1], (0.3 + 0.2) * 3.0, rtol=1e-6
+    )  # z = 0: all of v goes into the bristles
     npt.assert_allclose(found.force_N[3], 60.0 * found.deflection_mm[2], rtol=1e-13)
 
 
@@ -62,7 +66,9 @@ def test_exact_steps_and_the_stiff_solver_agree(exponent):
     by_steps = lugre_force(fine, speed(middle), LOAD, LuGre(**MODEL, contact=contact))
     by_solver = lugre_force(asked, speed, LOAD, LuGre(**MODEL, contact=contact))
     npt.assert_allclose(by_solver.deflection_mm, by_steps.deflection_mm[::2000], atol=2e-8)
-    npt.assert_allclose(by_solver.force_N, by_steps.force_N[::2000], atol=2e-3)  # the speeds differ by half a step
+    npt.assert_allclose(
+        by_solver.force_N, by_steps.force_N[::2000], atol=2e-3
+    )  # the speeds differ by half a step
 
 
 @given(
@@ -99,7 +105,10 @@ def test_the_distribution_cancels_unless_friction_depends_on_the_pressure(pressu
     local = lugre_force(
         time, speed, LOAD, LuGre(**MODEL, contact=Contact(pressure, width_mm=3.0, exponent=0.7))
     ).force_N
-    assert np.abs(local - plain).max() > (0.005 if pressure is not PRESSURES["uniform"] else -1) * np.abs(plain).max()
+    assert (
+        np.abs(local - plain).max()
+        > (0.005 if pressure is not PRESSURES["uniform"] else -1) * np.abs(plain).max()
+    )
 
 
 @pytest.mark.parametrize("pressure", PRESSURES.values(), ids=PRESSURES)
@@ -109,7 +118,9 @@ def test_local_pressure_ends_in_the_steady_force_summed_over_the_contact(pressur
     found = lugre_force([0.0, 100.0], [3.0, 3.0], LOAD, LuGre(**MODEL, contact=contact))
     # mu p integrated over the contact by another quadrature, for mu in proportion to (p / reference)^(n - 1)
     scaled, _ = quad(
-        lambda zeta: float(pressure(zeta, LOAD, width_mm=3.0)) ** exponent * reference ** (1 - exponent), 0, 3.0
+        lambda zeta: float(pressure(zeta, LOAD, width_mm=3.0)) ** exponent * reference ** (1 - exponent),
+        0,
+        3.0,
     )
     steady = stribeck_force(3.0, scaled, **STATIC, sigma_2=0.2)
     npt.assert_allclose(found.force_N[-1], steady, rtol=1e-5)
@@ -118,7 +129,8 @@ def test_local_pressure_ends_in_the_steady_force_summed_over_the_contact(pressur
 def test_friction_that_falls_with_pressure_grows_less_than_the_load():
     contact = Contact(exponent=0.8, reference_N_mm=50.0)
     one, two = (
-        lugre_force([0.0, 90.0], [2.0, 2.0], load, LuGre(**DAHL, contact=contact)).force_N[-1] for load in (50, 100)
+        lugre_force([0.0, 90.0], [2.0, 2.0], load, LuGre(**DAHL, contact=contact)).force_N[-1]
+        for load in (50, 100)
     )
     npt.assert_allclose(two / one, 2**0.8, rtol=1e-12)
 

@@ -25,7 +25,7 @@ def test_values_by_hand():
 
 
 def test_the_distribution_matters_where_mu_depends_on_local_pressure():
-    """Check 4 of the source, with the factor worked out by hand: mu in proportion to p^(-1/2), over that at p = 5."""
+    """Check 4 of the source, its factor worked out by hand: mu goes as p^(-1/2), over that at p = 5."""
     for pressure, expected in ((uniform, 1.0), (parabolic, np.sqrt(7.5 / 5.0) * np.pi / 4)):
         share, factor = Contact(pressure, width_mm=4.0, exponent=0.5, reference_N_mm=5.0).elements(20.0)
         # sqrt(5 * 7.5 (1 - u^2)) integrated over the contact, u from -1 to 1, times 2 mm, over 20 N

@@ -7,7 +7,12 @@ from hypothesis import strategies as st
 from sealfit.errors import ParameterError
 from sealfit.physics import stribeck_decay, stribeck_force
 
-PAPER = {"mu_s": 0.35, "mu_c": 0.3, "v_s": 5.0, "sigma_2": 0.2}  # the sensitivity study of the source, at 50 N
+PAPER = {
+    "mu_s": 0.35,
+    "mu_c": 0.3,
+    "v_s": 5.0,
+    "sigma_2": 0.2,
+}  # the sensitivity study of the source, at 50 N
 coefficient = st.floats(0.0, 2.0)
 positive = st.floats(1e-3, 1e3)
 

@@ -1,4 +1,4 @@
-"""Tables of campaigns with known truth, as a report gets them; the laws are Eq. 14 and Eq. 15, the scatter is drawn."""
+"""Tables of campaigns of known truth, as reports get them; laws are Eq. 14 and 15, scatter is drawn."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -64,7 +64,12 @@ PROVENANCE = {
     "inputs": [],
     "steps": [
         {"step": "ingest", "version": "0.1.0", "finished_at": "2024-05-02T09:31:10+00:00", "seconds": 12.4},
-        {"step": "close-loop", "version": "0.1.0", "finished_at": "2024-05-02T09:33:40+00:00", "seconds": 131.02},
+        {
+            "step": "close-loop",
+            "version": "0.1.0",
+            "finished_at": "2024-05-02T09:33:40+00:00",
+            "seconds": 131.02,
+        },
     ],
 }
 NOISE, RUN_SD = 0.25, 0.12
@@ -95,8 +100,11 @@ def aging_campaign(
     trace_points=200,
     seed=1,
 ):
-    """Return a campaign of the paper's kind; `verdict` "closed" has warming by sliding, "nothing_missing" has nothing,
-    "unexplained" a hump along displacement."""
+    """Return a campaign of the paper's kind.
+
+    With `verdict` "closed" it has warming by sliding, with "nothing_missing" nothing, and with "unexplained"
+    a hump along displacement.
+    """
     rng = np.random.default_rng(seed)
     config = Config()
     drop = DROP if verdict == "closed" else 0.0
@@ -138,7 +146,9 @@ def aging_campaign(
                     "operator": "AB"[order % 2],
                 }
                 frame = pd.DataFrame({**key, "bin": np.arange(bins_per_file), "force_N": force, "n": 50})
-                frame = frame.assign(displacement_mm=displacement, distance_mm=displacement - 2.0, time_s=time)
+                frame = frame.assign(
+                    displacement_mm=displacement, distance_mm=displacement - 2.0, time_s=time
+                )
                 # "before" is the same mean with part of the warming everywhere, between slow and fast runs
                 bins.append(frame.assign(force_sd_N=0.3, before=mean * (1 - 0.6 * drop), after=mean * warm))
                 files.append(
@@ -196,7 +206,7 @@ def aging_campaign(
 
 
 def _laws(steady, fits, config):
-    """Return the tables of the laws for all series; those of 73 conditions would take the tests half a minute."""
+    """Return the tables of the laws for all series; those of 73 conditions would take half a minute."""
     laws, curve = joint_laws(steady, table("steady_fit", fits), config)
     return {"aging_laws": table("aging_laws", laws), "master_curve": table("master_curve", curve)}
 
@@ -215,7 +225,7 @@ def paper_sized():
 
 
 def torque_campaign(seed=3):
-    """Return a rig that measures torque against rpm, without load and without aging: two pressures, both directions."""
+    """Return a rig that measures torque against rpm, without load or aging: two pressures, two directions."""
     rng = np.random.default_rng(seed)
     config = Config.model_validate(
         {
@@ -315,7 +325,13 @@ def torque_campaign(seed=3):
     closure = {
         "schema": 1,
         "verdict": "nothing_missing",
-        "units": {"force_N": "mN m", "displacement_mm": "turn", "speed_mm_s": "rpm", "load_N": "N", "time_s": "s"},
+        "units": {
+            "force_N": "mN m",
+            "displacement_mm": "turn",
+            "speed_mm_s": "rpm",
+            "load_N": "N",
+            "time_s": "s",
+        },
         "noise_floor_N": 1.2,
         "before": errors,
         "after": dict(errors),

@@ -1,4 +1,4 @@
-"""Tables of the dynamic fit as a report gets them: exponential rises over G / sigma_0, a peak at the fastest speed."""
+"""Tables of the dynamic fit as reports get them: exponential rises over G / sigma_0, a peak at top speed."""
 
 import numpy as np
 import pandas as pd
@@ -24,7 +24,8 @@ def starts(conditions, speeds, config, peak=True):
                 {
                     **own, "quantity": "dynamic", "parameter": name, "value": value, "se": 0.01 * value,
                     "lo95": 0.98 * value, "hi95": 1.02 * value, "u_sys": 0.004 * value, "unit": unit,
-                    "identified": known, "reason": "" if known else "no damping of the bristles is seen: at most 0.6",
+                    "identified": known,
+                    "reason": "" if known else "no damping of the bristles is seen: at most 0.6",
                 }
             )  # fmt: skip
         for speed in speeds:
@@ -32,16 +33,17 @@ def starts(conditions, speeds, config, peak=True):
             x = np.linspace(0.02, 2.5, 40)
             force = limit * (1 - np.exp(-x * SIGMA_0 / limit))
             curves.append(
-                pd.DataFrame({**own, "speed_set_mm_s": speed, "direction": 1, "distance_mm": x, "n": 3}).assign(
-                    force_N=force, force_se_N=0.05, model_N=force
-                )
+                pd.DataFrame(
+                    {**own, "speed_set_mm_s": speed, "direction": 1, "distance_mm": x, "n": 3}
+                ).assign(force_N=force, force_se_N=0.05, model_N=force)
             )
             high = 1 + PEAK if peak and speed == max(speeds) else 1.0
             for name, value, unit in (("F_ba", limit * high, "N"), ("F_ba/F", high, "")):
                 rows.append(
                     {
-                        **own, "quantity": "break_away", "parameter": name, "value": value, "se": 0.003 * value,
-                        "lo95": 0.99 * value, "hi95": 1.01 * value, "unit": unit, "identified": True,
+                        **own, "quantity": "break_away", "parameter": name, "value": value,
+                        "se": 0.003 * value, "lo95": 0.99 * value, "hi95": 1.01 * value, "unit": unit,
+                        "identified": True,
                         "reason": "" if high > 1 else "no peak", "speed_set_mm_s": speed, "direction": 1,
                     }
                 )  # fmt: skip

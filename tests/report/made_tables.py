@@ -1,4 +1,4 @@
-"""Single tables of a made campaign: fits, residuals, levels, shapes, quality; the laws are Eq. 14 and Eq. 15."""
+"""Single tables of a made campaign: fits, residuals, levels, shapes, quality; the laws are Eq. 14 and 15."""
 
 import numpy as np
 import pandas as pd
@@ -61,7 +61,12 @@ def steady_rows(temperature, compression, day, values, rng):
                 "reason": None if known else "fewer than two speeds lie below 2 v_s",
             }
         )
-    shared = {"temperature_C": temperature, "compression_ratio_pct": compression, "aging_days": day, "identified": True}
+    shared = {
+        "temperature_C": temperature,
+        "compression_ratio_pct": compression,
+        "aging_days": day,
+        "identified": True,
+    }
     rows.append({**shared, "quantity": "statistics", "parameter": "rmse_N", "value": 0.31, "unit": "N"})
     # the same names stand in rows that are no coefficients
     rows.append({**shared, "quantity": "sensor_shift", "parameter": "mu_s", "value": 0.0024, "unit": ""})
@@ -96,7 +101,9 @@ def aging_fit(fits):
                         "u_sys": 0.0024 if parameter == "mu_0" else 0.0002,
                         "unit": unit,
                         "identified": known,
-                        "reason": None if known else "no tested day is near b: only a and mu_0 - c are determined",
+                        "reason": None
+                        if known
+                        else "no tested day is near b: only a and mu_0 - c are determined",
                     }
                 )
     return table("aging_fit", rows)
@@ -225,7 +232,13 @@ def closure_document(found, verdict):
     return {
         "schema": 1,
         "verdict": verdict,
-        "units": {"force_N": "N", "displacement_mm": "mm", "speed_mm_s": "mm/s", "load_N": "N", "time_s": "s"},
+        "units": {
+            "force_N": "N",
+            "displacement_mm": "mm",
+            "speed_mm_s": "mm/s",
+            "load_N": "N",
+            "time_s": "s",
+        },
         "noise_floor_N": 0.262,
         **numbers,
         "heldout_unit": "run",
@@ -333,7 +346,11 @@ def channels(found):
     ):
         values = found["before"][name]
         numeric = pd.api.types.is_numeric_dtype(values)
-        group = pd.qcut(values.rank(method="dense"), 8, labels=False) if values.nunique() > 12 and numeric else values
+        group = (
+            pd.qcut(values.rank(method="dense"), 8, labels=False)
+            if values.nunique() > 12 and numeric
+            else values
+        )
         for _, index in values.groupby(group).groups.items():
             row = {
                 "channel": name,

@@ -14,13 +14,29 @@ from report.made_tables import DROP, empty, shapes, table
 
 from sealfit.config import Config
 from sealfit.report.figures import draw_all
-from sealfit.report.figures.aging import draw_aging, draw_master_curve, draw_trace, envelope, example_runs, traces_mean
-from sealfit.report.figures.residual import channel_order, draw_channel, draw_errors, draw_levels, draw_shape, run_means
+from sealfit.report.figures.aging import (
+    draw_aging,
+    draw_master_curve,
+    draw_trace,
+    envelope,
+    example_runs,
+    traces_mean,
+)
+from sealfit.report.figures.residual import (
+    channel_order,
+    draw_channel,
+    draw_errors,
+    draw_levels,
+    draw_shape,
+    run_means,
+)
 from sealfit.report.figures.speed import curve_lines, force_speed, run_points
 from sealfit.report.style import Key, Panel, Plot, compose, draw, is_logarithmic, panel_figure, value_ticks
 from sealfit.units import Units
 
-TORQUE = Units({"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")})
+TORQUE = Units(
+    {"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")}
+)
 
 
 @pytest.fixture
@@ -37,8 +53,8 @@ def made():
 def twelve_series():
     """A campaign of the paper's series, with two days, speeds and bins of each."""
     return aging_campaign(
-        temperatures=(20, 40, 60, 80), compressions=(80, 90, 100), days=(4, 16), speeds=(1, 10), bins_per_file=2,
-        trace_points=50,
+        temperatures=(20, 40, 60, 80), compressions=(80, 90, 100), days=(4, 16), speeds=(1, 10),
+        bins_per_file=2, trace_points=50,
     )  # fmt: skip
 
 
@@ -86,7 +102,12 @@ def test_torque_rig_shows_true_units_and_no_slot_names():
     axes = panel_figure(panel).axes[0]
     assert axes.get_ylabel() == "torque (mN m)"
     assert axes.get_xlabel() == "rotational speed (rpm)"
-    assert [key.label for key in plot.legend[:4]] == ["2 bar", "8 bar", "run means, forward", "run means, backward"]
+    assert [key.label for key in plot.legend[:4]] == [
+        "2 bar",
+        "8 bar",
+        "run means, forward",
+        "run means, backward",
+    ]
 
 
 def test_bands_of_backward_motion_are_not_upside_down():
@@ -101,7 +122,9 @@ def test_without_the_loop_the_steady_fit_is_drawn():
     made = not_run()
     curves = curve_lines(made.tables, made.config)
     fit = made.tables["steady_fit"]
-    values = fit[(fit["condition"] == "unaged") & (fit["quantity"] == "steady")].set_index("parameter")["value"]
+    values = fit[(fit["condition"] == "unaged") & (fit["quantity"] == "steady")].set_index("parameter")[
+        "value"
+    ]
     line = curves[curves["condition"] == "unaged"].iloc[0]
     # Eq. 14 by hand at the slowest point
     mu = values["mu_c"] + (values["mu_s"] - values["mu_c"]) * np.exp(-((line["speed"] / values["v_s"]) ** 2))
@@ -113,7 +136,8 @@ def test_many_conditions_of_one_kind_get_panels_of_their_own():
     rows = pd.DataFrame({"batch": np.repeat([f"b{k}" for k in range(14)], 2)})
     rows = rows.assign(
         condition="batch=" + rows["batch"], series="batch=" + rows["batch"], rubber="rubber", direction=1,
-        run_id=rows["batch"], file=[f"{k}.csv" for k in range(28)], speed_mm_s=5.0, force_N=10.0, load_N=1.0, used=True,
+        run_id=rows["batch"], file=[f"{k}.csv" for k in range(28)], speed_mm_s=5.0, force_N=10.0,
+        load_N=1.0, used=True,
     )  # fmt: skip
     tables = {"steady": rows} | {name: empty(name) for name in ("curves", "steady_fit", "residuals_after")}
     plot = force_speed(tables, Config(condition=["batch"]))
@@ -124,9 +148,11 @@ def test_many_conditions_of_one_kind_get_panels_of_their_own():
 
 # ---------------------------------------------------------------- aging and traces
 def test_aging_draws_points_bars_and_law(ax):
-    points = pd.DataFrame({"quantity": "mu_s", "aging_days": [0.0, 4.0], "value": [0.9, 0.8], "lo95": [0.88, 0.79],
-                           "hi95": [0.92, np.nan]})  # fmt: skip
-    curves = pd.DataFrame({"quantity": "mu_s", "aging_days": [0.0, 4.0], "value": [0.9, 0.8], "lo95": 0.7, "hi95": 1.0})
+    points = pd.DataFrame({"quantity": "mu_s", "aging_days": [0.0, 4.0], "value": [0.9, 0.8],
+                           "lo95": [0.88, 0.79], "hi95": [0.92, np.nan]})  # fmt: skip
+    curves = pd.DataFrame(
+        {"quantity": "mu_s", "aging_days": [0.0, 4.0], "value": [0.9, 0.8], "lo95": 0.7, "hi95": 1.0}
+    )
     draw_aging(ax, points, curves, Units())
     npt.assert_array_equal(ax.lines[0].get_ydata(), [0.9, 0.8])
     (bars,) = ax.containers
@@ -195,7 +221,9 @@ def test_run_means_weigh_files_alike():
 
 def test_levels_are_drawn_as_variance(ax):
     sds = {"before": 3.0, "after": 1.0}
-    rows = [{"stage": stage, "level": "run", "sd_N": sd, "share": 1.0, "df": 9.0} for stage, sd in sds.items()]
+    rows = [
+        {"stage": stage, "level": "run", "sd_N": sd, "share": 1.0, "df": 9.0} for stage, sd in sds.items()
+    ]
     draw_levels(ax, table("levels", rows), TORQUE)
     assert [bar.get_width() for bar in ax.patches] == [9.0, 1.0]
     assert {text.get_text() for text in ax.texts} == {"3.0", "1.0"}
@@ -230,7 +258,11 @@ def test_an_added_force_has_its_unit(ax, made):
 
 def test_directions_are_two_and_named(ax, made):
     x = np.linspace(-1, 1, 5)
-    rows = shapes().head(5).assign(channel="direction", x=x, value=0.1 * x, lo95=0.1 * x - 0.02, hi95=0.1 * x + 0.02)
+    rows = (
+        shapes()
+        .head(5)
+        .assign(channel="direction", x=x, value=0.1 * x, lo95=0.1 * x - 0.02, hi95=0.1 * x + 0.02)
+    )
     draw_shape(ax, rows, made.closure["effects"][0], Units())
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["backward", "forward"]
     npt.assert_allclose(ax.containers[0].lines[0].get_ydata(), [-10.0, 10.0])
@@ -281,7 +313,9 @@ def test_a_panel_of_the_page_holds_all_that_it_uses_and_nothing_of_its_neighbour
     drawn = draw(draw_all(made.tables, made.closure, made.config)["aging"])
     assert len(drawn.panels) == 2
     for image in drawn.panels:
-        names = [element.get("id") for element in ElementTree.fromstring(image.svg).iter() if element.get("id")]
+        names = [
+            element.get("id") for element in ElementTree.fromstring(image.svg).iter() if element.get("id")
+        ]
         used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', image.svg))
         assert used <= set(names)
         assert sum(name.startswith("axes") for name in names) == 1

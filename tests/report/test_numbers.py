@@ -39,7 +39,10 @@ def test_value_and_interval_are_rounded_alike_and_hold_each_other(value, below, 
     assert abs(read(text) - value) <= 0.051 * half + 1e-9 * abs(value)
     assert abs(ends[0] - (value - below)) <= 0.051 * half + 1e-9 * abs(value)
     assert ends[0] <= read(text) <= ends[1]
-    places = {len(part.partition(".")[2].split("×")[0].strip("\u202f]")) for part in (text, *interval[1:].split(", "))}
+    places = {
+        len(part.partition(".")[2].split("×")[0].strip("\u202f]"))
+        for part in (text, *interval[1:].split(", "))
+    }
     assert len(places) == 1
 
 

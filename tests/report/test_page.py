@@ -198,14 +198,21 @@ def test_any_table_may_be_missing(missing, small, unsaved):
 
 def test_with_no_tables_at_all_it_still_says_so():
     page = Page(build_report({}, None, {}, Config()).html)
-    for words in ("no steady window to draw", "No parameters were fitted", "no averaged traces", "no quality table"):
+    for words in (
+        "no steady window to draw",
+        "No parameters were fitted",
+        "no averaged traces",
+        "no quality table",
+    ):
         assert words in page.text
 
 
 def test_null_everywhere_is_a_page_too(small, unsaved):
     made = small
     nothing = dict.fromkeys(made.closure["before"])
-    made.closure.update(before=nothing, after=dict(nothing), noise_floor_N=None, heldout_unit=None, scatter=[])
+    made.closure.update(
+        before=nothing, after=dict(nothing), noise_floor_N=None, heldout_unit=None, scatter=[]
+    )
     made.closure["left"] = dict.fromkeys(made.closure["left"])
     for effect in made.closure["effects"]:
         effect.update(p_value=None, heldout_gain_N=None)
@@ -262,7 +269,13 @@ def test_the_page_states_the_sensitivity_and_the_effects_not_accepted():
 
     seen = {"variable": "displacement_mm", "level": "trace", "smallest_N": 0.123, "smallest_pct": 0.31}
     seen["files_needed"] = 1200
-    unseen = {"variable": "speed_mm_s", "level": "run", "smallest_N": None, "smallest_pct": None, "files_needed": None}
+    unseen = {
+        "variable": "speed_mm_s",
+        "level": "run",
+        "smallest_N": None,
+        "smallest_pct": None,
+        "files_needed": None,
+    }
     rows = sensitivity_rows({"sensitivity": [seen, unseen]}, Config())
     assert [row["smallest"].replace("\u00a0", " ") for row in rows] == ["0.12 N", "none"]
     assert [row["level"] for row in rows] == ["along strokes", "between runs"]

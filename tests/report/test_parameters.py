@@ -9,12 +9,17 @@ from sealfit.report.parameter_tables import parameter_tables
 def test_a_row_per_condition_with_u_sys_apart():
     made = aging_campaign()
     steady, statistics = parameter_tables(made.tables["steady_fit"], "condition", made.config)
-    assert [str(symbol) for symbol, _ in steady.groups][:2] == ["<i>μ</i><sub>s</sub>", "<i>μ</i><sub>c</sub>"]
+    assert [str(symbol) for symbol, _ in steady.groups][:2] == [
+        "<i>μ</i><sub>s</sub>",
+        "<i>μ</i><sub>c</sub>",
+    ]
     assert [unit for _, unit in steady.groups] == ["", "", "mm/s", "N s/mm"]
     assert len(steady.rows) == 7
     (name,), cells, _ = steady.rows[1]
     assert name == "60 °C · 80 % · 1 d"
-    row = made.tables["steady_fit"].query("aging_days == 1 and compression_ratio_pct == 80 and parameter == 'mu_s'")
+    row = made.tables["steady_fit"].query(
+        "aging_days == 1 and compression_ratio_pct == 80 and parameter == 'mu_s'"
+    )
     assert cells[0].value == f"{row['value'].iloc[0]:.3f}"  # half-width 0.0126: two digits, three decimals
     assert cells[0].interval == f"[{row['lo95'].iloc[0]:.3f}, {row['hi95'].iloc[0]:.3f}]"
     assert cells[0].u_sys == "0.0024"
@@ -72,8 +77,9 @@ def test_statistics_of_several_quantities_stand_apart():
         ("mu_c:lack_of_fit_p", 0.39, ""),
         ("mu_c:n_days", 5.0, ""),
     ]
-    fit = table("aging_fit", [{"series": "all", "quantity": "statistics", "parameter": p, "value": v, "reason": r,
-                               "unit": "", "identified": True} for p, v, r in rows])  # fmt: skip
+    fit = table("aging_fit", [{"series": "all", "quantity": "statistics", "parameter": p, "value": v,
+                               "reason": r, "unit": "", "identified": True}
+                              for p, v, r in rows])  # fmt: skip
     (found,) = parameter_tables(fit, "series", Config())
     assert [str(symbol) for symbol, _ in found.groups] == ["lack of fit, p", "days tested"]
     assert [(keys[1], [c.value for c in cells], note) for keys, cells, note in found.rows] == [

@@ -19,7 +19,9 @@ TEMPERATURES = (20, 30, 40, 50, 60, 70, 80)
 @pytest.fixture(scope="module")
 def large():
     """Return 14 series of two days, more than a figure shows; the one at 30 °C and 80 % fits worst."""
-    made = aging_campaign(temperatures=TEMPERATURES, days=(1, 4), speeds=(1, 10), bins_per_file=2, trace_points=5)
+    made = aging_campaign(
+        temperatures=TEMPERATURES, days=(1, 4), speeds=(1, 10), bins_per_file=2, trace_points=5
+    )
     after = made.tables["residuals_after"]
     worst = (after["temperature_C"] == 30) & (after["compression_ratio_pct"] == 80)
     made.tables["residuals_after"] = after.assign(residual_N=after["residual_N"].where(~worst, 9.0))
@@ -38,7 +40,8 @@ def test_many_show_the_worst_the_hottest_and_the_rest_spread():
     assert len(picked) == 12
     assert picked == sorted(picked)
     assert words == (
-        "12 of 100 series are drawn: the 4 with the largest misfit, the 4 hottest and 4 of the others, selected evenly."
+        "12 of 100 series are drawn: the 4 with the largest misfit, the 4 hottest and 4 of the others, "
+        "selected evenly."
     )
 
 
@@ -76,8 +79,12 @@ def test_the_page_says_what_is_not_drawn(large, unsaved):
 
 
 def steady_rows(days, runs=1):
-    names = [f"temperature_C=60, compression_ratio_pct={p}, aging_days={d}" for p in range(70, 84) for d in days]
-    rows = pd.DataFrame({"condition": np.repeat(names, runs), "rubber": "rubber", "direction": 1, "used": True})
+    names = [
+        f"temperature_C=60, compression_ratio_pct={p}, aging_days={d}" for p in range(70, 84) for d in days
+    ]
+    rows = pd.DataFrame(
+        {"condition": np.repeat(names, runs), "rubber": "rubber", "direction": 1, "used": True}
+    )
     rows = rows.assign(run_id=[f"r{k}" for k in range(len(rows))], force_N=10.0, load_N=1.0)
     return rows.assign(speed_mm_s=1.0 + np.arange(len(rows)) % runs, file=rows["run_id"])
 
@@ -103,8 +110,9 @@ def test_many_points_are_drawn_as_pixels():
 
 # ---------------------------------------------------------------- tables
 def fits(n, quantity="steady"):
-    rows = [{"temperature_C": 20.0 + k, "compression_ratio_pct": 80.0, "aging_days": 1.0, "quantity": quantity,
-             "parameter": "mu_s", "value": 0.9, "unit": "", "identified": True} for k in range(n)]  # fmt: skip
+    rows = [{"temperature_C": 20.0 + k, "compression_ratio_pct": 80.0, "aging_days": 1.0,
+             "quantity": quantity, "parameter": "mu_s", "value": 0.9, "unit": "", "identified": True}
+            for k in range(n)]  # fmt: skip
     frame = pd.DataFrame(rows)
     names = [f"temperature_C={t:g}, compression_ratio_pct=80, aging_days=1" for t in frame["temperature_C"]]
     return table("steady_fit", frame.assign(condition=names))
@@ -122,7 +130,11 @@ def test_long_parameter_tables_are_cut_and_say_where_the_rest_is():
 
 def test_break_aways_are_cut_and_counted():
     one = {"quantity": "break_away", "direction": 1, "unit": "", "identified": True, "lo95": 1.0, "hi95": 2.0}
-    rows = [{**one, "condition": f"c{k}", "parameter": p, "value": 1.5} for k in range(700) for p in ("F_ba", "F_ba/F")]
+    rows = [
+        {**one, "condition": f"c{k}", "parameter": p, "value": 1.5}
+        for k in range(700)
+        for p in ("F_ba", "F_ba/F")
+    ]
     frame = pd.DataFrame(rows).assign(speed_set_mm_s=5.0, u_sys=np.nan, reason="")
     rows, in_all = break_away_rows(frame, Config())
     assert (len(rows), in_all) == (600, 700)

@@ -11,8 +11,9 @@ from sealfit.report.style import BLUE, Key, Panel, Plot, compose, draw, look
 
 HOSTILE = {
     "font.size": 21.0, "axes.labelsize": "xx-large", "xtick.labelsize": "small", "ytick.labelsize": "large",
-    "xtick.labelcolor": "inherit", "axes.linewidth": 6.0, "lines.linewidth": 9.0, "lines.dashed_pattern": [1, 1],
-    "axes.xmargin": 0.4, "axes.prop_cycle": mpl.cycler(color=["r"]), "figure.facecolor": "0.3", "axes.facecolor": "0.5",
+    "xtick.labelcolor": "inherit", "axes.linewidth": 6.0, "lines.linewidth": 9.0,
+    "lines.dashed_pattern": [1, 1], "axes.xmargin": 0.4, "axes.prop_cycle": mpl.cycler(color=["r"]),
+    "figure.facecolor": "0.3", "axes.facecolor": "0.5",
     "legend.fontsize": "xx-small", "text.color": "red", "axes.titlesize": "small", "mathtext.fontset": "stix",
     "svg.fonttype": "none", "path.simplify": False, "axes.unicode_minus": False, "lines.markeredgewidth": 4.0,
 }  # fmt: skip
@@ -38,7 +39,8 @@ def test_settings_of_the_user_change_nothing():
 def test_a_matplotlibrc_changes_nothing(tmp_path):
     (tmp_path / "matplotlibrc").write_text("font.size: 21\nxtick.labelsize: xx-large\nlines.linewidth: 9\n")
     program = (
-        "import sys; sys.path[:0] = sys.argv[1:]; import matplotlib, test_style; from sealfit.report.style import draw;"
+        "import sys; sys.path[:0] = sys.argv[1:]; import matplotlib, test_style; "
+        "from sealfit.report.style import draw;"
         "assert matplotlib.rcParams['font.size'] == 21; sys.stdout.write(draw(test_style.PLOT).svg)"
     )
     environment = {**os.environ, "MATPLOTLIBRC": str(tmp_path)}

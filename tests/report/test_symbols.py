@@ -65,7 +65,9 @@ def test_sentences_of_others_lose_slot_names():
 
 
 def test_conditions_are_values_with_units():
-    names = ConditionNames.of(Config(condition=["pressure_bar", "oil", "material"], column_units={"oil": "°C"}))
+    names = ConditionNames.of(
+        Config(condition=["pressure_bar", "oil", "material"], column_units={"oil": "°C"})
+    )
     assert names("pressure_bar=2, oil=40, material=NBR, black") == "2 bar · 40 °C · NBR, black"
     assert names.parts("pressure_bar=2, oil=40, material=a=b") == {
         "pressure_bar": "2",

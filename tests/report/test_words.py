@@ -47,9 +47,17 @@ RIPPLE = {
 def document(kind="closed", effects=(WARMING,), floor=0.2899, **left):
     after = {**NUMBERS, "heldout_rmse_N": 0.3121, "rmse_N": 0.31} if effects else NUMBERS
     left = {"rmse_N": 0.31, "level": None, "channel": None, "p_value": None, **left}
-    found = {"verdict": kind, "before": NUMBERS, "after": after, "noise_floor_N": floor, "heldout_unit": "run"}
+    found = {
+        "verdict": kind,
+        "before": NUMBERS,
+        "after": after,
+        "noise_floor_N": floor,
+        "heldout_unit": "run",
+    }
     found["fit_quality"] = {"state": "above_scatter", "ratio": 1.07, "p_value": 0.0002}
-    return with_left_channels({**found, "effects": list(effects), "left": left}, {"displacement_mm", "oil temp"})
+    return with_left_channels(
+        {**found, "effects": list(effects), "left": left}, {"displacement_mm", "oil temp"}
+    )
 
 
 def said(closure, table=None, config=None):
@@ -59,9 +67,10 @@ def said(closure, table=None, config=None):
 
 def test_closed_says_which_effect_was_missing_and_the_errors():
     assert said(document()) == (
-        "The declared model lacks warming by sliding (μ falls by up to 6.1 % [5.5, 6.7] at time 76 s, time constant of "
-        "warming τ = 4.0 s [3.6, 4.5]). With it, the rms error on held-out runs falls from 1.42 N to 0.31 N (noise "
-        "floor: 0.29 N). The error is 1.1 times the scatter of repeats (lack of fit: p = 0.0002)."
+        "The declared model lacks warming by sliding (μ falls by up to 6.1 % [5.5, 6.7] at time 76 s, "
+        "time constant of warming τ = 4.0 s [3.6, 4.5]). With it, the rms error on held-out runs falls "
+        "from 1.42 N to 0.31 N (noise floor: 0.29 N). The error is 1.1 times the scatter of repeats "
+        "(lack of fit: p = 0.0002)."
     )
 
 
@@ -74,7 +83,8 @@ def test_several_effects_are_counted_and_candidates_are_not():
 def test_many_effects_are_named_once_each():
     text = said(document(effects=(WARMING, RIPPLE, RIPPLE, RIPPLE)))
     assert text.startswith(
-        "The declared model lacks four effects: warming by sliding and ripple along displacement (3 of them). With "
+        "The declared model lacks four effects: warming by sliding and ripple along displacement "
+        "(3 of them). With "
     )
 
 
@@ -94,7 +104,11 @@ def shape(values, **more):
         ([-3.0, -1.0, -0.1], {}, "the friction force falls by up to 3.0 N [2.5, 3.5]"),
         ([0.0, -3.0, 0.0], {}, "the friction force falls by up to 3.0 N [2.5, 3.5]"),
         ([-1.0, 2.0, -1.0], {}, "the friction force varies by 3.0 N along time"),
-        ([-1.0, 0.0, 1.0], {"channel": "direction"}, "the friction force differs by 2.0 N between directions"),
+        (
+            [-1.0, 0.0, 1.0],
+            {"channel": "direction"},
+            "the friction force differs by 2.0 N between directions",
+        ),
         ([0.7, 0.7, 0.7], {}, "λ = 5.020 mm [5.010, 5.030]"),  # flat: only its parameters say how large it is
     ],
 )
@@ -106,12 +120,18 @@ def test_the_size_of_an_effect_is_read_off_its_shape(values, more, words):
 def test_nothing_missing_gives_one_error():
     text = said(document("nothing_missing", effects=()), empty("shapes"))
     assert text == (
-        "No effect beyond the declared model is significant. The rms error on held-out runs is 1.42 N (noise floor: "
-        "0.29 N). The error is 1.1 times the scatter of repeats (lack of fit: p = 0.0002)."
+        "No effect beyond the declared model is significant. The rms error on held-out runs is 1.42 N "
+        "(noise floor: 0.29 N). The error is 1.1 times the scatter of repeats (lack of fit: p = 0.0002)."
     )
 
 
-SEEN = {"variable": "displacement_mm", "level": "trace", "smallest_N": 0.5, "smallest_pct": 1.25, "files_needed": 40}
+SEEN = {
+    "variable": "displacement_mm",
+    "level": "trace",
+    "smallest_N": 0.5,
+    "smallest_pct": 1.25,
+    "files_needed": 40,
+}
 SEEN["cannot_tell"] = True
 
 
@@ -125,20 +145,24 @@ def test_cannot_tell_says_of_what_and_what_would_do():
     closure = {**document("cannot_tell", effects=()), "sensitivity": [SEEN, unseen]}
     text = said(closure, empty("shapes"))
     assert text.startswith(
-        "These files do not decide whether an effect is missing: displacement (mm) (detection limit 1.2 % of the force"
-        "; 1 % needs about 40 files), oil temp (no effect is detectable; at least 12 files are needed). The rms error"
+        "These files do not decide whether an effect is missing: displacement (mm) "
+        "(detection limit 1.2 % of the force; 1 % needs about 40 files), "
+        "oil temp (no effect is detectable; at least 12 files are needed). The rms error"
     )
 
 
 def test_unexplained_says_where_it_sits():
     left = {"channel": "displacement_mm oil temp", "level": "trace", "p_value": 0.0005}
     assert said(document("unexplained", effects=(), **left)).startswith(
-        "A significant residual remains that no effect explains: the residual varies with displacement (mm) and "
-        "oil temp along strokes (p < 0.001). The rms error"
+        "A significant residual remains that no effect explains: the residual varies with "
+        "displacement (mm) and oil temp along strokes (p < 0.001). The rms error"
     )
     text = said(document("unexplained", **left))
     assert text.startswith("The declared model lacks warming by sliding (")
-    assert "A significant residual remains that no effect explains: the residual varies with displacement (mm)" in text
+    assert (
+        "A significant residual remains that no effect explains: the residual varies with displacement (mm)"
+        in text
+    )
     assert "With it, the rms error on held-out runs falls from 1.42 N to 0.31 N" in text
 
 
@@ -193,8 +217,8 @@ def test_what_is_left_is_called_scatter_only_if_it_is():
     left = {"channel": "displacement_mm", "level": "trace", "p_value": 0.0005}
     text = left_over(document("unexplained", **left), Config())
     assert (
-        "A significant residual remains: the residual varies with displacement (mm) along strokes (p &lt; 0.001)"
-        in text
+        "A significant residual remains: the residual varies with displacement (mm) along strokes "
+        "(p &lt; 0.001)" in text
     )
     assert "scatter" not in text
 
@@ -202,7 +226,9 @@ def test_what_is_left_is_called_scatter_only_if_it_is():
 def test_made_campaign_reads_as_the_example():
     made = aging_campaign()
     text = said(made.closure, made.tables["shapes"])
-    assert text.startswith("The declared model lacks warming by sliding (time; μ falls by up to 6.1 % [5.5, 6.7]")
+    assert text.startswith(
+        "The declared model lacks warming by sliding (time; μ falls by up to 6.1 % [5.5, 6.7]"
+    )
 
 
 def test_why_the_lack_of_fit_is_not_known_is_said():

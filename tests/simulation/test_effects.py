@@ -31,7 +31,9 @@ from sealfit.simulation import Spec, simulate, true_force
 def test_every_target_by_hand(campaign, acts_on, operation, shape, by_hand):
     physics = {"mu_s": {"mu_0": 0.8}, "mu_c": {"mu_0": 0.6}, "v_s": 5.0, "sigma_2": 0.1}
     design = {**ONE_CONDITION, "loads_N": (100.0,), "speeds_mm_s": (5.0,)}
-    truth, runs, traces = campaign(physics=physics, design=design, effects=[effect(str(shape), acts_on, operation)])
+    truth, runs, traces = campaign(
+        physics=physics, design=design, effects=[effect(str(shape), acts_on, operation)]
+    )
     assert mean_forces(runs, traces)[5.0] == pytest.approx(by_hand, abs=1e-6)
     assert truth["runs"][0]["mean_force_N"] == pytest.approx(by_hand, abs=1e-6)
     assert truth["effects"][0]["rms_N"] == pytest.approx(abs(by_hand - (60 + 20 / math.e + 0.5)), abs=1e-6)
@@ -39,9 +41,21 @@ def test_every_target_by_hand(campaign, acts_on, operation, shape, by_hand):
 
 @pytest.mark.parametrize(("acts_on", "shape"), [("a", 1.0), ("b", -0.5)])
 def test_aging_parameters_change_both_coefficients(campaign, acts_on, shape):
-    physics = {"mu_s": {"mu_0": 0.9, "a": 0.04, "b": 0.1}, "mu_c": {"mu_0": 0.6, "a": 0.03, "b": 0.2}, "sigma_2": 0.0}
-    design = {"days": (4.0,), "unaged": False, "speeds_mm_s": (0.001, 50.0), "repeats": 1, "loads_N": (100.0,)}
-    _, runs, traces = campaign(physics=physics, design=design, effects=[effect(str(shape), acts_on, "multiply")])
+    physics = {
+        "mu_s": {"mu_0": 0.9, "a": 0.04, "b": 0.1},
+        "mu_c": {"mu_0": 0.6, "a": 0.03, "b": 0.2},
+        "sigma_2": 0.0,
+    }
+    design = {
+        "days": (4.0,),
+        "unaged": False,
+        "speeds_mm_s": (0.001, 50.0),
+        "repeats": 1,
+        "loads_N": (100.0,),
+    }
+    _, runs, traces = campaign(
+        physics=physics, design=design, effects=[effect(str(shape), acts_on, "multiply")]
+    )
     force = mean_forces(runs, traces)
     a, b = (1 + shape, 1.0) if acts_on == "a" else (1.0, 1 + shape)
     assert force[0.001] == pytest.approx(90 - 4 * a * math.log1p(4 / (0.1 * b)), abs=1e-5)
@@ -49,10 +63,16 @@ def test_aging_parameters_change_both_coefficients(campaign, acts_on, shape):
 
 
 def test_order_of_application_parameters_mu_force_added(campaign):
-    effects = [effect("2", "force", "add"), effect("0.1", "force", "multiply"), effect("0.2", "mu", "multiply")]
+    effects = [
+        effect("2", "force", "add"),
+        effect("0.1", "force", "multiply"),
+        effect("0.2", "mu", "multiply"),
+    ]
     physics = {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.1}
     design = {**ONE_CONDITION, "loads_N": (100.0,), "speeds_mm_s": (10.0,)}
-    _, runs, traces = campaign(physics=physics, design=design, effects=[*effects, effect("0.1", "mu_c", "add")])
+    _, runs, traces = campaign(
+        physics=physics, design=design, effects=[*effects, effect("0.1", "mu_c", "add")]
+    )
     # mu_c 0.6 and e^-4 of the difference; * 1.2, + 0.1 * 10, * 1.1, + 2.
     mu = 0.6 - 0.1 * math.exp(-4)
     assert mean_forces(runs, traces)[10.0] == pytest.approx((100 * mu * 1.2 + 1.0) * 1.1 + 2, abs=1e-6)
@@ -72,7 +92,13 @@ def test_truth_agrees_with_the_written_traces_at_every_steady_sample(campaign):
         },
         channels=[
             {"kind": "numeric", "name": "humidity_pct", "level": "run", "mean": 50, "sd": 8},
-            {"kind": "category", "name": "batch", "level": "specimen", "labels": ["A", "B"], "assignment": "balanced"},
+            {
+                "kind": "category",
+                "name": "batch",
+                "level": "specimen",
+                "labels": ["A", "B"],
+                "assignment": "balanced",
+            },
             {"kind": "trace", "name": "oil_C", "mean": 30, "sd": 2},
         ],
         effects=[
@@ -82,7 +108,13 @@ def test_truth_agrees_with_the_written_traces_at_every_steady_sample(campaign):
             effect("0.002 * (humidity_pct - 50) * (oil_C - 30)", "mu_c"),
             effect("-0.05 * log(repeat)", "force", "multiply"),
             effect("0.01 * elapsed_h + 0.001 * run_order"),
-            {"id": "levels", "channels": ["batch"], "acts_on": "mu", "operation": "multiply", "parameters": {"B": 0.1}},
+            {
+                "id": "levels",
+                "channels": ["batch"],
+                "acts_on": "mu",
+                "operation": "multiply",
+                "parameters": {"B": 0.1},
+            },
         ],
     )
     tried = 0
@@ -98,7 +130,8 @@ def test_truth_agrees_with_the_written_traces_at_every_steady_sample(campaign):
         started = pd.to_datetime(runs["started_at"])
         points["elapsed_h"] = (pd.Timestamp(start) - started.min()).total_seconds() / 3600
         points["run_order"] = (started <= pd.Timestamp(start)).sum()
-        # What is left of the pre-sliding rise after 5 mm of 0.1 mm is nothing; displacement is rounded to 5 digits.
+        # What is left of the pre-sliding rise after 5 mm of 0.1 mm is nothing; displacement is rounded to 5
+        # digits.
         npt.assert_allclose(points["force_N"], true_force(truth, points), atol=2e-5)
         tried += len(points)
     assert tried > 10_000
@@ -127,7 +160,8 @@ def test_catalogue_effects_are_resolved_with_their_shapes(campaign, monkeypatch)
     truth, _, _ = campaign(physics=physics, design={**ONE_CONDITION, "loads_N": (50.0,)}, effects=[entry])
     assert truth["effects"][0]["acts_on"] == "mu"
     points = pd.DataFrame(
-        {"temperature_C": 23.0, "compression_ratio_pct": 100.0, "aging_days": 0.0, "speed_mm_s": -5.0}, index=[0, 1]
+        {"temperature_C": 23.0, "compression_ratio_pct": 100.0, "aging_days": 0.0, "speed_mm_s": -5.0},
+        index=[0, 1],
     )
     points["distance_mm"] = [10.0, 20.0]
     npt.assert_allclose(true_force(truth, points), [-25 * 1.2, -25 * 1.1], atol=1e-9)
@@ -151,20 +185,24 @@ SETTING = {"rest_s": 30.0, "humidity_pct": 55.0, "lab_temperature_C": 24.0}
 
 @pytest.mark.parametrize("known", EFFECTS.values(), ids=EFFECTS)
 def test_every_effect_of_the_catalogue_can_be_simulated(campaign, known):
-    """Amplitudes of 0.01 in its first role, other numbers as they start: the truth moves by what its shape gives."""
+    """Amplitudes of 0.01 in its first role, other numbers as they start: the truth moves by its shape."""
     values = {p.name: 0.01 if p.linear else p.start for p in known.parameters}
     values |= {"x_0": 20.0, "w": 5.0} if known.id == "bump" else {}  # it starts at 0, before steady sliding
     entry = {"id": known.id, "parameters": values, "channels": [FREELY.get(n, n) for n in known.reads]}
     channels = [{"kind": "constant", "name": n, "value": SETTING[n]} for n in known.reads if n in SETTING]
     design = {**ONE_CONDITION, "days": (16.0,), "speeds_mm_s": (2.0,), "directions": (1, -1)}
     truth, runs, traces = campaign(design=design, channels=channels, effects=[entry], noise=())
-    runs = runs.assign(direction=[1 if "fwd" in run else -1 for run in runs["run_id"]], stroke=1, elapsed_h=0.0)
+    runs = runs.assign(
+        direction=[1 if "fwd" in run else -1 for run in runs["run_id"]], stroke=1, elapsed_h=0.0
+    )
     moved = 0.0
     for row in runs.itertuples():
         points = steady(traces[row.file])
         points = points.assign(**{n: getattr(row, n) for n in runs.columns if n not in points})
         points["speed_mm_s"] = row.speed_mm_s * row.direction
-        points["distance_mm"] = points["displacement_mm"] if row.direction > 0 else 40 - points["displacement_mm"]
+        points["distance_mm"] = (
+            points["displacement_mm"] if row.direction > 0 else 40 - points["displacement_mm"]
+        )
         points["elapsed_h"] = (
             pd.Timestamp(row.started_at) - pd.Timestamp("2024-01-08T08:00:00")
         ).total_seconds() / 3600
@@ -179,7 +217,10 @@ def test_every_effect_of_the_catalogue_can_be_simulated(campaign, known):
         elif role == ("mu", "multiply"):
             npt.assert_allclose(found - bare, shape * (bare - 0.05 * points["speed_mm_s"]), atol=1e-9)
         moved = max(moved, np.abs(found - bare).max())
-    assert moved > 0 or known.id in ("conditioning", "run_in")  # one repeat and one stroke: nothing to settle yet
+    assert moved > 0 or known.id in (
+        "conditioning",
+        "run_in",
+    )  # one repeat and one stroke: nothing to settle yet
 
 
 def test_a_smooth_shape_passes_its_knots(campaign):
@@ -192,7 +233,9 @@ def test_a_smooth_shape_passes_its_knots(campaign):
         "parameters": {"c_2": 1.5, "c_3": -0.5},
     }
     truth, _, _ = campaign(design=ONE_CONDITION, effects=[entry])
-    points = pd.DataFrame({"displacement_mm": [10.0, 20.0, 30.0], "speed_mm_s": 2.0, **POINT, "aging_days": 0.0})
+    points = pd.DataFrame(
+        {"displacement_mm": [10.0, 20.0, 30.0], "speed_mm_s": 2.0, **POINT, "aging_days": 0.0}
+    )
     force = true_force(truth, points)
     npt.assert_allclose(force - force[0], [0.0, 1.5, -0.5], atol=1e-9)
     with pytest.raises(ConfigError, match="knots"):

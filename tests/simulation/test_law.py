@@ -32,11 +32,17 @@ def test_the_declared_parameters_come_back_from_three_speeds(campaign):
 
 
 def test_aging_follows_the_papers_law(campaign):
-    days = {"temperatures_C": (60.0,), "days": (4.0, 16.0), "speeds_mm_s": (50.0,), "repeats": 1, "loads_N": (100.0,)}
+    days = {
+        "temperatures_C": (60.0,),
+        "days": (4.0, 16.0),
+        "speeds_mm_s": (50.0,),
+        "repeats": 1,
+        "loads_N": (100.0,),
+    }
     truth, runs, traces = campaign(design=days, physics={"sigma_2": 0.0})
     mu_c = {row.aging_days: steady(traces[row.file])["force_N"].mean() / 100 for row in runs.itertuples()}
-    # Eq. 15 for mu_c with mu_0 = 0.609, worked in the project's reading of the paper: 0.49587 and 0.45083, with
-    # c = 0.06621 where -a ln b is 0.06687.
+    # Eq. 15 for mu_c with mu_0 = 0.609, worked in the project's reading of the paper: 0.49587 and 0.45083,
+    # with c = 0.06621 where -a ln b is 0.06687.
     assert mu_c[0.0] == pytest.approx(0.609, abs=1e-7)
     assert mu_c[4.0] == pytest.approx(0.49587, abs=7e-4)
     assert mu_c[16.0] == pytest.approx(0.45083, abs=7e-4)
@@ -47,7 +53,12 @@ def test_aging_follows_the_papers_law(campaign):
 def test_growth_doubles_a_per_step_of_temperature_and_adds_compression(campaign):
     truth, _, _ = campaign(
         physics={"growth": {"doubling_C": 20.0, "per_pct": 0.01}},
-        design={"temperatures_C": (40.0, 60.0, 80.0), "compressions_pct": (80.0, 100.0), "days": (4.0,), "repeats": 1},
+        design={
+            "temperatures_C": (40.0, 60.0, 80.0),
+            "compressions_pct": (80.0, 100.0),
+            "days": (4.0,),
+            "repeats": 1,
+        },
     )
     a = {row["condition"]: row["a_s"] / 0.04448 for row in truth["physics"]}
     assert a["4d_40C_80pct"] == pytest.approx(0.5)
@@ -75,7 +86,9 @@ def test_a_series_declared_by_itself_leaves_the_others_and_the_unaged_rubber_alo
 )
 def test_truth_is_odd_in_speed_and_linear_in_load(speed, days, load, factor):
     truth = {"spec": Spec(physics={"sigma_2": 0.0}).model_dump(mode="json")}
-    rows = [{"speed_mm_s": v, "load_N": n} for v, n in ((speed, load), (-speed, load), (speed, factor * load))]
+    rows = [
+        {"speed_mm_s": v, "load_N": n} for v, n in ((speed, load), (-speed, load), (speed, factor * load))
+    ]
     forward, back, scaled = true_force(truth, pd.DataFrame(rows).assign(**POINT, aging_days=days))
     assert back == -forward
     assert scaled == pytest.approx(factor * forward)
@@ -90,6 +103,9 @@ def test_truth_only_falls_with_age(days):
 
 
 def test_a_spec_survives_its_truth(campaign):
-    spec = {"design": {**ONE_CONDITION, "directions": (1, -1)}, "noise": [{"kind": "run_setup", "sd_rel": 0.1}]}
+    spec = {
+        "design": {**ONE_CONDITION, "directions": (1, -1)},
+        "noise": [{"kind": "run_setup", "sd_rel": 0.1}],
+    }
     truth, _, _ = campaign(**spec)
     assert Spec.model_validate(json.loads(json.dumps(truth["spec"]))) == Spec(force_decimals=9, **spec)

@@ -9,7 +9,13 @@ from simulation_helpers import ONE_CONDITION, steady
 def noisy(campaign, *kinds, **more):
     """Campaigns without and with noise; the difference of their forces, file by file."""
     spec = {
-        "design": {"days": (), "repeats": 10, "speeds_mm_s": tuple(range(1, 21)), "max_rows": 200, "specimens": 2},
+        "design": {
+            "days": (),
+            "repeats": 10,
+            "speeds_mm_s": tuple(range(1, 21)),
+            "max_rows": 200,
+            "specimens": 2,
+        },
         "physics": {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0},
         **more,
     }
@@ -25,7 +31,9 @@ def differences(pairs):
 
 
 def ratios(runs, pairs):
-    gain = [steady(dirty)["force_N"].mean() / steady(clean)["force_N"].mean() for clean, dirty in pairs.values()]
+    gain = [
+        steady(dirty)["force_N"].mean() / steady(clean)["force_N"].mean() for clean, dirty in pairs.values()
+    ]
     return runs.assign(gain=gain)
 
 
@@ -42,14 +50,17 @@ def test_autocorrelated_noise_has_its_sd_and_length(campaign, unit, length):
     _, _, pairs = noisy(campaign, {"kind": "autocorrelated", "sd_N": 0.3, "length": length, "unit": unit})
     found = differences(pairs)
     assert found.std() == pytest.approx(0.3, rel=0.05)
-    step = 1.0 if unit == "samples" else np.diff(steady(next(iter(pairs.values()))[0])["displacement_mm"]).mean()
+    step = (
+        1.0 if unit == "samples" else np.diff(steady(next(iter(pairs.values()))[0])["displacement_mm"]).mean()
+    )
     memory = np.mean(found[:, 1:] * found[:, :-1]) / np.mean(found**2)
     assert memory == pytest.approx(math.exp(-step / length), abs=0.05)
 
 
 def test_quantised_force_stands_on_its_grid(campaign):
     _, _, traces = campaign(
-        design=ONE_CONDITION, noise=[{"kind": "white", "sd_N": 0.5}, {"kind": "quantised", "resolution_N": 0.25}]
+        design=ONE_CONDITION,
+        noise=[{"kind": "white", "sd_N": 0.5}, {"kind": "quantised", "resolution_N": 0.25}],
     )
     force = np.concatenate([trace["force_N"] for trace in traces.values()])
     npt.assert_allclose(force / 0.25, np.round(force / 0.25), atol=1e-7)
@@ -63,7 +74,10 @@ def test_repeat_gain_has_its_sd_and_is_one_factor_per_file(campaign):
     assert table.groupby("run_id")["gain"].mean().std() == pytest.approx(0.02 / math.sqrt(10), rel=0.5)
     npt.assert_allclose(table["gain"], [row["gain"] for row in truth["files"]], rtol=1e-6)
     assert (
-        max((d := dirty["force_N"] / clean["force_N"])[clean["force_N"] > 1].std() for clean, dirty in pairs.values())
+        max(
+            (d := dirty["force_N"] / clean["force_N"])[clean["force_N"] > 1].std()
+            for clean, dirty in pairs.values()
+        )
         < 1e-6
     )
     assert len(d) > 0
@@ -73,7 +87,9 @@ def test_run_setup_is_shared_by_repeats(campaign):
     _, runs, pairs = noisy(campaign, {"kind": "run_setup", "sd_rel": 0.03})
     table = ratios(runs, pairs)
     assert table.groupby("run_id")["gain"].std().max() < 1e-9
-    assert table.groupby("run_id")["gain"].first().std() == pytest.approx(0.03, rel=0.4)  # 40 runs: SD known to 11 %
+    assert table.groupby("run_id")["gain"].first().std() == pytest.approx(
+        0.03, rel=0.4
+    )  # 40 runs: SD known to 11 %
     _, runs, pairs = noisy(campaign, {"kind": "run_setup", "sd_N": 0.4})
     offsets = runs.assign(offset=differences(pairs).mean(axis=1)).groupby("run_id")["offset"]
     assert offsets.std().max() < 1e-8
@@ -81,11 +97,19 @@ def test_run_setup_is_shared_by_repeats(campaign):
 
 
 def test_specimen_scatter_is_shared_by_a_specimens_runs(campaign):
-    design = {"days": tuple(range(1, 31)), "specimens": 2, "repeats": 1, "speeds_mm_s": (2.0, 20.0), "max_rows": 100}
+    design = {
+        "days": tuple(range(1, 31)),
+        "specimens": 2,
+        "repeats": 1,
+        "speeds_mm_s": (2.0, 20.0),
+        "max_rows": 100,
+    }
     _, runs, pairs = noisy(campaign, {"kind": "specimen", "sd_rel": 0.05}, design=design)
     table = ratios(runs, pairs)
     assert table.groupby("specimen_id")["gain"].std().max() < 1e-9
-    assert table.groupby("specimen_id")["gain"].first().std() == pytest.approx(0.05, rel=0.35)  # 62: known to 9 %
+    assert table.groupby("specimen_id")["gain"].first().std() == pytest.approx(
+        0.05, rel=0.35
+    )  # 62: known to 9 %
 
 
 def test_proportional_noise_grows_with_force(campaign):
@@ -97,7 +121,9 @@ def test_proportional_noise_grows_with_force(campaign):
 
 
 def test_displacement_and_speed_noise(campaign):
-    truth, runs, pairs = noisy(campaign, {"kind": "displacement", "sd_mm": 0.02}, {"kind": "speed", "sd_rel": 0.01})
+    truth, runs, pairs = noisy(
+        campaign, {"kind": "displacement", "sd_mm": 0.02}, {"kind": "speed", "sd_rel": 0.01}
+    )
     real = np.abs([row["speed_mm_s"] for row in truth["files"]]) / runs["speed_mm_s"]
     assert real.std() == pytest.approx(0.01, rel=0.15)
     measured, noise = [], []

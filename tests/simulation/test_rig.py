@@ -10,7 +10,9 @@ from sealfit.simulation import true_force
 
 
 def test_a_trace_rests_ramps_rises_slides_and_stops(campaign):
-    _, runs, traces = campaign(design={**ONE_CONDITION, "speeds_mm_s": (20.0,), "dwell_s": 0.1, "stiffness_mm": 0.05})
+    _, runs, traces = campaign(
+        design={**ONE_CONDITION, "speeds_mm_s": (20.0,), "dwell_s": 0.1, "stiffness_mm": 0.05}
+    )
     trace = traces[runs["file"][0]]
     t, x, force = (trace[name].to_numpy() for name in ("time_s", "displacement_mm", "force_N"))
     assert np.all(np.diff(t) > 0)
@@ -24,7 +26,8 @@ def test_a_trace_rests_ramps_rises_slides_and_stops(campaign):
     assert np.diff(x).min() >= 0
     speed = np.gradient(x, t)
     npt.assert_allclose(speed[(t > 0.4) & (t < 1.9)], 20.0, rtol=1e-4)
-    # mu_s > mu_c: break-away during the ramp stands above the plateau, and the force rises from nothing before it.
+    # mu_s > mu_c: break-away during the ramp stands above the plateau, and the force rises from nothing
+    # before it.
     plateau = force[(t > 1.0) & (t < 1.5)].mean()
     assert force[(t > 0.1) & (t < 0.4)].max() > 1.02 * plateau
     assert force[np.flatnonzero(x > 0)[0]] < 0.2 * plateau
@@ -32,7 +35,9 @@ def test_a_trace_rests_ramps_rises_slides_and_stops(campaign):
 
 def test_the_pre_sliding_rise_is_exponential_in_distance(campaign):
     design = {**ONE_CONDITION, "speeds_mm_s": (1.0,), "ramp_s": 0.0, "stiffness_mm": 1.0}
-    _, runs, traces = campaign(design=design, physics={"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0})
+    _, runs, traces = campaign(
+        design=design, physics={"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0}
+    )
     trace = traces[runs["file"][0]]
     moving = trace[(trace["displacement_mm"] > 0) & (trace["displacement_mm"] < 39)]
     by_hand = 0.5 * 49.03 * (1 - np.exp(-moving["displacement_mm"]))
@@ -119,11 +124,15 @@ def test_calendar_tests_each_day_when_the_rubber_is_ready(campaign):
     assert started.is_unique
     by_time = runs.assign(started=started).sort_values("started")
     assert not by_time["run_id"].drop_duplicates().is_monotonic_increasing
-    assert (by_time["run_id"].to_numpy()[::2] == by_time["run_id"].to_numpy()[1::2]).all()  # repeats follow each other
+    assert (
+        by_time["run_id"].to_numpy()[::2] == by_time["run_id"].to_numpy()[1::2]
+    ).all()  # repeats follow each other
 
 
 def test_randomised_order_goes_with_no_condition(campaign):
-    _, runs, _ = campaign(design={"days": tuple(range(1, 12)), "max_rows": 50, "repeats": 1, "order": "randomised"})
+    _, runs, _ = campaign(
+        design={"days": tuple(range(1, 12)), "max_rows": 50, "repeats": 1, "order": "randomised"}
+    )
     rank = pd.to_datetime(runs["started_at"]).rank()
     assert abs(np.corrcoef(rank, runs["aging_days"])[0, 1]) < 0.35  # 96 runs: 3.4 standard deviations
 

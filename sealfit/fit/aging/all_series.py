@@ -52,7 +52,9 @@ def aged_values(levels: Levels, rubber: str, quantity: str) -> Aged:
     )
 
 
-def joint_laws(steady: pd.DataFrame, steady_fit: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
+def joint_laws(
+    steady: pd.DataFrame, steady_fit: pd.DataFrame, config: Config
+) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return tables `aging_laws` and `master_curve`; empty without aging or with too few conditions.
 
     Parameters
@@ -115,8 +117,9 @@ def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
     apart = _separate(best)
     if apart is not None:
         yield {
-            "law": SEPARATE, "way": "", "form": "mu_0 - a ln(1 + t/b), a and b of each series", "rank": len(laws) + 1,
-            "rival": False, "criterion": apart[0] - best.bic, "heldout_last_day": apart[1], "identified": True,
+            "law": SEPARATE, "way": "", "form": "mu_0 - a ln(1 + t/b), a and b of each series",
+            "rank": len(laws) + 1, "rival": False, "criterion": apart[0] - best.bic,
+            "heldout_last_day": apart[1], "identified": True,
         }  # fmt: skip
 
 
@@ -140,10 +143,10 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
 
 
 def _master_curve(law: JointLaw) -> pd.DataFrame:
-    """Return the values on the master curve, and the law at the reference temperature and compression with its band.
+    """Return values on the master curve, and the law with band at reference temperature and compression.
 
-    If temperature and compression change the rate of aging, times are multiplied by k; if they change the loss, losses
-    are divided by k.
+    If temperature and compression change the rate of aging, times are multiplied by k; if they change the
+    loss, losses are divided by k.
     """
     aged = law.aged
     tested = (aged.temperature_C, aged.compression_pct)
@@ -164,7 +167,9 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
     return pd.concat([pd.DataFrame(points), pd.DataFrame(curve)], ignore_index=True)
 
 
-def law_of(steady: pd.DataFrame, steady_fit: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
+def law_of(
+    steady: pd.DataFrame, steady_fit: pd.DataFrame, quantity: str, name: str | None = None
+) -> list[JointLaw]:
     """Return the laws of one quantity in order of BIC, or only a named one.
 
     Parameters
@@ -179,7 +184,8 @@ def law_of(steady: pd.DataFrame, steady_fit: pd.DataFrame, quantity: str, name: 
     Raises
     ------
     RequestError
-        If rubber is not aged, the quantity was not fitted, there are several rubbers, or no such law can be fitted.
+        If rubber is not aged, the quantity was not fitted, there are several rubbers, or no such law can be
+        fitted.
     """
     if "aging_days" not in steady_fit.columns:
         raise RequestError("this rig ages no rubber.", fix="Name aging_days in the config's condition.")
@@ -190,7 +196,9 @@ def law_of(steady: pd.DataFrame, steady_fit: pd.DataFrame, quantity: str, name: 
         there = ", ".join(dict.fromkeys(own for _, own in known)) or "none"
         raise RequestError(f"there is no '{quantity}' to follow.", fix=f"Choose one of: {there}.")
     if len(rubbers) > 1:
-        raise RequestError(f"there are several rubbers: {', '.join(rubbers)}.", fix="Analyse them one by one.")
+        raise RequestError(
+            f"there are several rubbers: {', '.join(rubbers)}.", fix="Analyse them one by one."
+        )
     if name is not None and name not in LOSSES:
         raise RequestError(f"there is no law '{name}'.", fix=f"Choose one of: {', '.join(LOSSES)}.")
     aged = aged_values(levels, rubbers[0], quantity)

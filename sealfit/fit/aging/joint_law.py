@@ -35,8 +35,8 @@ def _plain(percent):
     return np.asarray(percent, float)
 
 
-# Variables that change the rate of aging: coefficient in ln k (kJ/mol, 1/%), attribute, and the function of the
-# attribute that the coefficient multiplies.
+# Variables that change the rate of aging: coefficient in ln k (kJ/mol, 1/%), attribute, and the function of
+# the attribute that the coefficient multiplies.
 DRIVERS = (("E", "temperature_C", _inverse), ("kappa", "compression_pct", _plain))
 
 
@@ -49,11 +49,11 @@ class Aged:
     days, value : ndarray, shape (n,)
         Aging time in days, and the value measured.
     temperature_C, compression_pct : ndarray, shape (n,), or None
-        Temperature in degrees Celsius and height in percent during aging; not used for unaged specimens. None if
-        unknown.
+        Temperature in degrees Celsius and height in percent during aging; not used for unaged specimens. None
+        if unknown.
     variance : ndarray, shape (n,) or (n, n), or None
-        Measurement variance or covariance of the values; the scatter between specimens is estimated and added. None if
-        it is 0.
+        Measurement variance or covariance of the values; the scatter between specimens is estimated and
+        added. None if it is 0.
     """
 
     days: np.ndarray
@@ -103,12 +103,12 @@ class Aged:
 
     @cached_property
     def middle(self) -> dict[str, float]:
-        """Reference temperature and compression, the middle of the tested ones, by the name of the coefficient."""
+        """Reference temperature and compression, the middle of the tested ones, by the coefficient's name."""
         there = ((name, getattr(self, column)) for name, column, _ in DRIVERS)
         return {name: reference_of(at[self.days > 0]) for name, at in there if at is not None}
 
     def away(self, name: str, middle: float) -> np.ndarray:
-        """Return the factor of a coefficient in ln k, relative to a temperature or compression, shape (n,)."""
+        """Return the factor of a coefficient in ln k relative to a temperature or compression, shape (n,)."""
         column, of = next((column, of) for own, column, of in DRIVERS if own == name)
         return np.where(self.days > 0, of(middle) - of(getattr(self, column)), 0.0)
 
@@ -175,12 +175,13 @@ def reference_of(tested: np.ndarray) -> float:
 # .. math:: \mu(t, T, C) = \mu_0 - a\, k^{w}\, \varphi(k^{1-w}\, t), \quad
 #     \ln k = \frac{E}{R} \Big(\frac{1}{T_{ref}} - \frac{1}{T}\Big) + \kappa\, (C_{ref} - C)
 #
-# with T in kelvin and C the height while aging in percent. Temperature and compression change the rate of aging (w = 0:
-# time-temperature superposition, all series fall on one master curve over k t) or the loss itself (w = 1). mu_0 is that
-# of the unaged rubber, shared by all. phi is one of `sealfit.physics.aging_laws`. BIC chooses the shape and w; the
-# rivals are kept beside the chosen law.
+# with T in kelvin and C the height while aging in percent. Temperature and compression change the rate of
+# aging (w = 0: time-temperature superposition, all series fall on one master curve over k t) or the loss
+# itself (w = 1). mu_0 is that of the unaged rubber, shared by all. phi is one of
+# `sealfit.physics.aging_laws`. BIC chooses the shape and w; the rivals are kept beside the chosen law.
 #
-# Ferry 1980, Viscoelastic Properties of Polymers, chapter 11 (superposition); ISO 11346 (life of rubber by Arrhenius).
+# Ferry 1980, Viscoelastic Properties of Polymers, chapter 11 (superposition); ISO 11346 (life of rubber by
+# Arrhenius).
 
 # Quantities that temperature and compression may change.
 TARGETS = ("rate", "loss")
@@ -239,7 +240,11 @@ class JointLaw:
         """Return the law at other conditions, shape (n,), or (..., n) for x of shape (..., p)."""
         x = self.x if x is None else x
         k, own = self.rate(aged, x), self.own(x)
-        lost = self.loss.value(aged.days * k, *own) if self.acts_on == "rate" else k * self.loss.value(aged.days, *own)
+        lost = (
+            self.loss.value(aged.days * k, *own)
+            if self.acts_on == "rate"
+            else k * self.loss.value(aged.days, *own)
+        )
         return x[..., :1] - x[..., 1:2] * lost
 
     def own(self, x: np.ndarray | None = None) -> list[np.ndarray]:
@@ -256,10 +261,13 @@ class JointLaw:
 
     def away(self, aged: Aged) -> dict[str, np.ndarray]:
         """Return the factors of E and kappa, if varied, in ln k at the conditions, shape (n,) each."""
-        return {name: aged.away(name, self.aged.middle[name]) for name in self.names[2 + len(self.loss.parameters) :]}
+        return {
+            name: aged.away(name, self.aged.middle[name])
+            for name in self.names[2 + len(self.loss.parameters) :]
+        }
 
     def slope(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
-        """Return the derivatives of the law with respect to x, shape (p, n), or (..., p, n) for x of shape (..., p)."""
+        """Return the derivatives with respect to x, shape (p, n), or (..., p, n) for x of shape (..., p)."""
         x = self.x if x is None else x
         k, own, a = self.rate(aged, x), self.own(x), x[..., 1:2]
         if self.acts_on == "rate":
@@ -314,7 +322,9 @@ def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> Joint
             f"{conditions} conditions do not determine the {len(names)} parameters of the law '{loss}'.",
             fix="Test more days, or choose a law with fewer parameters.",
         )
-    empty = JointLaw(aged, shape, acts_on, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf)
+    empty = JointLaw(
+        aged, shape, acts_on, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf
+    )
     x, scatter, before = None, 0.05, np.inf
     for _ in range(TURNS):
         x = solved(empty, aged.spread.whitening(scatter), x)
@@ -357,12 +367,14 @@ def rivals_of(laws: Sequence[JointLaw]) -> list[JointLaw]:
 
 
 def left_out(law: JointLaw) -> dict[str, float]:
-    """Return the RMS held-out error of a law at whole series and at last days; NaN if none can be left out."""
+    """Return a law's RMS held-out error at whole series and at last days; NaN if none can be left out."""
     aged, drivers = law.aged, law.aged.drivers()
     whole = aged.whole_series()
     folds = {"series": whole if len(whole) > 2 else [], "last_day": aged.last_days()}
     plain = replace(aged, variance=None)  # `part` need not copy the covariance
-    kept = {name: [out for out in masks if plain.part(~out).drivers() == drivers] for name, masks in folds.items()}
+    kept = {
+        name: [out for out in masks if plain.part(~out).drivers() == drivers] for name, masks in folds.items()
+    }
     masks = np.array([out for own in kept.values() for out in own])
     if not len(masks):
         return dict.fromkeys(kept, np.nan)

@@ -15,7 +15,13 @@ if TYPE_CHECKING:
 # Starting values of E in kJ/mol.
 ENERGIES = (0.0, 50.0, 100.0)
 # Starting values and bounds of the parameters of the shapes: days, and exponents.
-SHAPES = {"b": (0.01, 0.3, 10.0), "tau": (0.5, 5.0, 50.0), "beta": (0.5, 1.0), "n": (0.2, 0.5, 1.0), "t_i": (0.3, 3.0)}
+SHAPES = {
+    "b": (0.01, 0.3, 10.0),
+    "tau": (0.5, 5.0, 50.0),
+    "beta": (0.5, 1.0),
+    "n": (0.2, 0.5, 1.0),
+    "t_i": (0.3, 3.0),
+}
 LIMITS = {"b": (1e-9, 1e4), "tau": (1e-6, 1e6), "beta": (0.05, 5.0), "n": (0.01, 5.0), "t_i": (1e-3, 1e3)}
 # Number of linear parameters: mu_0 and a.
 LINEAR = 2
@@ -82,8 +88,8 @@ class _Projected:
 
     Notes
     -----
-    Golub & Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036, with the tangent of Kaufman 1975,
-    BIT 15, 49-57, doi:10.1007/BF01932995.
+    Golub & Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036, with the tangent of
+    Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995.
     """
 
     def __init__(self, law: JointLaw, white: np.ndarray, values: np.ndarray, masks: np.ndarray | None = None):
@@ -93,7 +99,8 @@ class _Projected:
             self.level = (level @ white / (level @ level))[None]
             self.white = white - np.outer(level, self.level)
         else:
-            # Leaving a value out equals giving it a parameter; these columns are projected out together with mu_0.
+            # Leaving a value out equals giving it a parameter; these columns are projected out together with
+            # mu_0.
             self.white, self.level = white, np.zeros(values.shape)
             self.aside = np.zeros((len(masks), masks.sum(axis=1).max() + 1, values.shape[1]))
             for k, out in enumerate(masks):
@@ -106,7 +113,9 @@ class _Projected:
     def _whitened(self, many: np.ndarray, of: np.ndarray) -> np.ndarray:
         """Return rows, shape (r, m, n), of the sets `of`, shape (r,), whitened, with mu_0 projected out."""
         many = (many.reshape(-1, len(self.white)) @ self.white.T).reshape(many.shape)
-        return many if self.aside is None else many - (many @ np.swapaxes(self.aside[of], 1, 2)) @ self.aside[of]
+        return (
+            many if self.aside is None else many - (many @ np.swapaxes(self.aside[of], 1, 2)) @ self.aside[of]
+        )
 
     def solve(self, nonlinear: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return mu_0 and a, shape (r, 2), the whitened residual, (r, n), and its derivative, (r, p - 2, n).
@@ -143,11 +152,13 @@ class _Projected:
         return points[np.argsort((rest**2).sum(axis=1), kind="stable")[:POLISHED]]
 
     def polished(self, nonlinear: np.ndarray, of: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return all parameters, shape (r, p), and the sums of squares, shape (r,), at the optima from starts."""
+        """Return all parameters, shape (r, p), and sums of squares, shape (r,), at the optima from starts."""
         of = np.arange(len(nonlinear)) if of is None else of
         own = self.law.loss.parameters
         low, high = (
-            np.array([np.log(LIMITS[name][end]) if name in own else infinity for name in self.law.names[LINEAR:]])
+            np.array(
+                [np.log(LIMITS[name][end]) if name in own else infinity for name in self.law.names[LINEAR:]]
+            )
             for end, infinity in enumerate((-np.inf, np.inf))
         )
         found, rss = levenberg_marquardt(lambda x, rows: self.solve(x, of[rows])[1:], nonlinear, low, high)

@@ -1,7 +1,8 @@
-"""Eq. 15 fitted to the coefficients of many conditions: one law per curve, the unaged value shared by all curves.
+"""Eq. 15 fitted to the coefficients of many conditions: one law per curve, one unaged value for all curves.
 
-A curve is one quantity (mu_s or mu_c) of one series. Curves of a quantity share mu_0, so their values are fitted
-together by generalised least squares. mu_0 and a are linear; ln b is searched globally, curve by curve.
+A curve is one quantity (mu_s or mu_c) of one series. Curves of a quantity share mu_0, so their values are
+fitted together by generalised least squares. mu_0 and a are linear; ln b is searched globally, curve by
+curve.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ PROFILED = 17
 
 
 def search_limits(days) -> tuple[np.ndarray, np.ndarray]:
-    """Return the limits of ln b, shape (...), for tested days, shape (..., n), at least one of each n above zero."""
+    """Return the limits of ln b, shape (...), for tested days, shape (..., n), not all n of them zero."""
     first = np.min(days, axis=-1, where=days > 0, initial=np.inf)
     return np.log(first * SOONEST), np.log(np.max(days, axis=-1) * LATEST)
 
@@ -171,8 +172,9 @@ def law_model(values: Values, x) -> tuple[np.ndarray, np.ndarray]:
 def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
     """Return the global generalised least-squares fit of all curves together.
 
-    Every curve is first fitted alone (with the unaged values of its quantity). Then all are fitted together from this
-    start. Then each b is searched over its whole range with the other parameters fixed, until none improves the fit.
+    Every curve is first fitted alone (with the unaged values of its quantity). Then all are fitted together
+    from this start. Then each b is searched over its whole range with the other parameters fixed, until none
+    improves the fit.
 
     Parameters
     ----------
@@ -184,7 +186,9 @@ def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
     m, k = values.origins, values.curves
     whiten = csr_array(values.whitening)
     limits = np.array([search_limits(values.days[values.curve == c]) for c in range(k)]).reshape(k, 2).T
-    low, high = (np.concatenate([np.full(m + k, end), own]) for end, own in zip((-np.inf, np.inf), limits, strict=True))
+    low, high = (
+        np.concatenate([np.full(m + k, end), own]) for end, own in zip((-np.inf, np.inf), limits, strict=True)
+    )
 
     def evaluate(x, _rows):
         model, slope = law_model(values, x[0])
@@ -230,7 +234,7 @@ def _each_alone(values: Values) -> np.ndarray:
 
 
 def _rescan(found: LawFit) -> np.ndarray | None:
-    """Return parameters with each b searched over its whole range, the others fixed; None if none improves the fit."""
+    """Return parameters with each b searched over its whole range, others fixed; None if none is better."""
     values, limits, whiten = found.values, found.limits, found.values.whitening
     m, k = values.origins, values.curves
     x, gained = found.x.copy(), False
@@ -252,7 +256,7 @@ def _rescan(found: LawFit) -> np.ndarray | None:
 
 
 def between_scatter(values: Values) -> tuple[float, LawFit]:
-    """Return the relative scatter of the values of one quantity in excess of their covariance, and the fit without it.
+    """Return the relative scatter of a quantity's values beyond their covariance, and the fit without it.
 
     The variance of every value is increased by (scatter times the law)^2; the estimate is Paule and Mandel's.
     """
@@ -269,7 +273,7 @@ def between_scatter(values: Values) -> tuple[float, LawFit]:
 
 
 def paule_mandel(chi2: Callable[[float], float], df: float, residual: np.ndarray) -> float:
-    """Return the relative scatter at which chi-square equals its degrees of freedom; 0 if chi-square is not larger.
+    """Return the relative scatter that reduces chi-square to its degrees of freedom; 0 if it is not larger.
 
     Parameters
     ----------

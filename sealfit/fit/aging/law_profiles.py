@@ -32,8 +32,9 @@ End = tuple[float, bool]  # of an interval of ln b, and whether it is open
 def curve_intervals(fit: LawFit, rise_of_origin: np.ndarray) -> list[CurveInterval]:
     """Return the profile-likelihood intervals of every curve.
 
-    The interval of b is where the least chi-square at fixed ln b exceeds the minimum by at most the rise. Those of a
-    and c = -a ln b, which are linear in a at fixed b, are the unions of their intervals over these b.
+    The interval of b is where the least chi-square at fixed ln b exceeds the minimum by at most the rise.
+    Those of a and c = -a ln b, which are linear in a at fixed b, are the unions of their intervals over these
+    b.
 
     Parameters
     ----------
@@ -68,8 +69,8 @@ def _curve_interval(series: _Series, place: int, rise: float) -> CurveInterval:
 class _Series:
     """The curves of one series, with its values and a Gaussian likelihood of mu_0 from the other series.
 
-    mu_0 hardly changes along a profile, so that the laws of the other series may be linearised. The parameters of a
-    series are its mu_0, then a, then ln b of its curves.
+    mu_0 hardly changes along a profile, so that the laws of the other series may be linearised. The
+    parameters of a series are its mu_0, then a, then ln b of its curves.
 
     Parameters
     ----------
@@ -90,7 +91,9 @@ class _Series:
         Chi-square there.
     """
 
-    def __init__(self, fit: LawFit, curves: list[int], rows: np.ndarray, root: np.ndarray, miss: np.ndarray) -> None:
+    def __init__(
+        self, fit: LawFit, curves: list[int], rows: np.ndarray, root: np.ndarray, miss: np.ndarray
+    ) -> None:
         self.values, self.root, self.miss = fit.values.part(rows), root, miss
         m, k = fit.values.origins, fit.values.curves
         places = np.r_[np.unique(fit.values.origin[rows]), m + np.array(curves), m + k + np.array(curves)]
@@ -114,7 +117,7 @@ class _Series:
         return float(chi2[0]), float(found[0, at]), float(covariance[at, at])
 
     def _evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the whitened residuals, those of mu_0 from other series last, shape (1, n + k), and the derivative."""
+        """Return whitened residuals, shape (1, n + k), and the derivative; mu_0 from other series is last."""
         model, slope = law_model(self.values, x[0])
         white = self.values.whitening
         others = np.zeros((self.miss.size, x.size))
@@ -126,7 +129,10 @@ class _Series:
 def _interval(log_b: np.ndarray, a: np.ndarray, half: np.ndarray, low: End, high: End) -> CurveInterval:
     """Return the interval of a curve from a and its half-width at fixed values of ln b between the ends."""
     around = {
-        name: [float((factor * a - np.abs(factor) * half).min()), float((factor * a + np.abs(factor) * half).max())]
+        name: [
+            float((factor * a - np.abs(factor) * half).min()),
+            float((factor * a + np.abs(factor) * half).max()),
+        ]
         for name, factor in (("a", 1.0), ("c", -log_b))
     }
     signs = [end for end, reached in ((1, around["a"][1] > 0), (0, around["a"][0] < 0)) if reached]
@@ -141,7 +147,7 @@ def _interval(log_b: np.ndarray, a: np.ndarray, half: np.ndarray, low: End, high
 
 
 def _end(series: _Series, place: int, sign: int, limit: float) -> End:
-    """Return the ln b at which the profile reaches the limit, from the optimum outwards, and whether it is open."""
+    """Return ln b where the profile reaches the limit, from the optimum outwards, and whether it is open."""
     at = series.b_at(place)
     near, edge = float(series.x[at]), float((series.low, series.high)[sign > 0][at])
 
@@ -171,14 +177,15 @@ def _linked(values: Values) -> list[list[int]]:
 def _other_series(
     fit: LawFit, series: list[list[int]], rows: list[np.ndarray]
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield for each series the likelihood of its mu_0 from the other series: R, shape (k, m), and r, shape (k,).
+    """Yield per series the likelihood of its mu_0 from the other series: R, shape (k, m), and r, shape (k,).
 
-    Their chi-square is |R (mu_0 - fitted) + r|^2, linearised, with their a and b eliminated. Series are not correlated,
-    so that their contributions add.
+    Their chi-square is |R (mu_0 - fitted) + r|^2, linearised, with their a and b eliminated. Series are not
+    correlated, so that their contributions add.
     """
     values, m, k = fit.values, fit.values.origins, fit.values.curves
     tangent = values.whitening @ fit.jacobian
-    columns = np.column_stack([tangent[:, :m], values.whitening @ (fit.model - values.value)])  # of mu_0, residual
+    # Of mu_0, and the residual.
+    columns = np.column_stack([tangent[:, :m], values.whitening @ (fit.model - values.value)])
     unaged = np.setdiff1d(np.arange(values.value.size), np.concatenate(rows))
     squares = []
     for curves, own in zip(series, rows, strict=True):
@@ -194,7 +201,9 @@ def _other_series(
         used = np.append(np.isin(np.arange(m), values.origin[own]), True)
         if not used.all():  # mu_0 of quantities that the series lacks are eliminated too
             cross = square[np.ix_(~used, used)]
-            square = square[np.ix_(used, used)] - cross.T @ np.linalg.pinv(square[np.ix_(~used, ~used)]) @ cross
+            square = (
+                square[np.ix_(used, used)] - cross.T @ np.linalg.pinv(square[np.ix_(~used, ~used)]) @ cross
+            )
         share, axes = np.linalg.eigh(square)
         half = np.sqrt(np.maximum(share, 0.0))[:, None] * axes.T
         yield half[:, :-1], half[:, -1]

@@ -1,4 +1,4 @@
-"""Rows of table `aging_fit` for one curve: its law, the lack of fit, and the parameters that are not determined."""
+"""Rows of table `aging_fit` for one curve: its law, lack of fit, and parameters that are not determined."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ WIDE_B = 100.0
 SIGNIFICANT = 0.05
 
 LAW = ("mu_0", "a", "b", "c")
-NO_SCATTER = "as many parameters as days: the interval excludes the scatter between specimens, which is not known."
+NO_SCATTER = (
+    "as many parameters as days: the interval excludes the scatter between specimens, which is not known."
+)
 
 
 @dataclass(frozen=True)
@@ -131,14 +133,21 @@ def _judge(curve: Curve, a: float, b: float, ends: CurveInterval) -> dict[str, t
     elif low == 0.0 or high > WIDE_B * low:
         span = f"from {low:.2g} to {high:.2g} d" if low > 0 else f"anything up to {high:.2g} d"
         why = (
-            f"b may be {span}: it trades off with a and mu_0; tests before {max(min(high, first), 1e-3):.2g} d decide."
+            f"b may be {span}: it trades off with a and mu_0; "
+            f"tests before {max(min(high, first), 1e-3):.2g} d decide."
         )
     else:
         why = ""
         if b < first and curve.unaged:
-            verdict["b"] = (True, f"below the first day tested ({first:g} d): it rests on the unaged rubber's value.")
+            verdict["b"] = (
+                True,
+                f"below the first day tested ({first:g} d): it rests on the unaged rubber's value.",
+            )
         elif b > last:
-            verdict["b"] = (True, f"beyond the last day tested ({last:g} d): it rests on how little the loss bends.")
+            verdict["b"] = (
+                True,
+                f"beyond the last day tested ({last:g} d): it rests on how little the loss bends.",
+            )
     if why:
         verdict["b"] = (False, why)
         verdict["c"] = (False, f"c = -a ln b, and b is not determined: {why}")
@@ -150,7 +159,9 @@ def _judge(curve: Curve, a: float, b: float, ends: CurveInterval) -> dict[str, t
 def without_law(curve: Curve) -> Iterator[dict]:
     """Return the rows of a curve with too few days: no values, and a reason."""
     days = ", ".join(f"{day:g}" for day in ([0.0, *curve.days] if curve.unaged else curve.days)) or "none"
-    reason = f"the law needs {DAYS_FOR_LAW} distinct days where {curve.quantity} is determined; there are: {days}."
+    reason = (
+        f"the law needs {DAYS_FOR_LAW} distinct days where {curve.quantity} is determined; there are: {days}."
+    )
     for name in LAW:
         yield table_row(
             quantity=curve.quantity,
@@ -179,15 +190,21 @@ def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Itera
         reason = "as many parameters as days: the law cannot disagree with them."
     elif p < SIGNIFICANT:
         reason = (
-            f"the values scatter about the law by {100 * tau:.2g} % more than their errors: specimens differ, or the "
-            "law is wrong. The intervals include this; replicate specimens would distinguish the two."
+            f"the values scatter about the law by {100 * tau:.2g} % more than their errors: "
+            "specimens differ, or the law is wrong. The intervals include this; replicate specimens would "
+            "distinguish the two."
         )
     name = curve.quantity
     for statistic, value, its_unit, why in (
         ("chi2", chi2, "", "against the steady fits' covariance alone"),
         ("df", own_df, "", "this series' share, mu_0 being shared"),
         ("lack_of_fit_p", p, "", reason),
-        ("specimen_sd_pct", 100 * tau, "%", "scatter between specimens beyond the steady fits, all series together"),
+        (
+            "specimen_sd_pct",
+            100 * tau,
+            "%",
+            "scatter between specimens beyond the steady fits, all series together",
+        ),
         ("error_df", quantity.df, "", "degrees of freedom of the intervals' Student t, all series together"),
         ("max_error_pct", 100 * np.abs(error).max(), "%", "largest error of the law over the days tested"),
         ("rmse", np.sqrt(np.mean((joint.model - values.value)[shown] ** 2)), curve.unit, ""),

@@ -1,4 +1,4 @@
-"""The lifetime, the aging time at which a quantity reaches a threshold, and the temperature for a given lifetime."""
+"""The lifetime, the aging time until a quantity reaches a threshold, and the temperature for a lifetime."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from sealfit.fit.aging.joint_least_squares import solved_many
 from sealfit.fit.least_squares import central_jacobian
 
 # ---------------------------------------------------------------- lifetime
-# The lifetime t of a joint law solves :math:`a\, k^w \varphi(k^{1-w} t) = \mu_0 - \mu^*`. Its interval is that of ln t
-# by the delta method with the full covariance of the law; `resampled` checks it by a parametric bootstrap. ISO 11346
-# (rubber, estimation of life-time and maximum temperature of use) has a threshold relative to the start.
+# The lifetime t of a joint law solves :math:`a\, k^w \varphi(k^{1-w} t) = \mu_0 - \mu^*`. Its interval is
+# that of ln t by the delta method with the full covariance of the law; `resampled` checks it by a parametric
+# bootstrap. ISO 11346 (rubber, estimation of life-time and maximum temperature of use) has a threshold
+# relative to the start.
 
 DAYS_PER_YEAR = 365.25
 # Range of temperatures of use in degrees Celsius.
 SPAN_C = (-80.0, 300.0)
-# Step in degrees Celsius of the search for the ends of a temperature interval, and number of bisections after it.
+# Step in degrees Celsius of the search for the ends of a temperature interval, and number of bisections after
+# it.
 STRIDE_C, HALVINGS = 2.0, 12
 # Range of the height in use, in percent of the original height; above 100 the rubber is stretched.
 SPAN_PCT = (1.0, 200.0)
@@ -49,8 +51,8 @@ class Lifetime:
     Attributes
     ----------
     days, low, high : float
-        Estimate and ends of the interval, inf if open; `days` is inf if the law does not reach the threshold, 0 if
-        unaged rubber is beyond it.
+        Estimate and ends of the interval, inf if open; `days` is inf if the law does not reach the threshold,
+        0 if unaged rubber is beyond it.
     threshold : float
         Value at the end of life.
     beyond : float
@@ -72,7 +74,9 @@ class Lifetime:
         return self.beyond > 1.0 or bool(self.outside)
 
 
-def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, compression_pct: float | None = None):
+def lifetime(
+    law: JointLaw, goal: Goal, temperature_C: float | None = None, compression_pct: float | None = None
+):
     """Return the `Lifetime` of rubber aged at a temperature and compression.
 
     Parameters
@@ -85,7 +89,8 @@ def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, comp
     Raises
     ------
     RequestError
-        If one is missing that the law needs, given though the tests did not vary it, or out of the range of use.
+        If one is missing that the law needs, given though the tests did not vary it, or out of the range of
+        use.
     """
     place = _place(law, temperature_C, compression_pct)
     days = _days(law, law.x, goal, place)
@@ -102,13 +107,16 @@ def lifetime(law: JointLaw, goal: Goal, temperature_C: float | None = None, comp
 
 
 def over_laws(
-    laws: Sequence[JointLaw], goal: Goal, temperature_C: float | None = None, compression_pct: float | None = None
+    laws: Sequence[JointLaw],
+    goal: Goal,
+    temperature_C: float | None = None,
+    compression_pct: float | None = None,
 ) -> tuple[float, float]:
     """Return the ends of the model-averaged 95 % interval of the lifetime, 0 or inf if open.
 
-    The log lifetime of each law has a Student distribution, and the weights are exp(-BIC/2). With few tests the law of
-    least BIC is often not the true one, and its own interval too short. Buckland, Burnham & Augustin 1997, Biometrics
-    53(2), 603-618, doi:10.2307/2533961.
+    The log lifetime of each law has a Student distribution, and the weights are exp(-BIC/2). With few tests
+    the law of least BIC is often not the true one, and its own interval too short. Buckland, Burnham &
+    Augustin 1997, Biometrics 53(2), 603-618, doi:10.2307/2533961.
 
     Parameters
     ----------
@@ -151,7 +159,7 @@ def ends_of(values: np.ndarray) -> tuple[float, float]:
 
 
 def _asked(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> Iterator[tuple]:
-    """Yield per driver of aging: name, name of the option, its value, tested values, allowed range, and unit."""
+    """Yield per driver of aging: name, option's name and value, tested values, allowed range, and unit."""
     asked = (temperature_C, compression_pct)
     spans = (("temperature", SPAN_C, "degC"), ("compression", SPAN_PCT, "percent"))
     for (name, column, _), value, (what, span, unit) in zip(DRIVERS, asked, spans, strict=True):
@@ -162,7 +170,9 @@ def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | 
     """Return the condition of use after checks; see `lifetime` for the errors raised."""
     for name, what, value, tested, (least, most), unit in _asked(law, temperature_C, compression_pct):
         if name in law.names and value is None:
-            raise RequestError(f"the rubber was aged at more than one {what}.", fix=f"Say which with --{what}.")
+            raise RequestError(
+                f"the rubber was aged at more than one {what}.", fix=f"Say which with --{what}."
+            )
         if value is not None and not least <= value <= most:
             raise RequestError(
                 f"--{what} {value:g} is no {what} of use.", fix=f"Give {unit} between {least:g} and {most:g}."
@@ -170,7 +180,9 @@ def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | 
         only = np.unique(tested[law.aged.days > 0]) if tested is not None else np.array([])
         if value is not None and name not in law.names and not (only.size and np.allclose(value, only)):
             where = f"at {only[0]:g} {unit} only" if only.size else f"at one {what}, which is not on record"
-            raise RequestError(f"the rubber was aged {where}.", fix=f"Leave --{what} away, or test at another {what}.")
+            raise RequestError(
+                f"the rubber was aged {where}.", fix=f"Leave --{what} away, or test at another {what}."
+            )
     at = (None if value is None else np.array([float(value)]) for value in (temperature_C, compression_pct))
     return Aged(np.ones(1), np.zeros(1), *at)
 
@@ -207,7 +219,8 @@ def resampled(
 ) -> tuple[float, float]:
     """Return the ends of the 95 % interval of the lifetime by a parametric bootstrap.
 
-    Quantiles of the logarithm are multiplied by Student's over the normal quantile, as the scatter is an estimate.
+    Quantiles of the logarithm are multiplied by Student's over the normal quantile, as the scatter is an
+    estimate.
 
     Parameters
     ----------
@@ -234,9 +247,9 @@ def temperature_for(
     Returns
     -------
     celsius, low, high : float
-        In degrees Celsius; celsius is inf if the lifetime is longer at all temperatures searched, -inf if shorter. The
-        interval contains the temperatures whose lifetime interval contains the years (Fieller's method); an end that
-        was not found is infinite.
+        In degrees Celsius; celsius is inf if the lifetime is longer at all temperatures searched, -inf if
+        shorter. The interval contains the temperatures whose lifetime interval contains the years (Fieller's
+        method); an end that was not found is infinite.
 
     Raises
     ------
@@ -246,7 +259,9 @@ def temperature_for(
     if not 0 < years < np.inf:
         raise RequestError(f"--years {years:g} is no time to last.", fix="Give a number above 0.")
     if "E" not in law.names:
-        raise RequestError("the rubber was aged at one temperature only.", fix="Test at two or more temperatures.")
+        raise RequestError(
+            "the rubber was aged at one temperature only.", fix="Test at two or more temperatures."
+        )
     wanted = years * DAYS_PER_YEAR
 
     def longer(celsius: float) -> float:
@@ -266,7 +281,7 @@ def temperature_for(
 
 
 def _last(contains: Callable[[float], bool], inside: float, limit: float) -> float:
-    """Return the end of the interval that contains `inside`, in the direction of a limit; infinite if open."""
+    """Return the end of the interval that contains `inside`, towards a limit; infinite if open."""
     direction = np.sign(limit - inside)
     outside = inside
     while (limit - outside) * direction > 0:
@@ -299,7 +314,9 @@ def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
     if threshold is not None and not np.isfinite(threshold):
         raise RequestError(f"--threshold {threshold:g} is no value to reach.", fix="Give a number.")
     if loss_pct is not None and not 0 < loss_pct < 100:
-        raise RequestError(f"--loss {loss_pct:g} is no share of the start.", fix="Give percent between 0 and 100.")
+        raise RequestError(
+            f"--loss {loss_pct:g} is no share of the start.", fix="Give percent between 0 and 100."
+        )
     return Goal(threshold) if loss_pct is None else Goal(loss=loss_pct / 100)
 
 
@@ -312,7 +329,7 @@ def answer(
     compression_pct: float | None = None,
     resample: bool = False,
 ) -> dict:
-    """Return the answer of a law as plain values: the lifetime with its interval, or the temperature for a lifetime.
+    """Return a law's answer as plain values: the lifetime with its interval, or temperature for a lifetime.
 
     Parameters
     ----------
@@ -329,7 +346,9 @@ def answer(
         If the request cannot be answered: see `lifetime` and `temperature_for`.
     """
     if years is not None and temperature_C is not None:
-        raise RequestError("--years asks for the temperature, and --temperature gives it.", fix="Give one of the two.")
+        raise RequestError(
+            "--years asks for the temperature, and --temperature gives it.", fix="Give one of the two."
+        )
     if goal.loss is not None and (law.aged.days > 0).all():
         raise RequestError(
             "no unaged rubber was tested: there is no start of which a share could be lost.",
@@ -342,10 +361,23 @@ def answer(
         low, high = ends_of(law.aged.temperature_C[law.aged.days > 0])
         found |= {"years": years, "temperature_C": _finite(celsius), "temperature_ci95": finite_ends(ends)}
         found |= {"always": None if np.isfinite(celsius) else "longer" if celsius > 0 else "shorter"}
-        return {**found, "extrapolated": not low <= celsius <= high, "tested_C": [low, high], "sought_C": list(SPAN_C)}
+        return {
+            **found,
+            "extrapolated": not low <= celsius <= high,
+            "tested_C": [low, high],
+            "sought_C": list(SPAN_C),
+        }
     life = lifetime(law, goal, temperature_C, compression_pct)
-    found |= {"threshold": life.threshold, "days": _finite(life.days), "ci95": finite_ends((life.low, life.high))}
-    found |= {"extrapolated": life.extrapolated, "beyond_tests": _finite(life.beyond), "outside": list(life.outside)}
+    found |= {
+        "threshold": life.threshold,
+        "days": _finite(life.days),
+        "ci95": finite_ends((life.low, life.high)),
+    }
+    found |= {
+        "extrapolated": life.extrapolated,
+        "beyond_tests": _finite(life.beyond),
+        "outside": list(life.outside),
+    }
     if resample and 0 < life.days < FOREVER:
         found["ci95_resampled"] = finite_ends(resampled(law, goal, temperature_C, compression_pct))
     return found

@@ -37,8 +37,9 @@ def fit_series(steady_fit: pd.DataFrame, config: Config) -> pd.DataFrame:
 
     .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b), \quad c = -a \ln b
 
-    All series and both quantities of a rubber are fitted together by generalised least squares. The covariance is that
-    of mu_s and mu_c in the steady fits plus the scatter between specimens, estimated from the residuals.
+    All series and both quantities of a rubber are fitted together by generalised least squares. The
+    covariance is that of mu_s and mu_c in the steady fits plus the scatter between specimens, estimated from
+    the residuals.
 
     Parameters
     ----------
@@ -50,15 +51,15 @@ def fit_series(steady_fit: pd.DataFrame, config: Config) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        Table `aging_fit`: per series and quantity mu_0, a, b, c; "statistics" and "covariance" rows, whose `parameter`
-        starts with the quantity ("mu_s:mu_0,mu_s:ln b"). Empty without `aging_days` in the condition or without aged
-        rubber.
+        Table `aging_fit`: per series and quantity mu_0, a, b, c; "statistics" and "covariance" rows, whose
+        `parameter` starts with the quantity ("mu_s:mu_0,mu_s:ln b"). Empty without `aging_days` in the
+        condition or without aged rubber.
 
     Notes
     -----
-    Intervals of a, b and c are profile-likelihood intervals, that of mu_0 is from the curvature, with Student's t. The
-    degrees of freedom are values minus parameters of the quantity, as specimens are the unit of evidence. `u_sys` is
-    the change of the fit if the sensor's error changes all steady values together.
+    Intervals of a, b and c are profile-likelihood intervals, that of mu_0 is from the curvature, with
+    Student's t. The degrees of freedom are values minus parameters of the quantity, as specimens are the unit
+    of evidence. `u_sys` is the change of the fit if the sensor's error changes all steady values together.
     """
     open_columns = [name for name in config.series_columns if name in steady_fit.columns]
     columns = [*AGING_FIT.names(), *open_columns]
@@ -94,7 +95,9 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
     number = np.array(
         [
             -1 if day == 0 else place[series, quantity] if place[series, quantity] >= 0 else -2
-            for day, series, quantity in zip(found["aging_days"], found["series"], found["quantity"], strict=True)
+            for day, series, quantity in zip(
+                found["aging_days"], found["series"], found["quantity"], strict=True
+            )
         ],
         int,
     )
@@ -115,7 +118,7 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
 
 
 def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
-    """Return the values without mu_c of conditions with too few speeds, if other conditions have a Stribeck curve.
+    """Return the values without mu_c of conditions with too few speeds, if others have a Stribeck curve.
 
     The "mu_c" of two or three slow speeds includes mu_s: it is a different quantity.
     """
@@ -130,7 +133,9 @@ def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str
 def _curves(found: pd.DataFrame, series: list[str], quantities: list[str], unit: str) -> list[Curve]:
     unaged = set(found.loc[found["aging_days"] == 0, "quantity"])
     aged = found[found["aging_days"] > 0]
-    tested = dict(aged["aging_days"].astype(float).groupby([aged["series"], aged["quantity"]], sort=False).unique())
+    tested = dict(
+        aged["aging_days"].astype(float).groupby([aged["series"], aged["quantity"]], sort=False).unique()
+    )
     curves, place = [], 0
     for name in series:
         for quantity in quantities:
@@ -144,7 +149,9 @@ def _curves(found: pd.DataFrame, series: list[str], quantities: list[str], unit:
 def values_of(steady_fit: pd.DataFrame, quantity: str) -> dict[tuple[str, str], float]:
     """Return the values of table `steady_fit` with a `quantity`, by condition and parameter."""
     rows = steady_fit[steady_fit["quantity"] == quantity]
-    return dict(zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"].tolist(), strict=True))
+    return dict(
+        zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"].tolist(), strict=True)
+    )
 
 
 def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -> np.ndarray:
@@ -169,7 +176,7 @@ def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -
 
 
 def _with_specimens(values: Values, taus: list[float], model: np.ndarray) -> Values:
-    """Return values with specimen scatter added to their covariance, correlated within a condition as the residuals."""
+    """Return values with specimen scatter in the covariance, correlated in a condition as the residuals."""
     relative = (values.value - model) / model
     tau = np.array(taus)[values.origin]
     near = values.covariance != 0
@@ -210,9 +217,11 @@ def _rubber_rows(
 
 
 def _shift(joint: LawFit, used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:
-    """Return the change of the parameters, shape (p,), if the sensor reads one standard uncertainty too high."""
+    """Return the change of parameters, shape (p,), if the sensor reads one standard uncertainty too high."""
     known = values_of(own, "sensor_shift")
-    moved = np.array([known.get(key, 0.0) for key in zip(used["condition"], used["quantity"], strict=True)], float)
+    moved = np.array(
+        [known.get(key, 0.0) for key in zip(used["condition"], used["quantity"], strict=True)], float
+    )
     white = joint.values.whitening
     weighted = (white @ joint.jacobian).T @ (white @ np.nan_to_num(moved))
     return np.where(np.isfinite(joint.covariance), joint.covariance, 0.0) @ weighted
@@ -232,11 +241,14 @@ def aging_curves(aging_fit: pd.DataFrame, days: np.ndarray | None = None) -> pd.
     Returns
     -------
     DataFrame
-        Table `aging_curves`; the band is that of the population mean, from the covariance of mu_0, a and ln b.
+        Table `aging_curves`; the band is that of the population mean, from the covariance of mu_0, a and ln
+        b.
     """
     parts: dict[str, list[np.ndarray]] = {name: [] for name in AGING_CURVES.names()}
     for series, own in aging_fit.groupby("series", sort=False) if len(aging_fit) else ():
-        known = dict(zip(zip(own["quantity"], own["parameter"], strict=True), own["value"].tolist(), strict=True))
+        known = dict(
+            zip(zip(own["quantity"], own["parameter"], strict=True), own["value"].tolist(), strict=True)
+        )
         for quantity in [quantity for quantity, parameter in known if parameter == "mu_0"]:
             curve = _curve(known, quantity, days)
             for name, values in curve.items():
@@ -246,11 +258,16 @@ def aging_curves(aging_fit: pd.DataFrame, days: np.ndarray | None = None) -> pd.
                 parts["quantity"].append(np.full(curve["value"].size, quantity, object))
     texts = {name: "str" if name in ("series", "quantity") else float for name in parts}
     return pd.DataFrame(
-        {name: pd.Series(np.concatenate(own) if own else [], dtype=texts[name]) for name, own in parts.items()}
+        {
+            name: pd.Series(np.concatenate(own) if own else [], dtype=texts[name])
+            for name, own in parts.items()
+        }
     )
 
 
-def _curve(known: dict[tuple[str, str], float], quantity: str, days: np.ndarray | None) -> dict[str, np.ndarray]:
+def _curve(
+    known: dict[tuple[str, str], float], quantity: str, days: np.ndarray | None
+) -> dict[str, np.ndarray]:
     """Return the curve of one quantity, empty without a law; `known` are values by quantity and parameter."""
     mu_0, a, b = (known[quantity, name] for name in ("mu_0", "a", "b"))
     if np.isnan([mu_0, a, b]).any():

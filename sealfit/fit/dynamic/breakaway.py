@@ -1,4 +1,4 @@
-"""The break-away force: the peak of the force before steady sliding, at each commanded speed and direction."""
+"""The break-away force: the peak of the force before steady sliding, per commanded speed and direction."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from sealfit.config import Config
 from sealfit.fit.dynamic.bristle_model import Cells
 from sealfit.fit.dynamic.stiffness import together
 
-# Width of the window over which a peak is averaged, the larger of a number of samples and a share of the distance.
+# Width of the window over which a peak is averaged, the larger of a number of samples and a share of the
+# distance.
 SAMPLES, SHARE = 8, 1 / 40
 # Family-wise error rate of the test for a peak in a campaign.
 FAMILY = 0.01
@@ -27,13 +28,14 @@ FEW = "no repeats: no scatter is known"
 
 
 def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the break-away force F_ba and its ratio to the sliding force, per file, or per stroke of a single file.
+    """Return the break-away force F_ba and its ratio to the sliding force, per unit of evidence.
 
-    The sliding force is extrapolated to the peak along the line through the beginning of steady sliding, so that
-    warming along the stroke does not count as break-away. The position of the peak is taken from the mean of the other
-    units, and the force of a start is read there, as the maximum of noisy samples is biased. For the test for a peak,
-    `top` is the force above sliding where the mean of all units is largest, `noise` its standard error in units of that
-    of a sample, and `places` the number of positions; `F` is the sliding force.
+    A unit is a file, or a stroke of a single file. The sliding force is extrapolated to the peak along the
+    line through the beginning of steady sliding, so that warming along the stroke does not count as
+    break-away. The position of the peak is taken from the mean of the other units, and the force of a start
+    is read there, as the maximum of noisy samples is biased. For the test for a peak, `top` is the force
+    above sliding where the mean of all units is largest, `noise` its standard error in units of that of a
+    sample, and `places` the number of positions; `F` is the sliding force.
 
     Parameters
     ----------
@@ -49,7 +51,8 @@ def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
     """
     of, count = cells.groups.of, cells.count
     each = np.arange(len(of))
-    half = np.ceil(count * np.maximum(SAMPLES / cells.samples, SHARE) / 2).astype(int)  # of the window, in cells
+    # Of the window, in cells.
+    half = np.ceil(count * np.maximum(SAMPLES / cells.samples, SHARE) / 2).astype(int)
     lines = _Lines(cells)
     distance = cells.middle_mm[of]
     sliding = lines.at(distance)
@@ -57,7 +60,8 @@ def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
     there = np.isfinite(force)
     wide = half[of]
     total, hits, above = (
-        _window(np.where(there, values, 0.0), wide) for values in (force, np.ones(force.shape), force - sliding)
+        _window(np.where(there, values, 0.0), wide)
+        for values in (force, np.ones(force.shape), force - sliding)
     )
     mean = np.where(hits > 0, total / np.maximum(hits, 1), np.nan)
     unit = _units(of, file)
@@ -85,18 +89,19 @@ def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
 def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: Config) -> pd.DataFrame:
     """Return rows of table `dynamic_fit` for all break-aways of a campaign.
 
-    The scatter of repeats is pooled within a condition: for the force relative to it, for the ratio as the force above
-    sliding over its noise, as other errors cancel in the ratio. The variance of the force includes set-up scatter,
-    which is common to the repeats of a run. There is a peak if the largest mean exceeds the sliding force in a t-test
-    at 1 % for all positions of all starts of the campaign (Bonferroni). Else `reason` says so, without an interval.
+    The scatter of repeats is pooled within a condition: for the force relative to it, for the ratio as the
+    force above sliding over its noise, as other errors cancel in the ratio. The variance of the force
+    includes set-up scatter, which is common to the repeats of a run. There is a peak if the largest mean
+    exceeds the sliding force in a t-test at 1 % for all positions of all starts of the campaign (Bonferroni).
+    Else `reason` says so, without an interval.
 
     Parameters
     ----------
     found : DataFrame
         Result of `peaks`, with the condition, commanded speed and direction of each unit.
     widened : (float, float)
-        Ratio of the variance of run means to that expected from repeats, and its degrees of freedom, from the steady
-        fit.
+        Ratio of the variance of run means to that expected from repeats, and its degrees of freedom, from the
+        steady fit.
     config : Config
         Gives the units and the sensor's accuracy.
     """
@@ -140,7 +145,8 @@ def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: C
 def largest_rows(found: pd.DataFrame, config: Config) -> pd.DataFrame:
     """Return rows of table `dynamic_fit` for the largest force in strokes over their sliding force.
 
-    It may be at the end of a stroke as well as at its start, so it is no break-away; `reason` has its position.
+    It may be at the end of a stroke as well as at its start, so it is no break-away; `reason` has its
+    position.
 
     Parameters
     ----------
@@ -156,7 +162,13 @@ def largest_rows(found: pd.DataFrame, config: Config) -> pd.DataFrame:
         INTO.format(where=where, reach=reach, unit=unit)
         for where, reach in zip(table[WHERE], table[REACH], strict=True)
     ]
-    row = {"quantity": "largest", "parameter": LARGEST, "value": np.exp(table[RATIO]), "unit": "", "identified": True}
+    row = {
+        "quantity": "largest",
+        "parameter": LARGEST,
+        "value": np.exp(table[RATIO]),
+        "unit": "",
+        "identified": True,
+    }
     return table[AT].assign(**row, reason=reason)
 
 
@@ -173,13 +185,13 @@ class _Lines:
         return self.force[:, None] + self.slope[:, None] * (distance_mm - self.distance[:, None])
 
     def error(self, distance_mm: np.ndarray) -> np.ndarray:
-        """Return the standard error of `at` at one distance per stroke, in standard deviations of a sample."""
+        """Return the standard error of `at` at a distance per stroke, in standard deviations of a sample."""
         away = (distance_mm - self.distance) / np.maximum(self.extent, 1e-300)
         return np.sqrt(1 / self.rows + away**2)
 
 
 def _pooled(values: pd.DataFrame, groups: Sequence[pd.Series]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return standard deviations within groups, pooled by their first key, and degrees of freedom, (groups,) each."""
+    """Return standard deviations in groups, pooled by first key, and degrees of freedom, (groups,) each."""
     away = values - values.groupby(groups, dropna=False, sort=False).transform("mean")
     pool, size = groups[0], values.groupby(groups, dropna=False, sort=False).size()
     squares = (away**2).groupby(pool, sort=False).sum()
@@ -193,7 +205,7 @@ def _pooled(values: pd.DataFrame, groups: Sequence[pd.Series]) -> tuple[dict[str
 
 
 def _units(group: np.ndarray, file: np.ndarray) -> np.ndarray:
-    """Return the number of each stroke's unit of evidence: its file, or the stroke itself if its group has one file."""
+    """Return the number of each stroke's unit of evidence: its file, or itself if its group has one file."""
     each = np.arange(len(file))
     first = np.searchsorted(group, group)  # groups lie one after the other
     alone = np.bincount(group, file != file[first], minlength=1)[group] == 0
@@ -208,8 +220,10 @@ def _mean_of(values: np.ndarray, unit: np.ndarray) -> np.ndarray:
     return np.where(n > 0, np.bincount(unit, np.where(known, values, 0.0)) / np.maximum(n, 1), np.nan)
 
 
-def _places(above: np.ndarray, hits: np.ndarray, unit: np.ndarray, cells: Cells) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cells of the peaks: for each stroke from its group's other units, for each group from all units.
+def _places(
+    above: np.ndarray, hits: np.ndarray, unit: np.ndarray, cells: Cells
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cells of the peaks: per stroke from its group's other units, per group from all units.
 
     Parameters
     ----------
@@ -230,7 +244,8 @@ def _places(above: np.ndarray, hits: np.ndarray, unit: np.ndarray, cells: Cells)
     own_total, own_count = (np.add.reduceat(values[order], first, axis=0)[unit] for values in (above, hits))
     several = np.bincount(of[order][first])[of] > 1
     others = highest(
-        total[of] - np.where(several[:, None], own_total, 0.0), count[of] - np.where(several[:, None], own_count, 0.0)
+        total[of] - np.where(several[:, None], own_total, 0.0),
+        count[of] - np.where(several[:, None], own_count, 0.0),
     )
     return others, highest(total, count)
 

@@ -23,8 +23,8 @@ MOST_CELLS = 200
 class Cells:
     """Cells of distance for groups of strokes.
 
-    The cells of a group extend to the median distance of its strokes. Their number is the median number of samples of a
-    stroke, at most MOST_CELLS. Arrays are padded to the largest number of cells.
+    The cells of a group extend to the median distance of its strokes. Their number is the median number of
+    samples of a stroke, at most MOST_CELLS. Arrays are padded to the largest number of cells.
 
     Attributes
     ----------
@@ -77,7 +77,9 @@ class Cells:
             Values of the samples of each stroke.
         """
         total = np.bincount(self._cell, np.concatenate(values), minlength=self._shape[0] * self._shape[1])
-        return np.where(self._hits > 0, total.reshape(self._shape)[:, :-1] / np.maximum(self._hits, 1), np.nan)
+        return np.where(
+            self._hits > 0, total.reshape(self._shape)[:, :-1] / np.maximum(self._hits, 1), np.nan
+        )
 
     @cached_property
     def force_N(self) -> np.ndarray:
@@ -90,7 +92,7 @@ class Cells:
 
 
 def mean_over(cells: Cells, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean over strokes in each cell of a group, its standard error and their number, (groups, cells) each.
+    """Return the mean over strokes in each cell, its standard error and their number, (groups, cells) each.
 
     Parameters
     ----------
@@ -118,8 +120,8 @@ DAMPINGS = np.array([0.0, 0.01, 0.03, 0.1, 0.3, 1.0])
 SHARE = (0.02, 0.98)
 # Number of rise lengths after which the exponential is zero; larger exponents overflow.
 FAR = 500.0
-# Level and start are not distinguishable if the determinant of their normal equations is below this share of the
-# product of its diagonal.
+# Level and start are not distinguishable if the determinant of their normal equations is below this share of
+# the product of its diagonal.
 APART = 1e-10
 
 
@@ -147,7 +149,7 @@ class Stroke:
 
 @dataclass(frozen=True)
 class Curve:
-    """The Stribeck curve of a condition under its load, in N: F_s, F_c; v_s in mm/s (inf: flat), sigma_2 in N s/mm.
+    """A condition's Stribeck curve under its load: F_s, F_c in N; v_s in mm/s (inf: flat), sigma_2 in N s/mm.
 
     `covariance`, shape (4, 4), is that of these four in this order, with `df` degrees of freedom.
     """
@@ -173,13 +175,17 @@ class Curve:
         for step in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
             if np.abs(step).max() > 1e-9:
                 static, coulomb, v_s, sigma_2 = at + step * size
-                yield replace(self, static_N=static, coulomb_N=coulomb, v_s=max(v_s, 0.1 * self.v_s), sigma_2=sigma_2)
+                yield replace(
+                    self, static_N=static, coulomb_N=coulomb, v_s=max(v_s, 0.1 * self.v_s), sigma_2=sigma_2
+                )
 
     def limit_N(self, speed_mm_s: np.ndarray) -> np.ndarray:
         """Return G, the bristle force in steady sliding in N, shape of the speed."""
         if not self.known:
             return np.full(np.shape(speed_mm_s), self.coulomb_N)
-        return bristle_limit(speed_mm_s, 1.0, mu_s=self.static_N, mu_c=self.coulomb_N, v_s=self.v_s, sigma_0=1.0)
+        return bristle_limit(
+            speed_mm_s, 1.0, mu_s=self.static_N, mu_c=self.coulomb_N, v_s=self.v_s, sigma_0=1.0
+        )
 
 
 @dataclass(frozen=True)
@@ -221,7 +227,8 @@ class Tangent:
 class _Columns:
     """The columns of level and start, linear in tau, shape (2, strokes, rows) each.
 
-    whole[0] + tau whole[1] is the force from relaxed bristles, start[0] + tau start[1] that of a start of 1 N.
+    whole[0] + tau whole[1] is the force from relaxed bristles, start[0] + tau start[1] that of a start of 1
+    N.
     """
 
     whole: np.ndarray
@@ -262,7 +269,7 @@ class Rises:
         return other
 
     def _columns(self, sigma_0: float, *, slopes: bool) -> list[_Columns]:
-        """Return the columns at a stiffness, and with `slopes` their derivatives with respect to its logarithm."""
+        """Return the columns at sigma_0, and with `slopes` their derivatives with respect to log sigma_0."""
         slid = sigma_0 * self.lengths
         kept = np.exp(-slid)
         bristles = _followed(slid, (1 - kept) * self.between)
@@ -299,7 +306,7 @@ class Rises:
         return Tangent(level, begin, residual, np.stack(moved))
 
     def solved(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return every stroke's level at (log sigma_0, tau), shape (strokes,), and residual, shape (strokes, rows)."""
+        """Return levels at (log sigma_0, tau), shape (strokes,), and residuals, shape (strokes, rows)."""
         both = np.stack(self._columns(float(np.exp(at[0])), slopes=False)[0].at(float(at[1])), axis=1)
         linear = _inverse(both @ both.transpose(0, 2, 1)) @ (both @ self.force[..., None])
         return linear[:, 0, 0], self.force - (linear * both).sum(axis=1)
@@ -344,7 +351,7 @@ class Rises:
         return noise_from_bends(np.diff(self.force, 2, axis=1)[self.there[:, 2:]])
 
     def gain_of(self, rss: float) -> float:
-        """Return the fall of the sum of squares from a force that is constant after one row, in residual variances."""
+        """Return the fall of the rss from a force that is constant after one row, in residual variances."""
         there = self.there[:, 1:]
         force = self.force[:, 1:]
         mean = force.sum(axis=1) / there.sum(axis=1)
@@ -372,8 +379,8 @@ class Rises:
 def _followed(slid: np.ndarray, added: np.ndarray, begin: np.ndarray | float = 0.0) -> np.ndarray:
     r"""Return x of the recursion :math:`x_k = e^{-s_k} x_{k-1} + a_k` along the last axis.
 
-    With D the cumulative sum of s, :math:`x_k = e^{-D_k} (x_{-1} + \sum_j a_j e^{D_j})`. If that would overflow, the
-    rows are split in two halves.
+    With D the cumulative sum of s, :math:`x_k = e^{-D_k} (x_{-1} + \sum_j a_j e^{D_j})`. If that would
+    overflow, the rows are split in two halves.
 
     Parameters
     ----------
@@ -394,7 +401,7 @@ def _followed(slid: np.ndarray, added: np.ndarray, begin: np.ndarray | float = 0
 
 
 def _inverse(gram: np.ndarray) -> np.ndarray:
-    """Return the inverse of Gram matrices of two columns, shape (..., 2, 2); of the first alone if dependent."""
+    """Return the inverse Gram matrices of two columns, shape (..., 2, 2); of the first alone if dependent."""
     ww, ss, ws = gram[..., 0, 0], gram[..., 1, 1], gram[..., 0, 1]
     own = ww * ss - ws**2
     apart = own > APART * ww * ss

@@ -1,4 +1,4 @@
-"""The dynamic part of the model per condition: sigma_0 and sigma_1 from pre-sliding, and the break-away force."""
+"""The model's dynamic part per condition: sigma_0 and sigma_1 from pre-sliding, and the break-away force."""
 
 from __future__ import annotations
 
@@ -23,8 +23,13 @@ from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
 # ---------------------------------------------------------------- bristle rows
 # Rows of table `dynamic_fit` for sigma_0 and sigma_1, with the reason if one of them is not determined.
 
-NO_START = "no stroke begins at rest or at a reversal within its rows: the rise of the force is not in these traces"
-ALONG = "the sliding force of some strokes lies along the motion: check the offset between the directions, and the sign"
+NO_START = (
+    "no stroke begins at rest or at a reversal within its rows: the rise of the force is not in these traces"
+)
+ALONG = (
+    "the sliding force of some strokes lies along the motion: check the offset between the directions, "
+    "and the sign"
+)
 TOO_FAST = "the force rises within a few samples: sample faster, or start more slowly"
 MISSED = "the rise of the force differs from the model's: the residual is {share:.0%} of the sliding force"
 NO_CURVE = "the Stribeck curve is not known: its effect along the ramp cannot be distinguished from damping"
@@ -32,7 +37,9 @@ ONE_START = "one start alone: no scatter is known; measure repeats"
 WIDE = "the starts disagree: only that it lies between {low:.3g} and {high:.3g} {unit} is known"
 
 
-def bristle_rows(found: Stiffness | None, curve: Curve, config: Config, *, braked: bool = True) -> Iterator[dict]:
+def bristle_rows(
+    found: Stiffness | None, curve: Curve, config: Config, *, braked: bool = True
+) -> Iterator[dict]:
     """Yield rows of table `dynamic_fit` for one condition: sigma_0, sigma_1 and statistics of the fit.
 
     Parameters
@@ -50,7 +57,9 @@ def bristle_rows(found: Stiffness | None, curve: Curve, config: Config, *, brake
     if found is None or not found.seen:
         reason = TOO_FAST if found is not None else NO_START if braked else ALONG
         for name in ("sigma_0", "sigma_1"):
-            yield table_row(quantity="dynamic", parameter=name, unit=units[name], identified=False, reason=reason)
+            yield table_row(
+                quantity="dynamic", parameter=name, unit=units[name], identified=False, reason=reason
+            )
         return
     yield _stiffness_row(found, curve, units["sigma_0"], config)
     yield _damping_row(found, curve, units["sigma_1"])
@@ -90,7 +99,9 @@ def _damping_row(found: Stiffness, curve: Curve, unit: str) -> dict:
     row |= {"lo95": low, "hi95": high, "se": found.damping_se}
     if low > 0.0:
         return table_row(**row, identified=True)
-    return table_row(**row, identified=False, reason=f"no damping of the bristles is seen: at most {high:.2g} {unit}")
+    return table_row(
+        **row, identified=False, reason=f"no damping of the bristles is seen: at most {high:.2g} {unit}"
+    )
 
 
 def dynamic_units(config: Config) -> Mapping[str, str]:
@@ -137,7 +148,8 @@ def fit_dynamic(
     steady : DataFrame
         Table `steady` or `steady_after`; rows with `used` false are left out.
     steady_fit : DataFrame
-        Its table `steady_fit` with the Stribeck curve of each condition; a curve that is not identified is flat.
+        Its table `steady_fit` with the Stribeck curve of each condition; a curve that is not identified is
+        flat.
     config : Config
         Names the condition columns, the units and the sensor's accuracy.
     workers : int
@@ -146,19 +158,22 @@ def fit_dynamic(
     Returns
     -------
     Dynamic
-        In its fit `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (per commanded speed and direction: the
-        force, and its ratio to the sliding force), "largest" (likewise: ratio of the largest force in the strokes to
-        the sliding force) or "statistics". Its curves are the mean starts, measured and fitted.
+        In its fit `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (per commanded speed and
+        direction: the force, and its ratio to the sliding force), "largest" (likewise: ratio of the largest
+        force in the strokes to the sliding force) or "statistics". Its curves are the mean starts, measured
+        and fitted.
 
     Notes
     -----
-    The unit of evidence is the file for the length of the rise and the run for the level of the force; it is the stroke
-    if there is only one file or run. Intervals of sigma_0 are symmetric in its logarithm. `u_sys` assumes one unknown
-    error of |force| for all samples.
+    The unit of evidence is the file for the length of the rise and the run for the level of the force; it is
+    the stroke if there is only one file or run. Intervals of sigma_0 are symmetric in its logarithm. `u_sys`
+    assumes one unknown error of |force| for all samples.
     """
     steady = steady[steady["used"].astype(bool) & steady["condition"].notna()].reset_index(drop=True)
     asked = _asked(traces, steady, steady_fit)
-    found = [one for made in run_map(partial(_fit_some, config=config), asked, workers=workers) for one in made]
+    found = [
+        one for made in run_map(partial(_fit_some, config=config), asked, workers=workers) for one in made
+    ]
     found.sort(key=lambda one: one.name)
     curves, broken, largest = (_stacked(found, name) for name in ("curves", "broken", "largest"))
     rows = [
@@ -185,7 +200,7 @@ class _Asked:
 
 @dataclass(frozen=True)
 class _Found:
-    """Results of one condition: rows of the fit, and columns of mean starts, break-aways and largest forces."""
+    """Results of one condition: rows of the fit; columns of mean starts, break-aways and largest forces."""
 
     name: str
     rows: list[dict]
@@ -203,7 +218,9 @@ def _asked(
     piece = {condition: k for k, part in enumerate(traces) for condition in part.conditions}
     rows = [dict(iter(table.groupby(table["condition"].map(piece)))) for table in (steady, steady_fit)]
     return [
-        _Asked(part, rows[0][k], rows[1].get(k, steady_fit.iloc[:0])) for k, part in enumerate(traces) if k in rows[0]
+        _Asked(part, rows[0][k], rows[1].get(k, steady_fit.iloc[:0]))
+        for k, part in enumerate(traces)
+        if k in rows[0]
     ]
 
 
@@ -218,21 +235,29 @@ def _stacked(found: Sequence[_Found], name: str) -> pd.DataFrame:
 
 
 class _Strokes:
-    """Rows of table `steady` as arrays of shape (strokes,), and the groups of one condition, speed and direction."""
+    """Table `steady` as arrays of shape (strokes,), and the groups of one condition, speed and direction."""
 
     def __init__(self, steady: pd.DataFrame) -> None:
         self.load_N, self.speed_mm_s, force = (
             steady[name].to_numpy(float) for name in ("load_N", "speed_mm_s", "force_N")
         )
-        self.direction, self.speed_set_mm_s = (steady[name].to_numpy() for name in ("direction", "speed_set_mm_s"))
+        self.direction, self.speed_set_mm_s = (
+            steady[name].to_numpy() for name in ("direction", "speed_set_mm_s")
+        )
         self.size_N = force * self.direction
         self.file = pd.factorize(steady["file"])[0]
-        self.group = steady.groupby(["condition", "speed_set_mm_s", "direction"], dropna=False).ngroup().to_numpy()
+        self.group = (
+            steady.groupby(["condition", "speed_set_mm_s", "direction"], dropna=False).ngroup().to_numpy()
+        )
         self.conditions = steady.groupby("condition", sort=True).indices
 
 
 def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
-    traces = asked.traces if isinstance(asked.traces, pd.DataFrame) else asked.traces.read(OF_TRACES, coded=["file"])
+    traces = (
+        asked.traces
+        if isinstance(asked.traces, pd.DataFrame)
+        else asked.traces.read(OF_TRACES, coded=["file"])
+    )
     table = asked.steady.reset_index(drop=True)
     along = _less_effects(strokes_along(traces, table), table)
     starts = {start.row: start for start in starts_of(along)}
@@ -287,19 +312,29 @@ class _Grouped:
         return {**{name: values[group] for name, values in self.at.items()}, **found}
 
     def curves(self, models: Sequence[np.ndarray] | None) -> Columns:
-        """Return the mean starts, measured and, if there is a fit, of the model, as table `dynamic_curves`."""
+        """Return the mean starts, measured and, if there is a fit, modelled, as table `dynamic_curves`."""
         force, error, n = mean_over(self.cells, self.cells.force_N)
-        model = np.full(n.shape, np.nan) if models is None else mean_over(self.cells, self.cells.means(models))[0]
+        model = (
+            np.full(n.shape, np.nan) if models is None else mean_over(self.cells, self.cells.means(models))[0]
+        )
         group, cell = np.nonzero(n > 0)
-        table = {"distance_mm": self.cells.middle_mm, "force_N": force, "force_se_N": error, "n": n, "model_N": model}
+        table = {
+            "distance_mm": self.cells.middle_mm,
+            "force_N": force,
+            "force_se_N": error,
+            "n": n,
+            "model_N": model,
+        }
         columns = {name: values[group, cell] for name, values in table.items()}
         return {**{name: values[group] for name, values in self.at.items()}, **columns}
 
 
 def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
-    """Return the reduced chi-square of run means under the repeats' scatter, all conditions pooled, and its df."""
+    """Return the reduced chi-square of all conditions' run means under the repeats' scatter, and its df."""
     rows = steady_fit[steady_fit["quantity"] == "statistics"]
-    table = rows[rows["parameter"].isin(["chi2", "df"])].pivot(index="condition", columns="parameter", values="value")
+    table = rows[rows["parameter"].isin(["chi2", "df"])].pivot(
+        index="condition", columns="parameter", values="value"
+    )
     table = table.reindex(columns=["chi2", "df"]).dropna()
     df = float(table["df"].sum())
     return (float(table["chi2"].sum()) / df, df) if df > 0 else (1.0, 1.0)
@@ -325,7 +360,9 @@ def _evidence(starts: Sequence[Start], strokes: _Strokes, run: np.ndarray, curve
     units = (_numbered(numbers[rows]).tolist() for numbers in (strokes.file, run))
     return [
         Stroke(file, run, part, s.distance_mm, s.speed_mm_s, s.force_N)
-        for file, run, part, s in zip(*units, np.where(np.isnan(ratio), 1.0, ratio).tolist(), starts, strict=True)
+        for file, run, part, s in zip(
+            *units, np.where(np.isnan(ratio), 1.0, ratio).tolist(), starts, strict=True
+        )
     ]
 
 
@@ -335,7 +372,7 @@ def _numbered(numbers: np.ndarray) -> np.ndarray:
 
 
 def _fitted(steady_fit: pd.DataFrame) -> dict[str, dict[tuple[str, str], float]]:
-    """Return the values of table `steady_fit` by condition, quantity and parameter; identified parameters only."""
+    """Return the values of table `steady_fit` by condition, quantity and parameter; only identified ones."""
     made: dict[str, dict[tuple[str, str], float]] = {}
     names = ("condition", "quantity", "parameter", "value", "identified")
     for condition, quantity, parameter, value, identified in zip(
@@ -355,7 +392,9 @@ def _curve(fitted: Mapping[tuple[str, str], float], strokes: _Strokes, rows: np.
         known = [fitted.get(("steady", name)) for name in (static, coulomb, "v_s")]
         if None not in known:
             own_unit = np.array([factor, factor, 1.0, 1.0])
-            covariance = _covariance(fitted, (static, coulomb, "v_s", "sigma_2")) * np.outer(own_unit, own_unit)
+            covariance = _covariance(fitted, (static, coulomb, "v_s", "sigma_2")) * np.outer(
+                own_unit, own_unit
+            )
             df = int(fitted.get(("statistics", "df"), 1))
             return Curve(known[0] * factor, known[1] * factor, known[2], sigma_2, covariance, df)
     return Curve(flat, flat, np.inf, sigma_2)

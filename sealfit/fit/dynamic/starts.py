@@ -15,11 +15,13 @@ from sealfit.ingest.segments import median
 from sealfit.ingest.stored_parts import noise_from_bends, stroke_index, strokes_of
 
 # ---------------------------------------------------------------- ramps
-# The motion of a platform that starts along a ramp of speed with two parameters, fitted to many strokes together.
+# The motion of a platform that starts along a ramp of speed with two parameters, fitted to many strokes
+# together.
 
 # Starting values of the length of a ramp, in time steps.
 RAMPS = np.geomspace(0.5, 200.0, 12)
-# The rows of every stroke are padded to a multiple of this, so that sums do not depend on the strokes fitted together.
+# The rows of every stroke are padded to a multiple of this, so that sums do not depend on the strokes fitted
+# together.
 PADDED = 64
 # Largest number of rows fitted together.
 TOGETHER = 16_384
@@ -49,7 +51,7 @@ class Ramp:
 
 @dataclass(frozen=True)
 class _Rows:
-    """The padded rows of strokes: time, displacement minus its mean, and mask of rows, shape (strokes, rows) each."""
+    """Padded rows of strokes: time, displacement minus its mean, and mask, shape (strokes, rows) each."""
 
     time: np.ndarray
     along: np.ndarray
@@ -73,9 +75,10 @@ def fit_ramps(
 ) -> list[Ramp]:
     """Return the motion of platforms along a linear ramp or a first-order lag, whichever fits better.
 
-    A local speed is too noisy where the speed changes most; the two parameters of a ramp, beginning and length, use all
-    samples. Position and final speed are linear and solved for exactly (variable projection: Kaufman 1975, BIT 15,
-    49-57, doi:10.1007/BF01932995). Beginning and length are fitted by Levenberg-Marquardt from the best of a grid.
+    A local speed is too noisy where the speed changes most; the two parameters of a ramp, beginning and
+    length, use all samples. Position and final speed are linear and solved for exactly (variable projection:
+    Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995). Beginning and length are fitted by
+    Levenberg-Marquardt from the best of a grid.
 
     Parameters
     ----------
@@ -91,7 +94,9 @@ def fit_ramps(
     for rows, members in of_length.items():
         size = max(TOGETHER // rows, 1)
         for group in (members[i : i + size] for i in range(0, len(members), size)):
-            fitted = _fit_some(*([values[k] for k in group] for values in (times_s, alongs_mm, paces_mm_s)), rows)
+            fitted = _fit_some(
+                *([values[k] for k in group] for values in (times_s, alongs_mm, paces_mm_s)), rows
+            )
             for k, ramp in zip(group, fitted, strict=True):
                 made[k] = ramp
     return made
@@ -110,12 +115,16 @@ def _fit_some(
     each, last = np.arange(len(sizes)), sizes - 1
     lagged = time[each, last] - (along[each, last] - along[:, 0]) / paces_mm_s
     padded = _Rows.of(time, along, there)
-    fits = [_fit_shape(padded, shape, lagged, lag, step) for shape, lag in ((_straight, 0.5), (_lagging, 1.0))]
+    fits = [
+        _fit_shape(padded, shape, lagged, lag, step) for shape, lag in ((_straight, 0.5), (_lagging, 1.0))
+    ]
     distance, rate, speed, squares = (np.stack(both) for both in zip(*fits, strict=True))
     best = np.argmin(squares, axis=0)
     rms = np.sqrt(squares[best, each] / sizes)
     return [
-        Ramp(speed[b, k] * distance[b, k, :n], speed[b, k] * rate[b, k, :n], float(speed[b, k]), float(rms[k]))
+        Ramp(
+            speed[b, k] * distance[b, k, :n], speed[b, k] * rate[b, k, :n], float(speed[b, k]), float(rms[k])
+        )
         for k, (b, n) in enumerate(zip(best.tolist(), sizes.tolist(), strict=True))
     ]
 
@@ -123,11 +132,13 @@ def _fit_some(
 Shape = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
-def _fit_shape(rows: _Rows, shape: Shape, lagged: np.ndarray, lag: float, step: np.ndarray) -> tuple[np.ndarray, ...]:
+def _fit_shape(
+    rows: _Rows, shape: Shape, lagged: np.ndarray, lag: float, step: np.ndarray
+) -> tuple[np.ndarray, ...]:
     """Return the best ramps of one shape.
 
-    Returns distance and speed for a final speed of 1, shape (strokes, rows) each, and the final speed and the sum of
-    squares, shape (strokes,) each.
+    Returns distance and speed for a final speed of 1, shape (strokes, rows) each, and the final speed and the
+    sum of squares, shape (strokes,) each.
     """
     grid = [np.stack([lagged - lag * ramp * step, np.log(ramp * step)], axis=1) for ramp in RAMPS]
     squares = [_solved(rows, rows.centred(_moved(rows, shape, at)[0]))[2] for at in grid]
@@ -138,7 +149,8 @@ def _fit_shape(rows: _Rows, shape: Shape, lagged: np.ndarray, lag: float, step: 
         distance, rate, by_ramp = _moved(own, shape, at)
         distance = own.centred(distance)
         speed, residual, _ = _solved(own, distance)
-        # residual = along - speed * distance(time - at[0], ramp); position and speed are projected out of its slopes
+        # residual = along - speed * distance(time - at[0], ramp); position and speed are projected out of its
+        # slopes
         slopes = speed[:, None, None] * np.stack([own.centred(rate), -own.centred(by_ramp)], axis=1)
         square = np.einsum("kr,kr->k", distance, distance)
         shared = np.einsum("kir,kr->ki", slopes, distance) / np.maximum(square, 1e-300)[:, None]
@@ -171,7 +183,7 @@ def _straight(since: np.ndarray, ramp: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _lagging(since: np.ndarray, ramp: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return distance, speed and d distance / d log ramp, for a speed that approaches 1 by a first-order lag."""
+    """Return distance, speed and d distance / d log ramp, for a speed approaching 1 by a first-order lag."""
     since = np.maximum(since, 0.0)
     decay = np.exp(-since / ramp)
     return since - ramp * (1 - decay), 1 - decay, since * decay - ramp * (1 - decay)
@@ -316,7 +328,14 @@ def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
         part = slice(begin, end)
         if row >= 0 and sliding[part].any():
             made.append(
-                Along(row, pace[row], time[part], sign[row] * along[part], sign[row] * force[part], sliding[part])
+                Along(
+                    row,
+                    pace[row],
+                    time[part],
+                    sign[row] * along[part],
+                    sign[row] * force[part],
+                    sliding[part],
+                )
             )
     return made
 
@@ -337,15 +356,19 @@ def starts_of(strokes: Sequence[Along]) -> list[Start]:
 
 
 def whole_strokes(strokes: Sequence[Along]) -> list[Part]:
-    """Return every stroke from its first row to its last; its sliding force is the mean of its steady window."""
+    """Return every stroke from first row to last; its sliding force is the mean of its steady window."""
     made = []
     for stroke in strokes:
         distance = np.maximum.accumulate(stroke.along_mm - stroke.along_mm[0])
         if len(distance) >= LEAST and distance[-1] > 0.0:
             steady = stroke.steady
             rows = int(np.count_nonzero(steady))
-            force, middle = (float(np.add.reduce(values[steady])) / rows for values in (stroke.force_N, distance))
-            made.append(Part(stroke.row, distance, stroke.force_N, Sliding(force, middle, 0.0, rows, math.inf)))
+            force, middle = (
+                float(np.add.reduce(values[steady])) / rows for values in (stroke.force_N, distance)
+            )
+            made.append(
+                Part(stroke.row, distance, stroke.force_N, Sliding(force, middle, 0.0, rows, math.inf))
+            )
     return made
 
 
@@ -368,8 +391,8 @@ def _begun(stroke: Along, ramp: Ramp | None) -> Start | None:
 def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
     """Return distance and speed up to steady sliding by a Savitzky-Golay filter of second order.
 
-    Its width depends on the noise, and the ends are padded with the first and last displacement (Savitzky and Golay
-    1964, Anal. Chem. 36(8), 1627-1639, doi:10.1021/ac60214a047).
+    Its width depends on the noise, and the ends are padded with the first and last displacement (Savitzky and
+    Golay 1964, Anal. Chem. 36(8), 1627-1639, doi:10.1021/ac60214a047).
     """
     half = _half_width(stroke) if stroke.noisy else 1
     rows = slice(0, stroke.until + half + 1)  # all rows that the filter needs
@@ -380,13 +403,17 @@ def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
         padded = np.pad(along, half, mode="edge")
         away = np.arange(-half, half + 1)
         square = half * (half + 1) * (2 * half + 1) / 3
-        weight = (3 * half**2 + 3 * half - 1 - 5 * away**2) * 3 / ((2 * half - 1) * (2 * half + 1) * (2 * half + 3))
+        weight = (
+            (3 * half**2 + 3 * half - 1 - 5 * away**2)
+            * 3
+            / ((2 * half - 1) * (2 * half + 1) * (2 * half + 3))
+        )
         smooth, rate = np.correlate(padded, weight, "valid"), np.correlate(padded, away / square, "valid")
     return smooth, np.maximum(rate / np.gradient(time), 0.0)
 
 
 def _half_width(stroke: Along) -> int:
-    """Return the half-width of the filter, in rows, that gives the local speed to `ROUGH` of the steady speed."""
+    """Return the filter's half-width in rows that gives the local speed to `ROUGH` of the steady speed."""
     step = stroke.pace_mm_s * median(np.diff(stroke.time_s))
     half = np.arange(1, max(2, len(stroke.time_s) // 16))
     enough = stroke.noise_mm * np.sqrt(3.0 / (half * (half + 1) * (2 * half + 1))) <= ROUGH * step

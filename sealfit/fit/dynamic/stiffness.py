@@ -1,17 +1,18 @@
 r"""sigma_0 and sigma_1 from the pre-sliding part of traces: one pair for the strokes of a condition.
 
-Over a stroke the bristles' force :math:`B = \sigma_0 z` follows Eqs. 2 and 6 exactly, step by step of the distance x,
+Over a stroke the bristles' force :math:`B = \sigma_0 z` follows Eqs. 2 and 6 exactly, step by step of the
+distance x,
 
 .. math::
     \frac{dB}{dx} = \sigma_0 \Big(1 - \frac{B}{G}\Big), \quad F = B + \tau \dot B + \sigma_2 v, \quad
     G = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}], \quad \tau = \sigma_1 / \sigma_0,
 
-with the Stribeck curve G of the condition's steady fit. B is linear in its initial value. Each stroke has two linear
-parameters, its level and its initial bristle force (0, or negative after a reversal), which are solved for exactly.
-sigma_0 and tau are searched on a grid and refined (Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432,
-doi:10.1137/0710036). The rise determines the length G / sigma_0; its unit of evidence is the file, as neighbouring
-samples are correlated. The level of the strokes converts it to a stiffness; its unit of evidence is the run, as a
-set-up shifts all files of a run.
+with the Stribeck curve G of the condition's steady fit. B is linear in its initial value. Each stroke has two
+linear parameters, its level and its initial bristle force (0, or negative after a reversal), which are solved
+for exactly. sigma_0 and tau are searched on a grid and refined (Golub and Pereyra 1973, SIAM J. Numer. Anal.
+10(2), 413-432, doi:10.1137/0710036). The rise determines the length G / sigma_0; its unit of evidence is the
+file, as neighbouring samples are correlated. The level of the strokes converts it to a stiffness; its unit of
+evidence is the run, as a set-up shifts all files of a run.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from sealfit.fit.least_squares import levenberg_marquardt
 LEAST = 3
 # Fall of the sum of squares by the rise, in residual variances, that an estimate needs.
 RISES = 30.0
-# A fit disagrees with the data if its RMS residual exceeds these multiples of the noise and of the sliding force.
+# A fit disagrees with the data if its RMS residual exceeds these multiples of the noise and of the sliding
+# force.
 MISSED_NOISE, MISSED_LEVEL = 2.0, 0.03
 # Half-width of the 95 % interval of log sigma_0 from which sigma_0 is not determined.
 OPEN = np.log(3.0)
@@ -37,7 +39,7 @@ OPEN = np.log(3.0)
 
 @dataclass(frozen=True)
 class Stiffness:
-    """sigma_0 in N/mm and tau = sigma_1 / sigma_0 in s, with the covariance of (log sigma_0, tau) between units.
+    """sigma_0 in N/mm and tau = sigma_1 / sigma_0 in s, with covariance of (log sigma_0, tau) between units.
 
     Attributes
     ----------
@@ -135,12 +137,18 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
     inverse = np.linalg.pinv(found.normal.sum(axis=0), rcond=1e-12, hermitian=True)
     shifts = []
     for other in (rises.along(moved) for moved in curve.moved()):
-        at = x + _step(found.normal.sum(axis=0), np.einsum("ikr,kr->i", found.jacobian, other.solved(x)[1]), x, bounds)
+        at = x + _step(
+            found.normal.sum(axis=0), np.einsum("ikr,kr->i", found.jacobian, other.solved(x)[1]), x, bounds
+        )
         shifts.append(at - x + [other.run_levels(other.solved(at)[0]).mean() - level.mean(), 0.0])
     by_files, df = _between_files(found, inverse, rises.file)
     by_level = float(level.var(ddof=1) / level.size) if level.size > 1 else np.nan
     by_curve = np.array(shifts).T @ np.array(shifts) if shifts else np.zeros((2, 2))
-    parts = ((np.diag(by_files), df), (np.array([by_level, 0.0]), level.size - 1), (np.diag(by_curve), curve.df))
+    parts = (
+        (np.diag(by_files), df),
+        (np.array([by_level, 0.0]), level.size - 1),
+        (np.diag(by_curve), curve.df),
+    )
     return Stiffness(
         sigma_0=float(np.exp(x[0] + level.mean())),
         tau_s=float(x[1]),
@@ -156,7 +164,7 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
 
 
 def _step(normal: np.ndarray, pull: np.ndarray, x: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Return one Gauss-Newton step from J'J and J'r, shape (p,), with parameters fixed at bounds it would cross."""
+    """Return a Gauss-Newton step from J'J and J'r, shape (p,), parameters fixed at bounds it would cross."""
     step, free = np.zeros(x.size), np.ones(x.size, bool)
     scale = np.sqrt(np.diag(normal))
     scale = np.where(scale > 0, scale, 1.0)
@@ -179,7 +187,7 @@ def together(parts: Sequence[tuple[np.ndarray, np.ndarray | int]]) -> np.ndarray
 
 
 def _between_files(found: Tangent, inverse: np.ndarray, file: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cluster-robust covariance of the estimates, shape (p, p), and its degrees of freedom, shape (p,).
+    """Return the cluster-robust covariance of estimates, shape (p, p), and degrees of freedom, shape (p,).
 
     It is the jackknife over files (CR3). The degrees of freedom depend on the leverages of the files.
 

@@ -1,4 +1,4 @@
-"""The parameters of the declared model that the conditions and speeds determine, and the conditions that use them."""
+"""Parameters of the declared model that conditions and speeds determine, and conditions that use them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ import pandas as pd
 from sealfit.fit.joint.rows import SAME_SPEED, Rows
 
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
-# Number of tested speeds that a Stribeck curve needs. With sigma_2 >= 0 three speeds determine it at these speeds.
+# Number of tested speeds that a Stribeck curve needs. With sigma_2 >= 0 three speeds determine it at these
+# speeds.
 SPEEDS_FOR_STRIBECK = 3
-# Number of tested speeds that determine the curve between them as well: mu_s, mu_c, v_s and sigma_2 are four numbers.
+# Number of tested speeds that determine the curve between them as well: mu_s, mu_c, v_s and sigma_2 are four
+# numbers.
 SPEEDS_BETWEEN = 4
 # Forms of the speed dependence with mu_s and v_s.
 CURVED = ("full", "interpolated")
@@ -36,7 +38,7 @@ class JointParameter:
 
 @dataclass(frozen=True)
 class Declared:
-    """The fitted number that each condition uses for each quantity; -1 if the model of the condition lacks it."""
+    """The fitted number that each condition uses for each quantity; -1 if the condition's model lacks it."""
 
     parameters: tuple[JointParameter, ...]
     index: Mapping[str, np.ndarray]  # quantity -> (conditions,) number of the parameter
@@ -47,7 +49,7 @@ class Declared:
 
     @property
     def mu_parameter_count(self) -> int:
-        """Number of parameters of one coefficient over all conditions; specimens in excess of it show scatter."""
+        """Number of parameters of a coefficient over all conditions; specimens beyond it show scatter."""
         return sum(p.quantity in ("mu_0c", "a_c", "b_c") for p in self.parameters)
 
 
@@ -55,10 +57,10 @@ def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
     """Return the declared model that these conditions and speeds determine.
 
     A series needs four speeds in one direction for Eq. 14, or three at which friction is not a straight line
-    ("interpolated"), and two for the viscous term. Eq. 15 needs three days, the unaged day included. Parameters that
-    are not determined are left out. Speeds are counted within one direction: an offset between directions could be
-    taken for a Stribeck curve. The result is cached. A part of a campaign with the same conditions takes the model of
-    the campaign, `as_in`.
+    ("interpolated"), and two for the viscous term. Eq. 15 needs three days, the unaged day included.
+    Parameters that are not determined are left out. Speeds are counted within one direction: an offset
+    between directions could be taken for a Stribeck curve. The result is cached. A part of a campaign with
+    the same conditions takes the model of the campaign, `as_in`.
     """
     if ("declared",) not in rows.cache:
         rows.cache["declared",] = _declare(rows) if as_in is None else declare(as_in)
@@ -102,7 +104,9 @@ def _declare(rows: Rows) -> Declared:
 
 
 def series_of_curve(conditions, aging: bool) -> np.ndarray:
-    """Return the series whose v_s and sigma_2 each condition uses; unaged rubber belongs to its series if there is one.
+    """Return the series whose v_s and sigma_2 each condition uses.
+
+    Unaged rubber belongs to the series of its rubber if there is exactly one.
 
     Parameters
     ----------
@@ -141,10 +145,10 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
 
 
 def _curved(rows: Rows, chosen: np.ndarray) -> bool:
-    """Return whether friction at three speeds is not a straight line, by Akaike's criterion on means of files.
+    """Return whether friction at three speeds is not a straight line, by Akaike's criterion on file means.
 
-    A curve through three speeds leaves few degrees of freedom for other effects, so a line is preferred. Each condition
-    has its own level; slope and curvature are shared. The two directions count as repeats.
+    A curve through three speeds leaves few degrees of freedom for other effects, so a line is preferred. Each
+    condition has its own level; slope and curvature are shared. The two directions count as repeats.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
     tested = tested_speeds(rows, chosen)
@@ -170,7 +174,7 @@ def _curved(rows: Rows, chosen: np.ndarray) -> bool:
 
 
 def tested_speeds(rows: Rows, chosen: np.ndarray) -> np.ndarray:
-    """Return the speeds of chosen rows: commanded ones, or means of measured ones that lie within 25 %, ascending."""
+    """Return the speeds of chosen rows, ascending: commanded, or means of measured ones within 25 %."""
     commanded = np.abs(rows.values("speed_set_mm_s")[chosen])
     if np.isfinite(commanded).all():
         return np.unique(np.round(commanded, 9))

@@ -1,7 +1,7 @@
 r"""One estimator for "before" and "after": generalised least squares with scatter at every level.
 
-The weights come from the variance components (`variance_components.py`), estimated by REML. Model and scatter are
-fitted alternately until they converge. Priors are in `prior.py`.
+The weights come from the variance components (`variance_components.py`), estimated by REML. Model and scatter
+are fitted alternately until they converge. Priors are in `prior.py`.
 """
 
 from __future__ import annotations
@@ -12,25 +12,33 @@ from functools import cached_property
 import numpy as np
 
 from sealfit.fit.joint.model import Model, evaluate, friction_of, term_slope
-from sealfit.fit.joint.prior import centre_of, covariance_of, free_of_others, penalised, precision_of, smoothed
+from sealfit.fit.joint.prior import (
+    centre_of,
+    covariance_of,
+    free_of_others,
+    penalised,
+    precision_of,
+    smoothed,
+)
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.search import descend, search_nonlinear, start_model
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.variance_components import estimate_components, estimate_scatter
 from sealfit.fit.joint.whitening import Scatter, Whitening
 
-# Fall of the whitened sum of squares at which a descent ends when fits are only compared. Rivals differ by several
-# units.
+# Fall of the whitened sum of squares at which a descent ends when fits are only compared. Rivals differ by
+# several units.
 COMPARED = 1e-2
 # The same for the first fit, before the scatter is estimated.
 ROUGH = 1.0
-# Number of alternating fits of model and scatter. The third changes no estimate by a tenth of its standard error.
+# Number of alternating fits of model and scatter. The third changes no estimate by a tenth of its standard
+# error.
 TURNS = 3
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model fitted to rows: its force, tangent and scatter at the optimum, and the whitened residual and tangent."""
+    """A model fitted to rows: force, tangent and scatter at the optimum, whitened residual and tangent."""
 
     model: Model
     scatter: Scatter
@@ -66,19 +74,22 @@ class Fitted:
         return {}
 
     def slope(self, acts_on: str, operation: str) -> np.ndarray:
-        """Return the force's derivative with respect to the shape of a term not yet in the model, shape (n,)."""
+        """Return the force's derivative dF/dh for the shape h of a term not yet in the model, shape (n,)."""
         if (acts_on, operation) not in self._slopes:
             self._slopes[acts_on, operation] = term_slope(self.model, self.rows, acts_on, operation)
         return self._slopes[acts_on, operation]
 
     def unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return eigenvalues, shape (g, k), and eigenvectors, shape (g, k, k), of each group's block of the hat matrix.
+        """Return eigenvalues and eigenvectors of each group's block of the hat matrix.
 
-        The eigenvectors are in the coordinates of the basis columns of the group's block.
+        Their shapes are (g, k) and (g, k, k). The eigenvectors are in the coordinates of the basis columns
+        of the group's block.
         """
         if level not in self._shares:
             starts = self.rows.groups.starts[level]
-            self._shares[level] = np.linalg.eigh(np.stack([b.T @ b for b in np.split(self.basis.values, starts[1:])]))
+            self._shares[level] = np.linalg.eigh(
+                np.stack([b.T @ b for b in np.split(self.basis.values, starts[1:])])
+            )
         return self._shares[level]
 
     def unit_residual(self, level: str) -> np.ndarray:
@@ -105,7 +116,7 @@ class Fitted:
 
 
 def fit_declared(rows: Rows) -> Fitted:
-    """Return the declared model fitted to `rows` ("before"); with several v_s, the better fit from two starts."""
+    """Return the declared model fitted to `rows` ("before"); with several v_s, the better of two starts."""
     fitted = fit(start_model(rows), rows)
     if sum(p.quantity == "v_s" for p in fitted.model.declared.parameters) > 1:
         other = fit(start_model(rows, together=True), rows)
@@ -165,10 +176,10 @@ def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray |
 
 
 def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
-    """Return a fit with variance components re-estimated from its own residual, and the row noise too if wanted.
+    """Return a fit with variance components, and row noise if wanted, re-estimated from its own residual.
 
-    An effect that a model lacks inflates its variance components. Deviances distinguish models only if each model has
-    its own components; under inflated ones all models fit about equally well.
+    An effect that a model lacks inflates its variance components. Deviances distinguish models only if each
+    model has its own components; under inflated ones all models fit about equally well.
 
     Parameters
     ----------
@@ -192,7 +203,9 @@ def effective_df(fitted: Fitted, number: int) -> float:
     return penalised(own, pull, precision_of(model)[place, place])[1]
 
 
-def with_reml_smoothness(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Model:
+def with_reml_smoothness(
+    model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None
+) -> Model:
     """Return the model with the smoothness of its free shapes estimated by REML under this scatter."""
     if all(term.smoothness is None for term in model.terms):
         return model

@@ -16,11 +16,11 @@ from sealfit.fit.joint.rows import ALONG, Rows
 from sealfit.fit.joint.tangent import Layout, Tangent, blocks_of
 
 # ---------------------------------------------------------------- terms
-# Effects bound to channels: their shapes at the rows, averaged over each row's bin, and the derivatives of these.
+# Effects bound to channels: their shapes at the rows, averaged over each row's bin, and their derivatives.
 
 # Gauss-Legendre nodes on [-1, 1] and weights that sum to 1: two for smooth shapes, four for narrow ones.
 TWO_NODES, FOUR_NODES = (
-    tuple((float(node), float(weight) / 2) for node, weight in zip(*np.polynomial.legendre.leggauss(k), strict=True))
+    tuple((float(x), float(w) / 2) for x, w in zip(*np.polynomial.legendre.leggauss(k), strict=True))
     for k in (2, 4)
 )
 
@@ -29,9 +29,9 @@ TWO_NODES, FOUR_NODES = (
 class Term:
     """An effect bound to the channels it reads and the quantity it acts on, with fixed reference values.
 
-    In `fixed`, `shift` is the origin of the channel in each pass. `held` are the parameters that were estimated from
-    the raw samples, with their 95 % intervals; fits to bins do not change them. `smoothness` is the weight of the
-    roughness penalty of a free shape (`prior.py`), None without a penalty.
+    In `fixed`, `shift` is the origin of the channel in each pass. `held` are the parameters that were
+    estimated from the raw samples, with their 95 % intervals; fits to bins do not change them. `smoothness`
+    is the weight of the roughness penalty of a free shape (`prior.py`), None without a penalty.
     """
 
     effect: Effect
@@ -62,15 +62,17 @@ class Term:
             given[name] = values
         shift = self.fixed.get("shift")
         if shift is not None:  # NaN where the origin of a pass is unknown
-            given[self.effect.reads[0]] = given[self.effect.reads[0]] + passes(rows.table).map(shift).to_numpy(float)
+            first = self.effect.reads[0]
+            given[first] = given[first] + passes(rows.table).map(shift).to_numpy(float)
         return {**given, **self.fixed}
 
     def nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
         """Return (weight, inputs) at the quadrature nodes of each row.
 
-        A row is the mean over the samples of a bin. The mean of a sine has a closed form. Another nonlinear shape along
-        the stroke is averaged by Gauss-Legendre quadrature, over a uniform distribution with the variance of the n
-        samples; shapes that may be as narrow as a bin get more nodes. All other shapes are evaluated at the bin mean.
+        A row is the mean over the samples of a bin. The mean of a sine has a closed form. Another nonlinear
+        shape along the stroke is averaged by Gauss-Legendre quadrature, over a uniform distribution with the
+        variance of the n samples; shapes that may be as narrow as a bin get more nodes. All other shapes are
+        evaluated at the bin mean.
         """
         key = ("nodes", self.shape_key)
         if key not in rows.cache:
@@ -114,9 +116,10 @@ def mean_derivatives(
 ) -> list[np.ndarray]:
     """Return the derivatives of a term's shape, averaged over each row's bin, each of shape (n,)."""
     parts = [
-        (weight, term_derivatives(term, values, inputs, only_linear=only_linear)) for weight, inputs in term.nodes(rows)
+        (weight, term_derivatives(term, values, inputs, only_linear=only_linear))
+        for weight, inputs in term.nodes(rows)
     ]
-    return [_zero_if_unknown(term, sum(weight * part[k] for weight, part in parts)) for k in range(len(parts[0][1]))]
+    return [_zero_if_unknown(term, sum(w * part[k] for w, part in parts)) for k in range(len(parts[0][1]))]
 
 
 def _zero_if_unknown(term: Term, shape: np.ndarray) -> np.ndarray:
@@ -127,7 +130,7 @@ def _zero_if_unknown(term: Term, shape: np.ndarray) -> np.ndarray:
 def term_derivatives(
     term: Term, values: Mapping[str, float], inputs: Mapping[str, np.ndarray], *, only_linear: bool = False
 ) -> list[np.ndarray]:
-    """Return the shape's derivatives with respect to the parameters, or to the amplitudes only, shape (n,) each."""
+    """Return the shape's derivatives with respect to parameters, or to amplitudes only, shape (n,) each."""
     if not term.effect.nonlinear and not only_linear:
         return list(_linear_columns(term, inputs).T)
     result = []
@@ -140,7 +143,8 @@ def term_derivatives(
             result.append(term.effect.shape(inputs, **{**values, **zero, p.name: 1.0}))
         elif not only_linear:
             step = 1e-5 * max(abs(values[p.name]), 1e-3)
-            ends = np.clip([values[p.name] - step, values[p.name] + step], *p.bounds)  # the shape may end there
+            # The shape may end at the bounds.
+            ends = np.clip([values[p.name] - step, values[p.name] + step], *p.bounds)
             down, up = (term.effect.shape(inputs, **{**values, p.name: float(end)}) for end in ends)
             result.append((up - down) / (ends[1] - ends[0]))
     return result
@@ -166,14 +170,14 @@ def shape_of(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
 
 
 def derivatives_of(term: Term, values: Mapping[str, float], rows: Rows) -> list[np.ndarray] | np.ndarray:
-    """Return the derivatives of a term's shape with respect to its parameters, shape (n,) each; the last are cached."""
+    """Return a shape's derivatives with respect to its parameters, shape (n,) each; the last are cached."""
     if not term.effect.nonlinear:
         return _columns_of(term, rows).T
     return _cached("derivatives", term, values, rows, lambda: mean_derivatives(term, values, rows))
 
 
 def _cached(what: str, term: Term, values: Mapping[str, float], rows: Rows, make: Callable):
-    """Return the cached result of a term if its values are the same, else compute it: a step may leave a term fixed."""
+    """Return a term's cached result, or compute it if its values changed: a step may leave a term fixed."""
     key, at = (what, term.shape_key), tuple(values.values())
     if key not in rows.cache or rows.cache[key][0] != at:
         rows.cache[key] = (at, make())
@@ -191,18 +195,18 @@ def _columns_of(term: Term, rows: Rows) -> np.ndarray:
 # The declared model, Eq. 14 with Eq. 15 in one joint fit, and the effects added to it.
 #
 # .. math::
-#     F = \Big[N (\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2})(1 + h_\mu)\,\mathrm{sgn}\,v + \sigma_2 v\Big](1 + h_F) + f,
-#     \quad \mu = \mu_0 - a \ln(1 + t/b)
+#     F = \Big[N (\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2})(1 + h_\mu)\,\mathrm{sgn}\,v
+#     + \sigma_2 v\Big](1 + h_F) + f, \quad \mu = \mu_0 - a \ln(1 + t/b)
 #
-# for both mu_s and mu_c. mu_0 is shared by the series of a rubber, v_s and sigma_2 by the days of a series. Effects on
-# a parameter are applied first, then factors on mu, then factors on the force, then added forces.
+# for both mu_s and mu_c. mu_0 is shared by the series of a rubber, v_s and sigma_2 by the days of a series.
+# Effects on a parameter are applied first, then factors on mu, then factors on the force, then added forces.
 #
-# Every quantity of a row depends on at most one fitted number, so that each row derivative has one place in the
-# tangent. Wu et al. 2020, Polymers 12(1) 102, doi:10.3390/polym12010102, Eqs. 14 and 15.
+# Every quantity of a row depends on at most one fitted number, so that each row derivative has one place in
+# the tangent. Wu et al. 2020, Polymers 12(1) 102, doi:10.3390/polym12010102, Eqs. 14 and 15.
 
 # Quantities whose logarithm is fitted.
 LOGARITHMIC = ("b_s", "b_c", "v_s")
-# Quantities of the declared model that an effect on each target changes. Effects on mu_s and mu_c come after aging.
+# Declared quantities that an effect on each target changes. Effects on mu_s and mu_c come after aging.
 QUANTITIES_OF = {
     "mu_0": ("mu_0s", "mu_0c"),
     "a": ("a_s", "a_c"),
@@ -211,13 +215,13 @@ QUANTITIES_OF = {
     "sigma_2": ("sigma_2",),
 }
 
-# A tangent of up to this many declared numbers (two or three series) is stored dense; blocks save no time there.
+# A tangent of up to so many declared numbers (two or three series) is dense; blocks save no time there.
 DENSE_NUMBERS = 24
 
 
 @dataclass(frozen=True)
 class Model:
-    """Declared model plus terms, with the fitted numbers: `theta`, shape (k,), of the model and `values` per term."""
+    """Declared model plus terms, with fitted numbers: `theta`, (k,), of the model and `values` per term."""
 
     declared: Declared
     theta: np.ndarray
@@ -233,7 +237,8 @@ class Model:
     def nonlinear(self) -> np.ndarray:
         """Mask of the nonlinear parameters, v_s and b included, in the order of `vector`, shape (size,)."""
         declared = [p.quantity in LOGARITHMIC for p in self.declared.parameters]
-        return np.array(declared + [not p.linear for t in self.terms for p in t.effect.parameters], dtype=bool)
+        added = [not p.linear for t in self.terms for p in t.effect.parameters]
+        return np.array(declared + added, dtype=bool)
 
     def term_slice(self, number: int) -> slice:
         """Return the slice of a term's parameters in `vector`."""
@@ -250,7 +255,8 @@ class Model:
         theta, rest, values = vector[: self.theta.size], list(vector[self.theta.size :]), []
         for term in self.terms:
             count = len(term.effect.parameters)
-            values.append({p.name: float(x) for p, x in zip(term.effect.parameters, rest[:count], strict=True)})
+            numbers = zip(term.effect.parameters, rest[:count], strict=True)
+            values.append({p.name: float(x) for p, x in numbers})
             rest = rest[count:]
         return replace(self, theta=theta, values=tuple(values))
 
@@ -261,7 +267,8 @@ class Model:
     def without_term(self, number: int) -> Model:
         """Return the model without one of its terms."""
         keep = [k for k in range(len(self.terms)) if k != number]
-        return replace(self, terms=tuple(self.terms[k] for k in keep), values=tuple(self.values[k] for k in keep))
+        terms = tuple(self.terms[k] for k in keep)
+        return replace(self, terms=terms, values=tuple(self.values[k] for k in keep))
 
 
 def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.ndarray, Tangent | None]:
@@ -304,8 +311,8 @@ def _layout(model: Model, rows: Rows) -> Layout:
         for pair in np.unique(specimen * conditions + rows.condition).tolist():
             number, condition = divmod(pair, conditions)
             touched[number] = touched.get(number, frozenset()) | of_condition[condition]
-        whole = [frozenset(range(size))]
-        index, block = blocks_of(whole * len(touched) if size <= DENSE_NUMBERS else list(touched.values()), size)
+        sets = [frozenset(range(size))] * len(touched) if size <= DENSE_NUMBERS else list(touched.values())
+        index, block = blocks_of(sets, size)
         rows.cache[key] = (declared, index, block[specimen])
     _, index, block = rows.cache[key]
     added = np.arange(size, model.size)
@@ -315,7 +322,7 @@ def _layout(model: Model, rows: Rows) -> Layout:
 
 
 def friction_of(model: Model, rows: Rows) -> np.ndarray:
-    """Return the model's force without added forces, shape (n,): the part that rubber, load and gains scale."""
+    """Return the force without added forces, shape (n,): the part that rubber, load and gains scale."""
     return _State.of(model, rows).friction
 
 
@@ -363,7 +370,8 @@ class _State:
         has_stribeck = (model.declared.index["v_s"] >= 0)[rows.condition]
         decay = np.where(has_stribeck, np.exp(-(ratio**2)), 0.0)
         mu = now["mu_c"] + (now["mu_s"] - now["mu_c"]) * decay
-        (on_mu, mu_added), (on_force, added) = (_factor_and_sum(effects, target, speed) for target in ("mu", "force"))
+        on_mu, mu_added = _factor_and_sum(effects, "mu", speed)
+        on_force, added = _factor_and_sum(effects, "force", speed)
         friction = (rows.load * (mu * on_mu + mu_added) * sign + now["sigma_2"] * speed) * on_force
         force = friction + added
         return cls(rows, shapes, base, now, through, ratio, decay, mu, on_mu, on_force, friction, force)
@@ -371,7 +379,8 @@ class _State:
     def slopes(self) -> dict[str, np.ndarray]:
         """Return the force's derivative with respect to every quantity."""
         now, speed, days = self.now, self.rows.pace, self.rows.days
-        drive = self.rows.load * np.sign(speed) * self.on_mu * self.on_force  # with respect to mu before its factor
+        # With respect to mu before its factor.
+        drive = self.rows.load * np.sign(speed) * self.on_mu * self.on_force
         found = {
             "mu_s": drive * self.decay,
             "mu_c": drive * (1 - self.decay),
@@ -389,7 +398,7 @@ class _State:
     def term_slope(
         self, slopes: Mapping[str, np.ndarray], acts_on: str, operation: str, shape: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return dF/dh for a term's shape h, shape (n,); `shape` is h if the term's factor is already in the state."""
+        """Return dF/dh for a term's shape h, (n,); `shape` is h if its factor is already in the state."""
         own = 1.0 if shape is None or operation == "add" else 1 + shape
         own = np.where(np.abs(own) < 1e-9, 1e-9, own)
         if acts_on == "force":
@@ -405,7 +414,7 @@ class _State:
 
 
 def _declared_values(model: Model, rows: Rows) -> dict[str, np.ndarray]:
-    """Return every quantity of the declared model at the rows; one that is not fitted is 0, or 1 for v_s and b."""
+    """Return every quantity of the declared model at the rows; one not fitted is 0, or 1 for v_s and b."""
     found = {}
     for quantity in QUANTITIES:
         number = model.declared.index[quantity]
@@ -415,7 +424,7 @@ def _declared_values(model: Model, rows: Rows) -> dict[str, np.ndarray]:
 
 
 def _change(quantity: str, effects: list[tuple[str, np.ndarray]], now: dict, through: dict) -> None:
-    """Apply effects, each an operation and its shape, to a quantity in `now`; record their factors in `through`."""
+    """Apply effects, each an operation and a shape, to a quantity in `now`; record factors in `through`."""
     for operation, shape in effects:
         if operation == "multiply":
             now[quantity] = now[quantity] * (1 + shape)

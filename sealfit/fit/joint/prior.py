@@ -1,17 +1,19 @@
 r"""Priors of the fitted numbers: weak ones on v_s and b, and the roughness penalty of free shapes.
 
-log v_s and log b have a Gaussian prior with standard deviation 3, a factor of 20, centred at the value of the global
-search. It determines a parameter that the data do not, and is negligible otherwise.
+log v_s and log b have a Gaussian prior with standard deviation 3, a factor of 20, centred at the value of the
+global search. It determines a parameter that the data do not, and is negligible otherwise.
 
-A free shape is a smoothing spline with many knots. Its amplitudes c have the prior precision :math:`\lambda S`, where
-:math:`c^T S c` is the integral of the squared second derivative; a straight line is not penalised. :math:`\lambda`
-maximises the restricted likelihood,
+A free shape is a smoothing spline with many knots. Its amplitudes c have the prior precision :math:`\lambda
+S`, where :math:`c^T S c` is the integral of the squared second derivative; a straight line is not penalised.
+:math:`\lambda` maximises the restricted likelihood,
 
-.. math:: -2 \log L(\lambda) = - g^T (G + \lambda S)^{-1} g + \log |G + \lambda S| - \mathrm{rank}(S) \log \lambda,
+.. math::
+    -2 \log L(\lambda) = - g^T (G + \lambda S)^{-1} g + \log |G + \lambda S| - \mathrm{rank}(S) \log \lambda,
 
-with G and g the normal matrix and gradient of the amplitudes after elimination of all other parameters. Intervals are
-those of the posterior. Wood 2011, J. R. Stat. Soc. B 73(1), 3-36, doi:10.1111/j.1467-9868.2010.00749.x; Nychka 1988,
-J. Am. Stat. Assoc. 83(404), 1134-1143, doi:10.1080/01621459.1988.10478711.
+with G and g the normal matrix and gradient of the amplitudes after elimination of all other parameters.
+Intervals are those of the posterior. Wood 2011, J. R. Stat. Soc. B 73(1), 3-36,
+doi:10.1111/j.1467-9868.2010.00749.x; Nychka 1988, J. Am. Stat. Assoc. 83(404), 1134-1143,
+doi:10.1080/01621459.1988.10478711.
 """
 
 from __future__ import annotations
@@ -27,8 +29,8 @@ from sealfit.fit.joint.model import LOGARITHMIC, Model, Term
 PRIOR_SD = 3.0
 # Decimal logarithms of the smoothness tried, relative to the one whose penalty weighs as much as the data.
 DECADES = np.linspace(-8.0, 6.0, 57)
-# Ridge added to the normal matrix, as a share of its diagonal. The declared model may contain the straight line, which
-# then makes the matrix singular.
+# Ridge added to the normal matrix, as a share of its diagonal. The declared model may contain the straight
+# line, which then makes the matrix singular.
 RIDGE = 1e-10
 
 
@@ -53,7 +55,7 @@ def precision_of(model: Model) -> np.ndarray:
 
 
 def centre_of(model: Model) -> np.ndarray:
-    """Return the mean of the prior, shape (model.size,): the present values, and 0 for amplitudes of free shapes."""
+    """Return the prior's mean, shape (model.size,): present values, and 0 for amplitudes of free shapes."""
     centre = model.vector()
     for number, term in enumerate(model.terms):
         if term.smoothness is not None:
@@ -62,11 +64,13 @@ def centre_of(model: Model) -> np.ndarray:
 
 
 def covariance_of(normal: np.ndarray, precision: np.ndarray) -> np.ndarray:
-    """Return the covariance of parameters from the normal matrix and the prior's precision, shape (p, p) each."""
+    """Return the covariance of parameters from normal matrix and prior precision, shape (p, p) each."""
     normal = normal + precision
     size = np.sqrt(np.diag(normal))
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # 0 for a parameter without effect
-    return scale[:, None] * np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
+    return (
+        scale[:, None] * np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
+    )
 
 
 def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray) -> float:
@@ -86,7 +90,9 @@ def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray)
         return 1.0
     tried = unit * 10.0**DECADES
     posterior = normal + np.diag(RIDGE * np.diag(normal)) + tried[:, None, None] * rough
-    solved = np.linalg.solve(posterior, np.broadcast_to(gradient[:, None], (tried.size, gradient.size, 1)))[..., 0]
+    solved = np.linalg.solve(posterior, np.broadcast_to(gradient[:, None], (tried.size, gradient.size, 1)))[
+        ..., 0
+    ]
     rank = rough.shape[0] - 1
     cost = -(solved @ gradient) + np.linalg.slogdet(posterior)[1] - rank * np.log(tried)
     return float(tried[np.argmin(cost)])
@@ -136,7 +142,9 @@ def free_of_others(
     precision = precision_of(model)
     pull = (gradient - precision @ (model.vector() - centre_of(model)))[others]
     cross = normal[place][:, others]
-    by_others = np.linalg.lstsq((normal + precision)[np.ix_(others, others)], np.c_[cross.T, pull], rcond=1e-12)[0]
+    by_others = np.linalg.lstsq(
+        (normal + precision)[np.ix_(others, others)], np.c_[cross.T, pull], rcond=1e-12
+    )[0]
     own = normal[place, place] - cross @ by_others[:, :-1]
     own = (own + own.T) / 2
     return own, gradient[place] - cross @ by_others[:, -1] + own @ model.vector()[place]

@@ -17,7 +17,7 @@ from sealfit.tables import BINS
 
 @dataclass(frozen=True, slots=True)
 class Groups:
-    """Nested groups of sorted rows: for each level, the first row of every group and each row's group number."""
+    """Nested groups of sorted rows: per level, the first row of every group and each row's group number."""
 
     starts: dict[str, np.ndarray]
     codes: dict[str, np.ndarray]
@@ -60,21 +60,24 @@ class Groups:
 
 
 # ---------------------------------------------------------------- both directions
-# Strokes of one file in both directions share set-up and repeat: they are one unit of evidence of the friction.
+# Strokes of one file in both directions share set-up and repeat: they are one unit of evidence of the
+# friction.
 
 # `direction` of a row that is the mean of both directions.
 BOTH_DIRECTIONS = 0
-# Measured speeds within this ratio are one setting. The speed of rigs without speed control varies by so much.
+# Measured speeds within this ratio are one setting. The speed of rigs without speed control varies by so
+# much.
 SAME_SPEED = 1.25
 
 KEYS = ["file", "run_id"]
 
 
 def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
-    """Return table `steady` with one row per record for runs with both directions at one speed; other rows unchanged.
+    """Return table `steady` with one row per record for runs with both directions at one speed.
 
-    The magnitude of the force is averaged over the two directions, so that an offset between them cancels. Gain and
-    set-up of a file are common to both directions, which are therefore not independent.
+    Other rows are unchanged. The magnitude of the force is averaged over the two directions, so that an
+    offset between them cancels. Gain and set-up of a file are common to both directions, which are therefore
+    not independent.
 
     Parameters
     ----------
@@ -84,8 +87,8 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        The same columns and `half_N`, half of the difference between the directions (NaN in other rows). In a merged
-        row `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id` has no sign.
+        The same columns and `half_N`, half of the difference between the directions (NaN in other rows). In a
+        merged row `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id` has no sign.
     """
     rows = steady.assign(half_N=np.nan)
     run, record = nesting_run(rows), records(rows)
@@ -143,8 +146,9 @@ NOT_CHANNELS = {
 class Rows:
     """Sorted rows of `bins` as arrays.
 
-    `table` holds them with a new index; `order` gives each row's place in the original table. A file with strokes in
-    both directions belongs to two runs; its group is the run without sign, so that groups are nested.
+    `table` holds them with a new index; `order` gives each row's place in the original table. A file with
+    strokes in both directions belongs to two runs; its group is the run without sign, so that groups are
+    nested.
     """
 
     table: pd.DataFrame
@@ -160,7 +164,8 @@ class Rows:
     has_load: bool
     has_aging: bool
     weight: np.ndarray  # (n,) sums to 1; all files have equal weight
-    filled: dict[str, np.ndarray] = field(default_factory=dict)  # channels that some files lack: `fill_missing`
+    # Channels that some files lack: `fill_missing`.
+    filled: dict[str, np.ndarray] = field(default_factory=dict)
     cache: dict = field(default_factory=dict, init=False, compare=False, repr=False)
     """Derived values that are computed once; the key names all that they depend on besides the rows."""
 
@@ -170,7 +175,7 @@ class Rows:
         return [name for name in self.table.columns if name not in NOT_CHANNELS]
 
     def values(self, channel: str) -> np.ndarray:
-        """Return one channel, shape (n,): floats, or strings if it is categorical; missing values filled in."""
+        """Return a channel, shape (n,): floats, or strings if it is categorical; missing values filled in."""
         if channel in self.filled:
             return self.filled[channel]
         if channel not in self.cache:
@@ -178,13 +183,16 @@ class Rows:
             if pd.api.types.is_numeric_dtype(column):
                 self.cache[channel] = column.to_numpy(dtype=float, na_value=np.nan)
             else:
-                self.cache[channel] = column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
+                self.cache[channel] = (
+                    column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
+                )
         return self.cache[channel]
 
     def bin_width(self, channel: str) -> np.ndarray:
-        """Return the width of each row's bin in a channel, shape (n,): number of samples times the step between them.
+        """Return the width of each row's bin in a channel, shape (n,).
 
-        The step is the difference of neighbouring bin means over half the sum of their numbers of samples.
+        It is the number of samples times the step between them. The step is the difference of neighbouring
+        bin means over half the sum of their numbers of samples.
         """
         key = ("width", channel)
         if key not in self.cache:
@@ -206,7 +214,7 @@ class Rows:
         return self.groups.codes[level]
 
     def sparse(self, most: int) -> Rows:
-        """Return about `most` or fewer rows of each stroke, evenly spread, for effects that act on whole strokes."""
+        """Return about `most` or fewer rows of each stroke, evenly spread, for effects on whole strokes."""
         key = ("sparse", most)
         if key not in self.cache:
             start, code = self.groups.starts["stroke"], self.codes("stroke")
@@ -218,7 +226,7 @@ class Rows:
         return self.cache[key]
 
     def subset(self, mask: np.ndarray) -> Rows:
-        """Return the rows for which `mask`, shape (n,), is true; conditions keep their numbers, as models need them."""
+        """Return the rows where `mask`, shape (n,), is true; conditions keep the numbers that models need."""
         weight = self.weight[mask]
         part = replace(
             self,
@@ -309,9 +317,9 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
 def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
     """Return the campaign's own numeric channels that a few files lack, with missing values filled in.
 
-    A missing value becomes the mean of its stroke, file, run or specimen, the first of these that has values, else the
-    mean of all files. A channel that was constant in a group remains so, and files without a value have little leverage
-    on a slope along it. Channels that too many files lack are left out.
+    A missing value becomes the mean of its stroke, file, run or specimen, the first of these that has values,
+    else the mean of all files. A channel that was constant in a group remains so, and files without a value
+    have little leverage on a slope along it. Channels that too many files lack are left out.
 
     Parameters
     ----------
@@ -374,8 +382,8 @@ def merge(bins: pd.DataFrame, together: int | np.ndarray) -> pd.DataFrame:
 def records(table: pd.DataFrame) -> pd.Series:
     """Return each row's record, named by its first file.
 
-    A file is a record. Files of one repeat of a run that contain different strokes (column `stroke` of runs.csv) are
-    one record.
+    A file is a record. Files of one repeat of a run that contain different strokes (column `stroke` of
+    runs.csv) are one record.
     """
     strokes = table.drop_duplicates(["file", "stroke"])
     repeat = [strokes["specimen_id"], _unsigned(strokes["run_id"]), strokes["repeat"]]

@@ -22,11 +22,11 @@ MAX_STEPS = 60
 GRID_POINTS = 12
 # Number of rows of each stroke that the grid search uses. v_s and b act on a stroke as a whole.
 ROWS_FOR_START = 4
-# Fall of the whitened sum of squares below which a step counts as slow. The descent ends after four slow steps in a
-# row: the data then determine nothing along its direction.
+# Fall of the whitened sum of squares below which a step counts as slow. The descent ends after four slow
+# steps in a row: the data then determine nothing along its direction.
 SLOW = 1e-2
-# Fall of the whitened sum of squares below which the descent has converged. The estimates then lie within a hundredth
-# of a standard error of the optimum.
+# Fall of the whitened sum of squares below which the descent has converged. The estimates then lie within a
+# hundredth of a standard error of the optimum.
 CONVERGED = 1e-4
 
 
@@ -39,7 +39,7 @@ def descend(
     *,
     tolerance: float = CONVERGED,
 ) -> Model:
-    """Return the model at the least penalised whitened sum of squares, at fixed scatter, by Levenberg-Marquardt.
+    """Return the model of least penalised whitened sum of squares at fixed scatter, by Levenberg-Marquardt.
 
     Parameters
     ----------
@@ -48,8 +48,8 @@ def descend(
     centre : ndarray, shape (model.size,)
         Mean of the prior.
     friction : ndarray, shape (n,), optional
-        Friction on which noise and gains load; default the model's at the start. It is fixed during the descent, so
-        that all steps minimise the same function.
+        Friction on which noise and gains load; default the model's at the start. It is fixed during the
+        descent, so that all steps minimise the same function.
     tolerance : float
         Fall of the sum of squares below which the descent ends.
     """
@@ -79,7 +79,8 @@ def descend(
         for _ in range(12):
             move = np.zeros_like(vector)
             move[free] = (
-                np.linalg.solve(scaled + (damping + 1e-12) * np.eye(scale.size), gradient[free] / scale) / scale
+                np.linalg.solve(scaled + (damping + 1e-12) * np.eye(scale.size), gradient[free] / scale)
+                / scale
             )
             trial = np.clip(vector + move, low, high)
             trial_model = model.at(trial)
@@ -95,17 +96,20 @@ def descend(
         vector, model, residual, cost = trial, trial_model, trial_residual, trial_cost
         damping /= 10
         slow_steps = slow_steps + 1 if gain < SLOW else 0
-        if slow_steps > 3 or (gain < tolerance and damping < 1e-3):  # under heavy damping every step gains little
+        if slow_steps > 3 or (
+            gain < tolerance and damping < 1e-3
+        ):  # under heavy damping every step gains little
             return model
         _, jacobian = evaluate(model, rows)
     return model
 
 
 def search_nonlinear(model: Model, rows: Rows, scatter: Scatter) -> Model:
-    """Return the model with each v_s, and all b together, at the best of a grid; linear parameters are solved for.
+    """Return the model with each v_s, and all b together, at the best of a grid.
 
-    Without the effect that was added, v_s and b may have converged to another local minimum. Series share mu_0, so that
-    one v_s alone may not leave it: first all v_s get the same value, then each is searched by itself.
+    Linear parameters are solved for. Without the effect that was added, v_s and b may have converged to
+    another local minimum. Series share mu_0, so that one v_s alone may not leave it: first all v_s get the
+    same value, then each is searched by itself.
     """
     rows = rows.sparse(ROWS_FOR_START)
     quantities = [p.quantity for p in model.declared.parameters]
@@ -119,17 +123,19 @@ def search_nonlinear(model: Model, rows: Rows, scatter: Scatter) -> Model:
 
 
 def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) -> Model:
-    """Return the model at the least cost among itself and the grid values of a group of parameters, all set equal.
+    """Return the model of least cost among itself and grid values of a group of parameters, all set equal.
 
-    The cost is the penalised whitened sum of squares, with the linear parameters at their optimum. Rows on which the
-    group does not act have the same normal equations at every grid value; these are computed once.
+    The cost is the penalised whitened sum of squares, with the linear parameters at their optimum. Rows on
+    which the group does not act have the same normal equations at every grid value; these are computed once.
     """
     low, high = bounds_of(model, rows)
     prior = _linear_prior(model)
     precision = np.diag(precision_of(model))[group]  # of the prior, which is centred at the present values
     acted_on, others = _split_by_action(model, rows, group)
     whitening = Whitening(scatter, acted_on.force, acted_on.groups)
-    constant = None if others is None else _equations(model, others, Whitening(scatter, others.force, others.groups))
+    constant = (
+        None if others is None else _equations(model, others, Whitening(scatter, others.force, others.groups))
+    )
 
     def optimum(trial: Model, ceiling: float = np.inf) -> tuple[float, Model]:
         own = _equations(trial, acted_on, whitening)
@@ -148,11 +154,13 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
 
 
 def _split_by_action(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, Rows | None]:
-    """Return the rows on which declared parameters act, and the others; all rows and None if one part is empty.
+    """Return rows on which declared parameters act, and the others; all rows and None if one part is empty.
 
     Rows of one specimen are correlated and stay together.
     """
-    acts = np.any([np.isin(numbers, group) for numbers in model.declared.index.values()], axis=0)[rows.condition]
+    acts = np.any([np.isin(numbers, group) for numbers in model.declared.index.values()], axis=0)[
+        rows.condition
+    ]
     specimen = rows.codes("specimen")
     acts = (np.bincount(specimen, acts) > 0)[specimen]
     if acts.all() or not acts.any():
@@ -166,8 +174,8 @@ def _split_by_action(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, 
 def solve_linear(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
     """Return the model with its linear parameters at their optimum, all nonlinear parameters fixed.
 
-    A new term explains part of what other terms explained before. This solve redistributes it before the descent,
-    which would otherwise start far from the optimum and may diverge.
+    A new term explains part of what other terms explained before. This solve redistributes it before the
+    descent, which would otherwise start far from the optimum and may diverge.
     """
     bounds = bounds_of(model, rows)
     equations = _equations(model, rows, Whitening(scatter, friction, rows.groups))
@@ -190,7 +198,9 @@ class _Equations(NamedTuple):
 
     def plus(self, other: _Equations) -> _Equations:
         """Return the equations of these rows and of others that are independent of them."""
-        return _Equations(self.normal + other.normal, self.gradient + other.gradient, self.square + other.square)
+        return _Equations(
+            self.normal + other.normal, self.gradient + other.gradient, self.square + other.square
+        )
 
     def penalised(self, precision: np.ndarray, away: np.ndarray) -> _Equations:
         """Return the equations with a prior; `away`, shape (k,), is the parameters less the prior's mean."""
@@ -205,7 +215,9 @@ class _Equations(NamedTuple):
 def _equations(model: Model, rows: Rows, whitening: Whitening) -> _Equations:
     force, jacobian = evaluate(model, rows)
     residual = whitening((rows.force - force)[:, None])[:, 0]
-    return _Equations(*whitening.normal(jacobian.columns(~model.nonlinear), residual), float(residual @ residual))
+    return _Equations(
+        *whitening.normal(jacobian.columns(~model.nonlinear), residual), float(residual @ residual)
+    )
 
 
 def _linear_optimum(
@@ -216,10 +228,10 @@ def _linear_optimum(
     *,
     ceiling: float = np.inf,
 ) -> tuple[float, Model]:
-    """Return the penalised sum of squares and the model, its linear parameters at their optimum within the bounds.
+    """Return the penalised sum of squares and the model, its linear parameters optimal within the bounds.
 
-    Without bounds, a wrong v_s could fit best with negative friction. Bounds can only raise the sum of squares, so they
-    are ignored where it is not below `ceiling` without them.
+    Without bounds, a wrong v_s could fit best with negative friction. Bounds can only raise the sum of
+    squares, so they are ignored where it is not below `ceiling` without them.
     """
     linear, vector = ~model.nonlinear, model.vector()
     precision, centre = prior
@@ -251,7 +263,9 @@ def least_squares_within(
     kept = size > 1e-10 * size[-1]
     root, axes = np.sqrt(size[kept]), axes[:, kept]
     bounds = (low[acts] / scale, high[acts] / scale)
-    inside[acts] = lsq_linear(root[:, None] * axes.T, (axes.T @ (gradient[acts] * scale)) / root, bounds).x * scale
+    inside[acts] = (
+        lsq_linear(root[:, None] * axes.T, (axes.T @ (gradient[acts] * scale)) / root, bounds).x * scale
+    )
     return inside
 
 
@@ -281,8 +295,8 @@ def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 
 # Number of grid values of v_s.
 GRID = 80
-# Values of v_s whose sums of squares differ by less than this share of the sum of squared forces fit equally well. The
-# middle one is taken.
+# Values of v_s whose sums of squares differ by less than this share of the sum of squared forces fit equally
+# well. The middle one is taken.
 EQUAL = 1e-10
 # Singular values below this share of the largest one count as zero.
 RANK = 1e-10
@@ -291,7 +305,8 @@ RANK = 1e-10
 def start_model(rows: Rows, *, together: bool = False) -> Model:
     """Return the declared model with v_s and b from a global search and the rest from exact least squares.
 
-    With `together`, all series start from one v_s and one sigma_2, which a few noisy runs cannot make far wrong.
+    With `together`, all series start from one v_s and one sigma_2, which a few noisy runs cannot make far
+    wrong.
     """
     declared = declare(rows)
     theta = np.zeros(len(declared.parameters))
@@ -309,10 +324,14 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
     for name in series:
         k = number.get(JointParameter("sigma_2", name), number.get(JointParameter("v_s", name)))
         full = JointParameter("v_s", name) in number
-        uses = curved if together and full else (declared.index["sigma_2"] == k) | (declared.index["v_s"] == k)
+        uses = (
+            curved if together and full else (declared.index["sigma_2"] == k) | (declared.index["v_s"] == k)
+        )
         if uses.tobytes() not in solved:
             mine = uses[condition]
-            solved[uses.tobytes()] = _per_condition(speeds[mine], load[mine], size[mine], condition[mine], full)
+            solved[uses.tobytes()] = _per_condition(
+                speeds[mine], load[mine], size[mine], condition[mine], full
+            )
         values, sigma_2, v_s = solved[uses.tobytes()]
         for c, pair in values.items():
             level[c], chosen[c] = pair, True
@@ -345,7 +364,7 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
 
 
 def _per_condition(speed, load, size, condition, full: bool):
-    """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of one series: a grid over v_s, the others solved for."""
+    """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of a series by a grid over v_s, others solved for."""
     own, code = np.unique(condition, return_inverse=True)
     grid = np.geomspace(*stribeck_range(speed), GRID) if full else np.array([1.0])
     solved, costs = [], []
@@ -368,8 +387,8 @@ def pairs_and_shared(
 ) -> tuple[np.ndarray, float]:
     """Return the least squares solution of two numbers per group and one, not below 0, that all groups share.
 
-    Each group's two columns are orthonormalised and projected out, which leaves one equation for the shared number.
-    Among several solutions it is the one of least norm.
+    Each group's two columns are orthonormalised and projected out, which leaves one equation for the shared
+    number. Among several solutions it is the one of least norm.
 
     Parameters
     ----------
@@ -395,7 +414,7 @@ def pairs_and_shared(
     inverse = np.divide(1.0, spread, out=np.zeros_like(spread), where=spread > least)
 
     def projected(column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a column's coefficients on the groups' columns, shape (groups, 2), and its residual, shape (n,)."""
+        """Return the coefficients on the groups' columns, shape (groups, 2), and the residual, shape (n,)."""
         inside = np.column_stack([np.bincount(code, one * column), np.bincount(code, two * column)])
         pairs = np.einsum("gji,gj->gi", right, np.einsum("gji,gj->gi", left, inside) * inverse)
         first, second = pairs.T
@@ -421,8 +440,9 @@ def _unit(column: np.ndarray, code: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def stribeck_range(speeds: np.ndarray) -> tuple[float, float]:
     """Return the range in which v_s is searched: from half the second slowest speed to the fastest, in mm/s.
 
-    Below that range only the slowest speed would depend on mu_s, which would not be bounded. Above it the exponential
-    is close to a parabola, which sigma_2 and mu_c can imitate (v_s needs two speeds below about 2 v_s).
+    Below that range only the slowest speed would depend on mu_s, which would not be bounded. Above it the
+    exponential is close to a parabola, which sigma_2 and mu_c can imitate (v_s needs two speeds below about 2
+    v_s).
     """
     positive = np.sort(speeds[speeds > 0])
     above = positive[positive > SAME_SPEED * positive[0]]

@@ -1,10 +1,10 @@
 r"""The tangent of the joint model, the derivatives of all rows, stored by blocks of columns.
 
-A row depends only on the parameters of its series and on a few that series share. Rows of a specimen share a *block*:
-the columns on which any of them depends. Whitening combines rows of one specimen only and keeps the blocks. Normal
-matrices are sums over blocks. A bordered block-diagonal factorisation orthonormalises the columns of each block first,
-then those that blocks share (as Golub and Pereyra 1973, doi:10.1137/0710036, eliminate linear parameters). Time and
-memory are linear in the number of rows.
+A row depends only on the parameters of its series and on a few that series share. Rows of a specimen share a
+*block*: the columns on which any of them depends. Whitening combines rows of one specimen only and keeps the
+blocks. Normal matrices are sums over blocks. A bordered block-diagonal factorisation orthonormalises the
+columns of each block first, then those that blocks share (as Golub and Pereyra 1973, doi:10.1137/0710036,
+eliminate linear parameters). Time and memory are linear in the number of rows.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Layout:
 
     @cached_property
     def pairs(self) -> np.ndarray:
-        """Flat index of each entry of the blocks' Gram matrices in the padded Gram matrix, shape (blocks * k * k,)."""
+        """Flat index of the blocks' Gram entries in the padded Gram matrix, shape (blocks * k * k,)."""
         return (self.index[:, :, None] * (self.size + 1) + self.index[:, None, :]).ravel()
 
     @cached_property
@@ -129,14 +129,16 @@ class Tangent:
         return found
 
     def project_out(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns, shape (n,) or (n, m), minus their projection on the tangent, which must be orthonormal."""
+        """Return columns, (n,) or (n, m), minus their projection on the tangent; it must be orthonormal."""
         return columns - self @ self.against(columns)
 
     def squares(self, matrix: np.ndarray) -> np.ndarray:
         """Return t' M t of each row t for a matrix M, shape (p, p) -> (n,)."""
         padded, found = np.pad(matrix, (0, 1)), np.empty(self.values.shape[0])
         for index, rows in zip(self.layout.index, self.layout.rows, strict=True):
-            found[rows] = np.einsum("ij,ij->i", self.values[rows] @ padded[np.ix_(index, index)], self.values[rows])
+            found[rows] = np.einsum(
+                "ij,ij->i", self.values[rows] @ padded[np.ix_(index, index)], self.values[rows]
+            )
         return found
 
     def norms(self) -> np.ndarray:
@@ -170,7 +172,7 @@ class Tangent:
     def orthonormal(
         self, tolerance: float, project_out: Callable[[np.ndarray], np.ndarray] = lambda columns: columns
     ) -> Tangent:
-        """Return an orthonormal basis of the span of the columns, scaled to length 1 first, of shape (n, rank).
+        """Return an orthonormal basis of the span of the columns, scaled to length 1 first, shape (n, rank).
 
         Parameters
         ----------
@@ -210,11 +212,13 @@ class Tangent:
     def _column(self, number: int) -> np.ndarray:
         """Return one column, shape (n,)."""
         place = self.layout.places[self.layout.block, number]
-        return np.where(place >= 0, np.take_along_axis(self.values, np.maximum(place, 0)[:, None], axis=1)[:, 0], 0.0)
+        return np.where(
+            place >= 0, np.take_along_axis(self.values, np.maximum(place, 0)[:, None], axis=1)[:, 0], 0.0
+        )
 
 
 class OwnColumns:
-    """One column per specimen, zero outside the specimen's rows; they are orthogonal, so no matrix is inverted.
+    """One column per specimen, zero outside its rows; they are orthogonal, so no matrix is inverted.
 
     Parameters
     ----------
@@ -236,7 +240,7 @@ class OwnColumns:
 
 
 def blocks_of(sets: Sequence[frozenset[int]], size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return blocks that contain sets of columns, and the block of each set; one block if a set has most columns.
+    """Return blocks that contain sets of columns, and each set's block; one block if a set has most columns.
 
     Parameters
     ----------
@@ -248,7 +252,8 @@ def blocks_of(sets: Sequence[frozenset[int]], size: int) -> tuple[np.ndarray, np
     Returns
     -------
     tuple of ndarray
-        Column at each place, shape (blocks, k), `size` if empty; and number of each set's block, shape (sets,).
+        Column at each place, shape (blocks, k), `size` if empty; and number of each set's block, shape
+        (sets,).
     """
     kept: list[frozenset[int]] = []
     home: dict[frozenset[int], int] = {}

@@ -19,26 +19,27 @@ from sealfit.ingest.scatter import two_nonnegative
 # ---------------------------------------------------------------- reml
 # Variance components at nested levels by restricted maximum likelihood (REML), with its exact gradient.
 #
-# With B = [1, F] the loadings of offset and gain, :math:`K_l` their variances at level l, and V_l the covariance up to
-# that level, Woodbury's identity gives for each group
+# With B = [1, F] the loadings of offset and gain, :math:`K_l` their variances at level l, and V_l the
+# covariance up to that level, Woodbury's identity gives for each group
 #
 # .. math:: B^T V_l^{-1} B = Q - Q M Q, \quad M = K^{1/2} (1 + K^{1/2} Q K^{1/2})^{-1} K^{1/2},
 #           \quad Q = \sum_\mathrm{inside} B^T V_{l-1}^{-1} B
 #
-# Only 2 x 2 matrices are inverted: from the finest level to the coarsest for the likelihood, and back for its gradient.
+# Only 2 x 2 matrices are inverted: from the finest level to the coarsest for the likelihood, and back for its
+# gradient.
 #
 # Searle, Casella & McCulloch 1992, *Variance Components*, doi:10.1002/9780470316856, chapter 6.
 
-# Smallest start of a component, as a share of the residual variance. The gradient is 0 at a component of 0, which
-# could not grow again.
+# Smallest start of a component, as a share of the residual variance. The gradient is 0 at a component of 0,
+# which could not grow again.
 LEAST_START = 0.03
-# Largest relative standard deviation of a gain; no rig's is larger. Without a limit a force of nearly 0 with a large
-# gain would fit any data.
+# Largest relative standard deviation of a gain; no rig's is larger. Without a limit a force of nearly 0 with
+# a large gain would fit any data.
 MOST_GAIN = 0.5
 # A component below this share of the residual variance counts as zero.
 LEAST = 1e-5
-# Largest component, as a multiple of the residual variance. It exceeds 1 as a model with nearly as many parameters as
-# groups leaves small residuals.
+# Largest component, as a multiple of the residual variance. It exceeds 1 as a model with nearly as many
+# parameters as groups leaves small residuals.
 MOST_SHARE = 30.0
 
 KINDS = ("offset", "gain")
@@ -149,7 +150,8 @@ class RestrictedLikelihood:
             size[level][k] = v
         own = self.variance + self.loads**2 @ size[self.finest]
         loads, columns = self.loads / own[:, None], self.columns / own[:, None]
-        square = (loads[:, 0], loads[:, 1], loads[:, 1] * self.loads[:, 1])  # B' V^-1 B: 11, 12 and 22, each (groups,)
+        # B' V^-1 B: 11, 12 and 22, each (groups,).
+        square = (loads[:, 0], loads[:, 1], loads[:, 1] * self.loads[:, 1])
         cross = (columns, columns * self.loads[:, 1:])  # B' V^-1 [X r], a row of each, (groups, p + 1)
         gram = self.layout[self.finest].gram(self.columns, columns)
         value = float(np.log(own).sum())
@@ -167,7 +169,11 @@ class RestrictedLikelihood:
             left = (1.0 - mq[0], -mq[1], -mq[2], 1.0 - mq[3])
             inner.append((m, mt, left))
             # q - q m q and t - q m t, for the groups of this level
-            square = (q[0] * left[0] + q[1] * left[2], q[0] * left[1] + q[1] * left[3], q[1] * left[1] + q[2] * left[3])
+            square = (
+                q[0] * left[0] + q[1] * left[2],
+                q[0] * left[1] + q[1] * left[3],
+                q[1] * left[1] + q[2] * left[3],
+            )
             cross = tuple(x - y for x, y in zip(t, _applied(q, mt), strict=True))
             steps.append((square, cross))
         chol = _root_of(gram[:-1, :-1])
@@ -177,7 +183,8 @@ class RestrictedLikelihood:
         turn = np.zeros_like(gram)
         turn[:-1, :-1] = solve_triangular(chol, np.eye(half.size), lower=True).T
         turn[:-1, -1], turn[-1, -1] = -turn[:-1, :-1] @ half, 1.0
-        turned = turn @ turn.T  # its product with a Gram matrix is the sum of squares of the transformed columns
+        # Its product with a Gram matrix is the sum of squares of the transformed columns.
+        turned = turn @ turn.T
         slope = {}
         n = y = None
         for k in reversed(range(len(steps))):
@@ -188,14 +195,18 @@ class RestrictedLikelihood:
                     n, y = m, mt
                 else:
                     code = self.groups[self.above[k + 1]][1]
-                    n = tuple(x + z for x, z in zip(m, _sandwich(left, tuple(x[code] for x in n)), strict=True))
+                    n = tuple(
+                        x + z for x, z in zip(m, _sandwich(left, tuple(x[code] for x in n)), strict=True)
+                    )
                     first, second = (x[code] for x in y)
                     y = (
                         mt[0] + left[0][:, None] * first + left[1][:, None] * second,
                         mt[1] + left[2][:, None] * first + left[3][:, None] * second,
                     )
                 code = self.groups[self.above[k]][1]
-                cross = tuple(x - z for x, z in zip(cross, _applied(square, tuple(x[code] for x in y)), strict=True))
+                cross = tuple(
+                    x - z for x, z in zip(cross, _applied(square, tuple(x[code] for x in y)), strict=True)
+                )
                 taken = _sandwich((square[0], square[1], square[1], square[2]), tuple(x[code] for x in n))
                 square = tuple(x - z for x, z in zip(square, taken, strict=True))
             level = self.above[k - 1] if k else self.finest
@@ -206,7 +217,7 @@ class RestrictedLikelihood:
 
 
 def _root_of(gram: np.ndarray) -> np.ndarray:
-    """Return the lower Cholesky root of a Gram matrix, with the smallest ridge that makes it positive definite."""
+    """Return a Gram matrix's lower Cholesky root, with the smallest ridge that makes it positive definite."""
     ridge = 1e-12
     while True:
         try:
@@ -219,11 +230,11 @@ def _root_of(gram: np.ndarray) -> np.ndarray:
 
 
 Symmetric = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""2 x 2 matrices by their entries 11, 12 and 22, shape (groups,) each; faster than products of stacked matrices."""
+"""2 x 2 matrices by entries 11, 12 and 22, shape (groups,) each; faster than products of stacked matrices."""
 
 
 def _shrinkage(q: Symmetric, size: np.ndarray) -> tuple[Symmetric, np.ndarray]:
-    """Return (S^-1 + q)^-1 and log det (1 + S q), shape (groups,), for S the diagonal of `size`, which may be 0."""
+    """Return (S^-1 + q)^-1 and log det (1 + S q), shape (groups,), for S = diag(size), which may be 0."""
     a, b, c = 1.0 + size[0] * q[0], np.sqrt(size[0] * size[1]) * q[1], 1.0 + size[1] * q[2]
     det = a * c - b * b
     return (size[0] * c / det, -np.sqrt(size[0] * size[1]) * b / det, size[1] * a / det), np.log(det)
@@ -262,8 +273,8 @@ def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
 # ---------------------------------------------------------------- scatter
 # Row noise, design effect and variance components of a residual.
 
-# Smallest row noise, as a share of the force. It is below the resolution of any sensor, and keeps the weights of
-# noise-free data finite.
+# Smallest row noise, as a share of the force. It is below the resolution of any sensor, and keeps the weights
+# of noise-free data finite.
 LEAST_NOISE = 1e-6
 # Number of files from which differences in their shape along strokes are estimated.
 LEAST_FILES = 6
@@ -332,7 +343,9 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
             finer = level
     if used and used[-1] == "specimen" and not _specimens_free(rows):
         used.pop()
-    both = rows.speed.min() < 0 < rows.speed.max() or np.ptp(np.abs(rows.force)) > 0.2 * np.abs(rows.force).max()
+    both = (
+        rows.speed.min() < 0 < rows.speed.max() or np.ptp(np.abs(rows.force)) > 0.2 * np.abs(rows.force).max()
+    )
     kinds = {level: ("offset", "gain") if both else ("offset",) for level in used}
     if both and "specimen" in kinds:
         kinds["specimen"] = ("gain",)  # specimens differ in friction, not in the sensor's zero
@@ -340,7 +353,7 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
 
 
 def _specimens_free(rows: Rows) -> bool:
-    """Return whether specimen scatter is estimable: replicate specimens of a condition, or a law across conditions."""
+    """Return whether specimen scatter is estimable: replicates of a condition, or a law across conditions."""
     return rows.groups.starts["specimen"].size - declare(rows).mu_parameter_count >= 2
 
 
@@ -353,9 +366,10 @@ def _df(rows: Rows, component: Component) -> float:
 
 
 def row_noise(rows: Rows, residual: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
-    """Return (s0, g, design effect): row noise sqrt(s0^2 + (gF)^2) within strokes, and the effect of its correlation.
+    """Return (s0, g, design effect) of the row noise, sqrt(s0^2 + (gF)^2) within strokes.
 
-    The mean pattern of all strokes along the bins is not noise and is subtracted first.
+    The design effect is the effect of its correlation. The mean pattern of all strokes along the bins is not
+    noise and is subtracted first.
     """
     groups = rows.groups
     code, start = groups.codes["stroke"], groups.starts["stroke"]
@@ -383,7 +397,7 @@ def row_noise(rows: Rows, residual: np.ndarray, force: np.ndarray) -> tuple[floa
 
 
 def _design_effect(inside: np.ndarray, code: np.ndarray, start: np.ndarray, count: np.ndarray) -> float:
-    """Return the design effect: 1 + 2 sum of autocorrelations over bins, up to the first that is below 0.05."""
+    """Return the design effect: 1 + 2 sum of autocorrelations over bins, up to the first below 0.05."""
     scale = np.sqrt(np.maximum(np.add.reduceat(inside**2, start) / count, 1e-300))[code]
     unit = inside / scale
     total, effect = max(float((unit**2).mean()), 1e-300), 1.0
@@ -397,10 +411,10 @@ def _design_effect(inside: np.ndarray, code: np.ndarray, start: np.ndarray, coun
 
 
 def shape_scatter(rows: Rows, residual: np.ndarray, sd: np.ndarray) -> float:
-    """Return the variance ratio, at least 1, of shapes along strokes between files to that expected from row noise.
+    """Return the variance of shapes along strokes between files over that expected of row noise, at least 1.
 
-    Slope and curvature of each pass along displacement are compared with their mean over all passes of that direction.
-    Without this factor hundreds of rows would outweigh the few files they come from.
+    Slope and curvature of each pass along displacement are compared with their mean over all passes of that
+    direction. Without this factor hundreds of rows would outweigh the few files they come from.
 
     Parameters
     ----------

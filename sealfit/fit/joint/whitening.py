@@ -5,13 +5,14 @@ A residual is noise of its row plus random offsets and gains of its stroke, file
 .. math:: r_i = \epsilon_i + \sum_l (o_{l,g(i)} + k_{l,g(i)} F_i), \quad
           \mathrm{Var}\, o_l = \sigma_{o,l}^2, \ \mathrm{Var}\, k_l = \sigma_{k,l}^2
 
-where F is the model's friction, its force without added forces. Neighbouring rows are correlated, which multiplies the
-noise variance of all patterns in a stroke by the design effect. Files differ in shape along their strokes, which
-multiplies that of all patterns other than the mean by a further factor, `shape`.
+where F is the model's friction, its force without added forces. Neighbouring rows are correlated, which
+multiplies the noise variance of all patterns in a stroke by the design effect. Files differ in shape along
+their strokes, which multiplies that of all patterns other than the mean by a further factor, `shape`.
 
-Within a stroke the components change only two numbers: its mean, and its projection on the variation of F about its
-mean (zero if F is constant). For these a root of the inverse covariance is a product of rank-one updates, as groups are
-nested; all other patterns are divided by their noise. This is exact, and linear in the number of rows.
+Within a stroke the components change only two numbers: its mean, and its projection on the variation of F
+about its mean (zero if F is constant). For these a root of the inverse covariance is a product of rank-one
+updates, as groups are nested; all other patterns are divided by their noise. This is exact, and linear in the
+number of rows.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ FLAT = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """Variance of one kind of random effect at one level: an `offset` in force units, or a relative `gain`."""
+    """Variance of a kind of random effect at one level: an `offset` in force units, or a relative `gain`."""
 
     level: str
     kind: str
@@ -46,8 +47,12 @@ class Scatter:
     s0: float
     g: float
     components: tuple[Component, ...] = ()
-    design_effect: float = 1.0  # factor on the variance of a stroke's mean, from correlation of neighbouring rows
-    shape: float = 1.0  # further factor on the variance of patterns along the stroke, from differences between files
+    design_effect: float = (
+        1.0  # factor on the variance of a stroke's mean, from correlation of neighbouring rows
+    )
+    shape: float = (
+        1.0  # further factor on the variance of patterns along the stroke, from differences between files
+    )
 
     def estimates(self, level: str) -> bool:
         """Return whether the variance of a level was estimated separately; the estimate may be zero."""
@@ -87,7 +92,11 @@ class Between:
     """
 
     def __init__(
-        self, variance: np.ndarray, loads: Mapping[str, np.ndarray], groups: Groups, components: Sequence[Component]
+        self,
+        variance: np.ndarray,
+        loads: Mapping[str, np.ndarray],
+        groups: Groups,
+        components: Sequence[Component],
     ) -> None:
         above = [
             (groups.starts[part.level], groups.codes[part.level], np.sqrt(part.variance) * loads[part.kind])
@@ -150,11 +159,16 @@ class Whitening:
         about = friction / sd - level[code] * mean
         spread = np.sqrt(np.bincount(code, about**2))
         flat = spread < FLAT * np.abs(level)
-        about = np.where(flat[code], 0.0, about / np.where(flat, 1.0, spread)[code])  # unit vector along F - mean
+        # Unit vector along F - mean.
+        about = np.where(flat[code], 0.0, about / np.where(flat, 1.0, spread)[code])
         self.root = np.sqrt(scatter.shape)
         self.unit = 1 / (sd * self.root)
         self.back = csr_array(
-            (np.column_stack([mean, about]).ravel(), (2 * code[:, None] + [0, 1]).ravel(), 2 * np.arange(n + 1)),
+            (
+                np.column_stack([mean, about]).ravel(),
+                (2 * code[:, None] + [0, 1]).ravel(),
+                2 * np.arange(n + 1),
+            ),
             shape=(n, 2 * m),
         )
         self.take = csr_array(self.back.T.multiply(1 / sd[None, :]))
@@ -170,9 +184,9 @@ class Whitening:
         self.logdet = self.between.logdet + float(2 * np.log(sd).sum() + (n - 2 * m) * np.log(scatter.shape))
 
     def normal(self, tangent: Tangent, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return C' V^-1 C, shape (p, p), and C' V^-1 r, shape (p,), of a tangent C, without whitening its columns.
+        """Return C' V^-1 C, shape (p, p), and C' V^-1 r, shape (p,), of a tangent C.
 
-        `residual`, shape (n,), is whitened already.
+        The columns of C are not whitened for this; `residual`, shape (n,), is whitened already.
         """
         scaled, numbers = tangent.values * self.unit[:, None], self.take @ tangent.values
         between, kept = self.between(numbers), numbers / self.root

@@ -51,11 +51,16 @@ class Condition:
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """|v|, N (1 without load), F sgn v and weight of each run, shape (n,)."""
         load = self.runs["load"].to_numpy(float) if self.has_load else np.ones(len(self.runs))
-        return self.runs["speed"].to_numpy(float), load, self.runs["force"].to_numpy(float), self.runs["weight"].values
+        return (
+            self.runs["speed"].to_numpy(float),
+            load,
+            self.runs["force"].to_numpy(float),
+            self.runs["weight"].values,
+        )
 
     @property
     def shifts(self) -> np.ndarray:
-        """Change of F sgn v of each run along the principal directions of the effects' uncertainty, shape (n, k)."""
+        """Change of F sgn v per run along principal directions of the effects' uncertainty, shape (n, k)."""
         return self.runs[shifts_of(self.runs)].to_numpy(float)
 
     @property
@@ -86,7 +91,10 @@ class Condition:
 
         The declared model has no offset, but it widens the intervals and can mask a Stribeck curve.
         """
-        rest, direction = self.runs["force"].to_numpy(float) - self.model_force(), self.runs["direction"].to_numpy()
+        rest, direction = (
+            self.runs["force"].to_numpy(float) - self.model_force(),
+            self.runs["direction"].to_numpy(),
+        )
         one, other = rest[direction > 0], rest[direction < 0]
         halves = self.runs["half"].dropna().to_numpy(float)
         if min(len(one), len(other)) >= 3:
@@ -105,7 +113,7 @@ class Condition:
 
 
 def make_condition(name: str, runs: pd.DataFrame) -> Condition:
-    """Return a condition with the fullest model that its speed levels determine; `runs` are means with `weight`."""
+    """Return a condition with the fullest model that its speeds determine; `runs` are means with `weight`."""
     loaded = runs["load"].notna().to_numpy()
     has_load = bool(loaded.any())
     kept = runs[loaded] if has_load and not loaded.all() else runs
@@ -153,7 +161,9 @@ def drop_flat_curve(condition: Condition, unit: float, df: float) -> None:
     _solve_linear(condition)
     if np.isfinite(unit) and unit > 0:
         columns = condition.columns()[:, : 2 if condition.values[1] > 0 else 1]
-        condition.flat_p = flat_p_value(speed, columns, weight, condition.grid, (condition.chi2 - chi2) / unit, df)
+        condition.flat_p = flat_p_value(
+            speed, columns, weight, condition.grid, (condition.chi2 - chi2) / unit, df
+        )
     if not condition.flat_p >= SIGNIFICANT:
         condition.model, condition.values, condition.chi2 = FULL, full, chi2
 
@@ -185,10 +195,15 @@ def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
     """Return per parameter whether the data determine it, and a remark."""
     verdict = _judge_form(condition)
     if condition.low is None and condition.model != FULL:
-        verdict = {n: (ok, why or "no repeats and no spare run: no interval.") for n, (ok, why) in verdict.items()}
+        verdict = {
+            n: (ok, why or "no repeats and no spare run: no interval.") for n, (ok, why) in verdict.items()
+        }
     zero = {name for name, value in zip(condition.names, condition.values, strict=True) if value == 0.0}
     if "sigma_2" in zero:
-        verdict["sigma_2"] = (verdict["sigma_2"][0], "at its physical limit 0: friction does not rise with speed here.")
+        verdict["sigma_2"] = (
+            verdict["sigma_2"][0],
+            "at its physical limit 0: friction does not rise with speed here.",
+        )
     for name in zero & {"mu_s", "mu_c"}:
         verdict[name] = (False, "at its physical limit 0: these runs show no friction that it could be.")
     against = int((condition.runs["force"] < 0).sum())
@@ -212,14 +227,20 @@ def _judge_form(condition: Condition) -> dict[str, tuple[bool, str]]:
         verdict["mu_c"] = (True, "the sliding coefficient over these speeds, without Stribeck curve.")
     elif condition.model == VISCOUS:
         flat = f"mu_s = mu_c is not rejected (p = {condition.flat_p:.2g}): no Stribeck curve is seen"
-        verdict |= {"mu_s": (False, f"{flat}, mu_s is mu_c."), "v_s": (False, f"{flat}, so v_s has no meaning.")}
+        verdict |= {
+            "mu_s": (False, f"{flat}, mu_s is mu_c."),
+            "v_s": (False, f"{flat}, so v_s has no meaning."),
+        }
         verdict["mu_c"] = (True, "of the fit without Stribeck curve; mu_s = mu_c is not rejected.")
         if condition.offset():
             hidden = (
-                "The offset between the two directions counts as scatter here and may hide a curve; see close-loop."
+                "The offset between the two directions counts as scatter here and may hide a curve; "
+                "see close-loop."
             )
             verdict |= {
-                name: (ok, f"{why} {hidden}".strip()) for name, (ok, why) in verdict.items() if name != "sigma_2"
+                name: (ok, f"{why} {hidden}".strip())
+                for name, (ok, why) in verdict.items()
+                if name != "sigma_2"
             }
     elif condition.low is None:
         unknown = "as many parameters as runs and no repeats: nothing shows how far to trust it."

@@ -1,4 +1,4 @@
-"""The fit of the steady distributed LuGre model (Eq. 14) per condition, and which parameters the speeds determine."""
+"""The steady distributed LuGre model (Eq. 14) fitted per condition; which parameters the speeds determine."""
 
 from __future__ import annotations
 
@@ -41,8 +41,9 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
     .. math:: F\,\mathrm{sgn}\,v = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}] + \sigma_2 |v|
 
-    Run means of both directions are fitted together, weighted by the pooled scatter of repeats. mu_s, mu_c and sigma_2
-    are not negative; mu_s < mu_c is allowed and reported. Without load the forces F_s and F_c are fitted.
+    Run means of both directions are fitted together, weighted by the pooled scatter of repeats. mu_s, mu_c
+    and sigma_2 are not negative; mu_s < mu_c is allowed and reported. Without load the forces F_s and F_c are
+    fitted.
 
     Parameters
     ----------
@@ -54,11 +55,12 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        Table `steady_fit` plus the condition columns. `quantity` is "steady" (one row per parameter), "statistics",
-        "covariance" (`parameter` "mu_s,mu_c": type A, for the aging fit), "sensor_shift" (change of the parameter if
-        the sensor reads every |force| one standard uncertainty too high; `u_sys` is its magnitude) or, if effects were
-        subtracted from the forces, "effect_shift" (`parameter` "mu_s:1": change along each principal direction of the
-        effects' uncertainty; it is included in the covariance and the intervals, and common to all conditions).
+        Table `steady_fit` plus the condition columns. `quantity` is "steady" (one row per parameter),
+        "statistics", "covariance" (`parameter` "mu_s,mu_c": type A, for the aging fit), "sensor_shift"
+        (change of the parameter if the sensor reads every |force| one standard uncertainty too high; `u_sys`
+        is its magnitude) or, if effects were subtracted from the forces, "effect_shift" (`parameter`
+        "mu_s:1": change along each principal direction of the effects' uncertainty; it is included in the
+        covariance and the intervals, and common to all conditions).
 
     Raises
     ------
@@ -67,21 +69,23 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
     Notes
     -----
-    Intervals are profile-likelihood intervals with Student's t. `u_sys` assumes one unknown error of |force| for all
-    samples, which no averaging reduces. A zero offset of the sensor has opposite signs in the two directions and
-    changes the parameters by no more; the loop tests for it.
+    Intervals are profile-likelihood intervals with Student's t. `u_sys` assumes one unknown error of |force|
+    for all samples, which no averaging reduces. A zero offset of the sensor has opposite signs in the two
+    directions and changes the parameters by no more; the loop tests for it.
     """
     conditions, scatter, variance = solve_conditions(steady)
     keys = condition_keys(steady, config)
     blocks = [slice(start, start + BLOCK) for start in range(0, len(conditions), BLOCK)]
     found = [_table_rows(conditions[block], variance.of(block), scatter, config) for block in blocks]
-    table = pd.concat(found, ignore_index=True).merge(keys, on="condition", how="left", validate="many_to_one")
+    table = pd.concat(found, ignore_index=True).merge(
+        keys, on="condition", how="left", validate="many_to_one"
+    )
     fixed = STEADY_FIT.names()
     return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
 
 
 def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, UnitVariance]:
-    """Return the fitted conditions without intervals, the scatter of repeats, and the factors on stated variances.
+    """Return fitted conditions without intervals, the scatter of repeats, and factors on stated variances.
 
     A Stribeck curve that does not differ significantly from a straight line is dropped.
 
@@ -114,13 +118,15 @@ def _solved(runs: pd.DataFrame) -> list[Condition]:
 
 
 def _more_likely_weights(even: list[Condition]) -> list[Condition]:
-    """Return the conditions fitted with equal weights or with a scatter proportional to friction, the more likely.
+    """Return conditions fitted with equal weights or scatter proportional to friction, the more likely ones.
 
     Without repeats the residuals have to determine how the scatter depends on the force.
     """
     sizes = np.cumsum([len(c.runs) for c in even])[:-1]
     weight = proportional_weights(np.concatenate([c.model_force() for c in even]))
-    other = [replace(c, runs=c.runs.assign(weight=w)) for c, w in zip(even, np.split(weight, sizes), strict=True)]
+    other = [
+        replace(c, runs=c.runs.assign(weight=w)) for c, w in zip(even, np.split(weight, sizes), strict=True)
+    ]
     solve(other)
     chi2 = [sum(c.chi2 for c in conditions) for conditions in (even, other)]
     chosen = more_likely(chi2, [np.ones(weight.size), weight], sum(c.df for c in even))
@@ -132,15 +138,19 @@ def _unit_variance(conditions: list[Condition], scatter: Scatter) -> UnitVarianc
 
 
 def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
-    """One row per condition: series, rubber and the condition columns; null where unaged rubber has several."""
-    names = [c for c in dict.fromkeys(["series", "rubber", *condition_columns(config)]) if c in steady.columns]
+    """One row per condition: series, rubber and condition columns; null where unaged rubber has several."""
+    names = [
+        c for c in dict.fromkeys(["series", "rubber", *condition_columns(config)]) if c in steady.columns
+    ]
     grouped = steady[steady["condition"].notna()].groupby("condition", sort=True)
     first, several = grouped[names].first(), grouped[names].nunique() > 1
     return first.mask(several).reset_index()
 
 
 # ---------------------------------------------------------------- table
-def _table_rows(conditions: list[Condition], variance: UnitVariance, scatter: Scatter, config: Config) -> pd.DataFrame:
+def _table_rows(
+    conditions: list[Condition], variance: UnitVariance, scatter: Scatter, config: Config
+) -> pd.DataFrame:
     """Return the rows of table `steady_fit` for some conditions; this computes their intervals."""
     bound(conditions, variance.rise())
     return pd.DataFrame(
@@ -152,13 +162,16 @@ def _table_rows(conditions: list[Condition], variance: UnitVariance, scatter: Sc
     )
 
 
-def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter, config: Config) -> Iterator[dict]:
+def _rows(
+    condition: Condition, k: int, variance: UnitVariance, scatter: Scatter, config: Config
+) -> Iterator[dict]:
     unit_of = parameter_units(config.units, condition.has_load)
     _, _, force, weight = condition.arrays
     covariance, shift = linearised(condition.jacobian(), weight, condition.values, condition.names)
     _, effects = linearised(condition.jacobian(), weight, condition.values, condition.names, condition.shifts)
     covariance = covariance * variance.value[k] + effects @ effects.T
-    shift = np.where(np.abs(shift) > 1e-12 * np.abs(condition.values), shift * config.sensor.u, 0.0)  # else rounding
+    # What is smaller is rounding.
+    shift = np.where(np.abs(shift) > 1e-12 * np.abs(condition.values), shift * config.sensor.u, 0.0)
     judged = judge(condition)
     spelled = {name: name if condition.has_load else FORCES.get(name, name) for name in NAMES}
     for name in NAMES:
@@ -172,7 +185,8 @@ def _rows(condition: Condition, k: int, variance: UnitVariance, scatter: Scatter
             if effects.any() and low is not None:
                 reach = stdtrit(variance.df[k], 0.975) * float(np.sqrt((effects[j] ** 2).sum()))
                 low, high = _widened(condition.values[j], low, high, reach)
-            stuck = name in ("mu_s", "mu_c") and condition.values[j] == 0.0  # at its limit: not known with error zero
+            # At its limit: not known with error zero.
+            stuck = name in ("mu_s", "mu_c") and condition.values[j] == 0.0
             se = None if stuck else _finite(np.sqrt(covariance[j, j]))
             row |= {"value": condition.values[j], "se": se, "u_sys": abs(shift[j])}
             row |= {"lo95": None if open_below else _finite(low), "hi95": _finite(high)}
@@ -221,12 +235,15 @@ def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterat
         lack = "as many parameters as runs: the fit cannot disagree with them."
     elif repeated and variance.p[k] < SIGNIFICANT:
         lack = (
-            "lack of fit: the runs disagree with the model by more than their repeats scatter (set-up scatter between "
-            f"runs, or something the model lacks); intervals are widened {np.sqrt(variance.value[k]):.2g} times."
+            "lack of fit: the runs disagree with the model by more than their repeats scatter (set-up "
+            "scatter between runs, or something the model lacks); "
+            f"intervals are widened {np.sqrt(variance.value[k]):.2g} times."
         )
     offset = condition.offset()
     if offset:
-        lack = f"{lack} The two directions differ: offset of {offset:.3g} {force_unit}, in no declared model.".strip()
+        lack = (
+            f"{lack} The two directions differ: offset of {offset:.3g} {force_unit}, in no declared model."
+        ).strip()
     if condition.left_out:
         lack = f"{lack} {condition.left_out} runs without load were left out of the fit.".strip()
     for name, value, unit, reason in (
@@ -246,10 +263,20 @@ def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterat
         ("rmse_N", np.sqrt(np.mean(residual**2)), force_unit, ""),
         ("n_runs", len(condition.runs), "", ""),
         ("n_files", condition.runs["files"].sum(), "", ""),
-        ("n_speeds", max(len(values) for values in condition.levels.values()), "", "levels within one direction"),
+        (
+            "n_speeds",
+            max(len(values) for values in condition.levels.values()),
+            "",
+            "levels within one direction",
+        ),
     ):
         yield table_row(
-            quantity="statistics", parameter=name, value=_finite(value), unit=unit, identified=True, reason=reason
+            quantity="statistics",
+            parameter=name,
+            value=_finite(value),
+            unit=unit,
+            identified=True,
+            reason=reason,
         )
 
 
@@ -271,7 +298,9 @@ def _finite(value) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
 
 
-def table_row(*, quantity: str, parameter: str, unit: str, identified: bool, reason: str = "", **numbers) -> dict:
+def table_row(
+    *, quantity: str, parameter: str, unit: str, identified: bool, reason: str = "", **numbers
+) -> dict:
     """Return one row of a fit table; None and infinite ends become null.
 
     `numbers` are any of value, se, lo95, hi95 and u_sys.

@@ -1,14 +1,15 @@
 r"""mu_s and mu_c of all conditions from the forces, one v_s and one sigma_2 for all days of a series.
 
-In the declared model (Eq. 14 with Eq. 15) the days of a series share v_s and sigma_2; only mu_s and mu_c age. For a
-given v_s the force is linear in all other parameters,
+In the declared model (Eq. 14 with Eq. 15) the days of a series share v_s and sigma_2; only mu_s and mu_c age.
+For a given v_s the force is linear in all other parameters,
 
 .. math:: F\,\mathrm{sgn}\,v = N [\mu_c^{(i)} + (\mu_s^{(i)} - \mu_c^{(i)}) e^{-(v/v_s)^2}] + \sigma_2 |v|,
 
-so mu_s and mu_c of the conditions i, with their covariance, contain all information of the forces on an aging law: a
-law fitted to them by generalised least squares is fitted to the forces. Sharing v_s and sigma_2 reduces the standard
-errors, and determines conditions with too few speeds for a separate fit. If an F test rejects that the days of a
-series share them, its conditions keep their separate fits; so do days with few speeds that disagree with the others.
+so mu_s and mu_c of the conditions i, with their covariance, contain all information of the forces on an aging
+law: a law fitted to them by generalised least squares is fitted to the forces. Sharing v_s and sigma_2
+reduces the standard errors, and determines conditions with too few speeds for a separate fit. If an F test
+rejects that the days of a series share them, its conditions keep their separate fits; so do days with few
+speeds that disagree with the others.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ SHARED_P = 0.01
 PER_DECADE = 30
 # Largest relative standard error of a value that counts as determined.
 DETERMINED = 0.3
-# Singular values of a condition's two columns below this share of the largest count as zero. With one speed mu_s and
-# mu_c are not distinguishable.
+# Singular values of a condition's two columns below this share of the largest count as zero. With one speed
+# mu_s and mu_c are not distinguishable.
 RANK = 1e-8
 
 
@@ -83,7 +84,10 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
     conditions, _, variance = solve_conditions(steady)
     place = {c.name: k for k, c in enumerate(conditions)}
     series = series_of_curve(about.reset_index(drop=True), aging=True)
-    known_covariances, known_shifts = values_of(steady_fit, "covariance"), values_of(steady_fit, "effect_shift")
+    known_covariances, known_shifts = (
+        values_of(steady_fit, "covariance"),
+        values_of(steady_fit, "effect_shift"),
+    )
     count = len(shifts_of(steady))
     tables, covariances, shifts = [], [], []
     for names in (about["condition"].to_numpy(object)[series == s] for s in dict.fromkeys(series)):
@@ -98,11 +102,14 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
         own = free[free["condition"].isin(set(names) - covered)]
         tables.append(own)
         keys = list(zip(own["condition"], own["quantity"], strict=True))
-        shift = np.array([[known_shifts.get((c, f"{q}:{k + 1}"), 0.0) for k in range(count)] for c, q in keys])
+        shift = np.array(
+            [[known_shifts.get((c, f"{q}:{k + 1}"), 0.0) for k in range(count)] for c, q in keys]
+        )
         shift = shift.reshape(len(own), count)
         shifts.append(shift)
         same = own["condition"].to_numpy()[:, None] == own["condition"].to_numpy()[None, :]
-        covariances.append(steady_covariance(own, known_covariances) - same * (shift @ shift.T))  # added again below
+        # What is subtracted is added again below.
+        covariances.append(steady_covariance(own, known_covariances) - same * (shift @ shift.T))
     table = pd.concat(tables, ignore_index=True) if tables else free
     together = np.concatenate(shifts) if shifts else np.zeros((0, count))
     covariance = block_diag(*covariances) + together @ together.T  # effects are common to all conditions
@@ -114,8 +121,9 @@ def _shared(
 ) -> tuple[pd.DataFrame, np.ndarray, np.ndarray, set[str]] | None:
     """Return the values of a series on a shared curve, or None if its days do not share one.
 
-    Returns the values, their covariance, their change along the directions of the effects' uncertainty, shape (values,
-    k), and the conditions on the curve. `widened`, shape (conditions,), is the factor on the stated variances.
+    Returns the values, their covariance, their change along the directions of the effects' uncertainty, shape
+    (values, k), and the conditions on the curve. `widened`, shape (conditions,), is the factor on the stated
+    variances.
     """
     is_full = np.array([c.model == FULL for c in own])
     full = [c for c in own if c.model == FULL]
@@ -145,7 +153,7 @@ def _shared(
 
 
 def _worse(rise: float, more: int, df: float) -> bool:
-    """Return whether an F test rejects that a sum of squares rises by chance; `more` are its degrees of freedom."""
+    """Return whether an F test finds a sum of squares' rise significant, for `more` degrees of freedom."""
     return more > 0 and bool(fdtrc(more, df, rise / more) < SHARED_P)
 
 
@@ -166,7 +174,9 @@ class _Curve:
         rss = self._along(grid)
         best = int(np.argmin(rss))
         ends = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
-        found = minimize_scalar(lambda u: self._solve(u)[0], bounds=ends, method="bounded", options={"xatol": 1e-9})
+        found = minimize_scalar(
+            lambda u: self._solve(u)[0], bounds=ends, method="bounded", options={"xatol": 1e-9}
+        )
         self.log_v_s = float(found.x) if found.fun <= rss[best] else float(grid[best])
         self.rss, self.levels, self.sigma_2, rank = self._solve(self.log_v_s)
         self.df = int((weight > 0).sum()) - rank - 2
@@ -197,7 +207,7 @@ class _Curve:
         return own - np.divide(np.maximum(cross, 0.0) ** 2, size, out=np.zeros(size.shape), where=size > 0)
 
     def _solve(self, log_v_s: float) -> tuple[float, np.ndarray, float, int]:
-        """Return the sum of squares, mu_s and mu_c, shape (conditions, 2), sigma_2, and the rank of the levels."""
+        """Return the sum of squares, mu_s and mu_c, (conditions, 2), sigma_2, and the rank of the levels."""
         columns = self._columns(log_v_s)
         inverse = np.linalg.pinv(columns, rcond=RANK)
         both = np.stack([self.force * self.root, self.speed * self.root], axis=-1)  # F and |v|
@@ -216,7 +226,7 @@ class _Curve:
                 yield condition.name, name if condition.has_load else FORCES[name]
 
     def tangent(self) -> np.ndarray:
-        """Return the weighted derivatives with respect to the levels, ln v_s and sigma_2 if not 0, shape (runs, p)."""
+        """Return weighted derivatives with respect to the levels, ln v_s and sigma_2 if not 0, (runs, p)."""
         columns = self._columns(self.log_v_s)
         square = (self.speed / np.exp(self.log_v_s)) ** 2
         bend = np.diff(self.levels[:, ::-1], axis=1) * self.load * np.exp(-square) * 2 * square * self.root
@@ -225,6 +235,6 @@ class _Curve:
         return np.column_stack([block_diag(*columns), *shared])[there]
 
     def shifts(self) -> np.ndarray:
-        """Return the weighted changes of the forces along the directions of the effects' uncertainty, (runs, k)."""
+        """Return weighted changes of forces along the directions of the effects' uncertainty, (runs, k)."""
         weighted = [c.shifts * root[: len(c.runs), None] for c, root in zip(self.own, self.root, strict=True)]
         return np.concatenate(weighted)

@@ -13,15 +13,17 @@ from sealfit.fit.least_squares import Separable, covariance_of, even_grid, globa
 # ---------------------------------------------------------------- interval
 # Exact intervals of nonnegative coefficients from the sum of squares.
 
-# A coefficient is unbounded if the share of its column's variance that other columns do not explain is below this.
+# A coefficient is unbounded if the share of its column's variance that other columns do not explain is below
+# this.
 FREE = 1e-12
 
 
 def constrained_ends(columns, y, limit, nonnegative):
-    """Return the ends of {c_j : the least sum of squares at fixed c_j, the others nonnegative, is at most `limit`}.
+    """Return the ends of {c_j : the least sum of squares at fixed c_j, the others nonnegative, <= `limit`}.
 
-    At fixed c_j every active set of zeros among the others gives a parabola in c_j. The constrained optimum at an end
-    lies on one of them, so that the ends are the outermost feasible crossings: exact, without iteration.
+    At fixed c_j every active set of zeros among the others gives a parabola in c_j. The constrained optimum
+    at an end lies on one of them, so that the ends are the outermost feasible crossings: exact, without
+    iteration.
 
     Parameters
     ----------
@@ -70,7 +72,7 @@ def constrained_ends(columns, y, limit, nonnegative):
 
 
 def _ends(gram, centre, spare, j, keep, nonnegative):
-    """Return the crossings of one parabola: c_k = 0 for k not in `keep`, c_j = t, the others at their optimum."""
+    """Return the crossings of one parabola: c_k = 0 for k not in `keep`, c_j = t, others at their optimum."""
     rest = keep.copy()
     rest[j] = False
     mask = np.broadcast_to(rest, centre.shape)
@@ -94,7 +96,9 @@ def _ends(gram, centre, spare, j, keep, nonnegative):
         d_j = least + sign * half
         d_rest = -by_fixed - by_j * d_j[..., None]
         c_rest = centre + d_rest
-        feasible = ~np.any((c_rest < -1e-12 * np.abs(centre).max(axis=-1, keepdims=True)) & rest & nonnegative, axis=-1)
+        feasible = ~np.any(
+            (c_rest < -1e-12 * np.abs(centre).max(axis=-1, keepdims=True)) & rest & nonnegative, axis=-1
+        )
         value = np.where(possible & bounded & feasible, centre[..., j] + d_j, np.nan)
         if sign > 0:  # unbounded if all coefficients stay feasible as c_j grows
             open_ = ~bounded & (spare - base >= 0) & ~np.any((by_j > 1e-9) & rest & nonnegative, axis=-1)
@@ -104,13 +108,15 @@ def _ends(gram, centre, spare, j, keep, nonnegative):
 
 
 # ---------------------------------------------------------------- stribeck
-# Eq. 14 fitted to many conditions at once: F sgn(v) = N mu_s E + N mu_c (1 - E) + sigma_2 |v|, E = exp(-(v/v_s)^2).
+# Eq. 14 fitted to many conditions at once: F sgn(v) = N mu_s E + N mu_c (1 - E) + sigma_2 |v|, E =
+# exp(-(v/v_s)^2).
 #
-# In this form the coefficients of the three columns are the parameters. All three are nonnegative, as friction
-# dissipates energy at every speed; mu_s < mu_c is allowed. Without load, N = 1 and the coefficients are F_s and F_c.
+# In this form the coefficients of the three columns are the parameters. All three are nonnegative, as
+# friction dissipates energy at every speed; mu_s < mu_c is allowed. Without load, N = 1 and the coefficients
+# are F_s and F_c.
 
-# v_s is searched from a fifth of the slowest speed, below which E < 1e-10 at every speed, to twenty times the fastest,
-# above which 1 - E < 0.0025 is proportional to v^2.
+# v_s is searched from a fifth of the slowest speed, below which E < 1e-10 at every speed, to twenty times the
+# fastest, above which 1 - E < 0.0025 is proportional to v^2.
 SLOWEST, FASTEST = 1 / 5, 20.0
 # Grid points of v_s per decade, 1 % apart. With four or five speeds a minimum can be that narrow.
 PER_DECADE = 240
@@ -193,7 +199,9 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
     >>> [round(float(value[0]), 8) for value in (fit.mu_s, fit.mu_c, fit.v_s, fit.sigma_2)]
     [0.4, 0.3, 6.0, 0.02]
     """
-    speed, load, force, weight = np.broadcast_arrays(*(np.asarray(x, float) for x in (speed, load, force, weight)))
+    speed, load, force, weight = np.broadcast_arrays(
+        *(np.asarray(x, float) for x in (speed, load, force, weight))
+    )
     limits = search_limits(speed, weight)
     problems = Separable(stribeck_basis(speed, load), force, weight, nonnegative)
     found = global_optimum(problems, even_grid(*limits, PER_DECADE))
@@ -205,9 +213,9 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
 def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
     """Return the ends of the profile-likelihood intervals of mu_s, mu_c, v_s, sigma_2.
 
-    The interval of v_s is where the least sum of squares exceeds the minimum by at most `rise`. Those of the others are
-    unions, over these v_s, of the exact interval at that v_s with nonnegative coefficients. No quadratic approximation
-    is made, so that intervals may be asymmetric or open.
+    The interval of v_s is where the least sum of squares exceeds the minimum by at most `rise`. Those of the
+    others are unions, over these v_s, of the exact interval at that v_s with nonnegative coefficients. No
+    quadratic approximation is made, so that intervals may be asymmetric or open.
 
     Parameters
     ----------
@@ -244,7 +252,7 @@ def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
 
 
 def _crossing(problems: Separable, grid, u_best, inside, limit, sign):
-    """Return the outermost u below (sign -1) or above (+1) the optimum within the limit, and whether it is open."""
+    """Return the last u within the limit below (sign -1) or above (1) the optimum, and whether it is open."""
     along = sign * grid
     near = np.maximum(np.max(np.where(inside, along, -np.inf), axis=1), sign * u_best)
     far = np.min(np.where(along > near[:, None], along, np.inf), axis=1)
@@ -270,18 +278,21 @@ def conditional_ends(problems: Separable, u, limit):
 
 # ---------------------------------------------------------------- one condition
 def tangent(speed, load, values) -> np.ndarray:
-    """Return the derivatives of F sgn(v) with respect to mu_s, mu_c, v_s, sigma_2 at `values`, shape (n, 4)."""
+    """Return derivatives of F sgn(v) with respect to mu_s, mu_c, v_s, sigma_2 at `values`, shape (n, 4)."""
     mu_s, mu_c, v_s, _ = values
     square = (speed / v_s) ** 2
     decay = np.exp(-square)
-    return np.stack([load * decay, load * (1 - decay), load * (mu_s - mu_c) * decay * 2 * square / v_s, speed], axis=1)
+    return np.stack(
+        [load * decay, load * (1 - decay), load * (mu_s - mu_c) * decay * 2 * square / v_s, speed], axis=1
+    )
 
 
 def linearised(jacobian, weight, values, names, moved=None):
     """Return the covariance at unit variance, shape (p, p), and the change of the parameters with the forces.
 
-    `moved`, shape (n, k), are changes of the forces, and the result has shape (p, k). Without it every force is 1
-    larger, and the result has shape (p,). A coefficient at its bound 0 is fixed: its variance and change are 0.
+    `moved`, shape (n, k), are changes of the forces, and the result has shape (p, k). Without it every force
+    is 1 larger, and the result has shape (p,). A coefficient at its bound 0 is fixed: its variance and change
+    are 0.
     """
     free = np.array([name == "v_s" or value > 0 for name, value in zip(names, values, strict=True)])
     root = np.sqrt(weight)
@@ -293,9 +304,9 @@ def linearised(jacobian, weight, values, names, moved=None):
 def flat_p_value(speed, columns, weight, grid, statistic, df) -> float:
     r"""Return the p-value of mu_s = mu_c against a Stribeck curve with free v_s.
 
-    Under mu_s = mu_c v_s is not defined, so that the statistic is a maximum over v_s and not chi-square. As v_s varies,
-    the normalised Stribeck column, with mu and sigma_2 projected out, moves along a curve of length kappa on the unit
-    sphere. The volume of a tube around it gives
+    Under mu_s = mu_c v_s is not defined, so that the statistic is a maximum over v_s and not chi-square. As
+    v_s varies, the normalised Stribeck column, with mu and sigma_2 projected out, moves along a curve of
+    length kappa on the unit sphere. The volume of a tube around it gives
 
     .. math:: p = \frac{\kappa}{\pi} (1 + c^2/\nu)^{-\nu/2} + P(|t_\nu| > c)
 
@@ -314,8 +325,9 @@ def flat_p_value(speed, columns, weight, grid, statistic, df) -> float:
 
     Notes
     -----
-    Hotelling 1939, Am. J. Math. 61, 440-460; Davies 1987, Biometrika 74(1), 33-43, doi:10.1093/biomet/74.1.33;
-    with estimated variance: Knowles and Siegmund 1989, Int. Stat. Rev. 57(3), 205-220, doi:10.2307/1403794.
+    Hotelling 1939, Am. J. Math. 61, 440-460; Davies 1987, Biometrika 74(1), 33-43,
+    doi:10.1093/biomet/74.1.33; with estimated variance: Knowles and Siegmund 1989, Int. Stat. Rev. 57(3),
+    205-220, doi:10.2307/1403794.
     """
     root = np.sqrt(weight)
     base = columns * root[:, None]

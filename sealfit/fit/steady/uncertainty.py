@@ -1,9 +1,9 @@
 """Run means, their variance from pooled repeats, and the Birge ratio of set-up scatter.
 
-The unit of evidence is the run. Strokes of a file are averaged first, then the files (repeats) of a run. The scatter of
-repeats, pooled over the campaign, gives the variance of each run mean. If run means disagree with the model by more,
-because the rig is set up for each run or because the model lacks an effect, the intervals are widened by the Birge
-ratio, the square root of the reduced chi-square.
+The unit of evidence is the run. Strokes of a file are averaged first, then the files (repeats) of a run. The
+scatter of repeats, pooled over the campaign, gives the variance of each run mean. If run means disagree with
+the model by more, because the rig is set up for each run or because the model lacks an effect, the intervals
+are widened by the Birge ratio, the square root of the reduced chi-square.
 """
 
 from __future__ import annotations
@@ -24,15 +24,26 @@ from sealfit.ingest.scatter import Scatter
 POOLING_P = 0.25
 # Level at which a condition with more lack of fit than the others is widened by its own ratio.
 WORSE_P = 0.01
-# Smallest standard deviation of a run mean, as a share of the largest force. It keeps the weights of identical repeats
-# finite.
+# Smallest standard deviation of a run mean, as a share of the largest force. It keeps the weights of
+# identical repeats finite.
 SMALLEST_SD = 1e-9
 # Smallest force in a scatter proportional to the force, as a share of the largest force.
 SMALLEST_SHARE = 0.05
 # Prefix of the columns of `steady_after` with the directions of the subtracted effects' uncertainty.
 SHIFT = "effects_u"
 
-NEEDED = ("condition", "series", "rubber", "run_id", "file", "direction", "speed_mm_s", "load_N", "force_N", "used")
+NEEDED = (
+    "condition",
+    "series",
+    "rubber",
+    "run_id",
+    "file",
+    "direction",
+    "speed_mm_s",
+    "load_N",
+    "force_N",
+    "used",
+)
 
 
 def run_means(steady: pd.DataFrame) -> pd.DataFrame:
@@ -46,9 +57,9 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        `condition`, `run_id`, `direction`, `speed` (|v|), `set` (commanded |v|, NaN where unknown), `load` (NaN where
-        unknown), `force` (F sgn v), `half` (half of the difference between the directions in a merged row) and `files`,
-        sorted by the first three; and the columns of `SHIFT`.
+        `condition`, `run_id`, `direction`, `speed` (|v|), `set` (commanded |v|, NaN where unknown), `load`
+        (NaN where unknown), `force` (F sgn v), `half` (half of the difference between the directions in a
+        merged row) and `files`, sorted by the first three; and the columns of `SHIFT`.
 
     Raises
     ------
@@ -72,7 +83,8 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
             "speed": rows["speed_mm_s"].astype(float).abs(),
             "set": commanded.astype(float).abs(),
             "load": rows["load_N"].astype(float),
-            "force": rows["force_N"].astype(float) * rows["direction"].astype(int).replace(BOTH_DIRECTIONS, 1),
+            "force": rows["force_N"].astype(float)
+            * rows["direction"].astype(int).replace(BOTH_DIRECTIONS, 1),
             "half": rows["half_N"],
             **{name: rows[name].astype(float) for name in shifts_of(rows)},
         }
@@ -85,7 +97,8 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     if bad.any():
         first = runs[bad].iloc[0]
         raise FitError(
-            f"run {first['run_id']} has speed {first['speed']:g} and force {first['force']:g} in its steady window.",
+            f"run {first['run_id']} has speed {first['speed']:g} and force {first['force']:g} "
+            "in its steady window.",
             fix="Leave it out of the campaign, or look at its steady window.",
         )
     return runs
@@ -97,7 +110,7 @@ def shifts_of(table: pd.DataFrame) -> list[str]:
 
 
 def run_weights(runs: pd.DataFrame, scatter: Scatter) -> np.ndarray:
-    """Return 1/variance of each run mean, shape (n,), from the pooled scatter of repeats; without repeats 1."""
+    """Return 1/variance of run means, shape (n,), from the pooled scatter of repeats; without repeats 1."""
     if not scatter.df > 0:
         return np.ones(len(runs))
     force = runs["force"].abs().to_numpy(float)
@@ -111,8 +124,8 @@ def proportional_weights(fitted_N: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     fitted_N : ndarray, shape (n,)
-        Friction of every run from a fit with equal weights. With the measured force the weight would depend on its
-        error, and a run whose force an offset brings near zero would dominate.
+        Friction of every run from a fit with equal weights. With the measured force the weight would depend
+        on its error, and a run whose force an offset brings near zero would dominate.
     """
     size = np.abs(fitted_N)
     return 1.0 / np.maximum(size, SMALLEST_SHARE * size.max(initial=0.0) or 1.0) ** 2
@@ -133,7 +146,9 @@ def more_likely(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float)
     if not df > 0:
         return 0
     with np.errstate(divide="ignore"):
-        return int(np.argmin([len(w) * np.log(c / df) - np.log(w).sum() for c, w in zip(chi2, weights, strict=True)]))
+        return int(
+            np.argmin([len(w) * np.log(c / df) - np.log(w).sum() for c, w in zip(chi2, weights, strict=True)])
+        )
 
 
 @dataclass(frozen=True)
@@ -154,7 +169,7 @@ class UnitVariance:
         return replace(self, **own)
 
     def rise(self) -> np.ndarray:
-        """Return the rise of chi-square above its minimum at the ends of a 95 % interval, shape (conditions,)."""
+        """Return chi-square's rise above its minimum at the ends of a 95 % interval, shape (conditions,)."""
         with np.errstate(invalid="ignore"):
             return stdtrit(self.df, 0.975) ** 2 * self.value
 
@@ -162,10 +177,10 @@ class UnitVariance:
 def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
     """Return the factors on the variances stated by the weights.
 
-    With repeats (`pure_df` > 0) the reduced chi-square, pooled over the conditions, is tested against pure error. If
-    its p-value is at most `POOLING_P`, the factor is the pooled ratio, at least 1, with the pooled degrees of freedom.
-    Else it is 1 with `pure_df`. A condition whose ratio exceeds that at level `WORSE_P` gets its own ratio. Without
-    repeats the weights are relative and the pooled ratio is the variance.
+    With repeats (`pure_df` > 0) the reduced chi-square, pooled over the conditions, is tested against pure
+    error. If its p-value is at most `POOLING_P`, the factor is the pooled ratio, at least 1, with the pooled
+    degrees of freedom. Else it is 1 with `pure_df`. A condition whose ratio exceeds that at level `WORSE_P`
+    gets its own ratio. Without repeats the weights are relative and the pooled ratio is the variance.
 
     Parameters
     ----------
@@ -176,7 +191,8 @@ def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
 
     Notes
     -----
-    Birge 1932, Phys. Rev. 40, 207; Bancroft 1944, Ann. Math. Statist. 15(2), 190-204, doi:10.1214/aoms/1177731284.
+    Birge 1932, Phys. Rev. 40, 207; Bancroft 1944, Ann. Math. Statist. 15(2), 190-204,
+    doi:10.1214/aoms/1177731284.
     """
     chi2, df = np.asarray(chi2, float), np.asarray(df, float)
     total, total_df = float(chi2.sum()), float(df.sum())
@@ -207,9 +223,9 @@ def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
 def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
     """Return the distinct speed levels of one condition, rising, per direction: {+1: (k,), -1: (m,)}.
 
-    They are commanded speeds if every run of the direction has one, else measured speeds grouped within 25 %. Each
-    direction is counted separately: an offset between slow strokes forward and fast ones backward could be taken for a
-    Stribeck curve.
+    They are commanded speeds if every run of the direction has one, else measured speeds grouped within 25 %.
+    Each direction is counted separately: an offset between slow strokes forward and fast ones backward could
+    be taken for a Stribeck curve.
     """
     directions, commanded, measured = (runs[name].to_numpy() for name in ("direction", "set", "speed"))
     levels = {}

@@ -55,7 +55,7 @@ MOST_TRACES = 6
 def draw_aging(
     ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Units, before: pd.DataFrame | None = None
 ) -> None:
-    """Draw the coefficients of one series over aging time: the law with its band, and the fit of each condition.
+    """Draw the coefficients of one series over aging time: the law with its band, and each condition's fit.
 
     Parameters
     ----------
@@ -74,20 +74,32 @@ def draw_aging(
     for k, quantity in enumerate(quantities):
         colour, marker = CYCLE[k % len(CYCLE)], "os^Dv"[k % 5]
         curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
-        ax.fill_between(curve["aging_days"], curve["lo95"], curve["hi95"], color=colour, alpha=0.18, linewidth=0)
+        ax.fill_between(
+            curve["aging_days"], curve["lo95"], curve["hi95"], color=colour, alpha=0.18, linewidth=0
+        )
         ax.plot(curve["aging_days"], curve["value"], color=colour)
         if before is not None:
             earlier = before[before["quantity"] == quantity].sort_values("aging_days")
             ax.plot(earlier["aging_days"], earlier["value"], color=colour, linestyle=":", linewidth=1.1)
         here = points[points["quantity"] == quantity]
-        spread = np.nan_to_num(np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float))
+        spread = np.nan_to_num(
+            np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float)
+        )
         ax.errorbar(
-            here["aging_days"], here["value"], np.abs(spread), color=colour, fmt=marker, elinewidth=0.8, capsize=1.5
+            here["aging_days"],
+            here["value"],
+            np.abs(spread),
+            color=colour,
+            fmt=marker,
+            elinewidth=0.8,
+            capsize=1.5,
         )
     ax.xaxis.set_major_locator(round_ticks(integer=True))
     ax.set_xlabel(plain(units.label("aging_days")))
     ax.set_ylabel(
-        "friction coefficient" if "mu_s" in quantities or "mu_c" in quantities else plain(units.label("force_N"))
+        "friction coefficient"
+        if "mu_s" in quantities or "mu_c" in quantities
+        else plain(units.label("force_N"))
     )
 
 
@@ -111,7 +123,9 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         note += " steady_fit.parquet and aging_curves.parquet have all."
     rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
     before = tables.get("aging_curves_before", curves.iloc[:0])
-    shown = pd.concat([curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"]]).dropna()
+    shown = pd.concat(
+        [curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"]]
+    ).dropna()
     span = padded(shown.quantile(0.002), shown.quantile(0.998))
     right = max(curves["aging_days"].max(), points["aging_days"].max() if len(points) else 0.0)
     unaged = points["series"].map(is_unaged).astype(bool)
@@ -126,7 +140,9 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
             ax.set_xlim(-0.03 * right, 1.03 * right)
 
         first = float(curve["value"].iloc[0])
-        alt = f"Aging, {names(name)}: {joined([symbol_plain(q) for q in quantities])} over {number(right)} d; "
+        alt = (
+            f"Aging, {names(name)}: {joined([symbol_plain(q) for q in quantities])} over {number(right)} d; "
+        )
         alt += f"{symbol_plain(quantities[0])} starts at {number(first)}."
         panels.append(Panel(short(names(name)), alt, draw))
     legend = [Key(q, CYCLE[k % len(CYCLE)], symbol=True) for k, q in enumerate(quantities)]
@@ -142,7 +158,9 @@ def _law_misfits(points: pd.DataFrame, curves: pd.DataFrame) -> dict[str, float]
     gaps: dict[str, list[float]] = {}
     for (name, quantity), own in points.groupby(["series", "quantity"]):
         if (law := laws.get((name, quantity))) is not None:
-            expected = np.interp(own["aging_days"].astype(float), law["aging_days"], law["value"].astype(float))
+            expected = np.interp(
+                own["aging_days"].astype(float), law["aging_days"], law["value"].astype(float)
+            )
             gaps.setdefault(name, []).extend((own["value"].astype(float) - expected).tolist())
     return {name: rms(values) for name, values in gaps.items()}
 
@@ -173,7 +191,12 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
     thin = envelope(along_motion(trace))
     error = thin["force_se_N"].fillna(0)
     ax.fill_between(
-        thin["displacement_mm"], thin["force_N"] - error, thin["force_N"] + error, color=AFTER, alpha=0.25, linewidth=0
+        thin["displacement_mm"],
+        thin["force_N"] - error,
+        thin["force_N"] + error,
+        color=AFTER,
+        alpha=0.25,
+        linewidth=0,
     )
     whole = thin["n"] == thin["n"].max()  # where a repeat begins later, its own start pulls the mean
     ax.plot(thin["displacement_mm"], thin["force_N"], color=SKY, linewidth=0.8)
@@ -181,8 +204,8 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
     trace = trace.sort_values("displacement_mm")
     steady = trace["steady"].astype(bool)
     ax.fill_between(
-        trace["displacement_mm"], 0, 1, where=steady, transform=ax.get_xaxis_transform(), color=QUIET, alpha=0.12,
-        linewidth=0, zorder=0,
+        trace["displacement_mm"], 0, 1, where=steady, transform=ax.get_xaxis_transform(), color=QUIET,
+        alpha=0.12, linewidth=0, zorder=0,
     )  # fmt: skip
     ax.set_xlabel(plain(units.label("displacement_mm")))
     ax.set_ylabel(plain(units.label("force_N")))
@@ -194,7 +217,7 @@ def along_motion(traces: pd.DataFrame) -> pd.DataFrame:
 
 
 def envelope(trace: pd.DataFrame, buckets: int = TRACE_BUCKETS) -> pd.DataFrame:
-    """Return a trace thinned to the lowest and highest force of each bucket, so that ripples keep their height."""
+    """Return a trace thinned to the lowest and highest force of each bucket; ripples keep their height."""
     trace = trace[trace["force_N"].notna()].sort_values("displacement_mm")
     if len(trace) <= 2 * buckets:
         return trace
@@ -280,7 +303,11 @@ SCALED = "scaled aging time"
 
 
 def draw_master_curve(
-    ax: Axes, rows: pd.DataFrame, colours: Mapping[float, str], units: Units, before: pd.DataFrame | None = None
+    ax: Axes,
+    rows: pd.DataFrame,
+    colours: Mapping[float, str],
+    units: Units,
+    before: pd.DataFrame | None = None,
 ) -> None:
     """Draw one quantity's values over scaled aging time, and the law with its 95 % band.
 
@@ -310,7 +337,9 @@ def draw_master_curve(
     ax.plot(fresh["scaled_days"], fresh["value"], linestyle="", marker="o", color=BLACK, clip_on=False)
     percents = np.sort(aged["compression_ratio_pct"].dropna().unique())
     for (celsius, percent), own in aged.groupby(["temperature_C", "compression_ratio_pct"], dropna=False):
-        marker = MARKERS[int(np.searchsorted(percents, percent)) % len(MARKERS)] if np.isfinite(percent) else "o"
+        marker = (
+            MARKERS[int(np.searchsorted(percents, percent)) % len(MARKERS)] if np.isfinite(percent) else "o"
+        )
         ax.plot(
             own["scaled_days"],
             own["value"],
@@ -346,8 +375,12 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
         title = f"{rubber}, {symbol_plain(quantity)}" if several else symbol_plain(quantity)
         alt = f"Master curve of {title}: from {number(rows['value'].max())} to {number(rows['value'].min())}."
         panels.append(Panel(title, alt, draw))
-    legend = [Key(f"{given(t)} °C", colour, "point") for t, colour in spread(list(colours.items()), MOST_KEYS)]
+    legend = [
+        Key(f"{given(t)} °C", colour, "point") for t, colour in spread(list(colours.items()), MOST_KEYS)
+    ]
     legend += [Key("unaged", BLACK, "point"), Key("law, 95 % band", FLOOR, "band")]
     legend += [Key("before, without the effects", FLOOR, "dotted")] if len(before) else []
-    note = "" if len(groups) == len(panels) else f"{len(panels)} of {len(groups)}; master_curve.parquet has all."
+    note = (
+        "" if len(groups) == len(panels) else f"{len(panels)} of {len(groups)}; master_curve.parquet has all."
+    )
     return Plot("master_curve", "Master curve", tuple(panels), tuple(legend), note)

@@ -62,10 +62,18 @@ def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
             ax.plot([before, after], [y, y], color=QUIET, linewidth=1.2, zorder=1)
             ax.plot(after, y, "o", color=AFTER, markersize=6.5, zorder=3)
             ax.annotate(
-                texts[2 * k + 1], (after, y), (0, 7), textcoords="offset points", ha="center", color=AFTER, bbox=box
+                texts[2 * k + 1],
+                (after, y),
+                (0, 7),
+                textcoords="offset points",
+                ha="center",
+                color=AFTER,
+                bbox=box,
             )
         ax.plot(before, y, "o", color=BEFORE, markersize=6.5, zorder=2)
-        ax.annotate(texts[2 * k], (before, y), (0, 7), textcoords="offset points", ha="center", color=BEFORE, bbox=box)
+        ax.annotate(
+            texts[2 * k], (before, y), (0, 7), textcoords="offset points", ha="center", color=BEFORE, bbox=box
+        )
     floor = closure.get("noise_floor_N")
     if known(floor):
         ax.axvline(floor, color=FLOOR, linestyle="--", linewidth=1.0, zorder=0)
@@ -105,12 +113,18 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, co
         return None
     unit = config.units.unit("force")
     pairs = [
-        f"{label} {number(closure['before'].get(key))} before, {number(closure['after'].get(key))} {unit} after"
+        f"{label} {number(closure['before'].get(key))} before, "
+        f"{number(closure['after'].get(key))} {unit} after"
         for key, label in ERRORS
     ]
     floor = closure.get("noise_floor_N")
-    alt = f"Rms errors: {'; '.join(pairs)}; noise floor {f'{number(floor)} {unit}' if known(floor) else 'unknown'}."
-    panels = [Panel("Errors and noise floor", alt, lambda ax: draw_errors(ax, closure, config.units), left=0.86)]
+    alt = (
+        f"Rms errors: {'; '.join(pairs)}; "
+        f"noise floor {f'{number(floor)} {unit}' if known(floor) else 'unknown'}."
+    )
+    panels = [
+        Panel("Errors and noise floor", alt, lambda ax: draw_errors(ax, closure, config.units), left=0.86)
+    ]
     before, after = tables["residuals_before"], tables["residuals_after"]
     if len(before) and len(after):
         held = before["heldout_residual_N"].notna().any() and after["heldout_residual_N"].notna().any()
@@ -121,11 +135,15 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, co
             alt += f"{number(float(np.std(a)))} before, "
             alt += f"{number(float(np.std(b)))} {unit} after."
             panels.append(
-                Panel("Errors of run means", alt, lambda ax: draw_histogram(ax, a, b, config.units, bool(held)))
+                Panel(
+                    "Errors of run means", alt, lambda ax: draw_histogram(ax, a, b, config.units, bool(held))
+                )
             )
     same = closure["before"] == closure["after"]
     legend = (
-        [Key("declared model", BEFORE, "bar")] if same else [Key("before", BEFORE, "bar"), Key("after", AFTER, "bar")]
+        [Key("declared model", BEFORE, "bar")]
+        if same
+        else [Key("before", BEFORE, "bar"), Key("after", AFTER, "bar")]
     )
     if known(floor):
         legend.append(Key("noise floor", FLOOR, "dashed"))
@@ -134,7 +152,7 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, co
 
 # ---------------------------------------------------------------- residual by level
 def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
-    """Draw the variance of the residual at every level, before and after; beside each bar its standard deviation."""
+    """Draw the residual variance at every level, before and after; beside each bar its standard deviation."""
     whole = levels[levels["channel"].isna()]
     names = [name for name in LEVELS if name in set(whole["level"])]
     names += [name for name in dict.fromkeys(whole["level"]) if name not in LEVELS]
@@ -151,7 +169,9 @@ def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
                 continue
             y = k if single else k + shift
             ax.barh(y, value**2, 0.34, color=colour, linewidth=0)
-            ax.annotate(texts[stage, name], (value**2, y), (4, 0), textcoords="offset points", va="center", size=7.5)
+            ax.annotate(
+                texts[stage, name], (value**2, y), (4, 0), textcoords="offset points", va="center", size=7.5
+            )
     unit = plain(units.unit("force"))
     ax.set_yticks(range(len(names)), list(reversed(names)))
     ax.set_ylim(-0.6, len(names) - 0.4)
@@ -171,7 +191,9 @@ def variance_levels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot 
     alt = f"Standard deviation of the residual by level: {', '.join(parts)}."
     height = 0.82 + 0.42 * whole["level"].nunique()
     title = f"Variance by level (labels: sd in {unit})"
-    panel = Panel(title, alt, lambda ax: draw_levels(ax, levels, config.units), height=max(height, 1.6), left=0.86)
+    panel = Panel(
+        title, alt, lambda ax: draw_levels(ax, levels, config.units), height=max(height, 1.6), left=0.86
+    )
     legend = (Key("before", BEFORE, "bar"), Key("after", AFTER, "bar"))
     return Plot("variance_levels", "Residual variance by level", (panel,), legend)
 
@@ -240,7 +262,9 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
 def categories(rows: pd.DataFrame, channel: str) -> list[str]:
     """Return the names of a category's rows; both directions in words."""
     if channel == "direction":
-        return ["forward" if value > 0 else "backward" for value in rows["x"].fillna(rows["label"]).astype(float)]
+        return [
+            "forward" if value > 0 else "backward" for value in rows["x"].fillna(rows["label"]).astype(float)
+        ]
     return rows["label"].astype(str).tolist()
 
 
@@ -287,7 +311,8 @@ def _span(channels: pd.DataFrame) -> tuple[float, float]:
     ]
     values = pd.concat([*ends, pd.Series([0.0])]).dropna()
     means = pd.concat([channels["before_N"], channels["after_N"]]).abs().max()
-    low, high = max(values.min(), -2.5 * means), min(values.max(), 2.5 * means)  # a wide bar does not flatten the rest
+    # a wide bar does not flatten the rest
+    low, high = max(values.min(), -2.5 * means), min(values.max(), 2.5 * means)
     room = 0.07 * (high - low) or 1.0
     return low - room, high + room
 
@@ -336,7 +361,9 @@ def shape_scale(effect: Mapping) -> float:
     return 100.0 if effect.get("operation") == "multiply" else 1.0
 
 
-def shape_label(rows: pd.DataFrame, effect: Mapping, units: Units, symbol: Callable[[str], str] = symbol_plain) -> str:
+def shape_label(
+    rows: pd.DataFrame, effect: Mapping, units: Units, symbol: Callable[[str], str] = symbol_plain
+) -> str:
     """Return the axis label of a shape, with the unit: "added force (N)", "change of μ (%)"."""
     target = effect.get("acts_on", "force")
     force = plain(units.quantity("force"))
@@ -348,7 +375,7 @@ def shape_label(rows: pd.DataFrame, effect: Mapping, units: Units, symbol: Calla
 
 
 def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> Plot | None:
-    """Return the shape of every effect, a panel for each channel it is drawn along, or None if there is none."""
+    """Return the shape of every effect, a panel for each channel it is drawn along; None if there is none."""
     shapes = tables["shapes"]
     if closure is None or shapes.empty:
         return None

@@ -10,7 +10,16 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sealfit.config import Config
-from sealfit.report.notation import ConditionNames, channel_words, count, given, is_unaged, number, plain, short
+from sealfit.report.notation import (
+    ConditionNames,
+    channel_words,
+    count,
+    given,
+    is_unaged,
+    number,
+    plain,
+    short,
+)
 from sealfit.report.style import (
     BLACK,
     CYCLE,
@@ -50,8 +59,8 @@ LOG_SPAN = 20.0  # speeds that span this factor are drawn on a logarithmic axis
 class Line:
     """One condition in a panel of force against speed, all in the direction of motion (magnitudes).
 
-    `curves` holds, per direction and load, columns direction, speed, before, after, lo, hi; `points` speed, force, sd,
-    direction.
+    `curves` holds, per direction and load, columns direction, speed, before, after, lo, hi; `points` speed,
+    force, sd, direction.
     """
 
     label: str
@@ -77,9 +86,18 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
     dense = sum(len(line.points) for line in lines) > MOST_MARKS
     for line in lines:
         for curve in line.curves:
-            ax.fill_between(curve["speed"], curve["lo"], curve["hi"], color=line.colour, alpha=0.2, linewidth=0)
+            ax.fill_between(
+                curve["speed"], curve["lo"], curve["hi"], color=line.colour, alpha=0.2, linewidth=0
+            )
             if not curve["before"].equals(curve["after"]):
-                ax.plot(curve["speed"], curve["before"], color=line.colour, linestyle=":", linewidth=0.9, alpha=0.8)
+                ax.plot(
+                    curve["speed"],
+                    curve["before"],
+                    color=line.colour,
+                    linestyle=":",
+                    linewidth=0.9,
+                    alpha=0.8,
+                )
             backward = len(curve) and curve["direction"].iloc[0] < 0
             ax.plot(curve["speed"], curve["after"], color=line.colour, linestyle="--" if backward else "-")
         for direction, points in line.points.groupby("direction") if len(line.points) else ():
@@ -130,7 +148,8 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     span = padded(shown.min(), shown.max())
     x_span = (speeds.min() / 1.2 if log else 0.0, speeds.max() * (1.2 if log else 1.06))
     drawn = {*unaged, *(c for group in groups.values() for c in group)}
-    most = max(2, MOST_CURVES // max(len(group) for group in groups.values()))  # of a condition: directions and loads
+    # curves of a condition: directions and loads
+    most = max(2, MOST_CURVES // max(len(group) for group in groups.values()))
     own_curves = {
         c: tuple(spread([part for _, part in own.groupby(["direction", "load"], dropna=False)], most))
         for c, own in curves[curves["condition"].isin(drawn)].groupby("condition")
@@ -157,7 +176,9 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
             )
         )
     legend = [Key(short(names(c)), BLACK) for c in spread(unaged, MOST_KEYS)]
-    legend += [Key(short(_level_label(last, level, names)), colour[level]) for level in spread(levels, MOST_KEYS)]
+    legend += [
+        Key(short(_level_label(last, level, names)), colour[level]) for level in spread(levels, MOST_KEYS)
+    ]
     both = points["direction"].nunique() > 1
     legend.append(Key("run means, forward" if both else "run means", FLOOR, "point"))
     if both:
@@ -188,20 +209,24 @@ def _force_drawer(lines, config: Config, log: bool, span, x_span) -> Callable[[A
 
 
 def _force_alt(title: str, lines: Sequence[Line], config: Config) -> str:
-    forces = pd.concat([line.points["force"] for line in lines if len(line.points)] or [pd.Series(dtype=float)])
+    forces = pd.concat(
+        [line.points["force"] for line in lines if len(line.points)] or [pd.Series(dtype=float)]
+    )
     unit = config.units.unit("force")
-    text = f"{config.units.quantity('force')} against {config.units.quantity('speed')}{', ' + title if title else ''}: "
-    text += f"{count(len(lines), 'condition')}"
+    text = f"{config.units.quantity('force')} against {config.units.quantity('speed')}"
+    text += f"{', ' + title if title else ''}: {count(len(lines), 'condition')}"
     if len(forces):
         text += f", run means from {number(forces.min())} to {number(forces.max())} {unit}"
     return text + "."
 
 
 def run_points(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
-    """Return mean and scatter of every run: condition, direction, speed, force (in the direction of motion), sd, n."""
+    """Return mean and scatter of every run: condition, direction, speed, force (along the motion), sd, n."""
     used = steady[steady["used"].astype(bool)]
     if used.empty:
-        return pd.DataFrame(columns=["condition", "direction", "speed", "force", "sd", "n"]).astype({"force": float})
+        return pd.DataFrame(columns=["condition", "direction", "speed", "force", "sd", "n"]).astype(
+            {"force": float}
+        )
     sign = used["direction"].astype(float)
     rows = used.assign(speed=used["speed_mm_s"].abs(), force=used["force_N"] * sign)
     files = rows.groupby(["condition", "run_id", "direction", "file"], sort=False)[["speed", "force"]].mean()
@@ -212,13 +237,14 @@ def run_points(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
 
 def curve_lines(tables: Mapping[str, pd.DataFrame], config: Config) -> pd.DataFrame:
-    """Return the loop's curves, or those of the steady fit where the loop was not run, by magnitude of the speed."""
+    """Return the loop's curves, or the steady fit's where the loop was not run, by magnitude of the speed."""
     curves = tables["curves"]
     if curves.empty:
         return _steady_curves(tables["steady_fit"], tables["steady"])
     sign = np.sign(curves["speed_mm_s"]).replace(0.0, 1.0)
     ends = np.sort(
-        np.stack([curves["force_after_lo95_N"] * sign, curves["force_after_hi95_N"] * sign]).astype(float), axis=0
+        np.stack([curves["force_after_lo95_N"] * sign, curves["force_after_hi95_N"] * sign]).astype(float),
+        axis=0,
     )
     return pd.DataFrame(
         {
@@ -245,29 +271,41 @@ def _steady_curves(fit: pd.DataFrame, steady: pd.DataFrame) -> pd.DataFrame:
         load = here["load_N"].mean() if here["load_N"].notna().any() else np.nan
         top = {"mu_s": values.get("mu_s", values.get("F_s")), "mu_c": values.get("mu_c", values.get("F_c"))}
         top |= {"v_s": values.get("v_s"), "sigma_2": values.get("sigma_2")}
-        if here.empty or any(value is None or not np.isfinite(value) for value in top.values()) or top["v_s"] <= 0:
+        if (
+            here.empty
+            or any(value is None or not np.isfinite(value) for value in top.values())
+            or top["v_s"] <= 0
+        ):
             continue
-        speed = np.geomspace(max(here["speed_mm_s"].abs().min(), 1e-6) / 1.2, here["speed_mm_s"].abs().max() * 1.05, 80)
+        speed = np.geomspace(
+            max(here["speed_mm_s"].abs().min(), 1e-6) / 1.2, here["speed_mm_s"].abs().max() * 1.05, 80
+        )
         force = stribeck_force(speed, 1.0 if np.isnan(load) else load, **top)
         found.append(pd.DataFrame({"condition": condition, "direction": 1.0, "load": load, "speed": speed,
                                    "before": force, "after": force, "lo": np.nan, "hi": np.nan}))  # fmt: skip
-    return pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=columns).astype({"speed": float})
+    return (
+        pd.concat(found, ignore_index=True)
+        if found
+        else pd.DataFrame(columns=columns).astype({"speed": float})
+    )
 
 
 def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict[str, list[str]]:
-    """Return {title: conditions} of the panels: conditions that differ in the last column only stand together."""
+    """Return {title: conditions} of the panels: conditions that differ only in the last column share one."""
     groups: dict[str, list[str]] = {}
     for condition in conditions:
         others = {name: value for name, value in names.parts(condition).items() if name != last}
         title = names(", ".join(f"{name}={value}" for name, value in others.items())) if others else ""
         groups.setdefault(title, []).append(condition)
     groups = {
-        t: in_order(g, key=lambda c: names.parts(c).get(last, "")) for t, g in sorted(groups.items(), key=natural)
+        t: in_order(g, key=lambda c: names.parts(c).get(last, ""))
+        for t, g in sorted(groups.items(), key=natural)
     }
     if all(len(group) <= MOST_COLOURS for group in groups.values()):
         return groups
     if len(conditions) > MOST_PANELS and all(is_number(names.parts(c).get(last, "")) for c in conditions):
-        return {title: spread(group, MOST_COLOURS) for title, group in groups.items()}  # numbers have an order
+        # numbers have an order
+        return {title: spread(group, MOST_COLOURS) for title, group in groups.items()}
     return {names(c): [c] for group in groups.values() for c in group}
 
 
@@ -314,7 +352,7 @@ BEYOND = 1.5  # of that distance is shown
 
 
 def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], units: Units) -> None:
-    """Draw the mean pre-sliding force of a condition over the distance slid, its standard error, and the model.
+    """Draw a condition's mean pre-sliding force over the distance slid, its standard error, and the model.
 
     Parameters
     ----------
@@ -336,10 +374,13 @@ def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], un
             linewidth=0,
         )  # fmt: skip
         ax.plot(
-            curve["distance_mm"], curve["force_N"], linestyle="", marker="o" if direction > 0 else "<", markersize=2.6,
-            color=colour, markerfacecolor=colour if direction > 0 else "white", markeredgewidth=0.7,
+            curve["distance_mm"], curve["force_N"], linestyle="", marker="o" if direction > 0 else "<",
+            markersize=2.6, color=colour, markerfacecolor=colour if direction > 0 else "white",
+            markeredgewidth=0.7,
         )  # fmt: skip
-        ax.plot(curve["distance_mm"], curve["model_N"], color=colour, linestyle="-" if direction > 0 else "--")
+        ax.plot(
+            curve["distance_mm"], curve["model_N"], color=colour, linestyle="-" if direction > 0 else "--"
+        )
     ax.set_xlim(0.0, _reach(curves))
     ax.set_xlabel(plain(units.label("distance_mm")))
     ax.set_ylabel(plain(units.label("force_N")))
@@ -356,12 +397,14 @@ def _reach(curves: pd.DataFrame) -> float:
 
 
 def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
-    """Return the pre-sliding force of up to six conditions at up to three speeds each, or None without one."""
+    """Return the pre-sliding force of up to six conditions at up to three speeds each; None without one."""
     curves = tables["dynamic_curves"]
     if curves.empty:
         return None
     names, units = ConditionNames.of(config), config.units
-    ordered = sorted(curves["condition"].unique(), key=lambda c: (not is_unaged(c), natural((names(c), None))))
+    ordered = sorted(
+        curves["condition"].unique(), key=lambda c: (not is_unaged(c), natural((names(c), None)))
+    )
     picked = [ordered[k] for k in evenly(len(ordered), min(len(ordered), MOST_START_PANELS))]
     speeds = np.sort(curves["speed_set_mm_s"].dropna().unique())
     speeds = speeds[evenly(len(speeds), min(len(speeds), MOST_SPEEDS))]
@@ -379,9 +422,9 @@ def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
             draw_starts(ax, own, colours, units)
             ax.set_ylim(*span)
 
-        alt = f"Pre-sliding, {names(condition)}: {units.quantity('force')} from {number(own['force_N'].min())} to "
-        alt += f"{number(own['force_N'].max())} {units.unit('force')} over {number(_reach(own))} "
-        alt += f"{units.unit('displacement')}."
+        alt = f"Pre-sliding, {names(condition)}: {units.quantity('force')} "
+        alt += f"from {number(own['force_N'].min())} to {number(own['force_N'].max())} {units.unit('force')} "
+        alt += f"over {number(_reach(own))} {units.unit('displacement')}."
         panels.append(Panel(short(names(condition)), alt, draw))
     legend = [Key(f"{given(speed)} {units.unit('speed')}", colour) for speed, colour in colours.items()]
     legend.append(Key("mean of the strokes", FLOOR, "point"))
