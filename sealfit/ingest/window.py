@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import median_filter
+from scipy.special import chdtrc
 
 from sealfit.ingest.presliding import Rise, Start, rise_of
 from sealfit.ingest.segments import median, stretches, weighted_median
@@ -32,9 +33,9 @@ SPEED_PIECES = (8, 64)
 LEAST_ROWS = 8
 # Share by which speeds may differ without a finding. Errors of screws and scales are of that size.
 SAME_SPEED = 0.001
-# Scatter of the speeds, in units of that by chance, from which they differ. 3 strokes of 1,000 exceed it by
-# chance.
-CLEAR = 3.0
+# P-value below which the speeds of pieces differ. It is small because campaigns have thousands of strokes,
+# and one stroke with a change of speed that is noise can outweigh the differences between runs.
+CLEAR = 1e-6
 # Noise of the local speed, as a share of the tolerance. A false exit from the plateau then takes four SDs.
 SPEED_NOISE = 0.25
 # Samples of a steady window, or of a stroke that may have one, at least.
@@ -263,7 +264,7 @@ def _off_speed(
     alike = residual.size / max(2 * np.count_nonzero(np.diff(np.sign(residual), axis=1)), 1)
     variance = (residual**2).mean() * max(alike, 1.0) / square + error**2
     scatter = float(((slope - slope.mean()) ** 2 / variance).sum())
-    if not scatter > CLEAR * (pieces - 1):
+    if chdtrc(pieces - 1, scatter) > CLEAR:
         return np.zeros(n)
     off = slope - speed
     # A whole piece further at either end, along a straight line.
