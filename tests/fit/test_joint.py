@@ -103,6 +103,25 @@ def test_through_three_speeds_goes_a_curve_with_no_number_below_zero():
     assert min(values["mu_0s"], values["mu_0c"], values["sigma_2"]) >= 0
 
 
+def test_friction_that_falls_along_a_line_has_the_curve():
+    rows = rows_of(speeds=(0.1, 0.5, 12.0), repeats=2, bins=4)  # the first two are the same on this scale
+    falls = rows.load * (0.6 - 0.003 * np.abs(rows.speed)) * np.sign(rows.speed)
+    rows = replace(rows, force=falls)
+    assert set(declare(rows).stribeck.values()) == {"interpolated"}
+    fitted = fit_declared(rows)
+    assert np.sqrt(np.mean(fitted.residual**2)) < 0.002 * np.abs(falls).mean()
+
+
+def test_a_rising_curve_through_three_speeds_does_not_start_with_friction_below_zero():
+    rows = rows_of(speeds=(0.502, 9.81, 192.0), days=(), repeats=2, bins=4)
+    mu = np.interp(np.abs(rows.speed), [0.502, 9.81, 192.0], [0.5695, 0.609, 0.654])
+    rows = replace(rows, force=rows.load * mu * np.sign(rows.speed))
+    start = start_model(rows).theta
+    assert start[:2].min() > 0.5  # mu_s and mu_c
+    fitted = fit_declared(rows)
+    assert np.sqrt(np.mean(fitted.residual**2)) < 1e-3 * np.abs(rows.force).mean()
+
+
 def test_a_straight_line_through_three_speeds_is_mostly_left_one():
     rows, forms = rows_of(speeds=(1.0, 8.0, 64.0), repeats=2, bins=4), []
     for seed in range(10):

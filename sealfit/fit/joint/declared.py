@@ -145,9 +145,10 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
 
 
 def _curved(rows: Rows, chosen: np.ndarray) -> bool:
-    """Return whether friction at three speeds is not a straight line, by Akaike's criterion on file means.
+    """Return whether friction at three speeds is no line that rises, by Akaike's criterion on file means.
 
-    A curve through three speeds leaves few degrees of freedom for other effects, so a line is preferred. Each
+    A curve through three speeds leaves few degrees of freedom for other effects, so a line is preferred. As
+    in the declared model its slope is not negative: friction that falls with speed needs the curve. Each
     condition has its own level; slope and curvature are shared. The two directions count as repeats.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
@@ -163,14 +164,19 @@ def _curved(rows: Rows, chosen: np.ndarray) -> bool:
         }
     )
     files = table.groupby(["file", "direction", "condition"], as_index=False).mean()
-    line = np.column_stack([pd.get_dummies(files["condition"], dtype=float), files["slope"]])
-    costs = []
-    for columns in (line, np.column_stack([line, files["middle"]])):
-        found, _, rank, _ = np.linalg.lstsq(columns, files["mu"], rcond=1e-9)
-        residual = files["mu"] - columns @ found
-        rss = max(residual @ residual, ROUNDING * (files["mu"] @ files["mu"]))
-        costs.append(len(files) * np.log(rss) + 2 * rank)
-    return bool(costs[1] < costs[0])
+    levels = pd.get_dummies(files["condition"], dtype=float).to_numpy()
+    line = np.column_stack([levels, files["slope"]])
+    curve = np.column_stack([line, files["middle"]])
+    falls = np.linalg.lstsq(line, files["mu"], rcond=1e-9)[0][-1] < 0
+    return bool(_akaike(curve, files["mu"]) < _akaike(levels if falls else line, files["mu"]))
+
+
+def _akaike(columns: np.ndarray, values: pd.Series) -> float:
+    """Return Akaike's criterion of a linear model of values, shape (n,), from its columns, shape (n, k)."""
+    found, _, rank, _ = np.linalg.lstsq(columns, values, rcond=1e-9)
+    residual = values - columns @ found
+    rss = max(residual @ residual, ROUNDING * (values @ values))
+    return len(values) * np.log(rss) + 2 * rank
 
 
 def tested_speeds(rows: Rows, chosen: np.ndarray) -> np.ndarray:

@@ -364,7 +364,10 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
 
 
 def _per_condition(speed, load, size, condition, full: bool):
-    """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of a series by a grid over v_s, others solved for."""
+    """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of a series by a grid over v_s, others solved for.
+
+    Through few speeds a wrong v_s fits exactly, with a negative coefficient. Its cost is that with 0 instead.
+    """
     own, code = np.unique(condition, return_inverse=True)
     grid = np.geomspace(*stribeck_range(speed), GRID) if full else np.array([1.0])
     solved, costs = [], []
@@ -372,6 +375,7 @@ def _per_condition(speed, load, size, condition, full: bool):
         decay = np.exp(-((speed / v_s) ** 2)) if full else np.zeros_like(speed)
         columns = (load * decay, load * (1 - decay))
         pairs, sigma_2 = pairs_and_shared(columns, code, speed, size)
+        pairs = np.maximum(pairs, 0.0)
         first, second = pairs.T
         residual = size - first[code] * columns[0] - second[code] * columns[1] - sigma_2 * speed
         costs.append(float(residual @ residual))
