@@ -6,7 +6,7 @@ NO_NETWORK = echo "make: the packages that sealfit needs could not be installed;
 CODE := $(wildcard sealfit tests benchmarks)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test golden lint check bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed bench-worlds paper clean
+.PHONY: help demo test golden lint check docs bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed bench-worlds paper clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -23,6 +23,11 @@ golden: .venv/.installed-test ## compare ten campaigns with what is on record; a
 lint: .venv/.installed-test ## check style and formatting
 	$(BIN)/ruff check $(CODE)
 	$(BIN)/ruff format --check $(CODE)
+
+docs: .venv/.installed-test ## build the documentation into out/docs
+	$(BIN)/python docs/generate.py
+	$(BIN)/zensical build --strict
+	@echo out/docs/index.html
 
 check: test ## what the continuous integration runs: the same as test
 

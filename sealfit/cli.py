@@ -27,7 +27,7 @@ Results = Annotated[
 ]
 Out = Annotated[Path, typer.Option("--out", help="Folder of results; created if it is missing.")]
 ConfigFile = Annotated[
-    Path | None, typer.Option("--config", help="Rig config (TOML); default: as the README's table.")
+    Path | None, typer.Option("--config", help="Rig config (TOML); none: files in the default format.")
 ]
 Workers = Annotated[
     int | None, typer.Option("--workers", min=1, help="Processes to use. [default: all cores]")

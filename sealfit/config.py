@@ -33,7 +33,7 @@ AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
 class Strict(BaseModel):
     """A table of a config or SPEC: unknown keys refused, values fixed, numbers finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class FileColumn(Strict):
@@ -77,61 +77,64 @@ class StartedAt(Strict):
 class TraceFormat(Strict):
     """How one trace file is written."""
 
-    format: Literal["csv", "xlsx", "tdms", "mat", "parquet"] | None = Field(
-        None, description="what the files are; without it their endings say so"
-    )
-    sheet: str | int | None = Field(
-        None, description="xlsx: name or number (from 1) of the sheet with the data"
-    )
-    group: str | None = Field(None, description="tdms: group of the channels")
-    variable: str | None = Field(None, description="mat: struct or matrix with the data, or '(vectors)'")
-    encoding: str = Field(
-        "auto", description="utf-8, latin-1, utf-16, or auto (byte-order mark, then UTF-8, then Latin-1)"
-    )
-    delimiter: str = Field(",", description="one character, 'tab' or 'whitespace'")
+    format: Literal["csv", "xlsx", "tdms", "mat", "parquet"] | None = None
+    """What the files are where their endings do not say it: `"csv"`, `"xlsx"`, `"tdms"`, `"mat"` or
+    `"parquet"`.
+    """
+    sheet: str | int | None = None
+    """Excel: name or number, from 1, of the sheet with the data; none: the only one with cells in it."""
+    group: str | None = None
+    """TDMS: the group of channels; none: the only one, or the only one with the columns below."""
+    variable: str | None = None
+    """MATLAB: the struct or matrix with the data, `"S.field"` for one in a struct, `"(vectors)"` for vectors
+    by themselves; none: as `group`.
+    """
+    encoding: str = "auto"
+    """`utf-8`, `latin-1`, `utf-16`, or `auto`: byte-order mark, then UTF-8, then Latin-1."""
+    delimiter: str = ","
+    """One character, `"tab"` or `"whitespace"`."""
     decimal: Literal[".", ","] = "."
-    header_lines: int | None = Field(
-        None, ge=0, description="lines before the first data row, column names included"
-    )
-    header_ends_at: str | None = Field(
-        None, description="regular expression; the header ends with the line it matches"
-    )
-    names: Literal["header", "none"] = Field(
-        "header", description="'none': no line of names, columns are by position"
-    )
-    names_line: int | None = Field(
-        None, description="line of names counted back from the header's end: 1 = the last"
-    )
-    units_row: bool = Field(False, description="a row of units follows the names")
-    trailing_separator: bool = Field(False, description="lines end in stray separators; strip them")
+    """or `","`."""
+    header_lines: int | None = Field(None, ge=0)
+    """Lines before the first data row, column names included."""
+    header_ends_at: str | None = None
+    """Regular expression; the header ends with the line that it matches."""
+    names: Literal["header", "none"] = "header"
+    """`"none"`: there is no line of names, columns are given by position."""
+    names_line: int | None = None
+    """The line of names, counted back from the header's end: 1 = the last."""
+    units_row: bool = False
+    """A row of units follows the names."""
+    trailing_separator: bool = False
+    """Lines end in stray separators; they are stripped."""
     drop_first_rows: int = Field(0, ge=0)
+    """Data rows to leave out at the start of each file."""
     columns: FileColumns = Field(
         default_factory=lambda: {
             name: FileColumn(name=name) for name in ("time_s", "displacement_mm", "force_N")
-        },
-        description="our name = the file's column name, or its position from 1; with a unit "
-        "{name = .., unit = ..}",
+        }
     )
-    optional: list[str] = Field(default_factory=list, description="of `columns`, those a file may lack")
-    other_columns: Literal["channels", "ignore"] = Field("channels", description="columns not listed above")
-    header_fields: dict[str, str] = Field(
-        default_factory=dict,
-        description="channel = regular expression with one group, searched in the header lines",
-    )
-    keep: str | None = Field(None, description="row filter, e.g. 'load_N > 4.9'")
-    compute: dict[str, str] = Field(
-        default_factory=dict,
-        description="column = safe expression over columns, file-name parts and constants",
-    )
+    """Our name = the file's name, or its position from 1; with the unit that its numbers are in: `force_N =
+    {name = "Kraft", unit = "kgf"}`.
+    """
+    optional: list[str] = Field(default_factory=list)
+    """Those of `columns` that a file may lack."""
+    other_columns: Literal["channels", "ignore"] = "channels"
+    """Columns not listed in `columns`: kept as channels, or `"ignore"`."""
+    header_fields: dict[str, str] = Field(default_factory=dict)
+    """Channel = regular expression with one group, searched in the header lines."""
+    keep: str | None = None
+    """Row filter, e.g. `"load_N > 4.9"`."""
+    compute: dict[str, str] = Field(default_factory=dict)
+    """Column = expression over columns, parts of the file name and constants."""
     constants: dict[str, float] = Field(default_factory=dict)
-    drop_columns: list[str] = Field(
-        default_factory=list,
-        description="columns that `compute`, `keep` or the integral read and that are no channels",
-    )
-    integrate_displacement: str | None = Field(
-        None, description="speed column whose time integral is displacement"
-    )
-    integrate_per: Literal["s", "min"] = Field("s", description="time unit of that speed: rpm is per min")
+    """Numbers that expressions may name."""
+    drop_columns: list[str] = Field(default_factory=list)
+    """Columns that expressions read and that are no channels."""
+    integrate_displacement: str | None = None
+    """Speed column whose integral over time is the displacement."""
+    integrate_per: Literal["s", "min"] = "s"
+    """Time unit of that speed; `"min"` for rpm."""
 
     @property
     def their_columns(self) -> dict[str, str | int]:
@@ -142,40 +145,39 @@ class TraceFormat(Strict):
 class Files(Strict):
     """Where the trace files are when runs.csv does not list them, and what their names say."""
 
-    glob: str | None = Field(None, description="e.g. 'raw/**/*.csv'; then runs.csv is not needed")
-    exclude: list[str] = Field(default_factory=list, description="globs of files that are not traces")
-    name_pattern: str | None = Field(
-        None,
-        description="regular expression with named groups, matched against the whole relative path; "
-        "every part is a channel but those whose name starts with '_'",
-    )
-    values: dict[str, dict[str, float | str]] = Field(
-        default_factory=dict, description="value map per named part: sign = {'' = 1, n = -1}"
-    )
-    columns: dict[str, str] = Field(
-        default_factory=dict, description="our column = template over parts, e.g. run_id = '{rig}_{bar}bar'"
-    )
-    compute: dict[str, str] = Field(
-        default_factory=dict,
-        description="column = safe expression over parts, e.g. speed_mm_s = 'sign * rpm'",
-    )
-    units: dict[str, str] = Field(
-        default_factory=dict,
-        description="unit of a part or column that names of files give: temperature_C = 'degF'",
-    )
-    date_format: Annotated[list[str], BeforeValidator(_as_list)] = Field(
-        default_factory=list,
-        description="formats of started_at as strptime has them, one or several, tried in order",
-    )
-    started_at: StartedAt | None = Field(
-        None, description="columns of date and time of day, where these are two"
-    )
-    runs_columns: FileColumns = Field(
-        default_factory=dict,
-        description="our name = runs.csv's column name; with a unit {name = .., unit = ..}",
-    )
-    runs_table: str | None = Field(None, description="table to read as runs.csv: .csv, .xlsx or .parquet")
-    runs_sheet: str | int | None = Field(None, description="xlsx: name or number (from 1) of its sheet")
+    glob: str | None = None
+    """E.g. `"raw/**/*.csv"`; then runs.csv is not needed."""
+    exclude: list[str] = Field(default_factory=list)
+    """Globs of files that are not traces."""
+    name_pattern: str | None = None
+    """Regular expression with named groups, matched against the whole relative path. Every part is a channel,
+    except names that start with `_`. Files without a match are listed, with where the match broke.
+    """
+    values: dict[str, dict[str, float | str]] = Field(default_factory=dict)
+    """Value map per part: `sign = {"" = 1, n = -1}`."""
+    columns: dict[str, str] = Field(default_factory=dict)
+    """Our column = template over the parts: `run_id = "{rig}_{bar}bar"`."""
+    compute: dict[str, str] = Field(default_factory=dict)
+    """Our column = expression over the parts: `speed_mm_s = "sign * rpm"`."""
+    units: dict[str, str] = Field(default_factory=dict)
+    """Unit of a part, or of a column made of parts: `temperature_C = "degF"`."""
+    date_format: Annotated[list[str], BeforeValidator(_as_list)] = Field(default_factory=list)
+    """Formats of `started_at` as in Python's strptime, one or several, tried in order: `["%d.%m.%Y %H:%M",
+    "%d.%m.%Y"]`; then ISO 8601 and Excel's serial numbers. A time with a zone (`%z`) is an instant, one
+    without is taken as it stands.
+    """
+    started_at: StartedAt | None = None
+    """Columns, or parts of names, of the date and the time of day where these are two: `{date = "Datum", time
+    = "Uhrzeit"}`.
+    """
+    runs_columns: FileColumns = Field(default_factory=dict)
+    """Our name = the name in runs.csv; with a unit as in `[trace.columns]`: `load_N = {name = "Last", unit =
+    "kgf"}`.
+    """
+    runs_table: str | None = None
+    """Table to read in place of runs.csv: a `.csv`, `.xlsx` or `.parquet` file in the folder."""
+    runs_sheet: str | int | None = None
+    """Excel: name or number, from 1, of its sheet; none: the first."""
 
     @property
     def copies(self) -> dict[str, str]:
@@ -209,13 +211,14 @@ class Files(Strict):
 class Runs(Strict):
     """What is worked out from runs.csv, or what it leaves out."""
 
-    compute: dict[str, str] = Field(
-        default_factory=dict,
-        description="column = safe expression over what is known of a file: load_N = 'm_kg * 9.81'",
-    )
-    constants: dict[str, float | str] = Field(
-        default_factory=dict, description="columns with one value, where the log has none: load_N = 49.03"
-    )
+    compute: dict[str, str] = Field(default_factory=dict)
+    """Our column = expression over the columns that are known of each file, from runs.csv, names and headers:
+    `load_N = "9.80665 * mass_kg + 2.1"`. Without a value where one of these has none.
+    """
+    constants: dict[str, float | str] = Field(default_factory=dict)
+    """Columns of one value, number or word, for files that have none: `{load_N = 49.03}`. Constants and
+    columns whose name starts with `_` are for expressions only.
+    """
 
 
 class Quantity(Strict):
@@ -228,56 +231,59 @@ class Quantity(Strict):
 class Strokes(Strict):
     """How strokes and their steady windows are found."""
 
-    smooth_samples: int = Field(
-        7, ge=1, description="displacement is smoothed over this many samples to find turns"
-    )
-    min_travel_mm: float | None = Field(
-        None, description="shorter strokes are not strokes; default: 5 % of the range"
-    )
-    min_samples: int = Field(20, ge=4, description="fewer samples in the steady window: too short")
-    speed_tolerance: float = Field(
-        0.1, gt=0, description="steady: smoothed speed within this share of its plateau"
-    )
-    min_steady_share: float = Field(
-        0.2, gt=0, lt=1, description="a steady window shorter than this share is too short"
-    )
-    whole_file: bool = Field(False, description="every file is one steady stroke; no pre-sliding, no ramps")
+    smooth_samples: int = Field(7, ge=1)
+    """Displacement is smoothed over this many samples to find where it turns."""
+    min_travel_mm: float | None = None
+    """Shorter strokes are not strokes."""
+    min_samples: int = Field(20, ge=4)
+    """A steady window with fewer samples is too short."""
+    speed_tolerance: float = Field(0.1, gt=0)
+    """Steady: smoothed speed within this share of its plateau."""
+    min_steady_share: float = Field(0.2, gt=0, lt=1)
+    """A steady window that is a smaller share of its stroke is too short."""
+    whole_file: bool = False
+    """Every file is one steady stroke, without ramps."""
 
 
 class Bins(Strict):
     """How the steady window is cut along displacement."""
 
     per_stroke: int = Field(40, ge=1)
+    """Bins in a stroke."""
     min_samples: int = Field(4, ge=1)
+    """Bins with fewer samples are left out."""
 
 
 class Quality(Strict):
     """When a row, file or repeat is left out."""
 
-    max_bad_rows: float = Field(
-        0.05, ge=0, le=1, description="share of rows a file may lose before it is left out"
-    )
-    outlier_p: float = Field(0.001, gt=0, lt=1, description="family-wise level at which a repeat is flagged")
+    max_bad_rows: float = Field(0.05, ge=0, le=1)
+    """Share of its rows that a file may lose before it is left out."""
+    outlier_p: float = Field(0.001, gt=0, lt=1)
+    """Family-wise level at which a repeat is flagged."""
     drop_outliers: bool = False
-    max_gap_factor: float = Field(10.0, gt=1, description="a time step this many times the median is a gap")
-    max_gap_share: float = Field(
-        0.2, gt=0, le=1, description="gaps that hide more of the time leave the stroke out"
-    )
-    saturated_share: float = Field(0.05, gt=0, le=1, description="share of samples at the very extreme")
-    stuck_samples: int = Field(50, ge=3, description="this many equal force samples in a row are stuck")
-    spike_sigma: float = Field(
-        12.0, gt=3, description="a sample this many robust SDs off its neighbours is a spike"
-    )
-    speed_disagreement: float = Field(
-        0.2, gt=0, description="share by which speed x time may miss displacement"
-    )
+    """Leave flagged repeats out of the fits."""
+    max_gap_factor: float = Field(10.0, gt=1)
+    """A time step this many times the median is a gap."""
+    max_gap_share: float = Field(0.2, gt=0, le=1)
+    """Gaps that hide more of the time leave the stroke out."""
+    saturated_share: float = Field(0.05, gt=0, le=1)
+    """Share of samples at the very extreme that counts as saturated."""
+    stuck_samples: int = Field(50, ge=3)
+    """This many equal force samples in a row are stuck."""
+    spike_sigma: float = Field(12.0, gt=3)
+    """A sample this many robust standard deviations off its neighbours is a spike."""
+    speed_disagreement: float = Field(0.2, gt=0)
+    """Share by which speed x time may miss the displacement."""
 
 
 class Sensor(Strict):
     """The force sensor's accuracy: type B, one unknown shared by all samples."""
 
-    accuracy: float = Field(0.2, ge=0, description="half-width in the force slot's unit")
+    accuracy: float = Field(0.2, ge=0)
+    """Half-width, in the force's unit."""
     distribution: Literal["rectangular", "normal"] = "rectangular"
+    """or `"normal"` (then the half-width is that of 95 %)."""
 
     @property
     def u(self) -> float:
@@ -288,32 +294,46 @@ class Sensor(Strict):
 class Loop(Strict):
     """How the loop is closed."""
 
-    family_error: float = Field(0.005, gt=0, lt=0.5, description="chance of any false effect per campaign")
+    family_error: float = Field(0.005, gt=0, lt=0.5)
+    """Family-wise error rate: probability of any false effect per campaign."""
     max_rounds: int = Field(12, ge=1)
+    """Effects added at most."""
     folds: int = Field(5, ge=2)
+    """Folds of the cross-validation."""
     seed: int = 1
+    """Seed of the random numbers."""
     ignore_channels: list[str] = Field(default_factory=list)
-    effects_folder: str | None = Field(
-        None, description="folder of the user's own effects; Python is run from it"
-    )
+    """Channels that are not tested."""
+    effects_folder: str | None = None
+    """Folder with your own effects, relative to the config. **Python is run from it**: only if `--config`
+    names this config. Later commands need `--effects-folder`.
+    """
 
 
 class Config(Strict):
     """One rig: what its files look like and which columns make a condition."""
 
     name: str = "default"
+    """What reports call the rig."""
     condition: list[str] = Field(default_factory=lambda: list(AGING_CONDITION))
-    rubber: list[str] = Field(default_factory=list, description="columns that tell rubbers apart")
+    """Columns that define a condition; without `aging_days` there is no aging law."""
+    rubber: list[str] = Field(default_factory=list)
+    """Columns that identify the rubber."""
     position_origin: Literal["rig", "file"] = "rig"
+    """`"file"`: the origin of the position differs between files, so the phase of a ripple is separate for
+    each file.
+    """
     trace: TraceFormat = TraceFormat()
     files: Files = Files()
     runs: Runs = Runs()
     quantities: dict[Literal["force", "displacement", "speed", "load", "time"], Quantity] = Field(
         default_factory=dict
     )
-    column_units: dict[str, str] = Field(
-        default_factory=dict, description="units of the campaign's own channels"
-    )
+    """Another quantity in a slot (`force`, `displacement`, `speed`, `load`, `time`): `force = {quantity =
+    "torque", unit = "mN m"}`. Column names stay; labels, summaries and metadata show the true unit.
+    """
+    column_units: dict[str, str] = Field(default_factory=dict)
+    """Units of your own channels: `humidity = "%"`."""
     strokes: Strokes = Strokes()
     bins: Bins = Bins()
     quality: Quality = Quality()
@@ -457,7 +477,7 @@ def parse_config(text: str, name: str) -> Config:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
     except ValidationError as error:
-        raise ConfigError(explain(error, Config), file=name, fix="See the README for every key.") from error
+        raise ConfigError(explain(error, Config), file=name, fix="docs/reference/config.md has every key.") from error
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:

@@ -1,17 +1,136 @@
-"""The examples in docs/ run and print what they say."""
+"""What the README and docs/ show runs, and prints what they say."""
 
 import doctest
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-DOCS = sorted((Path(__file__).resolve().parents[1] / "docs").glob("*.md"))
+from sealfit.config import load_config, parse_config
+from sealfit.effects.user import load_user_effects
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(page for page in DOCS.rglob("*.md") if page.parent.name != "paper")
 WITH_RESULTS = ("notebook.md",)  # run where there are results of the sample campaign: tests/notebook
-PAGES = [page for page in DOCS if ">>>" in page.read_text("utf-8") and page.name not in WITH_RESULTS]
+EXAMPLES = [page for page in PAGES if ">>>" in page.read_text("utf-8") and page.name not in WITH_RESULTS]
+NAMES = {page: str(page.relative_to(DOCS)) for page in PAGES}
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
-@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+def blocks(page, language):
+    """Return the fenced blocks of a language in a page."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def console(page):
+    """Return the commands of a page, each with the output that the page shows."""
+    indented = re.findall(r"(?:^    .*\n|^\n(?=    ))+", page.read_text("utf-8"), re.MULTILINE)
+    for block in indented:
+        for part in re.split(r"^    \$ ", block, flags=re.MULTILINE)[1:]:
+            command, _, output = part.partition("\n")
+            yield command, re.sub(r"^    ", "", output, flags=re.MULTILINE)
+
+
+def has(expected, printed):
+    """Whether an output is what a page shows; `...` stands for anything."""
+    return doctest.OutputChecker().check_output(expected, printed, FLAGS)
+
+
+@pytest.fixture
+def desk(tmp_path):
+    """A folder with the sample data and the configs beside it, as in a clone."""
+    for name in ("sample_data", "configs"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    shutil.copytree(ROOT / "sample_data" / "simulated", tmp_path / "my_campaign")
+    return tmp_path
+
+
+def run(command, folder):
+    """Run a command of a page with this Python's sealfit, and return what it prints on stdout."""
+    words = shlex.split(command)
+    programs = {"sealfit": ["-m", "sealfit"], "python": []}
+    if words[0] in programs:
+        words = [sys.executable, *programs[words[0]], *words[1:]]
+    path = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, cwd=folder, env=path, capture_output=True, text=True)
+    assert done.returncode in (0, 1), done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("page", EXAMPLES, ids=[NAMES[page] for page in EXAMPLES])
 def test_examples_print_what_they_say(page):
     failed, tried = doctest.testfile(str(page), module_relative=False, encoding="utf-8")
     assert tried > 10
     assert not failed
+
+
+@pytest.mark.parametrize("name", ["tutorial.md", "how-to/enough-runs.md"])
+def test_commands_print_what_they_say(name, desk):
+    commands = list(console(DOCS / name))
+    assert commands
+    for command, expected in commands:
+        printed = run(command, desk)
+        assert has(expected, printed), f"{command}\n{printed}"
+
+
+def test_the_commands_of_the_readme_for_your_own_data_run(desk):
+    text = (ROOT / "README.md").read_text("utf-8").split("## Your own data")[1].split("\n## ")[0]
+    commands = re.findall(r"^    \.venv/bin/(sealfit .*)$", text, re.MULTILINE)
+    assert [command.split()[1] for command in commands] == ["init", "check", "run"]
+    for command in commands:
+        printed = run(command, desk)
+    assert "verdict     closed" in printed
+    (code,) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    assert run(f"python -c {shlex.quote(code)}", desk) == ""
+
+
+def test_the_readme_shows_what_make_demo_prints(desk):
+    text = (ROOT / "README.md").read_text("utf-8")
+    shown = re.findall(r"^    ((?:verdict|   |error|noise).*)$", text, re.MULTILINE)
+    assert len(shown) == 4
+    printed = run("sealfit run sample_data/simulated --out demo-out", desk)
+    assert all(line in printed for line in shown)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES.get)
+def test_configs_are_sound(page):
+    for block in blocks(page, "toml"):
+        assert parse_config(block, NAMES[page]) != load_config()
+
+
+def test_the_example_of_an_effect_loads(tmp_path):
+    (code,) = (block for block in blocks(DOCS / "how-to" / "own-effects.md", "python"))
+    (tmp_path / "worn_patch.py").write_text(code, "utf-8")
+    assert list(load_user_effects(tmp_path)) == ["worn_patch"]
+
+
+def test_generated_pages_are_up_to_date():
+    done = subprocess.run(
+        [sys.executable, "generate.py", "--check"], cwd=DOCS, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_site_builds_without_a_warning_and_loads_nothing_from_another_host(tmp_path):
+    shutil.copytree(DOCS, tmp_path / "docs")
+    shutil.copy(ROOT / "mkdocs.yml", tmp_path)
+    program = Path(sys.executable).with_name("zensical")
+    command = [str(program), "build", "--strict"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    page = (tmp_path / "out" / "docs" / "index.html").read_text("utf-8")
+    assert not re.findall(r"<(?:script|link|img)[^>]+(?:src|href)=.?https?://[^>]*>", page)
+
+
+def test_links_of_the_readme_lead_somewhere():
+    text = (ROOT / "README.md").read_text("utf-8")
+    links = re.findall(r"\]\(([^)#]+)\)", text)
+    assert len(links) > 15
+    assert [link for link in links if not (ROOT / link).exists()] == []
+    assert len(text.split()) <= 900

@@ -121,7 +121,7 @@ def test_the_nearest_name_beside_a_path_that_is_not_there_or_nothing(tmp_path, m
             "[files.runs_columns]\nload_N = {name = 'Last', units = 'kgf'}",
             "Did you mean 'files.runs_columns.load_N.unit'?",
         ),
-        ("zzz = 1", "unknown key 'zzz'. See the README"),
+        ("zzz = 1", "unknown key 'zzz'. docs/reference/config.md has"),
     ],
 )
 def test_a_mistyped_key_is_answered_with_the_nearest(text, said):

@@ -18,11 +18,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 README = (ROOT / "README.md").read_text("utf-8")
 
 
-def keys_of(model):
-    for name, field in model.model_fields.items():
-        yield name
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            yield from keys_of(field.annotation)
+def is_model(annotation):
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
 def test_the_version_is_said_once():
@@ -58,29 +55,12 @@ def test_every_config_that_ships_is_sound(path):
     assert load_config(path).condition
 
 
-def test_every_key_of_a_config_is_in_the_readme():
-    for key in keys_of(Config):
-        assert re.search(rf"^\| (\*\*)?`\[?{key}\]?`", README, re.MULTILINE), key
-
-
-def test_defaults_in_the_readme_are_those_of_the_config():
-    guide = README.split("## The config")[1].split("\n## ")[0]
-    said, section = {}, None
-    for key, default in re.findall(r"^\| (\S+) \| (.*?) \|", guide, re.MULTILINE):
-        if key.startswith("**"):
-            section = key.strip("*`[]")
-        elif key.startswith("`"):
-            said[section, key.strip("`")] = default.strip("`")
-    compared = 0
-    for section, model in [(None, Config), *((n, f.annotation) for n, f in Config.model_fields.items())]:
-        if not (isinstance(model, type) and issubclass(model, BaseModel)):
-            continue
-        for name, field in model.model_fields.items():
-            default = field.default
-            if isinstance(default, bool | int | float | str):
-                assert tomllib.loads(f"x = {said[section, name]}")["x"] == default, (section, name)
-                compared += 1
-    assert compared > 25
+def test_every_key_of_a_config_has_a_meaning():
+    models = [Config, *(f.annotation for f in Config.model_fields.values() if is_model(f.annotation))]
+    keys = [(model, name) for model in models for name in model.model_fields]
+    assert len(keys) > 60
+    missing = [name for model, name in keys if not model.model_fields[name].description]
+    assert missing == [name for name, f in Config.model_fields.items() if is_model(f.annotation)]
 
 
 def test_every_dependency_has_its_reason_in_the_readme():

@@ -115,7 +115,7 @@ def test_the_tutorial_is_kept_without_what_it_shows():
 
 
 def test_the_page_about_notebooks_prints_what_it_says(tutorial, out, monkeypatch):
-    page, known = ROOT / "docs" / "notebook.md", {}
+    page, known = ROOT / "docs" / "how-to" / "notebook.md", {}
     monkeypatch.chdir(tutorial[1])
     Path("results").symlink_to(out)
     (block,) = re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
