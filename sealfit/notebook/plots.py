@@ -41,6 +41,10 @@ class Plots:
     def __init__(self, current: Callable[[str], Store]):
         self._current = current  # gives the store if a step is current, else raises
 
+    def finding(self) -> Figure:
+        """Return the residual along the variable of the largest effect, and the errors, before and after."""
+        return self._drawn("finding")
+
     def before_after(self) -> Figure:
         """Return the errors before and after with the noise floor, and the spread of run means' errors."""
         return self._drawn("before_after")

@@ -12,6 +12,7 @@ from sealfit.report.figures.residual import LEVELS
 from sealfit.report.notation import (
     NOTHING,
     ConditionNames,
+    by_gain,
     channel_label,
     channel_words,
     effect_label,
@@ -103,16 +104,16 @@ def _change(before: float, after: float) -> str:
 
 
 def effect_cards(closure: Mapping, config: Config) -> list[dict]:
-    """Return every effect, added or candidate, with the content of its card."""
+    """Return every effect, added or candidate, with the content of its card; the largest gain first."""
     cards = []
-    for index, effect in enumerate(closure["effects"]):
+    for effect in by_gain(closure["effects"]):
         label = effect_label(effect, config.units)
         channels = joined([channel_label(name, config.units) for name in effect["channels"]])
         gain, left = effect.get("heldout_gain_N"), effect.get("heldout_rmse_N")
         unit = config.units.unit("force")
         cards.append(
             {
-                "index": index,
+                "index": closure["effects"].index(effect),
                 "title": label[:1].upper() + label[1:],
                 "named": effect["named"],
                 "candidate": effect["candidate"],

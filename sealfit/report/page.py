@@ -303,6 +303,7 @@ def _content(
     return {
         "closure": closure,
         "badge": VERDICTS[closure["verdict"] if closure else None],
+        "fit": fit_quality(closure),
         "verdict": verdict(closure, tables["shapes"], config),
         "facts": page.campaign_facts(tables, config),
         "errors": error_rows(closure, config) if closure else [],
@@ -331,6 +332,18 @@ def _content(
         "findings_in_all": in_all,
         "provenance": page.provenance_facts(provenance),
     }
+
+
+def fit_quality(closure: Mapping | None) -> tuple[str, str]:
+    """Return how well the model fits: the state, and a few words; both empty if the loop was not run."""
+    quality = (closure or {}).get("fit_quality") or {"state": ""}
+    words = {
+        "": "",
+        "unknown": "Fit: not known",
+        "within_scatter": "Fit: within the scatter of repeats",
+        "above_scatter": f"Fit: {quality.get('ratio') or 0:.2g} times the scatter of repeats",
+    }
+    return quality["state"], words[quality["state"]]
 
 
 def _images(plot: Plot, drawn: Drawn) -> dict:

@@ -120,8 +120,8 @@ def test_nothing_unavailable_is_printed_raw(name, pages):
 
 def test_figures_are_named_for_the_store(reports):
     assert set(reports["closed"].figures) == {
-        "before_after", "effect_shapes", "variance_levels", "residual_channels", "force_speed", "aging",
-        "master_curve", "starts", "traces_mean",
+        "finding", "before_after", "effect_shapes", "variance_levels", "residual_channels", "force_speed",
+        "aging", "master_curve", "starts", "traces_mean",
     }  # fmt: skip
     assert set(reports["torque"].figures) == {"before_after", "force_speed"}
 
@@ -253,8 +253,8 @@ def test_paper_sized_campaign_gives_a_page_that_can_be_mailed():
     report = build_report(*made.arguments)
     assert len(report.html.encode()) < 8e6
     assert (
-        report.html.count("<img") == 12 + 12 + 9 + 6 + 6 + 2 + 1 + 1
-    )  # series, aging, channels, starts, traces, errors, levels, shape
+        report.html.count("<img") == 2 + 12 + 12 + 9 + 6 + 6 + 1 + 1 + 1
+    )  # finding, series, aging, channels, starts, traces, errors, levels, shape
 
 
 def test_empty_tables_may_lack_columns(small, unsaved):

@@ -8,7 +8,13 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.report.figures.aging import aging, master_curve, traces_mean
-from sealfit.report.figures.residual import before_after, effect_shapes, residual_channels, variance_levels
+from sealfit.report.figures.residual import (
+    before_after,
+    effect_shapes,
+    finding,
+    residual_channels,
+    variance_levels,
+)
 from sealfit.report.figures.speed import force_speed, starts
 from sealfit.report.style import Plot
 
@@ -26,6 +32,7 @@ def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config
         Gives the labels their true units.
     """
     plots = (
+        finding(tables, closure, config),
         before_after(tables, closure, config),
         effect_shapes(tables, closure, config),
         variance_levels(tables, config),

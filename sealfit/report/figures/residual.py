@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,7 @@ from matplotlib.axes import Axes
 from sealfit.config import Config
 from sealfit.report.figures.speed import LOG_SPAN as SPEED_SPAN
 from sealfit.report.notation import (
+    by_gain,
     channel_label,
     channel_words,
     effect_label,
@@ -150,6 +152,34 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, co
     return Plot("before_after", "Errors before and after", tuple(panels), tuple(legend))
 
 
+# ---------------------------------------------------------------- finding
+def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> Plot | None:
+    """Return the evidence for the verdict: the residual along one variable, and the errors.
+
+    The variable is that of the effect that reduces the held-out error most, or, without an effect, the one
+    along which the residual is largest relative to its error. None if the loop was not run.
+    """
+    errors, channels = before_after(tables, closure, config), tables["channels"]
+    if errors is None or channels.empty:
+        return None
+    order = channel_order(channels)
+    own = [
+        name
+        for effect in by_gain(closure["effects"])
+        if not effect["candidate"]
+        for name in effect["channels"]
+    ]
+    name = next((name for name in own if name in order), order[0])
+    panel = _channel_panel(channels[channels["channel"] == name], name, tables, config)
+    legend = (
+        Key("before", BEFORE, "open"),
+        Key("after", AFTER, "point"),
+        *(key for key in errors.legend if key.mark == "dashed"),
+    )
+    title = "Residual and errors before and after"
+    return Plot("finding", title, (panel, replace(errors.panels[0], height=panel.height)), legend)
+
+
 # ---------------------------------------------------------------- residual by level
 def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
     """Draw the residual variance at every level, before and after; beside each bar its standard deviation."""
@@ -281,26 +311,36 @@ def residual_channels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plo
     if channels.empty:
         return None
     span = _span(channels)
-    tested = tables["levels"].dropna(subset=["channel", "p_value"])
-    p = tested.groupby(["stage", "channel"])["p_value"].min().to_dict()
-    panels = []
-    for name in channel_order(channels)[:MOST_CHANNELS]:
-        rows = channels[channels["channel"] == name]
-        rows = rows.sort_values("x") if rows["x"].notna().all() else rows
-
-        def draw(ax: Axes, rows=rows, name=name) -> None:
-            draw_channel(ax, rows, name, config.units)
-            ax.set_ylim(*span)
-
-        words = channel_words(name, config.units)
-        largest = [rows[f"{stage}_N"].abs().max() for stage in ("before", "after")]
-        alt = f"Mean residual along {words}: largest {number(largest[0])} before, {number(largest[1])} "
-        alt += f"{config.units.unit('force')} after"
-        found = p.get(("before", name))
-        alt += f"; p {p_value(found)} before." if found is not None else "."
-        panels.append(Panel(short(capital(words), 38), alt, draw))
+    panels = [
+        _channel_panel(channels[channels["channel"] == name], name, tables, config, span)
+        for name in channel_order(channels)[:MOST_CHANNELS]
+    ]
     legend = (Key("before", BEFORE, "open"), Key("after", AFTER, "point"))
     return Plot("residual_channels", "Residual by variable", tuple(panels), legend)
+
+
+def _channel_panel(
+    rows: pd.DataFrame,
+    name: str,
+    tables: Mapping[str, pd.DataFrame],
+    config: Config,
+    span: tuple[float, float] | None = None,
+) -> Panel:
+    """Return a panel of the mean residual along a channel; `span` is that of its axis of forces."""
+    rows = rows.sort_values("x") if rows["x"].notna().all() else rows
+
+    def draw(ax: Axes) -> None:
+        draw_channel(ax, rows, name, config.units)
+        ax.set_ylim(*(span or _span(rows)))
+
+    words = channel_words(name, config.units)
+    largest = [rows[f"{stage}_N"].abs().max() for stage in ("before", "after")]
+    alt = f"Mean residual along {words}: largest {number(largest[0])} before, {number(largest[1])} "
+    alt += f"{config.units.unit('force')} after"
+    tested = tables["levels"].dropna(subset=["channel", "p_value"])
+    p = tested.loc[(tested["stage"] == "before") & (tested["channel"] == name), "p_value"]
+    alt += f"; p {p_value(p.min())} before." if len(p) else "."
+    return Panel(short(capital(words), 38), alt, draw)
 
 
 def _span(channels: pd.DataFrame) -> tuple[float, float]:
