@@ -3,7 +3,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
 BIN := .venv/bin
 NO_NETWORK = echo "make: the packages that sealfit needs could not be installed; pip says why above." >&2
-CODE := $(wildcard sealfit tests benchmarks)
+CODE := $(wildcard sealfit tests benchmarks docs/generate.py)
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test golden lint check docs bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed bench-worlds paper clean

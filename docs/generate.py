@@ -9,7 +9,6 @@ They are committed, so that they can be read without building the documentation.
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from pathlib import Path
 
@@ -39,7 +38,7 @@ def commands() -> str:
     """Return the page of the commands, with the text of their help."""
     context = typer.Context(get_command(app), info_name="sealfit")
     text = get_docs_for_click(obj=get_command(app), ctx=context, name="sealfit", title="Commands")
-    return re.sub(r"\{([A-Z]+)\}", r"\1", text).strip() + "\n\n" + COMMON.strip() + "\n"
+    return text.strip() + "\n\n" + COMMON.strip() + "\n"
 
 
 def config() -> str:

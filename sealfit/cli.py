@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer.core import TyperCommand
 
 from sealfit import __version__
 from sealfit.engine import one_thread
@@ -62,7 +65,24 @@ def end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: b
     if as_json:
         print_json({"ok": True, "command": command, **made})
     else:
-        typer.echo("\n".join(lines(made)))
+        typer.echo("\n".join(_coloured(text) for text in lines(made)))
+
+
+VERDICT_COLOURS = {
+    "closed": "green",
+    "nothing_missing": "green",
+    "cannot_tell": "yellow",
+    "unexplained": "red",
+}
+
+
+def _coloured(text: str) -> str:
+    """Return a line of a summary, its verdict in colour; `typer.echo` removes colour off a terminal."""
+    found = re.match(r"verdict +(\w+)", text)
+    if found is None or os.environ.get("NO_COLOR"):
+        return text
+    start, stop = found.span(1)
+    return text[:start] + typer.style(found[1], fg=VERDICT_COLOURS.get(found[1]), bold=True) + text[stop:]
 
 
 def print_json(document: dict) -> None:
@@ -128,14 +148,26 @@ def _error(reason: str) -> dict:
 
 # ---------------------------------------------------------------- cli
 
+
+class Command(TyperCommand):
+    """A command whose usage has its arguments without braces: CAMPAIGN."""
+
+    def collect_usage_pieces(self, ctx: typer.Context) -> list[str]:
+        """Return the parts of the line of usage after the name."""
+        return [piece.strip("{}") for piece in super().collect_usage_pieces(ctx)]
+
+
 app = typer.Typer(
     help="From a friction rig's CSV files to the LuGre model of an aging rubber seal, and to what that "
     "model lacks.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # plain help: rich takes longer to load than all the rest
 )
+
+
+command = partial(app.command, cls=Command)
 
 
 def _print_version(wanted: bool) -> None:
@@ -154,7 +186,7 @@ def _sealfit(
     pass
 
 
-@app.command()
+@command(epilog="Example: sealfit init my_campaign --output rig.toml")
 def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with the trace files of a rig.")],
     output: Annotated[Path, typer.Option("--output", help="Config to write (TOML).")] = Path("rig.toml"),
@@ -168,7 +200,63 @@ def init(
     end("init", commands.init(folder, output, force=force), summary_lines, as_json)
 
 
-@app.command()
+@command(epilog="Example: sealfit check my_campaign --config rig.toml")
+def check(
+    campaign: Campaign,
+    config: ConfigFile = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """List every fault of a campaign, write nothing."""
+    count = _workers(workers, scheduler)
+    from sealfit import commands, progress
+    from sealfit.report import summary_lines
+
+    found, faults = commands.check(
+        campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr()
+    )
+    if as_json:
+        print_json(
+            {"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]}
+        )
+    else:
+        for group in grouped(faults):
+            typer.echo(f"{group[0].severity}: {told(group)}")
+        for line in summary_lines.ingest_lines(found) if found["files"] else ():
+            typer.echo(line)
+        typer.echo(
+            f"{len(faults)} {'fault' if len(faults) == 1 else 'faults'} found."
+            if faults
+            else "No faults found."
+        )
+    if faults:
+        raise typer.Exit(1)
+
+
+@command(epilog="Example: sealfit run my_campaign --config rig.toml --out results")
+def run(
+    campaign: Campaign,
+    out: Out,
+    config: ConfigFile = None,
+    effects_folder: EffectsFolder = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    force: Force = False,
+    strict: Strict = False,
+    profile: Profile = False,
+    as_json: Json = False,
+) -> None:
+    """Run all out-of-date steps, in order."""
+    options = _options(workers, scheduler, force=force, strict=strict, effects_folder=effects_folder)
+
+    def work(pipeline, progress):
+        return pipeline.run(campaign, out, config, progress=progress, **options)
+
+    _do("run", profile, as_json, work)
+
+
+@command(epilog="Example: sealfit ingest my_campaign --config rig.toml --out results")
 def ingest(
     campaign: Campaign,
     out: Out,
@@ -192,7 +280,7 @@ def ingest(
 def _fit_command(step: str) -> Callable[..., None]:
     """Return the command of a fit; all fits have the same options."""
 
-    def command(
+    def fit(
         out: Results,
         workers: Workers = None,
         scheduler: Scheduler = None,
@@ -202,17 +290,18 @@ def _fit_command(step: str) -> Callable[..., None]:
     ) -> None:
         _single(step, out, profile, as_json, **_options(workers, scheduler, force=force))
 
-    return command
+    return fit
 
 
-app.command("fit-steady", help="Fit steady LuGre to each condition.")(_fit_command("fit-steady"))
-app.command("fit-aging", help="Fit the aging law across days.")(_fit_command("fit-aging"))
-app.command("fit-dynamic", help="Fit sigma_0 and sigma_1 to the pre-sliding part.")(
-    _fit_command("fit-dynamic")
-)
+for step, text in (
+    ("fit-steady", "Fit steady LuGre to each condition."),
+    ("fit-aging", "Fit the aging law across days."),
+    ("fit-dynamic", "Fit sigma_0 and sigma_1 to the pre-sliding part."),
+):
+    command(step, help=text, epilog=f"Example: sealfit {step} results")(_fit_command(step))
 
 
-@app.command("close-loop")
+@command("close-loop", epilog="Example: sealfit close-loop results")
 def close_loop(
     out: Results,
     effects_folder: EffectsFolder = None,
@@ -227,35 +316,21 @@ def close_loop(
     _single("close-loop", out, profile, as_json, **options)
 
 
-@app.command()
-def report(out: Results, force: Force = False, profile: Profile = False, as_json: Json = False) -> None:
-    """Write report.html and its plots."""
-    _single("report", out, profile, as_json, force=force)
-
-
-@app.command()
-def run(
-    campaign: Campaign,
-    out: Out,
-    config: ConfigFile = None,
-    effects_folder: EffectsFolder = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
+@command(epilog="Example: sealfit report results --open")
+def report(
+    out: Results,
     force: Force = False,
-    strict: Strict = False,
+    show: Annotated[bool, typer.Option("--open", help="Open the report in the browser.")] = False,
     profile: Profile = False,
     as_json: Json = False,
 ) -> None:
-    """Run all out-of-date steps, in order."""
-    options = _options(workers, scheduler, force=force, strict=strict, effects_folder=effects_folder)
-
-    def work(pipeline, progress):
-        return pipeline.run(campaign, out, config, progress=progress, **options)
-
-    _do("run", profile, as_json, work)
+    """Write report.html and its plots."""
+    _single("report", out, profile, as_json, force=force)
+    if show:
+        typer.launch(str(out / "report.html"))
 
 
-@app.command()
+@command(epilog="Example: sealfit predict results --points points.csv --output answers.csv")
 def predict(
     out: Results,
     points: Annotated[
@@ -275,7 +350,9 @@ def predict(
     end("predict", made, summary_lines.predict_lines, as_json)
 
 
-@app.command()
+@command(
+    epilog="Example: sealfit lifetime results --quantity mu_s --threshold 0.70 --temperature 40 --compression 80"
+)
 def lifetime(
     out: Results,
     quantity: Annotated[str, typer.Option("--quantity", help="mu_s, mu_c, F_s or F_c.")] = "mu_s",
@@ -308,10 +385,10 @@ def lifetime(
     end("lifetime", commands.lifetime(out, asked), summary_lines.lifetime_lines, as_json)
 
 
-@app.command()
+@command(epilog="Example: sealfit effects results")
 def effects(
     out: Annotated[
-        Path | None, typer.Argument(metavar="[OUT]", help="Results, for their units and effects.")
+        Path | None, typer.Argument(metavar="OUT", help="Results, for their units and effects.")
     ] = None,
     effects_folder: EffectsFolder = None,
     as_json: Json = False,
@@ -323,9 +400,9 @@ def effects(
     end("effects", commands.effects(out, effects_folder), summary_lines.effects_lines, as_json)
 
 
-@app.command()
+@command(epilog="Example: sealfit simulate sample_data/simulated.spec.toml --out my_campaign")
 def simulate(
-    spec: Annotated[Path, typer.Argument(metavar="SPEC.toml", help="What to simulate (TOML).")],
+    spec: Annotated[Path, typer.Argument(metavar="SPEC", help="What to simulate (TOML).")],
     out: Annotated[Path, typer.Option("--out", help="Campaign folder to write; the truth goes beside it.")],
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier simulated campaign.")] = False,
     as_json: Json = False,
@@ -340,40 +417,6 @@ def simulate(
         lambda m: [f"{m['files']} trace files in {m['campaign']}", f"truth: {m['truth']}"],
         as_json,
     )
-
-
-@app.command()
-def check(
-    campaign: Campaign,
-    config: ConfigFile = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    as_json: Json = False,
-) -> None:
-    """List every fault of a campaign, write nothing."""
-    count = _workers(workers, scheduler)
-    from sealfit import commands, progress
-    from sealfit.report import summary_lines
-
-    found, faults = commands.check(
-        campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr()
-    )
-    if as_json:
-        print_json(
-            {"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]}
-        )
-    else:
-        for group in grouped(faults):
-            typer.echo(f"{group[0].severity}: {told(group)}")
-        for line in summary_lines.ingest_lines(found) if found["files"] else ():
-            typer.echo(line)
-        typer.echo(
-            f"{len(faults)} {'fault' if len(faults) == 1 else 'faults'} found."
-            if faults
-            else "No faults found."
-        )
-    if faults:
-        raise typer.Exit(1)
 
 
 # ---------------------------------------------------------------- what the commands share

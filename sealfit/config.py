@@ -477,7 +477,9 @@ def parse_config(text: str, name: str) -> Config:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
     except ValidationError as error:
-        raise ConfigError(explain(error, Config), file=name, fix="docs/reference/config.md has every key.") from error
+        raise ConfigError(
+            explain(error, Config), file=name, fix="docs/reference/config.md has every key."
+        ) from error
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:

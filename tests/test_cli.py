@@ -80,6 +80,35 @@ def test_help_lists_every_command_whole(sealfit):
     assert "..." not in ended.stdout.split("Commands:")[1]
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_an_example_and_plain_arguments(sealfit, command):
+    ended = sealfit(command, "-h")
+    assert f"Example: sealfit {command} " in " ".join(ended.stdout.split())
+    assert "{" not in ended.stdout
+
+
+@pytest.mark.parametrize(("colour", "expected"), [(None, "\x1b["), ("1", "verdict     closed: it is")])
+def test_a_verdict_is_in_colour_unless_it_is_not_wanted(monkeypatch, colour, expected):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    if colour:
+        monkeypatch.setenv("NO_COLOR", colour)
+    assert expected in cli._coloured("verdict     closed: it is")
+    assert cli._coloured("files       3 used") == "files       3 used"
+
+
+def test_the_summary_names_the_settings_of_the_next_runs(sealfit, parts, campaign, out):
+    ended = sealfit("run", campaign, "--out", out)
+    assert "next runs   a second load would separate them: load_N 98\n" in ended.stdout
+
+
+def test_the_report_opens_in_the_browser(sealfit, parts, campaign, out, monkeypatch):
+    opened = []
+    monkeypatch.setattr(cli.typer, "launch", opened.append)
+    sealfit("run", campaign, "--out", out)
+    assert sealfit("report", out, "--open").code == 0
+    assert opened == [str(out / "report.html")]
+
+
 def test_the_command_line_starts_without_the_heavy_libraries():
     heavy = ("numpy", "pandas", "scipy", "pyarrow", "matplotlib", "pydantic", "rich", "distributed")
     program = f"import sys, sealfit.cli; print([name for name in {heavy} if name in sys.modules])"

@@ -8,16 +8,16 @@ from collections.abc import Mapping
 
 
 def lines(summary: Mapping) -> list[str]:
-    """Return the summary of one or more steps, as lines.
+    """Return the summary of one or more steps, as lines, the verdict first.
 
     Where the loop added effects, the fits without their contribution come first, then those before the loop.
     """
     writers = {
+        "close_loop": closure_lines,
         "ingest": ingest_lines,
         "fit_steady": lambda part: _fit_lines("steady fit", part),
         "fit_aging": lambda part: _fit_lines("aging", part),
         "fit_dynamic": dynamic_lines,
-        "close_loop": closure_lines,
         "report": lambda part: [line("report", part["file"])],
     }
     after, found = summary.get("close_loop", {}).get("fits") or {}, []
@@ -117,7 +117,9 @@ def closure_lines(part: Mapping) -> list[str]:
     if part["left"]["channel"] is not None:
         found.append(line("residual", _left(part["left"], part["verdict"], unit)))
     for run in part["next_runs"][:3]:
-        found.append(line("next runs", run["why"]))
+        texts = {k: v if isinstance(v, str) else f"{v:.4g}" for k, v in run["conditions"].items()}
+        settings = ", ".join(f"{name} {text}" for name, text in texts.items())
+        found.append(line("next runs", f"{run['why']}: {settings}" if settings else run["why"]))
     return found
 
 
