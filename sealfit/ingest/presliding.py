@@ -24,6 +24,8 @@ HALF_WAY = 0.75
 SHORT = 0.01
 # Share of the stroke in which the fall of an overshoot comes down by 63 %, at most.
 SOON = 0.03
+# The same for a peak of more than 1.25 times the level.
+HIGH = 1.0 / 3.0
 # Share of the distance between which the plateau is read: near the rise, and past any ordinary rise.
 EARLY = (0.05, 0.5)
 # The same where the rise takes so long that half of the stroke may still be part of it.
@@ -46,6 +48,9 @@ POWERS = (1, 2)
 ENDS = np.geomspace(0.8, 8.0, 14)
 # Twice the log likelihood by which a rival must be better. It is then no bristle, and nothing is taken out.
 UNLIKELY = 10.0
+# Factor by which the rise on the plateau of the speed must be longer than that from rest to be the bristles'.
+# The lengths that are tried reach three times as far as the force's arrival.
+LONGER = 3.0
 # Rise lengths beyond which an exponential overflows.
 FAR = 500.0
 
@@ -118,7 +123,7 @@ def rise_of(start: Start) -> Rise:
     if (peak := _early_peak(start)) is not None:
         turned, peak_mm = _turned(start, peak), float(start.distance_mm[peak])
         fall = _rise(turned)
-        if _by_damping(start, peak_mm, fall):
+        if _by_damping(start, turned, fall):
             left_N, length = _left_over(turned, fall.length_mm)
             if left_N < 0.0:  # it follows the law
                 unsettled = -left_N * math.exp(min(peak_mm / length, FAR)) if fall.left_N else 0.0
@@ -149,18 +154,42 @@ def _turned(start: Start, peak: int) -> Start:
     return Start(distance[peak:] - distance[peak], 2.0 * level - force[peak:], max(start.ramp_end - peak, 0))
 
 
-def _by_damping(start: Start, peak_mm: float, fall: Rise) -> bool:
+def _by_damping(start: Start, turned: Start, fall: Rise) -> bool:
     """Return whether a peak may be the bristles' damping.
 
-    Such a peak is reached while the speed rises and is over within a share of the stroke. The peak of a
-    break-away falls over a longer distance.
+    Such a peak is reached while the speed rises. It falls within a share of the stroke, as a peak of
+    break-away falls over a longer distance, unless it is so high that no break-away or warming explains it.
     """
-    soon = 0.0 < fall.length_mm < SOON * float(start.distance_mm[-1])
+    length, level = float(start.distance_mm[-1]), _level_N(turned)
+    high = level is not None and float(turned.force_N[0]) <= HALF_WAY * level
+    soon = 0.0 < fall.length_mm < (HIGH if high else SOON) * length
+    peak_mm = length - float(turned.distance_mm[-1])
     return soon and peak_mm <= start.plateau_mm + fall.length_mm
 
 
 def _rise(start: Start) -> Rise:
-    """Return the rise of a start whose force comes up, and none of any other."""
+    """Return the rise of a start whose force comes up, and none of any other.
+
+    Where a fast stroke starts, damping brings up a part of the force at once, and the bristles the rest. The
+    rise is then that on the plateau of the speed, which is much longer than the one found from rest.
+    """
+    rise, ramp = _rise_from_rest(start), start.plateau_mm
+    later = _rise_from_rest(_on_plateau(start))
+    if not later.length_mm > LONGER * rise.length_mm > 0.0:
+        return rise
+    unsettled = later.left_N * math.exp(min(ramp / later.length_mm, FAR)) if later.left_N else 0.0
+    return Rise(ramp + later.end_mm, unsettled, later.length_mm)
+
+
+def _on_plateau(start: Start) -> Start:
+    """Return a start from where the speed has reached its plateau."""
+    rows = slice(start.ramp_end, None)
+    return Start(start.distance_mm[rows] - start.plateau_mm, start.force_N[rows], 0)
+
+
+def _rise_from_rest(start: Start) -> Rise:
+    if len(start.force_N) < 2:
+        return Rise(0.0)
     level = _level_N(start)
     scale = _scale_mm(start, level)
     if not scale > 0.0:
@@ -183,8 +212,7 @@ def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
 
     C is 0 where the force does not follow that law: where a rise that is over at some distance fits better.
     """
-    distance = start.distance_mm[start.ramp_end :]
-    plateau = Start(distance - distance[0], start.force_N[start.ramp_end :], 0)
+    plateau = _on_plateau(start)
     reach = REACH * length_mm
     sloped = min(plateau.distance_mm[-1], reach) >= SLOPED * length_mm
     length = _rise_length_mm(plateau, reach, length_mm * REFINED, sloped)
