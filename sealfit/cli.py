@@ -350,9 +350,7 @@ def predict(
     end("predict", made, summary_lines.predict_lines, as_json)
 
 
-@command(
-    epilog="Example: sealfit lifetime results --quantity mu_s --threshold 0.70 --temperature 40 --compression 80"
-)
+@command(epilog="Example: sealfit lifetime results --quantity mu_s --threshold 0.70 --temperature 40")
 def lifetime(
     out: Results,
     quantity: Annotated[str, typer.Option("--quantity", help="mu_s, mu_c, F_s or F_c.")] = "mu_s",
