@@ -112,6 +112,14 @@ def test_friction_that_falls_along_a_line_has_the_curve():
     assert np.sqrt(np.mean(fitted.residual**2)) < 0.002 * np.abs(falls).mean()
 
 
+def test_friction_that_falls_in_one_condition_and_rises_in_another_has_the_curve():
+    rows = rows_of(speeds=(0.16, 3.5, 76.0), temperatures=(60.0,), days=(4.0,), repeats=2, bins=4)
+    own = np.where(rows.condition == 0, 0.06, -0.01)  # mu_s less mu_c
+    mu = 0.17 + own * np.exp(-((np.abs(rows.speed) / 10.0) ** 2)) + 1e-3 * np.abs(rows.speed)
+    rows = replace(rows, force=rows.load * mu * np.sign(rows.speed))
+    assert set(declare(rows).stribeck.values()) == {"interpolated"}
+
+
 def test_a_rising_curve_through_three_speeds_does_not_start_with_friction_below_zero():
     rows = rows_of(speeds=(0.502, 9.81, 192.0), days=(), repeats=2, bins=4)
     mu = np.interp(np.abs(rows.speed), [0.502, 9.81, 192.0], [0.5695, 0.609, 0.654])

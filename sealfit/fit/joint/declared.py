@@ -145,11 +145,12 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
 
 
 def _curved(rows: Rows, chosen: np.ndarray) -> bool:
-    """Return whether friction at three speeds is no line that rises, by Akaike's criterion on file means.
+    """Return whether friction at three speeds is no line that rises, by AICc on file means.
 
     A curve through three speeds leaves few degrees of freedom for other effects, so a line is preferred. As
-    in the declared model its slope is not negative: friction that falls with speed needs the curve. Each
-    condition has its own level; slope and curvature are shared. The two directions count as repeats.
+    in the declared model its slope is not negative and shared by all conditions, each of which has its own
+    level. The curve adds curvature that all share, and may add a slope of each condition (mu_s less mu_c).
+    The two directions count as repeats.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
     tested = tested_speeds(rows, chosen)
@@ -165,18 +166,23 @@ def _curved(rows: Rows, chosen: np.ndarray) -> bool:
     )
     files = table.groupby(["file", "direction", "condition"], as_index=False).mean()
     levels = pd.get_dummies(files["condition"], dtype=float).to_numpy()
-    line = np.column_stack([levels, files["slope"]])
-    curve = np.column_stack([line, files["middle"]])
+    slope = files["slope"].to_numpy()[:, None]
+    line = np.column_stack([levels, slope])
     falls = np.linalg.lstsq(line, files["mu"], rcond=1e-9)[0][-1] < 0
-    return bool(_akaike(curve, files["mu"]) < _akaike(levels if falls else line, files["mu"]))
+    curves = [np.column_stack([levels, slopes, files["middle"]]) for slopes in (slope, levels * slope)]
+    least = min(_akaike(curve, files["mu"]) for curve in curves)
+    return bool(least < _akaike(levels if falls else line, files["mu"]))
 
 
 def _akaike(columns: np.ndarray, values: pd.Series) -> float:
-    """Return Akaike's criterion of a linear model of values, shape (n,), from its columns, shape (n, k)."""
+    """Return Akaike's corrected criterion (AICc) of a linear model of values, from its columns, shape (n, k).
+
+    Hurvich & Tsai 1989, Biometrika 76(2), 297-307, doi:10.1093/biomet/76.2.297.
+    """
     found, _, rank, _ = np.linalg.lstsq(columns, values, rcond=1e-9)
-    residual = values - columns @ found
+    residual, n, k = values - columns @ found, len(values), rank + 1  # and the variance
     rss = max(residual @ residual, ROUNDING * (values @ values))
-    return len(values) * np.log(rss) + 2 * rank
+    return n * np.log(rss) + 2 * k + 2 * k * (k + 1) / max(n - k - 1, 1)
 
 
 def tested_speeds(rows: Rows, chosen: np.ndarray) -> np.ndarray:
