@@ -24,8 +24,13 @@ HALF_WAY = 0.75
 SHORT = 0.01
 # Share of the stroke in which the fall of an overshoot comes down by 63 %, at most.
 SOON = 0.03
-# The same for a peak of more than 1.25 times the level.
+# The same for a peak that is `LARGE`.
 HIGH = 1.0 / 3.0
+# Share of the whole change of the force since rest from which a rise or fall on the plateau of the speed is
+# large: damping explains it, and nothing that changes slowly along a stroke.
+LARGE = 0.25
+# Share of the variance of the force on the plateau that the law of the bristles must explain there.
+EXPLAINED = 0.9
 # Share of the distance between which the plateau is read: near the rise, and past any ordinary rise.
 EARLY = (0.05, 0.5)
 # The same where the rise takes so long that half of the stroke may still be part of it.
@@ -158,10 +163,11 @@ def _by_damping(start: Start, turned: Start, fall: Rise) -> bool:
     """Return whether a peak may be the bristles' damping.
 
     Such a peak is reached while the speed rises. It falls within a share of the stroke, as a peak of
-    break-away falls over a longer distance, unless it is so high that no break-away or warming explains it.
+    break-away falls over a longer distance, unless it is too high for a break-away or for warming.
     """
-    length, level = float(start.distance_mm[-1]), _level_N(turned)
-    high = level is not None and float(turned.force_N[0]) <= HALF_WAY * level
+    length, level, peak_N = float(start.distance_mm[-1]), _level_N(turned), float(start.force_N.max())
+    # The fall is as large in the turned force, whose level is the same.
+    high = level is not None and level - turned.force_N[0] > LARGE * (peak_N - start.force_N[0])
     soon = 0.0 < fall.length_mm < (HIGH if high else SOON) * length
     peak_mm = length - float(turned.distance_mm[-1])
     return soon and peak_mm <= start.plateau_mm + fall.length_mm
@@ -170,15 +176,28 @@ def _by_damping(start: Start, turned: Start, fall: Rise) -> bool:
 def _rise(start: Start) -> Rise:
     """Return the rise of a start whose force comes up, and none of any other.
 
-    Where a fast stroke starts, damping brings up a part of the force at once, and the bristles the rest. The
-    rise is then that on the plateau of the speed, which is much longer than the one found from rest.
+    Where a fast stroke starts, damping brings up a part of the force at once, and the bristles the rest. If
+    that rest is large, the rise is that on the plateau of the speed, longer than the one found from rest.
     """
-    rise, ramp = _rise_from_rest(start), start.plateau_mm
-    later = _rise_from_rest(_on_plateau(start))
-    if not later.length_mm > LONGER * rise.length_mm > 0.0:
+    rise, ramp, plateau = _rise_from_rest(start), start.plateau_mm, _on_plateau(start)
+    level = _level_N(plateau) if rise.length_mm > 0.0 else None
+    if level is None or level - plateau.force_N[0] < LARGE * (level - start.force_N[0]):
+        return rise
+    later = _rise_from_rest(plateau)
+    if not (later.length_mm > LONGER * rise.length_mm and _explained(plateau, later.length_mm) > EXPLAINED):
         return rise
     unsettled = later.left_N * math.exp(min(ramp / later.length_mm, FAR)) if later.left_N else 0.0
     return Rise(ramp + later.end_mm, unsettled, later.length_mm)
+
+
+def _explained(start: Start, length_mm: float) -> float:
+    """Return the share of the variance of the force that an exponential of that length explains."""
+    n = _rows_within(start, REACH * length_mm)
+    beside = _Beside(start.distance_mm[:n], False)
+    force = beside.free(start.force_N[:n])
+    return 1.0 - beside.fitted(_shape(start.distance_mm[:n], length_mm), force)[1] / max(
+        force @ force, 1e-300
+    )
 
 
 def _on_plateau(start: Start) -> Start:

@@ -121,8 +121,8 @@ def test_damped_bristles_that_overshoot_are_over_too(ratio, damping):
 
 
 @pytest.mark.parametrize("ratio", [6.0, 11.0, 30.0])
-@pytest.mark.parametrize("damping", [50.0, 60.0, 110.0, 150.0])
+@pytest.mark.parametrize("damping", [50.0, 56.0, 135.0, 150.0])
 def test_damping_that_jumps_at_a_reversal_hides_no_rise(ratio, damping):
-    """The force jumps from -45 N to 5, 15, 65 or 105 N, and follows the bristles from there."""
+    """The force jumps from -45 N to 5, 11, 90 or 105 N, and follows the bristles from there."""
     _, steady = steady_forces(ratio, begin=-LEVEL, damping=damping, ramp=0.02, hertz=400.0)
     assert steady.mean() == pytest.approx(LEVEL, abs=0.05)
