@@ -89,6 +89,16 @@ def test_noise_and_resolution_of_the_displacement_are_no_change_of_speed(blur, s
         assert np.ptp(speed) == 0.0
 
 
+def test_beats_between_the_steps_of_the_sensor_and_the_sampling_are_no_change_of_speed():
+    rng = np.random.default_rng(3)
+    for hertz, v in ((172.68, 3.92), (1013.2, 23.0)):
+        for _ in range(30):
+            time = np.arange(0.0, 14.4 / v, 1.0 / hertz)
+            x = np.round(v * (1 + 7e-4 * rng.normal()) * time / 0.0018974) * 0.0018974
+            speed, _steady = speeds_along(time, x, 10.0 + rng.normal(0, 0.005, time.size))
+            assert np.ptp(speed) == 0.0
+
+
 def test_the_window_begins_where_the_rise_and_the_ramp_are_over_and_no_later_than_needed():
     time, x, force, level = stroke()
     found = only(time, x, force)
