@@ -120,6 +120,15 @@ def test_friction_that_falls_in_one_condition_and_rises_in_another_has_the_curve
     assert set(declare(rows).stribeck.values()) == {"interpolated"}
 
 
+def test_at_several_loads_a_fall_of_friction_beside_viscous_friction_has_the_curve():
+    rows = rows_of(speeds=(7.0, 32.0, 150.0), temperatures=(60.0,), days=(4.0,), repeats=2, bins=4)
+    load = np.where(rows.codes("file") % 2, 60.0, 210.0)
+    mu = 0.25 + 0.04 * np.exp(-((np.abs(rows.speed) / 40.0) ** 2))
+    force = load * mu + 0.057 * np.abs(rows.speed)
+    rows = replace(rows, load=load, force=force * np.sign(rows.speed))
+    assert set(declare(rows).stribeck.values()) == {"interpolated"}
+
+
 def test_a_rising_curve_through_three_speeds_does_not_start_with_friction_below_zero():
     rows = rows_of(speeds=(0.502, 9.81, 192.0), days=(), repeats=2, bins=4)
     mu = np.interp(np.abs(rows.speed), [0.502, 9.81, 192.0], [0.5695, 0.609, 0.654])

@@ -153,13 +153,14 @@ def _curved(rows: Rows, chosen: np.ndarray) -> bool:
     The two directions count as repeats.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
-    tested = tested_speeds(rows, chosen)
+    nearest = np.abs(speed[:, None] - tested_speeds(rows, chosen)).argmin(axis=1)
     table = pd.DataFrame(
         {
             "file": rows.codes("file")[chosen],
             "direction": np.sign(rows.speed[chosen]),
             "condition": rows.condition[chosen],
-            "middle": np.abs(speed[:, None] - tested).argmin(axis=1) == 1,
+            "slow": nearest == 0,
+            "middle": nearest == 1,
             "slope": speed / load,
             "mu": np.abs(rows.force[chosen]) / load,
         }
@@ -169,7 +170,8 @@ def _curved(rows: Rows, chosen: np.ndarray) -> bool:
     slope = files["slope"].to_numpy()[:, None]
     line = np.column_stack([levels, slope])
     falls = np.linalg.lstsq(line, files["mu"], rcond=1e-9)[0][-1] < 0
-    curves = [np.column_stack([levels, slopes, files["middle"]]) for slopes in (slope, levels * slope)]
+    bends = files[["slow", "middle"]]  # with one load, one of them is a slope
+    curves = [np.column_stack([levels, slopes, bends]) for slopes in (slope, levels * slope)]
     least = min(_akaike(curve, files["mu"]) for curve in curves)
     return bool(least < _akaike(levels if falls else line, files["mu"]))
 
