@@ -22,33 +22,21 @@ from sealfit.errors import SealfitError, grouped, told
 # ---------------------------------------------------------------- options
 # Arguments and options that several commands share.
 
-Campaign = Annotated[
-    Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder: runs.csv and the trace files.")
-]
-Results = Annotated[
-    Path, typer.Argument(metavar="OUT", help="Folder of results that `ingest` or `run` made.")
-]
+Campaign = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Folder of runs.csv and trace files.")]
+Results = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results of `ingest` or `run`.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder of results; created if it is missing.")]
-ConfigFile = Annotated[
-    Path | None, typer.Option("--config", help="Rig config (TOML); none: files in the default format.")
-]
-Workers = Annotated[
-    int | None, typer.Option("--workers", min=1, help="Processes to use. [default: all cores]")
-]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Rig config (TOML); else the default.")]
+Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Processes. [default: all cores]")]
 Scheduler = Annotated[
     str | None,
-    typer.Option(
-        "--scheduler", metavar="ADDRESS", help="Dask scheduler to work on: tcp://host:port, or its file."
-    ),
+    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler: tcp://host:port, or its file."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Redo steps that are up to date, too.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
 Profile = Annotated[bool, typer.Option("--profile", help="Print seconds and rows per step.")]
 EffectsFolder = Annotated[
     Path | None,
-    typer.Option(
-        "--effects-folder", metavar="FOLDER", help="Folder of your own effects. Python is run from it."
-    ),
+    typer.Option("--effects-folder", metavar="FOLDER", help="Your own effects. Python is run from it."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
 
@@ -68,12 +56,7 @@ def end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: b
         typer.echo("\n".join(_coloured(text) for text in lines(made)))
 
 
-VERDICT_COLOURS = {
-    "closed": "green",
-    "nothing_missing": "green",
-    "cannot_tell": "yellow",
-    "unexplained": "red",
-}
+VERDICT_COLOURS = {"closed": "green", "nothing_missing": "green", "cannot_tell": "yellow"}
 
 
 def _coloured(text: str) -> str:
@@ -81,8 +64,8 @@ def _coloured(text: str) -> str:
     found = re.match(r"verdict +(\w+)", text)
     if found is None or os.environ.get("NO_COLOR"):
         return text
-    start, stop = found.span(1)
-    return text[:start] + typer.style(found[1], fg=VERDICT_COLOURS.get(found[1]), bold=True) + text[stop:]
+    verdict = typer.style(found[1], fg=VERDICT_COLOURS.get(found[1], "red"), bold=True)
+    return text[: found.start(1)] + verdict + text[found.end(1) :]
 
 
 def print_json(document: dict) -> None:
@@ -409,12 +392,8 @@ def simulate(
     from sealfit import commands
 
     made = commands.simulate(spec, out, force=force)
-    end(
-        "simulate",
-        made,
-        lambda m: [f"{m['files']} trace files in {m['campaign']}", f"truth: {m['truth']}"],
-        as_json,
-    )
+    lines = [f"{made['files']} trace files in {made['campaign']}", f"truth: {made['truth']}"]
+    end("simulate", made, lambda _: lines, as_json)
 
 
 # ---------------------------------------------------------------- what the commands share

@@ -6,7 +6,7 @@ import pytest
 from sealfit.closure.output import POINTS, curve_table
 from sealfit.fit.joint.estimate import fit
 from sealfit.fit.joint.rows import make_rows
-from sealfit.fit.joint.search import start_model
+from sealfit.fit.joint.start import start_model
 
 
 def test_curves_go_both_ways_over_the_speeds_of_each_condition_at_its_mean_load():
