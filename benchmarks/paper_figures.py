@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from paper_numbers import MEASURED, SERIES, UNAGED, as_printed, condition, printed_errors
 
 from sealfit.config import Config
-from sealfit.physics import stribeck_force
+from sealfit.physics import aging_law, stribeck_force
 from sealfit.report.figures.aging import aging_points, draw_aging
 from sealfit.report.figures.speed import Line, curve_lines, draw_force_speed, run_points
 from sealfit.report.notation import ConditionNames, symbol_math
@@ -69,10 +69,12 @@ def figures(found: Found) -> Iterator[Plot]:
     )  # fmt: skip
     aged = [((60, 80, day), f"{day} d") for day in DAYS]
     yield _forces(found, "figure_12", "Figure 12: force and aging time, 60 °C, 80 %", aged)
-    yield _law(found, "figure_13", "Figure 13: coefficients over aging time, 60 °C, 80 %", printed=False)
-    yield _law(found, "figure_14", "Figure 14: Eq. 15 as fitted and as printed, 60 °C, 80 %", printed=True)
-    late = [((80, 80, day), f"{day} d") for day in (1, 4, 16)]
-    yield _forces(found, "figure_15", "Figure 15: the model after aging, 80 °C, 80 %", late)
+    yield _law(found, "figure_13", "Figure 13: Eq. 15 as fitted and as printed, 60 °C, 80 %")
+    last = [((80, 80, 16), "16 d")]
+    yield _forces(found, "figure_14", "Figure 14: the model before and after aging, 80 °C, 80 %", last)
+    yield _predicted(
+        found, "figure_15", "Figure 15: predicted and measured, 80 °C, 80 %, day 16", (80, 80, 16)
+    )
 
 
 def _sensitivity(name: str, title: str, quantity: str) -> Plot:
@@ -135,7 +137,37 @@ def _coefficients(
     return Plot(name, title, tuple(panels), tuple(legend))
 
 
-def _law(found: Found, name: str, title: str, *, printed: bool) -> Plot:
+def _predicted(found: Found, name: str, title: str, at: At) -> Plot:
+    """Return the force that Eq. 15, fitted across the days, gives at a condition, and what was measured."""
+    laws, steady = found.tables["aging_fit"], found.tables["steady_fit"]
+    celsius, percent, day = at
+    laws = laws[laws["series"] == f"temperature_C={celsius:g}, compression_ratio_pct={percent:g}"]
+    own = steady[(steady["condition"] == condition(at)) & (steady["quantity"] == "steady")]
+    shared = own.set_index("parameter")["value"]
+    values = {}
+    for quantity, law in laws[laws["parameter"].isin(["mu_0", "a", "b"])].groupby("quantity"):
+        values[quantity] = aging_law(day, **law.set_index("parameter")["value"].to_dict())
+    points = run_points(found.tables["steady"], found.config)
+    points = points[points["condition"] == condition(at)]
+    speed = np.geomspace(points["speed"].abs().min() / 1.5, points["speed"].abs().max() * 1.2, 200)
+    load = float(found.tables["steady"]["load_N"].mean())
+    force = stribeck_force(speed, load, **values, v_s=shared["v_s"], sigma_2=shared["sigma_2"])
+
+    def draw(ax: Axes) -> None:
+        ax.plot(speed, force, color=CYCLE[0])
+        ax.plot(points["speed"].abs(), points["force"].abs(), "o", color=FLOOR)
+        ax.set_xscale("log")
+        ax.set_xlabel("speed (mm/s)")
+        ax.set_ylabel("friction force (N)")
+
+    off = points["force"].abs() / np.interp(points["speed"].abs(), speed, force) - 1.0
+    alt = "Friction force over speed: run means and the prediction, which differ by at most "
+    alt += f"{abs(off).max():.1%}."
+    legend = (Key("predicted by Eq. 15", CYCLE[0]), Key("run means", FLOOR, "point"))
+    return Plot(name, title, (Panel("", alt, draw, height=3.2),), legend)
+
+
+def _law(found: Found, name: str, title: str) -> Plot:
     curves = found.tables["aging_curves"]
     curves = curves[curves["series"] == SERIES]
     points = aging_points(found.tables["steady_fit"], ["mu_s", "mu_c"], ConditionNames.of(found.config))
@@ -144,13 +176,12 @@ def _law(found: Found, name: str, title: str, *, printed: bool) -> Plot:
 
     def draw(ax: Axes) -> None:
         draw_aging(ax, points, curves, found.config.units)
-        if printed:
-            for quantity in ("mu_s", "mu_c"):
-                ax.plot(days, as_printed(quantity, days), color=BLACK, linestyle=":")
-            ax.plot(days, as_printed("mu_c", days, needed), color=QUIET, linestyle="--")
-            for section, _, at, value in MEASURED:
-                if section == "4.3":
-                    ax.plot(0 if at is None else at[2], value, marker="x", color=BLACK, markersize=6)
+        for quantity in ("mu_s", "mu_c"):
+            ax.plot(days, as_printed(quantity, days), color=BLACK, linestyle=":")
+        ax.plot(days, as_printed("mu_c", days, needed), color=QUIET, linestyle="--")
+        for section, _, at, value in MEASURED:
+            if section == "4.3":
+                ax.plot(0 if at is None else at[2], value, marker="x", color=BLACK, markersize=6)
 
     ends = points.groupby("quantity")["value"].agg(["max", "min"])
     alt = "Coefficients over aging time with the fitted Eq. 15: " + "; ".join(
@@ -158,7 +189,6 @@ def _law(found: Found, name: str, title: str, *, printed: bool) -> Plot:
     ) + "."  # fmt: skip
     legend = [Key(q, CYCLE[k], symbol=True) for k, q in enumerate(("mu_s", "mu_c"))]
     legend += [Key("fit per condition, 95 %", FLOOR, "point"), Key("Eq. 15, 95 % band", FLOOR, "band")]
-    if printed:
-        legend += [Key("Eq. 15 as printed; x: printed values", BLACK, "dotted")]
-        legend += [Key(f"the printed prediction, start {needed:.3f}", QUIET, "dashed")]
+    legend += [Key("Eq. 15 as printed; x: printed values", BLACK, "dotted")]
+    legend += [Key(f"the printed prediction, start {needed:.3f}", QUIET, "dashed")]
     return Plot(name, title, (Panel("", alt, draw, height=3.2),), tuple(legend))
