@@ -129,6 +129,14 @@ def test_at_several_loads_a_fall_of_friction_beside_viscous_friction_has_the_cur
     assert set(declare(rows).stribeck.values()) == {"interpolated"}
 
 
+def test_a_steep_fall_at_three_speeds_with_two_files_each_has_the_curve():
+    rows = rows_of(speeds=(18.5, 84.2, 383.0), days=(), temperatures=(), repeats=2, bins=4)
+    slow = np.abs(rows.speed) < 20.0
+    files = np.random.default_rng(1).normal(1.0, 0.005, rows.groups.starts["file"].size)[rows.codes("file")]
+    rows = replace(rows, force=rows.load * np.where(slow, 0.49, 0.274) * files * np.sign(rows.speed))
+    assert set(declare(rows).stribeck.values()) == {"interpolated"}
+
+
 def test_a_rising_curve_through_three_speeds_does_not_start_with_friction_below_zero():
     rows = rows_of(speeds=(0.502, 9.81, 192.0), days=(), repeats=2, bins=4)
     mu = np.interp(np.abs(rows.speed), [0.502, 9.81, 192.0], [0.5695, 0.609, 0.654])
@@ -147,9 +155,7 @@ def test_a_straight_line_through_three_speeds_is_mostly_left_one():
         ]
         line = rows.load * (0.5 + 0.002 * np.abs(rows.speed)) * np.sign(rows.speed) * files
         forms += declare(replace(rows, force=line)).stribeck.values()
-    assert forms.count("viscous") > 0.7 * len(
-        forms
-    )  # Akaike's criterion prefers a needless number one time in six
+    assert forms.count("viscous") > 0.85 * len(forms)  # the F test rejects one line in twenty
 
 
 def test_law_needs_three_days():

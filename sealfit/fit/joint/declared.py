@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.special import fdtrc
 
 from sealfit.fit.joint.rows import SAME_SPEED, Rows
 
@@ -24,6 +25,8 @@ CURVED = ("full", "interpolated")
 SPEEDS_FOR_VISCOUS = 2
 # Number of aging days that Eq. 15 needs: mu_0, a and b are three numbers.
 DAYS_FOR_LAW = 3
+# P-value below which a line through three speeds is rejected.
+REJECTED = 0.05
 # A residual sum of squares below this share of the total is rounding.
 ROUNDING = 1e-24
 
@@ -145,12 +148,13 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
 
 
 def _curved(rows: Rows, chosen: np.ndarray) -> bool:
-    """Return whether friction at three speeds is no line that rises, by AICc on file means.
+    """Return whether friction at three speeds is no line that rises, by F tests on file means.
 
-    A curve through three speeds leaves few degrees of freedom for other effects, so a line is preferred. As
-    in the declared model its slope is not negative and shared by all conditions, each of which has its own
-    level. The curve adds curvature that all share, and may add a slope of each condition (mu_s less mu_c).
-    The two directions count as repeats.
+    A curve through three speeds leaves few degrees of freedom for other effects, so a line is kept if it is
+    not rejected. As in the declared model its slope is not negative and shared by all conditions, each of
+    which has its own level. The curve adds curvature that all share, and may add a slope of each condition
+    (mu_s less mu_c). The two directions count as repeats. Without a degree of freedom there is no test, and
+    the curve is taken.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
     nearest = np.abs(speed[:, None] - tested_speeds(rows, chosen)).argmin(axis=1)
@@ -172,19 +176,27 @@ def _curved(rows: Rows, chosen: np.ndarray) -> bool:
     falls = np.linalg.lstsq(line, files["mu"], rcond=1e-9)[0][-1] < 0
     bends = files[["slow", "middle"]]  # with one load, one of them is a slope
     curves = [np.column_stack([levels, slopes, bends]) for slopes in (slope, levels * slope)]
-    least = min(_akaike(curve, files["mu"]) for curve in curves)
-    return bool(least < _akaike(levels if falls else line, files["mu"]))
+    tests = [_p_of_line(levels if falls else line, curve, files["mu"].to_numpy()) for curve in curves]
+    p_values = [p for p in tests if p is not None]
+    return not p_values or len(p_values) * min(p_values) < REJECTED
 
 
-def _akaike(columns: np.ndarray, values: pd.Series) -> float:
-    """Return Akaike's corrected criterion (AICc) of a linear model of values, from its columns, shape (n, k).
+def _p_of_line(line: np.ndarray, curve: np.ndarray, values: np.ndarray) -> float | None:
+    """Return the p-value of the F test of a line within a curve, from their columns, shape (n, k) each.
 
-    Hurvich & Tsai 1989, Biometrika 76(2), 297-307, doi:10.1093/biomet/76.2.297.
+    None where the curve leaves no degree of freedom and the line does not fit exactly.
     """
-    found, _, rank, _ = np.linalg.lstsq(columns, values, rcond=1e-9)
-    residual, n, k = values - columns @ found, len(values), rank + 1  # and the variance
-    rss = max(residual @ residual, ROUNDING * (values @ values))
-    return n * np.log(rss) + 2 * k + 2 * k * (k + 1) / max(n - k - 1, 1)
+    sums, ranks = [], []
+    for columns in (line, curve):
+        found, _, rank, _ = np.linalg.lstsq(columns, values, rcond=1e-9)
+        sums.append(float(np.sum((values - columns @ found) ** 2)))
+        ranks.append(rank)
+    more, left, rounding = ranks[1] - ranks[0], values.size - ranks[1], ROUNDING * float(values @ values)
+    if more == 0 or sums[0] <= rounding:
+        return 1.0
+    if left == 0:
+        return None
+    return float(fdtrc(more, left, (sums[0] - sums[1]) / more / max(sums[1] / left, rounding)))
 
 
 def tested_speeds(rows: Rows, chosen: np.ndarray) -> np.ndarray:
