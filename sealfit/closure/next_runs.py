@@ -113,13 +113,17 @@ BEYOND = 0.5  # Share of a channel's range by which a run may exceed it.
 SHOWN = 0.5  # Least share of an effect's size that a proposed run must show.
 TIE = 1e-9  # Relative difference below which two runs differ by rounding only.
 ROWS = 4  # Rows per stroke at which forces are compared.
+STRAY = 12.0  # Standard deviations of the files by which the mean of one must be off to be named.
+STRAY_SHARE = 0.02  # Share of the force by which it must be off.
+MOST_STRAY = 3  # Largest number of files that are named.
+LEAST_FILES = 12  # Fewest files whose standard deviation is known well enough.
 
 
 def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect]) -> list[dict]:
     """Return the runs that would distinguish effects from rivals, and those that would show aliases.
 
-    There is a run for each effect, which would distinguish it from its nearest rival, and a run for each
-    alias, which would show it.
+    Files that are far off all others come first: their runs are to be repeated. Then there is a run for each
+    effect, which would distinguish it from its nearest rival, and a run for each alias, which would show it.
 
     Parameters
     ----------
@@ -135,7 +139,7 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
     list of dict
         `why`, a text, and `conditions`: the condition and the channels of one run.
     """
-    wanted = []
+    wanted = list(_runs_to_repeat(selection.after, config))
     for item in selection.added:
         for rival in item.rivals[:1]:
             chosen = item.proposal
@@ -157,6 +161,28 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
     if selection.after.rows.has_aging and not selection.after.scatter.estimates("specimen"):
         wanted.append(_second_specimen(selection.after.rows, config))
     return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
+
+
+def _runs_to_repeat(fitted: Fitted, config: Config) -> Iterator[dict]:
+    """Yield the runs of files whose mean is far off the model, the farthest first."""
+    rows, groups = fitted.rows, fitted.rows.groups
+    along = np.sign(rows.speed)
+    off = groups.means(fitted.residual * along, "file") / groups.means(rows.force * along, "file")
+    off -= np.median(off)
+    # The median of the absolute deviations is 0.6745 standard deviations, and a few files do not change it.
+    times = np.abs(off) / max(np.median(np.abs(off)) / 0.6745, 1e-300)
+    if off.size < LEAST_FILES:
+        return
+    stray = np.flatnonzero((times > STRAY) & (np.abs(off) > STRAY_SHARE))
+    names = (*config.condition, "speed_mm_s", "load_N")
+    for k in stray[np.argsort(-np.abs(off[stray]))][:MOST_STRAY]:
+        row = rows.table.iloc[groups.starts["file"][k]]
+        side = "above" if off[k] > 0 else "below"
+        yield {
+            "why": f"file {row['file']} is {abs(off[k]):.0%} {side} the model, {times[k]:.0f} times the "
+            "standard deviation of the files: look at it, and repeat its run",
+            "conditions": {name: _plain(row[name]) for name in names if name in row},
+        }
 
 
 def _second_specimen(rows: Rows, config: Config) -> dict:
