@@ -38,7 +38,7 @@ from sealfit.report.notation import (
 )
 from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter_tables
 from sealfit.report.style import Drawn, Plot, data_uri, draw
-from sealfit.report.words import left_over, verdict, with_left_channels
+from sealfit.report.words import left_over, undecided, verdict, with_left_channels
 from sealfit.tables import SCHEMAS
 
 # ---------------------------------------------------------------- facts
@@ -305,6 +305,7 @@ def _content(
         "badge": VERDICTS[closure["verdict"] if closure else None],
         "fit": fit_quality(closure),
         "verdict": verdict(closure, tables["shapes"], config),
+        "undecided": undecided(closure, config),
         "facts": page.campaign_facts(tables, config),
         "errors": error_rows(closure, config) if closure else [],
         "cards": effect_cards(closure, config) if closure else [],

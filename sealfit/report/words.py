@@ -24,6 +24,7 @@ from sealfit.report.notation import (
     split_channels,
     symbol_html,
     together,
+    true_units,
 )
 from sealfit.report.summary import level_words, power_clause, quality_clause, untold_clause
 
@@ -66,10 +67,19 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
     if missed:
         errors[0] = Markup("with {} {}").format("them," if len(added) > 1 else "it,", errors[0])
     if closure["verdict"] == "closed":
-        untold = untold_clause(closure, config.units)
-        return _sentences(lacked, *errors, f"not decided by these files: {untold}" if untold else "")
+        return _sentences(lacked, *errors)
     left = f"a significant residual remains that no effect explains: {_where(closure['left'], config)}"
     return _sentences(lacked, left, *errors)
+
+
+def undecided(closure: Mapping | None, config: Config) -> Markup:
+    """Return what the files do not decide beside the effects that were found, in a sentence; may be empty."""
+    untold = untold_clause(closure, config.units) if closure and closure["verdict"] == "closed" else ""
+    return (
+        _sentences(f"not decided by these files: {true_units(untold, config.units)}")
+        if untold
+        else Markup("")
+    )
 
 
 def _missed_effects(
