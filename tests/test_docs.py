@@ -42,13 +42,26 @@ def has(expected, printed):
     return doctest.OutputChecker().check_output(expected, printed, FLAGS)
 
 
+def as_in_a_clone(folder):
+    """Put the sample data and the configs into a folder."""
+    for name in ("sample_data", "configs"):
+        (folder / name).symlink_to(ROOT / name)
+    shutil.copytree(ROOT / "sample_data" / "simulated", folder / "my_campaign")
+    return folder
+
+
 @pytest.fixture
 def desk(tmp_path):
-    """A folder with the sample data and the configs beside it, as in a clone."""
-    for name in ("sample_data", "configs"):
-        (tmp_path / name).symlink_to(ROOT / name)
-    shutil.copytree(ROOT / "sample_data" / "simulated", tmp_path / "my_campaign")
-    return tmp_path
+    """A folder with the sample data and the configs beside it."""
+    return as_in_a_clone(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def with_results(tmp_path_factory):
+    """The same with the results of the sample campaign, as several pages show these."""
+    folder = as_in_a_clone(tmp_path_factory.mktemp("docs"))
+    run("sealfit run sample_data/simulated --out results", folder)
+    return folder
 
 
 def run(command, folder):
@@ -70,12 +83,12 @@ def test_examples_print_what_they_say(page):
     assert not failed
 
 
-@pytest.mark.parametrize("name", ["tutorial.md", "how-to/enough-runs.md"])
-def test_commands_print_what_they_say(name, desk):
-    commands = list(console(DOCS / name))
+@pytest.mark.parametrize(("name", "folder"), [("tutorial", "desk"), ("how-to/enough-runs", "with_results")])
+def test_commands_print_what_they_say(name, folder, request):
+    commands = list(console(DOCS / f"{name}.md"))
     assert commands
     for command, expected in commands:
-        printed = run(command, desk)
+        printed = run(command, request.getfixturevalue(folder))
         assert has(expected, printed), f"{command}\n{printed}"
 
 
@@ -90,11 +103,11 @@ def test_the_commands_of_the_readme_for_your_own_data_run(desk):
     assert run(f"python -c {shlex.quote(code)}", desk) == ""
 
 
-def test_the_readme_shows_what_make_demo_prints(desk):
+def test_the_readme_shows_what_make_demo_prints(with_results):
     text = (ROOT / "README.md").read_text("utf-8")
     shown = re.findall(r"^    ((?:verdict|   |error|noise).*)$", text, re.MULTILINE)
     assert len(shown) == 4
-    printed = run("sealfit run sample_data/simulated --out demo-out", desk)
+    printed = run("sealfit run sample_data/simulated --out results", with_results)
     assert all(line in printed for line in shown)
 
 
