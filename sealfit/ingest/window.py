@@ -31,9 +31,12 @@ HALF_UP = 0.5
 SPEED_PIECES = (8, 64)
 # Rows of such a piece, at least.
 LEAST_ROWS = 8
-# Share by which speeds may differ without a finding. Errors of screws and scales are of that size, and so are
-# beats between the steps of a position sensor and the sampling.
+# Share by which speeds may differ without a finding. Errors of screws and scales are of that size.
 SAME_SPEED = 0.002
+# Range of the displacement about a straight line over time, in units of its largest second difference, below
+# which the speed does not change. Beats between the steps of a position sensor and the sampling reach half of
+# it, also where the last digits scatter (300 strokes: 0.53 at most).
+DEPARTURE = 1.0
 # P-value below which the speeds of pieces differ. It is small because campaigns have thousands of strokes,
 # and one stroke with a change of speed that is noise can outweigh the differences between runs.
 CLEAR = 1e-6
@@ -251,12 +254,8 @@ def _off_speed(
     # k slopes of n / k samples over 1/k of the time have errors of sqrt(12 k^3 / n) noise over the whole of
     # it.
     noise = max(noise_mm / (time_s[-1] - time_s[0]), 1e-9 * error)
-    # A piece is off by as much as a step of the sensor over its length.
-    step_mm, length_mm = _resolution(displacement_mm), abs(displacement_mm[-1] - displacement_mm[0])
     least, most = SPEED_PIECES
-    most = min(most, SAME_SPEED * length_mm / max(step_mm, 1e-300))
-    pieces = (n * (error / noise) ** 2 / 12.0) ** (1.0 / 3.0)
-    pieces = int(min(max(min(pieces, most), least), n // LEAST_ROWS))
+    pieces = int(min(max((n * (error / noise) ** 2 / 12.0) ** (1.0 / 3.0), least), most, n // LEAST_ROWS))
     rows = n // pieces * pieces
     time, place = (values[:rows].reshape(pieces, -1) for values in (time_s, displacement_mm))
     middle = time.mean(axis=1)
@@ -267,22 +266,18 @@ def _off_speed(
     # Neighbours that err alike (steps of a coarse sensor) count as one: a sign lasts for two of independent
     # ones.
     alike = residual.size / max(2 * np.count_nonzero(np.diff(np.sign(residual), axis=1)), 1)
-    off_by_step = speed * step_mm * pieces / length_mm
-    variance = (residual**2).mean() * max(alike, 1.0) / square + error**2 + off_by_step**2
+    variance = (residual**2).mean() * max(alike, 1.0) / square + error**2
     scatter = float(((slope - slope.mean()) ** 2 / variance).sum())
     if chdtrc(pieces - 1, scatter) > CLEAR:
+        return np.zeros(n)
+    straight = np.polynomial.Polynomial.fit(middle, place.mean(axis=1), 1)
+    if np.ptp(place.mean(axis=1) - straight(middle)) < DEPARTURE * np.abs(np.diff(displacement_mm, 2)).max():
         return np.zeros(n)
     off = slope - speed
     # A whole piece further at either end, along a straight line.
     at = np.r_[2.0 * middle[0] - middle[1], middle, 2.0 * middle[-1] - middle[-2]]
     off = np.r_[2.0 * off[0] - off[1], off, 2.0 * off[-1] - off[-2]]
     return np.interp(time_s - lag_s, at, off)
-
-
-def _resolution(displacement_mm: np.ndarray) -> float:
-    """Return the smallest step between different displacements: that of the sensor, if it is coarse."""
-    steps = np.diff(np.unique(displacement_mm))
-    return float(steps.min()) if steps.size else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -95,8 +95,19 @@ def test_beats_between_the_steps_of_the_sensor_and_the_sampling_are_no_change_of
         for _ in range(30):
             time = np.arange(0.0, 14.4 / v, 1.0 / hertz)
             x = np.round(v * (1 + 7e-4 * rng.normal()) * time / 0.0018974) * 0.0018974
+            x *= 1.0 + rng.choice([0.0, 1e-6]) * rng.normal(size=time.size)
             speed, _steady = speeds_along(time, x, 10.0 + rng.normal(0, 0.005, time.size))
             assert np.ptp(speed) == 0.0
+
+
+@pytest.mark.parametrize("sag", [0.02, 0.04])
+@pytest.mark.parametrize("blur", [0.0, 1e-9, 1e-6, 1e-4])
+def test_a_small_sag_is_found_whatever_the_last_digits_say(sag, blur):
+    rng = np.random.default_rng(2)
+    time = np.linspace(0.0, 8.0, 600)
+    x = 5.0 * time + sag * 5.0 * 1.5 * (1.0 - np.exp(-time / 1.5)) + rng.normal(0.0, blur, 600)
+    speed, _steady = speeds_along(time, x, 30.0 + rng.normal(0.0, 0.1, 600))
+    assert np.ptp(speed) == pytest.approx(sag * 5.0, rel=0.05)
 
 
 def test_the_window_begins_where_the_rise_and_the_ramp_are_over_and_no_later_than_needed():
