@@ -94,7 +94,7 @@ class TraceFormat(Strict):
     delimiter: str = ","
     """One character, `"tab"` or `"whitespace"`."""
     decimal: Literal[".", ","] = "."
-    """or `","`."""
+    """`"."` or `","`."""
     header_lines: int | None = Field(None, ge=0)
     """Lines before the first data row, column names included."""
     header_ends_at: str | None = None
@@ -283,7 +283,7 @@ class Sensor(Strict):
     accuracy: float = Field(0.2, ge=0)
     """Half-width, in the force's unit."""
     distribution: Literal["rectangular", "normal"] = "rectangular"
-    """or `"normal"` (then the half-width is that of 95 %)."""
+    """`"rectangular"`, or `"normal"`, whose half-width is that of 95 %."""
 
     @property
     def u(self) -> float:

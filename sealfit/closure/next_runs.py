@@ -166,13 +166,13 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
 def _runs_to_repeat(fitted: Fitted, config: Config) -> Iterator[dict]:
     """Yield the runs of files whose mean is far off the model, the farthest first."""
     rows, groups = fitted.rows, fitted.rows.groups
+    if groups.starts["file"].size < LEAST_FILES:
+        return
     along = np.sign(rows.speed)
     off = groups.means(fitted.residual * along, "file") / groups.means(rows.force * along, "file")
     off -= np.median(off)
     # The median of the absolute deviations is 0.6745 standard deviations, and a few files do not change it.
     times = np.abs(off) / max(np.median(np.abs(off)) / 0.6745, 1e-300)
-    if off.size < LEAST_FILES:
-        return
     stray = np.flatnonzero((times > STRAY) & (np.abs(off) > STRAY_SHARE))
     names = (*config.condition, "speed_mm_s", "load_N")
     for k in stray[np.argsort(-np.abs(off[stray]))][:MOST_STRAY]:

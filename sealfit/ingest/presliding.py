@@ -207,8 +207,6 @@ def _on_plateau(start: Start) -> Start:
 
 
 def _rise_from_rest(start: Start) -> Rise:
-    if len(start.force_N) < 2:
-        return Rise(0.0)
     level = _level_N(start)
     scale = _scale_mm(start, level)
     if not scale > 0.0:

@@ -303,7 +303,7 @@ def _content(
     return {
         "closure": closure,
         "badge": VERDICTS[closure["verdict"] if closure else None],
-        "fit": fit_quality(closure),
+        "fit": fit_badge(closure),
         "verdict": verdict(closure, tables["shapes"], config),
         "undecided": undecided(closure, config),
         "facts": page.campaign_facts(tables, config),
@@ -335,7 +335,7 @@ def _content(
     }
 
 
-def fit_quality(closure: Mapping | None) -> tuple[str, str]:
+def fit_badge(closure: Mapping | None) -> tuple[str, str]:
     """Return how well the model fits: the state, and a few words; both empty if the loop was not run."""
     quality = (closure or {}).get("fit_quality") or {"state": ""}
     words = {
