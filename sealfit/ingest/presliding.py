@@ -29,8 +29,10 @@ HIGH = 1.0 / 3.0
 # Share of the whole change of the force since rest from which a rise or fall on the plateau of the speed is
 # large: damping explains it, and nothing that changes slowly along a stroke.
 LARGE = 0.25
-# Share of the variance of the force on the plateau that the law of the bristles must explain there.
+# Share of the variance of the force on the plateau that the law of the bristles must explain there, and the
+# number of means of which that variance is taken.
 EXPLAINED = 0.9
+MEANS = 24
 # Share of the distance between which the plateau is read: near the rise, and past any ordinary rise.
 EARLY = (0.05, 0.5)
 # The same where the rise takes so long that half of the stroke may still be part of it.
@@ -191,13 +193,14 @@ def _rise(start: Start) -> Rise:
 
 
 def _explained(start: Start, length_mm: float) -> float:
-    """Return the share of the variance of the force that an exponential of that length explains."""
+    """Return the share of the variance of the force, its noise averaged out, that an exponential explains."""
     n = _rows_within(start, REACH * length_mm)
-    beside = _Beside(start.distance_mm[:n], False)
-    force = beside.free(start.force_N[:n])
-    return 1.0 - beside.fitted(_shape(start.distance_mm[:n], length_mm), force)[1] / max(
-        force @ force, 1e-300
-    )
+    edges = np.linspace(0, n, min(MEANS, n) + 1).astype(int)[:-1]
+    count = np.diff(np.r_[edges, n])
+    distance, force = (np.add.reduceat(values[:n], edges) / count for values in start[:2])
+    beside = _Beside(distance, False)
+    force = beside.free(force)
+    return 1.0 - beside.fitted(_shape(distance, length_mm), force)[1] / max(force @ force, 1e-300)
 
 
 def _on_plateau(start: Start) -> Start:

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.ndimage import uniform_filter1d
 
 from sealfit.config import Config, Strokes
 from sealfit.ingest.campaign import ingest_campaign
@@ -13,7 +14,7 @@ LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
 
 
 def bristle_trace(
-    ratio, *, hertz=100.0, ramp=0.2, blur=0.002, begin=0.0, damping=0.0, seed=1, shape="straight"
+    ratio, *, hertz=100.0, ramp=0.2, blur=0.002, begin=0.0, damping=0.0, seed=1, shape="straight", drift=0.0
 ):
     """Return time, displacement and force of a stroke `ratio` bristle lengths long, after a rest of a second.
 
@@ -28,7 +29,10 @@ def bristle_trace(
         slid = SPEED * (since - ramp * -np.expm1(-since / ramp))
     bent = np.exp(-slid / LENGTH)  # damping: sigma_1 dz/dt, in N at the stroke's speed
     force = LEVEL + (begin - LEVEL) * bent + damping * np.gradient(slid, time) / SPEED * bent
-    return time, slid + random.normal(0.0, blur, time.size), force + random.normal(0.0, NOISE, time.size)
+    noise = random.normal(0.0, NOISE, time.size)
+    if drift:
+        noise += uniform_filter1d(random.normal(0.0, drift, time.size), 8) * 8**0.5
+    return time, slid + random.normal(0.0, blur, time.size), force + noise
 
 
 def steady_forces(ratio, many=12, **more):
@@ -126,3 +130,10 @@ def test_damping_that_jumps_at_a_reversal_hides_no_rise(ratio, damping):
     """The force jumps from -45 N to 5, 11, 90 or 105 N, and follows the bristles from there."""
     _, steady = steady_forces(ratio, begin=-LEVEL, damping=damping, ramp=0.02, hertz=400.0)
     assert steady.mean() == pytest.approx(LEVEL, abs=0.05)
+
+
+@pytest.mark.parametrize("ratio", [4.0, 6.0])
+def test_noise_does_not_hide_the_rise_after_a_jump(ratio):
+    """The force jumps to 25 N, and follows the bristles from there under correlated noise of 3 N."""
+    _, steady = steady_forces(ratio, damping=25.0, ramp=0.02, hertz=400.0, drift=3.0)
+    assert steady.mean() == pytest.approx(LEVEL, abs=3 * steady.std() / np.sqrt(steady.size) + 0.1)
