@@ -26,7 +26,7 @@ from sealfit.closure.criteria import LEAST_UNITS_OF_SLOPES as LEAST_SLOPES
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.joint.declared import SAME_SPEED
-from sealfit.fit.joint.rows import LEVELS, Rows, open_columns
+from sealfit.fit.joint.rows import LEVELS, POWER, Rows, open_columns
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 ROUNDING = 1e-9  # Relative rounding error of the mean of equal numbers.
@@ -50,7 +50,7 @@ class Channel:
     @property
     def scatters(self) -> bool:
         """Whether specimens differ in their slope along the channel without any effect."""
-        return self.unit == "sample" or self.name in ("speed_mm_s", "direction")
+        return self.unit == "sample" or self.name in ("speed_mm_s", "direction", "load_N", POWER)
 
 
 def channels_of(rows: Rows, config: Config) -> list[Channel]:
@@ -165,8 +165,8 @@ def scatter_level(channels: Iterable[Channel], rows: Rows) -> str:
     """Return the level of the units between which a contrast of some channels is tested.
 
     It is the coarsest level at which the slope along the channels may scatter without any effect. The
-    dependence of friction on the place in a stroke, on speed and on direction differs between specimens, so
-    these are tested between specimens; what else varies between runs is tested between runs. A product has
+    dependence of friction on the place in a stroke, on speed, load and direction differs between specimens,
+    so these are tested between specimens; what else varies between runs is tested between runs. A product has
     the units of its coarser channel, because each of them may have a slope of its own along the finer one.
     With few units the next finer level is used.
     """
