@@ -20,8 +20,8 @@ from truths import NO_INTERVAL, TrueEffect, test_true_forms, true_effects, truth
 from sealfit.closure.loop import Closure, close_loop
 from sealfit.closure.output import from_record
 from sealfit.closure.predict import predict
+from sealfit.closure.ripple_selection import numbered
 from sealfit.closure.score_test import project
-from sealfit.closure.selection import numbered
 from sealfit.closure.subsampling import merged_bins
 from sealfit.config import load_config
 from sealfit.fit.joint.estimate import fitted_at

@@ -28,8 +28,9 @@ from counts import bounds
 
 from sealfit.closure.channels import scaled
 from sealfit.closure.confirm import Context
+from sealfit.closure.ripple_selection import numbered, steady_samples
 from sealfit.closure.score_test import project
-from sealfit.closure.selection import Selection, numbered, select_effects, steady_samples
+from sealfit.closure.selection import Selection, select_effects
 from sealfit.closure.sensitivity import sensitivity
 from sealfit.closure.subsampling import merged_bins
 from sealfit.config import Config

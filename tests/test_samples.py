@@ -8,7 +8,7 @@ from bins_helpers import make_bins, make_traces
 
 from sealfit.closure.confirm import Context
 from sealfit.closure.loop import _Folds
-from sealfit.closure.selection import numbered, steady_samples
+from sealfit.closure.ripple_selection import numbered, steady_samples
 from sealfit.closure.subsampling import Subsample
 from sealfit.config import Config
 from sealfit.effects import EFFECTS

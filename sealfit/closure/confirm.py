@@ -12,6 +12,7 @@ from sealfit.closure.channels import CALENDAR, level_values, settings, varies
 from sealfit.closure.criteria import (
     CURVE_P,
     LEAST_FALL,
+    LEAST_GAIN,
     LEAST_SIZE,
     MOST_PROPOSALS,
     MOST_RIVALS,
@@ -34,6 +35,9 @@ from sealfit.fit.joint.whitening import Whitening
 
 LEAST_SETTINGS, MOST_SETTINGS = 3, 15
 """Least and most settings for which interpolation is tested: fewer have no inner one, and more are dense."""
+
+NEGLIGIBLE = "it is smaller than the resolution of the recorded force"
+"""Reason of a refusal after which nothing is left to explain: the effect is too small to matter."""
 
 WHOLE = ("mu", "force")
 """Targets that are the whole friction."""
@@ -255,6 +259,11 @@ class RefusedEffect:
         """Whether its evidence is too weak for the verdict `unexplained`."""
         return self.p_value > WEAK_P
 
+    @property
+    def negligible(self) -> bool:
+        """Whether it is too small to matter."""
+        return self.reason == NEGLIGIBLE
+
 
 def silent(text: str) -> None:
     """Write no progress message."""
@@ -337,17 +346,20 @@ def _reason_refused(
     fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame, known: dict
 ) -> str | None:
     """Return the reason why a proposal is refused; None if it is confirmed."""
+    force = float(np.sqrt(np.mean(fitted.rows.force**2)))
+    size = float(np.sqrt(np.mean(added_force(proposal) ** 2)))
+    if size <= max(rounding_error_N(samples), LEAST_SIZE * force):
+        return NEGLIGIBLE
     if not gain.real:
         return "it does not lower the error on held-out data"
+    if gain.rmse_N < LEAST_GAIN * force and not proposal.term.effect.periodic:
+        return NEGLIGIBLE
     if proposal.p_value > CURVE_P and _changes_the_curve(proposal):
         return f"its p-value is above {CURVE_P:g}, and the scatter of such a coefficient is not known"
     if proposal.p_value > WEAK_P and gain.share < LEAST_FALL:
         return (
             f"its p-value is above {WEAK_P:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
         )
-    least = max(rounding_error_N(samples), LEAST_SIZE * float(np.sqrt(np.mean(fitted.rows.force**2))))
-    if np.sqrt(np.mean(added_force(proposal) ** 2)) <= least:
-        return "it is smaller than the resolution of the recorded force"
     if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
         return "it does not predict held-out settings between those it was fitted to"
     return None

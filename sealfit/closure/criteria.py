@@ -245,6 +245,13 @@ random 11 of 13 false claims of this kind had larger p-values.
 LEAST_SIZE = 2e-4
 """Smallest reported effect, as a share of the RMS force. The sensor's nonlinearity may be as large."""
 
+LEAST_GAIN = 1e-4
+"""Smallest gain on held-out data that counts, as a share of the RMS force.
+
+A ripple needs none: a wave of the same length in every file is no error of the model along strokes. In 690
+worlds drawn at random 9 of 38 false claims and 7 of 120 true ones gained less.
+"""
+
 
 # ---------------------------------------------------------------- the verdict, and what could have been seen
 NOT_ADJUSTED = 0.05

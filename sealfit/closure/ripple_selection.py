@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,9 @@ from sealfit.closure.ripples import Peak, find_ripple
 from sealfit.fit.joint.estimate import Fitted, fit
 from sealfit.fit.joint.model import Model, passes
 from sealfit.fit.joint.rows import Rows
+from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
+
+SAMPLED = ("displacement_mm", "time_s", "force_N")  # columns of the samples that the ripple search reads
 
 
 class Ripples:
@@ -117,3 +121,43 @@ def without_ripples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
         shape = term.effect.shape({term.effect.reads[0]: place, **term.fixed}, **values)
         residual = residual - shape * (1.0 if term.operation == "add" else level[own])
     return samples.assign(residual_N=residual)
+
+
+def numbered(bins: pd.DataFrame) -> pd.DataFrame:
+    """Return `bins` with `stroke_id`, a number per stroke that samples and all subsets of the rows share."""
+    return bins.assign(stroke_id=bins.groupby(["file", "stroke"], sort=False).ngroup().to_numpy())
+
+
+def steady_samples(traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows) -> pd.DataFrame:
+    """Return the steady samples of the strokes in `rows`, for the ripple search.
+
+    Parameters
+    ----------
+    traces : DataFrame or sequence of StoredTraces
+        Table `traces`, its samples ordered by stroke; or where it is stored, to be read part by part.
+    rows : Rows
+        Rows made from `numbered` bins.
+
+    Returns
+    -------
+    DataFrame
+        stroke_id, stroke, direction, unit (number of the file), displacement_mm, time_s, force_N.
+    """
+    first = rows.groups.starts["stroke"]
+    strokes = rows.table.iloc[first]
+    index = stroke_index(strokes)
+    about = {name: strokes[name].to_numpy() for name in ("stroke_id", "stroke", "direction")}
+    about["unit"] = rows.codes("file")[first]
+    parts = []
+    for part in a_part_at_a_time(traces, ["file", "stroke", "steady", "presliding_N", *SAMPLED]):
+        steady = part[part["steady"].to_numpy(dtype=bool)]
+        steady = steady.assign(force_N=steady["force_N"] - steady["presliding_N"])
+        edges, own = strokes_of(steady, index)
+        place = np.repeat(own, np.diff(edges))
+        known = place >= 0
+        parts.append((place[known].astype(np.int32), *(steady[name].to_numpy()[known] for name in SAMPLED)))
+    place, *values = (
+        map(np.concatenate, zip(*parts, strict=True)) if parts else [np.zeros(0, int)] * (1 + len(SAMPLED))
+    )
+    about = {name: own.astype(np.int32)[place] for name, own in about.items()}
+    return pd.DataFrame({**about, **dict(zip(SAMPLED, values, strict=True))})

@@ -29,12 +29,9 @@ from sealfit.closure.search import (
 )
 from sealfit.effects.contract import Effect
 from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
-from sealfit.fit.joint.model import Model, evaluate
+from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter
-from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time, stroke_index, strokes_of
-
-SAMPLED = ("displacement_mm", "time_s", "force_N")  # columns of the samples that the ripple search reads
 
 
 class Start(NamedTuple):
@@ -122,6 +119,7 @@ class _Loop:
         self.ripple, self.samples, self.unconfirmed = ripples.found, ripples.samples, ripples.refused
         self.renaming = Renaming(self.channels, self.samples, context)
         self.refused: set[tuple] = set()
+        self.negligible: set[tuple] = set()  # those of them that are too small to matter
         self.left: Candidate | Peak | None = None
         self.masked: list[MaskedPair] = []  # effects that mask each other, until both are in the model
         self.renamed = False  # whether earlier effects have been renamed
@@ -157,9 +155,15 @@ class _Loop:
         claimable, laws = self.found.claimable, [p for _, p in self.found.laws]
         open_ += [c for c in _related_candidates(open_, claimable) if c.key not in self.refused]
         proposals = propose(self.fitted, open_, self.channels, self.context.effects, laws)
-        accepted = self.confirm(self.fitted, proposals, number, self.unconfirmed)
+        failed: list[RefusedEffect] = []
+        accepted = self.confirm(self.fitted, proposals, number, failed)
+        self.unconfirmed += failed
         if accepted is None:
-            self.refused |= {p.source for p in proposals[:MOST_PROPOSALS]} or {c.key for c in open_}
+            keys = {p.source for p in proposals[:MOST_PROPOSALS]} or {c.key for c in open_}
+            if failed and failed[0].negligible:
+                keys |= _no_stronger(open_, proposals[0])
+                self.negligible |= keys
+            self.refused |= keys
             self.masked = []
         else:
             self.add(accepted)
@@ -207,7 +211,7 @@ class _Loop:
             found.significant
         )
         significant += [c for c, _ in found.laws if c.p_value <= self.alpha and c.claimable]
-        self.left = significant[0] if significant else self.ripple
+        self.left = next((c for c in significant if c.key not in self.negligible), self.ripple)
         significant += equivalent_pairs(self.tests, significant, self.channels)
         return [c for c in significant if c.key not in self.refused]
 
@@ -364,6 +368,12 @@ def _related_candidates(significant: list[Candidate], candidates: list[Candidate
     return found
 
 
+def _no_stronger(candidates: Sequence[Candidate], proposal: Proposal) -> set[tuple]:
+    """Return the keys of candidates that share a channel with a proposal and explain no more than it does."""
+    names = set(proposal.term.channels)
+    return {c.key for c in candidates if names & set(c.channels) and c.chi2 <= max(proposal.chi2, 0.0)}
+
+
 def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
     """Return the fit without effects that a later one has made redundant by the BIC.
 
@@ -398,48 +408,3 @@ def _wald_statistic(fitted: Fitted, number: int) -> float:
     places = [at + k for k, p in enumerate(effect.parameters) if p.linear]
     amplitude = np.array([values[p.name] for p in effect.parameters if p.linear])
     return float(amplitude @ np.linalg.pinv(fitted.covariance[np.ix_(places, places)]) @ amplitude)
-
-
-def numbered(bins: pd.DataFrame) -> pd.DataFrame:
-    """Return `bins` with `stroke_id`, a number per stroke that samples and all subsets of the rows share."""
-    return bins.assign(stroke_id=bins.groupby(["file", "stroke"], sort=False).ngroup().to_numpy())
-
-
-def steady_samples(traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows) -> pd.DataFrame:
-    """Return the steady samples of the strokes in `rows`, for the ripple search.
-
-    Parameters
-    ----------
-    traces : DataFrame or sequence of StoredTraces
-        Table `traces`, its samples ordered by stroke; or where it is stored, to be read part by part.
-    rows : Rows
-        Rows made from `numbered` bins.
-
-    Returns
-    -------
-    DataFrame
-        stroke_id, stroke, direction, unit (number of the file), displacement_mm, time_s, force_N.
-    """
-    first = rows.groups.starts["stroke"]
-    strokes = rows.table.iloc[first]
-    index = stroke_index(strokes)
-    about = {name: strokes[name].to_numpy() for name in ("stroke_id", "stroke", "direction")}
-    about["unit"] = rows.codes("file")[first]
-    parts = []
-    for part in a_part_at_a_time(traces, ["file", "stroke", "steady", "presliding_N", *SAMPLED]):
-        steady = part[part["steady"].to_numpy(dtype=bool)]
-        steady = steady.assign(force_N=steady["force_N"] - steady["presliding_N"])
-        edges, own = strokes_of(steady, index)
-        place = np.repeat(own, np.diff(edges))
-        known = place >= 0
-        parts.append((place[known].astype(np.int32), *(steady[name].to_numpy()[known] for name in SAMPLED)))
-    place, *values = (
-        map(np.concatenate, zip(*parts, strict=True)) if parts else [np.zeros(0, int)] * (1 + len(SAMPLED))
-    )
-    about = {name: own.astype(np.int32)[place] for name, own in about.items()}
-    return pd.DataFrame({**about, **dict(zip(SAMPLED, values, strict=True))})
-
-
-def predict_rows(fitted: Fitted, rows: Rows) -> np.ndarray:
-    """Return the fitted model's force at other rows of the same campaign, shape (n,)."""
-    return evaluate(fitted.model, rows, jacobian=False)[0]

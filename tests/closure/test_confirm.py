@@ -87,7 +87,7 @@ FORCE = SimpleNamespace(rows=SimpleNamespace(force=np.full(3, 10.0)))
 
 
 def proposal(effect="smooth", channels=("run_order",), acts_on="mu", p_value=1e-9, physical=False):
-    own = SimpleNamespace(id=effect, physical=physical, label=effect)
+    own = SimpleNamespace(id=effect, physical=physical, label=effect, periodic=False)
     term = SimpleNamespace(effect=own, channels=channels, acts_on=acts_on, operation="multiply")
     return SimpleNamespace(term=term, p_value=p_value, unit="run")
 
@@ -170,6 +170,7 @@ STEPS = pd.DataFrame({"force_N": np.repeat([10.0, 10.1, 10.2], 40), "stroke_id":
             {"added": 0.028, "samples": STEPS},
             "smaller than the resolution of the recorded force",
         ),  # 0.1 N over sqrt(12)
+        ({"gains": [Gain(0.0009, 0.01, 9.0)]}, "smaller than the resolution of the recorded force"),  # 1e-4
         ({"settings": [GOOD, Gain(-0.1, 1.0, 1.0)]}, "does not predict held-out settings"),
     ],
 )

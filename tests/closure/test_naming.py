@@ -9,8 +9,8 @@ from bins_helpers import make_bins
 from sealfit.closure import naming
 from sealfit.closure.linearised import ZERO_OFFSET, Proposal
 from sealfit.closure.naming import correlation, determined, named_among, rivals
+from sealfit.closure.ripple_selection import numbered
 from sealfit.closure.ripples import Peak
-from sealfit.closure.selection import numbered
 from sealfit.effects import EFFECTS
 from sealfit.effects.free import free_effect
 from sealfit.fit.joint.estimate import fit_declared

@@ -8,9 +8,10 @@ from sealfit.closure.confirm import AcceptedEffect, Context
 from sealfit.closure.criteria import PAIR_PENALTY
 from sealfit.closure.forms import terms_of
 from sealfit.closure.linearised import Linearised, Proposal
+from sealfit.closure.ripple_selection import numbered, steady_samples
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.search import search
-from sealfit.closure.selection import numbered, select_effects, steady_samples
+from sealfit.closure.selection import select_effects
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit, fit_declared

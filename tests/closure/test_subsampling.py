@@ -8,7 +8,8 @@ from bins_helpers import TRUE, make_bins, make_traces, warm
 
 from sealfit.closure.confirm import Context
 from sealfit.closure.loop import close_loop
-from sealfit.closure.selection import numbered, select_effects, steady_samples
+from sealfit.closure.ripple_selection import numbered, steady_samples
+from sealfit.closure.selection import select_effects
 from sealfit.closure.subsampling import (
     FURTHER,
     MOST_ROWS,
