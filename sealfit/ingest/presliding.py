@@ -17,6 +17,8 @@ AFTER_RAMP = 3.0
 # Rise lengths after which a rise is over where `SETTLED` would take more than a third of the stroke: 1 % is
 # left.
 ENOUGH = np.log(100.0)
+# Share of the stroke at which a rise ends at the latest where what is left of it is known.
+HALF = 0.5
 # Share of its level above which a force that begins there comes up, if at all, over a short distance.
 HALF_WAY = 0.75
 # That distance, as a share of the stroke. A longer climb is an effect (run-in, warming) and stays inside the
@@ -222,9 +224,10 @@ def _rise_from_rest(start: Start) -> Rise:
     if not end > 0.0:
         return Rise(end)
     ramp = start.plateau_mm if start.plateau_mm > length else 0.0  # along a short one nothing else happens
-    if end < ramp + 0.99 * SETTLED * length:
-        return Rise(end, *_left_over(start, length))
-    return Rise(end, 0.0, length)
+    if end >= ramp + 0.99 * SETTLED * length:
+        return Rise(end, 0.0, length)
+    left_N, length = _left_over(start, length)
+    return Rise(min(end, max(HALF * float(start.distance_mm[-1]), ramp)) if left_N else end, left_N, length)
 
 
 def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
