@@ -230,6 +230,8 @@ def read_closure(world: World, rows: Rows, closure: dict, effects: list[dict]) -
         "before": closure["before"]["heldout_rmse_N"], "after": closure["after"]["heldout_rmse_N"],
         "rmse_before": closure["before"]["rmse_N"], "rmse_after": closure["after"]["rmse_N"],
         "floor": closure["noise_floor_N"], "left": closure["left"], "fit_quality": closure.get("fit_quality"),
+        "stray": [one["file"] for one in closure.get("stray_files", [])],
+        "wrong": world.files.loc[world.files["_wrong"], "file"].tolist(),
         "refused": closure.get("refused"), "has_sensitivity": stated is not None,
     }  # fmt: skip
 

@@ -16,13 +16,15 @@ from sealfit.closure.forms import describe
 from sealfit.closure.heldout import covered, folds, heldout_level
 from sealfit.closure.output import channel_table, curve_table, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
-from sealfit.closure.selection import Selection, Start, numbered, predict_rows, select_effects, steady_samples
+from sealfit.closure.ripple_selection import numbered, steady_samples
+from sealfit.closure.selection import Selection, Start, select_effects
+from sealfit.closure.stray_files import stray_files
 from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.engine.run_map import run_map
 from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
-from sealfit.fit.joint.model import Model, shape_of
+from sealfit.fit.joint.model import Model, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows, make_rows
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import timed
@@ -71,6 +73,10 @@ def close_loop(
     columns, counted = list(bins.columns), numbered(bins.reset_index(drop=True))
     del bins
     rows = make_rows(counted, has_aging=config.aging)
+    stray = stray_files(rows)
+    if stray:
+        say("left out, far off all others: " + ", ".join(one.file for one in stray))
+        rows = rows.subset(~rows.table["record"].isin([one.file for one in stray]).to_numpy())
     del counted  # it takes much memory, and `rows` contains it
     start = None
     for part in subsamples(rows, config.loop.seed):
@@ -110,7 +116,7 @@ def close_loop(
         models.held_after,
     )
     drawn = _drawn_tables(selection, before, after, config)
-    document = closure_document(selection, models, heldout.level, config, effects)
+    document = closure_document(selection, models, heldout.level, config, effects, stray)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their original order
     tables = {
         "effects": effect_table([e for e in document["effects"] if not e["candidate"]], selection.added),
@@ -259,7 +265,7 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
 
     def force(fitted: Fitted) -> np.ndarray:
         own = fitted if fold.every is None else fit(fitted.model, fold.every, fitted.scatter, turns=0)
-        return predict_rows(own, fold.test)
+        return evaluate(own.model, fold.test, jacobian=False)[0]
 
     first = force(before)
     return first, first if after is before else force(after), after.model

@@ -12,6 +12,7 @@ from sealfit.closure.confirm import AcceptedEffect, added_force
 from sealfit.closure.criteria import IDENTIFIABLE
 from sealfit.closure.forms import describe, grid_of, reference
 from sealfit.closure.selection import Selection
+from sealfit.closure.stray_files import StrayFile
 from sealfit.config import Config
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.joint.estimate import Fitted
@@ -113,16 +114,14 @@ BEYOND = 0.5  # Share of a channel's range by which a run may exceed it.
 SHOWN = 0.5  # Least share of an effect's size that a proposed run must show.
 TIE = 1e-9  # Relative difference below which two runs differ by rounding only.
 ROWS = 4  # Rows per stroke at which forces are compared.
-STRAY = 12.0  # Standard deviations of the files by which the mean of one must be off to be named.
-STRAY_SHARE = 0.02  # Share of the force by which it must be off.
-MOST_STRAY = 3  # Largest number of files that are named.
-LEAST_FILES = 12  # Fewest files whose standard deviation is known well enough.
 
 
-def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect]) -> list[dict]:
+def next_runs(
+    selection: Selection, config: Config, effects: Mapping[str, Effect], stray: Sequence[StrayFile] = ()
+) -> list[dict]:
     """Return the runs that would distinguish effects from rivals, and those that would show aliases.
 
-    Files that are far off all others come first: their runs are to be repeated. Then there is a run for each
+    The runs of files that were left out come first: they are to be repeated. Then there is a run for each
     effect, which would distinguish it from its nearest rival, and a run for each alias, which would show it.
 
     Parameters
@@ -133,13 +132,15 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
         The rig.
     effects : mapping
         The catalogue.
+    stray : sequence of StrayFile
+        Files that were left out.
 
     Returns
     -------
     list of dict
         `why`, a text, and `conditions`: the condition and the channels of one run.
     """
-    wanted = list(_runs_to_repeat(selection.after, config))
+    wanted = [_run_to_repeat(one, config) for one in stray]
     for item in selection.added:
         for rival in item.rivals[:1]:
             chosen = item.proposal
@@ -163,26 +164,15 @@ def next_runs(selection: Selection, config: Config, effects: Mapping[str, Effect
     return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
 
 
-def _runs_to_repeat(fitted: Fitted, config: Config) -> Iterator[dict]:
-    """Yield the runs of files whose mean is far off the model, the farthest first."""
-    rows, groups = fitted.rows, fitted.rows.groups
-    if groups.starts["file"].size < LEAST_FILES:
-        return
-    along = np.sign(rows.speed)
-    off = groups.means(fitted.residual * along, "file") / groups.means(rows.force * along, "file")
-    off -= np.median(off)
-    # The median of the absolute deviations is 0.6745 standard deviations, and a few files do not change it.
-    times = np.abs(off) / max(np.median(np.abs(off)) / 0.6745, 1e-300)
-    stray = np.flatnonzero((times > STRAY) & (np.abs(off) > STRAY_SHARE))
+def _run_to_repeat(one: StrayFile, config: Config) -> dict:
+    """Return the run of a file that was left out."""
     names = (*config.condition, "speed_mm_s", "load_N")
-    for k in stray[np.argsort(-np.abs(off[stray]))][:MOST_STRAY]:
-        row = rows.table.iloc[groups.starts["file"][k]]
-        side = "above" if off[k] > 0 else "below"
-        yield {
-            "why": f"file {row['file']} is {abs(off[k]):.0%} {side} the model, {times[k]:.0f} times the "
-            "standard deviation of the files: look at it, and repeat its run",
-            "conditions": {name: _plain(row[name]) for name in names if name in row},
-        }
+    side = "above" if one.off > 0 else "below"
+    return {
+        "why": f"file {one.file} is {abs(one.off):.0%} {side} what all others predict and was left out: "
+        "look at it, and repeat its run",
+        "conditions": {name: _plain(one.conditions[name]) for name in names if name in one.conditions},
+    }
 
 
 def _second_specimen(rows: Rows, config: Config) -> dict:

@@ -29,6 +29,7 @@ from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
 from sealfit.closure.sensitivity import LEVEL_NAMES, sensitivity, undetectable_variables
+from sealfit.closure.stray_files import StrayFile
 from sealfit.config import Config
 from sealfit.effects.contract import Effect, fill_unit
 from sealfit.fit.joint.estimate import Fitted, effective_df, fit
@@ -97,6 +98,7 @@ def closure_document(
     heldout_unit: str,
     config: Config,
     effects: Mapping[str, Effect],
+    stray: Sequence[StrayFile] = (),
 ) -> dict:
     """Return closure.json."""
     after, units = models.after, config.units
@@ -127,7 +129,7 @@ def closure_document(
     elif only_inconclusive:
         verdict = "cannot_tell"
     else:
-        weak = any(item.weak for item in selection.refused)
+        weak = any(item.weak and not item.negligible for item in selection.refused)
         unseen = undetectable and quality["state"] != "within_scatter"
         verdict = "cannot_tell" if weak or unseen else "nothing_missing"
     return {
@@ -143,7 +145,10 @@ def closure_document(
         "effects": effect_entries(after, selection, config),
         "scatter": scatter,
         "left": left_entry(selection, numbers["after"]["rmse_N"], floor),
-        "next_runs": next_runs(selection, config, effects),
+        "stray_files": [
+            {"file": one.file, "off_pct": 100 * one.off, "p_value": one.p_value} for one in stray
+        ],
+        "next_runs": next_runs(selection, config, effects, stray),
         "incomplete_channels": incomplete_channels(after.rows),
     }
 

@@ -129,6 +129,7 @@ def of_closure(closure: Mapping, units: Units) -> dict:
     kept = (
         "verdict", "fit_quality", "sensitivity", "refused", "units", "noise_floor_N", "before", "after",
         "heldout_unit", "left", "next_runs",
+        "stray_files",
     )  # fmt: skip
     effects = [{key: effect[key] for key in EFFECT_KEYS} for effect in closure["effects"]]
     return {
@@ -151,6 +152,10 @@ def of_after(store: Store) -> dict:
 
 def verdict_sentence(closure: Mapping, units: Units) -> str:
     """Return the verdict in one sentence."""
+    return "; ".join(filter(None, [_verdict_clause(closure, units), stray_clause(closure)]))
+
+
+def _verdict_clause(closure: Mapping, units: Units) -> str:
     count = sum(not effect["candidate"] for effect in closure["effects"])
     added = {0: "no effect was added", 1: "one effect was added"}.get(count, f"{count} effects were added")
     quality = quality_clause(closure)
@@ -220,6 +225,17 @@ LEVEL_WORDS = {
 
 NAMED = 3
 """Variables whose smallest effect a sentence gives."""
+
+
+def stray_clause(closure: Mapping) -> str:
+    """Return which files the loop left out; empty if none."""
+    stray = closure.get("stray_files") or []
+    if not stray:
+        return ""
+    named = [f"{one['file']} ({one['off_pct']:+.2g} %)" for one in stray[:NAMED]]
+    more = f" and {len(stray) - NAMED} more" if len(stray) > NAMED else ""
+    what = "a file whose force is" if len(stray) == 1 else f"{len(stray)} files whose force is"
+    return f"left out: {what} far off what all others predict: {', '.join(named)}{more}"
 
 
 def level_words(level: str) -> str:

@@ -47,6 +47,31 @@ def test_nothing_is_claimed_where_nothing_is_missing(null):
     assert document["noise_floor_N"] == pytest.approx(0.335, abs=0.02)  # 0.3 N a bin, 0.5 % a file of 30 N
 
 
+def test_a_stray_file_is_left_out_and_changes_nothing(null):
+    bins, sound = null
+    wrong = bins.assign(force_N=bins["force_N"] * np.where(bins["file"] == "f0020.csv", 1.15, 1.0))
+    found = close(wrong)
+    (stray,) = found.document["stray_files"]
+    assert (stray["file"], stray["off_pct"]) == ("f0020.csv", pytest.approx(15.0, abs=2.0))
+    assert "f0020.csv is" in found.document["next_runs"][0]["why"]
+    assert "f0020.csv" not in set(found.tables["residuals_after"]["file"])
+    assert found.document["verdict"] == sound.document["verdict"] == "nothing_missing"
+    assert sound.document["stray_files"] == []
+    assert found.document["after"]["rmse_N"] == pytest.approx(sound.document["after"]["rmse_N"], rel=0.02)
+
+
+def test_an_effect_too_small_to_matter_is_refused_and_leaves_nothing_missing():
+    def climb(table, force):
+        return force + 0.001 * table["bin"]
+
+    document = close(make_bins(3, bins=8, noise_N=0.003, gain=1e-6, effect=climb)).document
+    assert document["refused"][0]["id"] == "linear"
+    reasons = {refused["reason"] for refused in document["refused"]}
+    assert reasons == {"it is smaller than the resolution of the recorded force"}
+    assert document["verdict"] == "nothing_missing"
+    assert document["left"]["channel"] is None
+
+
 def test_scatter_is_what_was_put_in(null):
     found = {s["level"]: s["sd_rel"] for s in null[1].document["scatter"]}
     assert found["file"] == pytest.approx(0.005, rel=0.25)

@@ -7,6 +7,7 @@ from bins_helpers import make_bins
 
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.next_runs import find_aliases, largest_difference, next_runs
+from sealfit.closure.stray_files import StrayFile
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Parameter
@@ -87,19 +88,11 @@ def test_an_effect_on_what_does_not_act_where_it_is_there_is_no_alias():
     assert find_aliases(fitted, {"fast": fast}, ()) == []
 
 
-@pytest.mark.parametrize("repeats", [1, 2])
-def test_a_file_that_went_wrong_is_named_first(repeats):
-    bins = make_bins(bins=4, repeats=repeats, noise_N=0.05)
-    wrong = bins["file"].unique()[17]
-    bins.loc[bins["file"] == wrong, "force_N"] *= 1.2
-    fitted = fit_declared(make_rows(bins, has_aging=True))
+def test_the_run_of_a_stray_file_comes_first():
+    fitted = fit_declared(make_rows(make_bins(bins=4, repeats=1), has_aging=True))
     selection = SimpleNamespace(added=(), inconclusive=None, after=fitted)
-    first, *_ = next_runs(selection, Config(), {})
-    assert first["why"].startswith(f"file {wrong} is ")
-    assert "% above the model" in first["why"]
-    own = bins[bins["file"] == wrong].iloc[0]
-    assert first["conditions"]["aging_days"] == own["aging_days"]
-    assert first["conditions"]["load_N"] == own["load_N"]
-    right = fit_declared(make_rows(make_bins(bins=4, repeats=repeats, noise_N=0.05), has_aging=True))
-    kept = next_runs(SimpleNamespace(added=(), inconclusive=None, after=right), Config(), {})
-    assert not any(run["why"].startswith("file ") for run in kept)
+    where = {"temperature_C": 80.0, "aging_days": 4.0, "speed_mm_s": 2.0, "load_N": 49.03, "bin": 3}
+    stray = StrayFile("a.csv", -0.12, 1e-6, where)
+    first, *_ = next_runs(selection, Config(), {}, [stray])
+    assert first["why"].startswith("file a.csv is 12% below what all others predict and was left out")
+    assert first["conditions"] == {name: value for name, value in where.items() if name != "bin"}

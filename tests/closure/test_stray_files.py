@@ -1,0 +1,54 @@
+"""Files that went wrong as a whole."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bins_helpers import make_bins
+
+from sealfit.closure.stray_files import stray_files
+from sealfit.fit.joint.rows import make_rows
+
+
+def bins_with(factor: dict[int, float], **design):
+    bins = make_bins(bins=4, noise_N=0.05, **design)
+    files = bins["file"].unique()
+    for number, gain in factor.items():
+        bins.loc[bins["file"] == files[number], "force_N"] *= gain
+    return bins, files
+
+
+@pytest.mark.parametrize("repeats", [1, 2])
+def test_a_file_that_went_wrong_is_found(repeats):
+    bins, files = bins_with({17: 1.2}, repeats=repeats)
+    (one,) = stray_files(make_rows(bins, has_aging=True))
+    assert one.file == files[17]
+    assert one.off == pytest.approx(0.2, abs=0.02)
+    assert one.p_value < 1e-3
+    own = bins[bins["file"] == files[17]].iloc[0]
+    assert one.conditions["aging_days"] == own["aging_days"]
+
+
+def test_two_files_do_not_hide_each_other():
+    bins, files = bins_with({5: 0.9, 17: 1.15}, repeats=1)
+    found = stray_files(make_rows(bins, has_aging=True))
+    assert [one.file for one in found] == [files[17], files[5]]
+
+
+def test_scatter_of_the_files_is_not_stray():
+    bins, files = bins_with({}, repeats=1)
+    gain = 1 + 0.02 * np.random.default_rng(3).standard_normal(files.size)
+    bins["force_N"] *= gain[bins["file"].map({name: k for k, name in enumerate(files)})]
+    assert stray_files(make_rows(bins, has_aging=True)) == []
+
+
+def test_a_file_within_a_fiftieth_is_not_stray():
+    bins, _ = bins_with({17: 1.015}, repeats=1)
+    assert stray_files(make_rows(bins, has_aging=True)) == []
+
+
+def test_too_few_files_predict_no_other():
+    bins, files = bins_with({}, repeats=1)
+    few = bins[bins["file"].isin(files[:6])].copy()
+    few.loc[few["file"] == files[2], "force_N"] *= 1.3
+    assert stray_files(make_rows(few, has_aging=True)) == []
