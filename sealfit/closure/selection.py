@@ -371,7 +371,7 @@ def _related_candidates(significant: list[Candidate], candidates: list[Candidate
 def _no_stronger(candidates: Sequence[Candidate], proposal: Proposal) -> set[tuple]:
     """Return the keys of candidates that share a channel with a proposal and explain no more than it does."""
     names = set(proposal.term.channels)
-    return {c.key for c in candidates if names & set(c.channels) and c.chi2 <= max(proposal.chi2, 0.0)}
+    return {c.key for c in candidates if names & set(c.channels) and c.chi2 <= proposal.chi2}
 
 
 def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
