@@ -122,7 +122,7 @@ def run_world(task: Task) -> dict:
             "peak_MB": ended.peak_bytes / 1e6,
         }
         if ended.code != 0:
-            return record | {"said": ended.output[-3000:]}
+            return json.loads(json.dumps(record | {"said": ended.output[-3000:]}, default=float))
         closure = json.loads((home / "out" / "closure.json").read_text("utf-8"))
         record |= read_closure(world, rows, closure, record["effects"])
         record |= predicted(task, world, rows, home)

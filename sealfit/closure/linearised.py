@@ -24,7 +24,7 @@ ZERO_OFFSET = (("direction",), "force", "add")
 PREFERRED = ("mu", "mu_c", "mu_s", "force", "v_s", "sigma_2", "a", "b", "mu_0")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # compared by identity: it holds arrays
 class Proposal:
     """A term with start values, what it explains, and the joint fit once it is refitted."""
 

@@ -220,3 +220,9 @@ def test_rivals_are_told_apart_under_the_noise_that_the_effect_leaves():
     first, second = naming.propose_ripples(fitted, peak, bins.iloc[:0], EFFECTS)[:2]
     assert (first.term.acts_on, first.term.operation) == ("force", "add")
     assert second.bic - first.bic > 100
+
+
+def test_proposals_of_one_term_are_compared_by_identity():
+    one, other = (proposal("linear", column=np.array([1.0, 2.0])) for _ in range(2))
+    assert one in [one]
+    assert one not in [other]
