@@ -59,7 +59,7 @@ CLOSURE = {
     "effects": [EFFECT],
     "scatter": [],
     "left": {"rmse_N": 0.2, "level": None, "channel": None, "p_value": None},
-    "stray_files": [],
+    "outlier_files": [],
     "next_runs": [{"why": "a second load would separate them", "conditions": {"load_N": 98.0}}],
 }
 

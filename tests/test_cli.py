@@ -367,8 +367,8 @@ def test_the_verdict_is_a_sentence(sealfit, parts, campaign, out, verdict, effec
 
 
 def test_a_file_that_the_loop_left_out_is_named_beside_the_verdict(sealfit, parts, campaign, out):
-    stray = [{"file": "a.csv", "off_pct": 12.3, "p_value": 1e-5}]
-    parts.closure = {**fake_parts.CLOSURE, "stray_files": stray}
+    outliers = [{"file": "a.csv", "deviation_pct": 12.3, "p_value": 1e-5}]
+    parts.closure = {**fake_parts.CLOSURE, "outlier_files": outliers}
     assert "what all others predict: a.csv (+12 %)" in sealfit("run", campaign, "--out", out).stdout
 
 

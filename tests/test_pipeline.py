@@ -43,7 +43,7 @@ ERROR_KEYS = {
 KEYS = {
     "schema", "verdict", "units", "noise_floor_N", "before", "after", "heldout_unit", "effects", "scatter",
     "left",
-    "next_runs", "stray_files", "fit_quality", "sensitivity", "refused", "incomplete_channels",
+    "next_runs", "outlier_files", "fit_quality", "sensitivity", "refused", "incomplete_channels",
 }  # fmt: skip
 TIMES = ("provenance.json", "state.json", "report.html")  # hold times of day
 

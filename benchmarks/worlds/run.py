@@ -122,12 +122,13 @@ def run_world(task: Task) -> dict:
             "peak_MB": ended.peak_bytes / 1e6,
         }
         if ended.code != 0:
-            return json.loads(json.dumps(record | {"said": ended.output[-3000:]}, default=float))
-        closure = json.loads((home / "out" / "closure.json").read_text("utf-8"))
-        record |= read_closure(world, rows, closure, record["effects"])
-        record |= predicted(task, world, rows, home)
-        if not world.effects and world.days.size:
-            record |= {"laws": laws_inside(world, home / "out"), "lifetime": lifetime(task, world, home)}
+            record["said"] = ended.output[-3000:]
+        else:
+            closure = json.loads((home / "out" / "closure.json").read_text("utf-8"))
+            record |= read_closure(world, rows, closure, record["effects"])
+            record |= predicted(task, world, rows, home)
+            if not world.effects and world.days.size:
+                record |= {"laws": laws_inside(world, home / "out"), "lifetime": lifetime(task, world, home)}
     return json.loads(json.dumps(record, default=float))
 
 
@@ -230,7 +231,7 @@ def read_closure(world: World, rows: Rows, closure: dict, effects: list[dict]) -
         "before": closure["before"]["heldout_rmse_N"], "after": closure["after"]["heldout_rmse_N"],
         "rmse_before": closure["before"]["rmse_N"], "rmse_after": closure["after"]["rmse_N"],
         "floor": closure["noise_floor_N"], "left": closure["left"], "fit_quality": closure.get("fit_quality"),
-        "stray": [one["file"] for one in closure.get("stray_files", [])],
+        "outliers": [one["file"] for one in closure.get("outlier_files", [])],
         "wrong": world.files.loc[world.files["_wrong"], "file"].tolist(),
         "refused": closure.get("refused"), "has_sensitivity": stated is not None,
     }  # fmt: skip

@@ -14,11 +14,11 @@ from sealfit.closure.criteria import JACKKNIFE_UNITS, PART_WITHIN, RIVAL_CORRELA
 from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import covered, folds, heldout_level
+from sealfit.closure.outlier_files import outlier_files
 from sealfit.closure.output import channel_table, curve_table, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
 from sealfit.closure.ripple_selection import numbered, steady_samples
 from sealfit.closure.selection import Selection, Start, select_effects
-from sealfit.closure.stray_files import stray_files
 from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -73,10 +73,10 @@ def close_loop(
     columns, counted = list(bins.columns), numbered(bins.reset_index(drop=True))
     del bins
     rows = make_rows(counted, has_aging=config.aging)
-    stray = stray_files(rows)
-    if stray:
-        say("left out, far off all others: " + ", ".join(one.file for one in stray))
-        rows = rows.subset(~rows.table["record"].isin([one.file for one in stray]).to_numpy())
+    outliers = outlier_files(rows)
+    if outliers:
+        say("left out, far off all others: " + ", ".join(one.file for one in outliers))
+        rows = rows.subset(~rows.table["record"].isin([one.file for one in outliers]).to_numpy())
     del counted  # it takes much memory, and `rows` contains it
     start = None
     for part in subsamples(rows, config.loop.seed):
@@ -116,7 +116,7 @@ def close_loop(
         models.held_after,
     )
     drawn = _drawn_tables(selection, before, after, config)
-    document = closure_document(selection, models, heldout.level, config, effects, stray)
+    document = closure_document(selection, models, heldout.level, config, effects, outliers)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their original order
     tables = {
         "effects": effect_table([e for e in document["effects"] if not e["candidate"]], selection.added),

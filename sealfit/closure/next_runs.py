@@ -11,8 +11,8 @@ import numpy as np
 from sealfit.closure.confirm import AcceptedEffect, added_force
 from sealfit.closure.criteria import IDENTIFIABLE
 from sealfit.closure.forms import describe, grid_of, reference
+from sealfit.closure.outlier_files import OutlierFile
 from sealfit.closure.selection import Selection
-from sealfit.closure.stray_files import StrayFile
 from sealfit.config import Config
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.joint.estimate import Fitted
@@ -117,7 +117,7 @@ ROWS = 4  # Rows per stroke at which forces are compared.
 
 
 def next_runs(
-    selection: Selection, config: Config, effects: Mapping[str, Effect], stray: Sequence[StrayFile] = ()
+    selection: Selection, config: Config, effects: Mapping[str, Effect], outliers: Sequence[OutlierFile] = ()
 ) -> list[dict]:
     """Return the runs that would distinguish effects from rivals, and those that would show aliases.
 
@@ -132,7 +132,7 @@ def next_runs(
         The rig.
     effects : mapping
         The catalogue.
-    stray : sequence of StrayFile
+    outliers : sequence of OutlierFile
         Files that were left out.
 
     Returns
@@ -140,7 +140,7 @@ def next_runs(
     list of dict
         `why`, a text, and `conditions`: the condition and the channels of one run.
     """
-    wanted = [_run_to_repeat(one, config) for one in stray]
+    wanted = [_run_to_repeat(one, config) for one in outliers]
     for item in selection.added:
         for rival in item.rivals[:1]:
             chosen = item.proposal
@@ -164,13 +164,13 @@ def next_runs(
     return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
 
 
-def _run_to_repeat(one: StrayFile, config: Config) -> dict:
+def _run_to_repeat(one: OutlierFile, config: Config) -> dict:
     """Return the run of a file that was left out."""
     names = (*config.condition, "speed_mm_s", "load_N")
-    side = "above" if one.off > 0 else "below"
+    side = "above" if one.deviation > 0 else "below"
     return {
-        "why": f"file {one.file} is {abs(one.off):.0%} {side} what all others predict and was left out: "
-        "look at it, and repeat its run",
+        "why": f"file {one.file} is {abs(one.deviation):.0%} {side} what all others predict and was left "
+        "out: look at it, and repeat its run",
         "conditions": {name: _plain(one.conditions[name]) for name in names if name in one.conditions},
     }
 

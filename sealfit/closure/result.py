@@ -24,12 +24,12 @@ from sealfit.closure.error_sizes import errors, lack_of_fit, noise_floor, scatte
 from sealfit.closure.forms import describe, free_term
 from sealfit.closure.intervals import effect_intervals
 from sealfit.closure.next_runs import next_runs
+from sealfit.closure.outlier_files import OutlierFile
 from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
 from sealfit.closure.sensitivity import LEVEL_NAMES, sensitivity, undetectable_variables
-from sealfit.closure.stray_files import StrayFile
 from sealfit.config import Config
 from sealfit.effects.contract import Effect, fill_unit
 from sealfit.fit.joint.estimate import Fitted, effective_df, fit
@@ -98,7 +98,7 @@ def closure_document(
     heldout_unit: str,
     config: Config,
     effects: Mapping[str, Effect],
-    stray: Sequence[StrayFile] = (),
+    outliers: Sequence[OutlierFile] = (),
 ) -> dict:
     """Return closure.json."""
     after, units = models.after, config.units
@@ -145,10 +145,11 @@ def closure_document(
         "effects": effect_entries(after, selection, config),
         "scatter": scatter,
         "left": left_entry(selection, numbers["after"]["rmse_N"], floor),
-        "stray_files": [
-            {"file": one.file, "off_pct": 100 * one.off, "p_value": one.p_value} for one in stray
+        "outlier_files": [
+            {"file": one.file, "deviation_pct": 100 * one.deviation, "p_value": one.p_value}
+            for one in outliers
         ],
-        "next_runs": next_runs(selection, config, effects, stray),
+        "next_runs": next_runs(selection, config, effects, outliers),
         "incomplete_channels": incomplete_channels(after.rows),
     }
 

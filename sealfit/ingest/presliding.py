@@ -18,7 +18,7 @@ AFTER_RAMP = 3.0
 # left.
 ENOUGH = np.log(100.0)
 # Share of the stroke at which a rise ends at the latest where what is left of it is known.
-HALF = 0.5
+LATEST = 0.5
 # Share of its level above which a force that begins there comes up, if at all, over a short distance.
 HALF_WAY = 0.75
 # That distance, as a share of the stroke. A longer climb is an effect (run-in, warming) and stays inside the
@@ -227,7 +227,7 @@ def _rise_from_rest(start: Start) -> Rise:
     if end >= ramp + 0.99 * SETTLED * length:
         return Rise(end, 0.0, length)
     left_N, length = _left_over(start, length)
-    return Rise(min(end, max(HALF * float(start.distance_mm[-1]), ramp)) if left_N else end, left_N, length)
+    return Rise(min(end, max(LATEST * float(start.distance_mm[-1]), ramp)) if left_N else end, left_N, length)
 
 
 def _left_over(start: Start, length_mm: float) -> tuple[float, float]:

@@ -128,8 +128,7 @@ def of_closure(closure: Mapping, units: Units) -> dict:
     """Return the verdict, the errors before and after, the effects and the remaining residual."""
     kept = (
         "verdict", "fit_quality", "sensitivity", "refused", "units", "noise_floor_N", "before", "after",
-        "heldout_unit", "left", "next_runs",
-        "stray_files",
+        "heldout_unit", "left", "next_runs", "outlier_files",
     )  # fmt: skip
     effects = [{key: effect[key] for key in EFFECT_KEYS} for effect in closure["effects"]]
     return {
@@ -152,7 +151,7 @@ def of_after(store: Store) -> dict:
 
 def verdict_sentence(closure: Mapping, units: Units) -> str:
     """Return the verdict in one sentence."""
-    return "; ".join(filter(None, [_verdict_clause(closure, units), stray_clause(closure)]))
+    return "; ".join(filter(None, [_verdict_clause(closure, units), outlier_clause(closure)]))
 
 
 def _verdict_clause(closure: Mapping, units: Units) -> str:
@@ -227,14 +226,14 @@ NAMED = 3
 """Variables whose smallest effect a sentence gives."""
 
 
-def stray_clause(closure: Mapping) -> str:
+def outlier_clause(closure: Mapping) -> str:
     """Return which files the loop left out; empty if none."""
-    stray = closure.get("stray_files") or []
-    if not stray:
+    outliers = closure.get("outlier_files") or []
+    if not outliers:
         return ""
-    named = [f"{one['file']} ({one['off_pct']:+.2g} %)" for one in stray[:NAMED]]
-    more = f" and {len(stray) - NAMED} more" if len(stray) > NAMED else ""
-    what = "a file whose force is" if len(stray) == 1 else f"{len(stray)} files whose force is"
+    named = [f"{one['file']} ({one['deviation_pct']:+.2g} %)" for one in outliers[:NAMED]]
+    more = f" and {len(outliers) - NAMED} more" if len(outliers) > NAMED else ""
+    what = "a file whose force is" if len(outliers) == 1 else f"{len(outliers)} files whose force is"
     return f"left out: {what} far off what all others predict: {', '.join(named)}{more}"
 
 

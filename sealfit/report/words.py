@@ -26,7 +26,7 @@ from sealfit.report.notation import (
     together,
     true_units,
 )
-from sealfit.report.summary import level_words, power_clause, quality_clause, stray_clause, untold_clause
+from sealfit.report.summary import level_words, outlier_clause, power_clause, quality_clause, untold_clause
 
 # A shape that crosses zero by at most this share of its span counts as one of constant sign. 0.02 is about
 # the resolution of a plot.
@@ -53,7 +53,7 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
     errors = [error_clause(closure, config)]
     if known(closure["noise_floor_N"]):
         errors.append(quality_clause(closure))
-    errors.append(stray_clause(closure))
+    errors.append(outlier_clause(closure))
     if closure["verdict"] == "nothing_missing":
         power = power_clause(closure, config.units)
         return _sentences("no effect beyond the declared model is significant", *errors, power)

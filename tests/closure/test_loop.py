@@ -47,16 +47,16 @@ def test_nothing_is_claimed_where_nothing_is_missing(null):
     assert document["noise_floor_N"] == pytest.approx(0.335, abs=0.02)  # 0.3 N a bin, 0.5 % a file of 30 N
 
 
-def test_a_stray_file_is_left_out_and_changes_nothing(null):
+def test_an_outlying_file_is_left_out_and_changes_nothing(null):
     bins, sound = null
     wrong = bins.assign(force_N=bins["force_N"] * np.where(bins["file"] == "f0020.csv", 1.15, 1.0))
     found = close(wrong)
-    (stray,) = found.document["stray_files"]
-    assert (stray["file"], stray["off_pct"]) == ("f0020.csv", pytest.approx(15.0, abs=2.0))
+    (outlier,) = found.document["outlier_files"]
+    assert (outlier["file"], outlier["deviation_pct"]) == ("f0020.csv", pytest.approx(15.0, abs=2.0))
     assert "f0020.csv is" in found.document["next_runs"][0]["why"]
     assert "f0020.csv" not in set(found.tables["residuals_after"]["file"])
     assert found.document["verdict"] == sound.document["verdict"] == "nothing_missing"
-    assert sound.document["stray_files"] == []
+    assert sound.document["outlier_files"] == []
     assert found.document["after"]["rmse_N"] == pytest.approx(sound.document["after"]["rmse_N"], rel=0.02)
 
 

@@ -339,7 +339,7 @@ def torque_campaign(seed=3):
         "effects": [],
         "scatter": [],
         "left": {"rmse_N": 1.31, "level": None, "channel": None, "p_value": None},
-        "stray_files": [],
+        "outlier_files": [],
         "next_runs": [],
     }
     return Made(tables, closure, PROVENANCE, config)

@@ -248,7 +248,7 @@ def closure_document(found, verdict):
             {"level": "file", "sd_rel": 0.004, "sd_N": 0.05, "df": 80.0},
         ],
         "left": left,
-        "stray_files": [],
+        "outlier_files": [],
         "next_runs": runs if verdict == "closed" else [],
     }
 

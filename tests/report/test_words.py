@@ -4,7 +4,7 @@ from report.made_campaigns import aging_campaign, torque_campaign
 from report.made_tables import empty, shapes
 
 from sealfit.config import Config
-from sealfit.report.summary import quality_clause, stray_clause
+from sealfit.report.summary import outlier_clause, quality_clause
 from sealfit.report.words import acts, does, left_over, verdict, with_left_channels
 
 NUMBERS = {
@@ -238,8 +238,10 @@ def test_why_the_lack_of_fit_is_not_known_is_said():
 
 
 def test_files_that_were_left_out_are_named():
-    assert stray_clause({"stray_files": []}) == ""
-    files = [{"file": f"{k}.csv", "off_pct": -12.34 + 5 * k, "p_value": 1e-6} for k in range(4)]
+    assert outlier_clause({"outlier_files": []}) == ""
+    files = [{"file": f"{k}.csv", "deviation_pct": -12.34 + 5 * k, "p_value": 1e-6} for k in range(4)]
     one = "left out: a file whose force is far off what all others predict: 0.csv (-12 %)"
-    assert stray_clause({"stray_files": files[:1]}) == one
-    assert stray_clause({"stray_files": files}).endswith("(-12 %), 1.csv (-7.3 %), 2.csv (-2.3 %) and 1 more")
+    assert outlier_clause({"outlier_files": files[:1]}) == one
+    assert outlier_clause({"outlier_files": files}).endswith(
+        "(-12 %), 1.csv (-7.3 %), 2.csv (-2.3 %) and 1 more"
+    )

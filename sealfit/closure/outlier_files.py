@@ -14,39 +14,39 @@ from sealfit.fit.joint.rows import SAME_SPEED, Rows
 SCREEN_P = 0.05
 # Files that are tried, those with the largest residuals.
 MOST_SUSPECTS = 3
-# Largest p-value of a stray file, times the number of files. With 0.01, 5 of 73 worlds drawn at random lost a
+# Largest p-value of an outlier, times the number of files. With 0.01, 5 of 73 worlds drawn at random lost a
 # sound file: their scatter was not normal.
-STRAY_P = 1e-3
+OUTLIER_P = 1e-3
 # Largest p-value beside the files of the same speed. Where these scatter more than others, or differ from the
-# model like the file, it is not stray.
+# model like the file, it is no outlier.
 SAME_SPEED_P = 0.01
 # Fewest files of the same speed from which their scatter is estimated.
-LEAST_MATES = 3
-# Least share of the force by which a stray file is off.
-STRAY_SHARE = 0.05
-# Largest share of the files that may be stray. If there are more, they are not exceptions.
-MOST_STRAY = 0.1
+LEAST_OF_SPEED = 3
+# Least share of the force by which an outlier is off.
+OUTLIER_SHARE = 0.05
+# Largest share of the files that may be outliers. If there are more, they are not exceptions.
+MOST_OUTLIERS = 0.1
 # Least degrees of freedom of the files. With fewer, all files together do not predict another one.
 LEAST_DF = 4
 # Rows of each stroke in the fits. The mean of a file needs no more.
 ROWS = 8
 
 
-class StrayFile(NamedTuple):
+class OutlierFile(NamedTuple):
     """A file that went wrong as a whole."""
 
     file: str
-    off: float  # its mean force over that predicted, less 1
+    deviation: float  # its mean force over that predicted, less 1
     p_value: float  # times the number of files
     conditions: dict  # the columns of its first row
 
 
-def stray_files(rows: Rows) -> list[StrayFile]:
+def outlier_files(rows: Rows) -> list[OutlierFile]:
     """Return the files whose mean force is far off what all other files predict, the farthest first.
 
-    Model and scatter are fitted without the file, so that it does not hide itself. It is stray if the gain
-    that would explain it is significant beside the scatter of the others. These are then judged without it.
-    In linear regression the test is that of the deletion residual (Cook & Weisberg 1982, *Residuals and
+    Model and scatter are fitted without the file, so that it does not hide itself. It is an outlier if the
+    gain that would explain it is significant beside the scatter of the others. These are then judged without
+    it. In linear regression the test is that of the deletion residual (Cook & Weisberg 1982, *Residuals and
     Influence in Regression*, section 2.2.2).
 
     Parameters
@@ -56,28 +56,28 @@ def stray_files(rows: Rows) -> list[StrayFile]:
     """
     rows = rows.sparse(ROWS)
     fitted, found = fit_declared(rows), []
-    for _ in range(int(MOST_STRAY * rows.groups.starts["file"].size)):
+    for _ in range(int(MOST_OUTLIERS * rows.groups.starts["file"].size)):
         tried = [_without(fitted, number) for number in _suspects(fitted)]
         one, kept = min(tried, key=lambda pair: pair[0].p_value, default=(None, fitted))
-        if one is None or one.p_value > STRAY_P or abs(one.off) < STRAY_SHARE:
+        if one is None or one.p_value > OUTLIER_P or abs(one.deviation) < OUTLIER_SHARE:
             break
         found.append(one)
         fitted = kept
-    return sorted(found, key=lambda one: -abs(one.off))
+    return sorted(found, key=lambda one: -abs(one.deviation))
 
 
-def _df(rows: Rows, fitted: Fitted) -> int:
+def _df(fitted: Fitted) -> int:
     """Return the degrees of freedom of the files, one of them left out."""
-    return rows.groups.starts["file"].size - 1 - fitted.basis.shape[1]
+    return fitted.rows.groups.starts["file"].size - 1 - fitted.basis.shape[1]
 
 
 def _suspects(fitted: Fitted) -> list[int]:
-    """Return the numbers of the files with the largest mean residuals, where these may be stray files'.
+    """Return the numbers of the files with the largest mean residuals, where these may be outliers.
 
     A residual over a standard deviation that was estimated without it has Student's distribution; here that
     of all files is known, which contains it.
     """
-    groups, df = fitted.rows.groups, _df(fitted.rows, fitted)
+    groups, df = fitted.rows.groups, _df(fitted)
     if df < LEAST_DF:
         return []
     along = fitted.unit_residual("file") * np.sign(fitted.rows.speed)
@@ -87,22 +87,22 @@ def _suspects(fitted: Fitted) -> list[int]:
     return [int(k) for k in np.argsort(-square)[:MOST_SUSPECTS] if suspect[k]]
 
 
-def _without(fitted: Fitted, number: int) -> tuple[StrayFile, Fitted]:
+def _without(fitted: Fitted, number: int) -> tuple[OutlierFile, Fitted]:
     """Return the test of one file, and the fit to the others.
 
-    The file's gain is a further parameter of the model, at the estimates and the scatter of the others.
+    The file's gain is a further parameter of the model, at the estisame and the scatter of the others.
     """
     rows, own = fitted.rows, fitted.rows.codes("file") == number
     kept = fit(fitted.model, rows.subset(~own), fitted.scatter, turns=2)
     at = fitted_at(kept.model, rows, kept.scatter)
     column = at.basis.project_out(at.whitening(np.where(own, at.friction, 0.0)[:, None])[:, 0])
     size = max(float(np.linalg.norm(column)), 1e-9)  # 0 if only this file determines a parameter
-    off = float(column @ at.white_residual) / size**2
-    p_value = 2 * stdtr(_df(rows, at), -abs(off) * size) * rows.groups.starts["file"].size
+    deviation = float(column @ at.white_residual) / size**2
+    p_value = 2 * stdtr(_df(at), -abs(deviation) * size) * rows.groups.starts["file"].size
     if _like_others_of_its_speed(at, number):
         p_value = 1.0
     first = rows.table.iloc[rows.groups.starts["file"][number]]
-    return StrayFile(str(first["record"]), off, float(min(p_value, 1.0)), dict(first)), kept
+    return OutlierFile(str(first["record"]), deviation, float(min(p_value, 1.0)), dict(first)), kept
 
 
 def _like_others_of_its_speed(fitted: Fitted, number: int) -> bool:
@@ -113,10 +113,10 @@ def _like_others_of_its_speed(fitted: Fitted, number: int) -> bool:
     )
     speed = groups.means(np.abs(fitted.rows.speed), "file")
     ratio = speed / speed[number]
-    mates = np.maximum(ratio, 1 / ratio) < SAME_SPEED
-    mates[number] = False
-    others = relative[mates]
-    if others.size < LEAST_MATES:
+    same = np.maximum(ratio, 1 / ratio) < SAME_SPEED
+    same[number] = False
+    others = relative[same]
+    if others.size < LEAST_OF_SPEED:
         return False
     sd = float(np.std(others, ddof=1)) * np.sqrt(1 + 1 / others.size)
     t = abs(relative[number] - others.mean()) / max(sd, 1e-300)

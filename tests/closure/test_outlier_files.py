@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.stray_files import stray_files
+from sealfit.closure.outlier_files import outlier_files
 from sealfit.fit.joint.rows import make_rows
 
 
@@ -21,9 +21,9 @@ def bins_with(factor: dict[int, float], **design):
 @pytest.mark.parametrize("repeats", [1, 2])
 def test_a_file_that_went_wrong_is_found(repeats):
     bins, files = bins_with({17: 1.2}, repeats=repeats)
-    (one,) = stray_files(make_rows(bins, has_aging=True))
+    (one,) = outlier_files(make_rows(bins, has_aging=True))
     assert one.file == files[17]
-    assert one.off == pytest.approx(0.2, abs=0.02)
+    assert one.deviation == pytest.approx(0.2, abs=0.02)
     assert one.p_value < 1e-3
     own = bins[bins["file"] == files[17]].iloc[0]
     assert one.conditions["aging_days"] == own["aging_days"]
@@ -31,24 +31,24 @@ def test_a_file_that_went_wrong_is_found(repeats):
 
 def test_two_files_do_not_hide_each_other():
     bins, files = bins_with({5: 0.9, 17: 1.15}, repeats=1)
-    found = stray_files(make_rows(bins, has_aging=True))
+    found = outlier_files(make_rows(bins, has_aging=True))
     assert [one.file for one in found] == [files[17], files[5]]
 
 
-def test_scatter_of_the_files_is_not_stray():
+def test_scatter_of_the_files_is_no_outlier():
     bins, files = bins_with({}, repeats=1)
     gain = 1 + 0.02 * np.random.default_rng(3).standard_normal(files.size)
     bins["force_N"] *= gain[bins["file"].map({name: k for k, name in enumerate(files)})]
-    assert stray_files(make_rows(bins, has_aging=True)) == []
+    assert outlier_files(make_rows(bins, has_aging=True)) == []
 
 
-def test_a_file_within_a_fiftieth_is_not_stray():
+def test_a_file_within_a_fiftieth_is_no_outlier():
     bins, _ = bins_with({17: 1.015}, repeats=1)
-    assert stray_files(make_rows(bins, has_aging=True)) == []
+    assert outlier_files(make_rows(bins, has_aging=True)) == []
 
 
 def test_too_few_files_predict_no_other():
     bins, files = bins_with({}, repeats=1)
     few = bins[bins["file"].isin(files[:6])].copy()
     few.loc[few["file"] == files[2], "force_N"] *= 1.3
-    assert stray_files(make_rows(few, has_aging=True)) == []
+    assert outlier_files(make_rows(few, has_aging=True)) == []
