@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, added_force
 from sealfit.closure.criteria import IDENTIFIABLE
@@ -171,7 +172,7 @@ def _run_to_repeat(one: OutlierFile, config: Config) -> dict:
     return {
         "why": f"file {one.file} is {abs(one.deviation):.0%} {side} what all others predict and was left "
         "out: look at it, and repeat its run",
-        "conditions": {name: _plain(one.conditions[name]) for name in names if name in one.conditions},
+        "conditions": _settings(one.conditions, names),
     }
 
 
@@ -181,7 +182,7 @@ def _second_specimen(rows: Rows, config: Config) -> dict:
     return {
         "why": "would show the scatter of specimens, which is unknown in this campaign and in no interval: "
         "a second specimen of a tested condition",
-        "conditions": {name: _plain(rows.table[name].iloc[k]) for name in config.condition},
+        "conditions": _settings(rows.table.iloc[k], config.condition),
     }
 
 
@@ -211,9 +212,7 @@ def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
     return {
         "why": f"{few} too few to distinguish {describe(item.proposal.term)} from the scatter of specimens: "
         "test a second specimen of the same conditions, here first",
-        "conditions": {
-            name: _plain(fitted.rows.table[name].iloc[k]) for name in (*config.condition, "speed_mm_s")
-        },
+        "conditions": _settings(fitted.rows.table.iloc[k], (*config.condition, "speed_mm_s")),
     }
 
 
@@ -235,9 +234,8 @@ def largest_difference(
         apart = np.where(np.isfinite(apart), apart, 0.0)
         k = int(np.argmax(apart >= apart.max() * (1 - TIE)))  # the first of those equal but for rounding
         if apart[k] > (0.0 if best is None else best[1] * (1 + TIE)):
-            names = dict.fromkeys((*config.condition, "speed_mm_s", *channels))
-            where = {name: _plain(moved.table[name].iloc[k]) for name in names if name in moved.table}
-            best = (where, float(apart[k]))
+            names = (*config.condition, "speed_mm_s", *channels)
+            best = (_settings(moved.table.iloc[k], names), float(apart[k]))
     return best
 
 
@@ -287,6 +285,12 @@ def _rows_with(rows: Rows, changes: Mapping[str, object]) -> Rows:
     return replace(rows, table=table, speed=speed, pace=speed, days=days, load=load)
 
 
-def _plain(value: object) -> object:
-    value = value.item() if hasattr(value, "item") else value
-    return float(f"{value:.4g}") if isinstance(value, float) else value
+def _settings(row: Mapping[str, object], names: Sequence[str]) -> dict[str, object]:
+    """Return the settings of a run that are known, numbers to four digits."""
+    found = {}
+    for name in dict.fromkeys(names):
+        value = row.get(name)
+        value = value.item() if isinstance(value, np.generic) else value
+        if not pd.isna(value):
+            found[name] = float(f"{value:.4g}") if isinstance(value, float) else value
+    return found
