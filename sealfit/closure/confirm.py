@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, level_values, settings, varies
+from sealfit.closure.channels import CALENDAR, level_values, settings, unit_of, varies
 from sealfit.closure.criteria import (
     CURVE_P,
     LEAST_FALL,
@@ -20,6 +20,7 @@ from sealfit.closure.criteria import (
     RIPPLE_CONFIRMED_P,
     SAMPLES_PER_VALUE,
     WEAK_P,
+    WITHIN_P,
 )
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import blocks, covered, foldable, folds, whole_settings
@@ -356,6 +357,8 @@ def _reason_refused(
         return NEGLIGIBLE
     if proposal.p_value > CURVE_P and _changes_the_curve(proposal):
         return f"its p-value is above {CURVE_P:g}, and the scatter of such a coefficient is not known"
+    if proposal.p_value > WITHIN_P and _shape_along_strokes(proposal.term, fitted.rows):
+        return f"its p-value is above {WITHIN_P:g}, and it is a shape along strokes without a mechanism"
     if proposal.p_value > WEAK_P and gain.share < LEAST_FALL:
         return (
             f"its p-value is above {WEAK_P:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
@@ -371,6 +374,12 @@ def _changes_the_curve(proposal: Proposal) -> bool:
     by_speed = len(term.channels) > 1 and "speed_mm_s" in term.channels
     free = not term.effect.physical and proposal.unit != "specimen"
     return free and (by_speed or term.acts_on not in WHOLE)
+
+
+def _shape_along_strokes(term: Term, rows: Rows) -> bool:
+    """Whether it is a form without a mechanism of a channel that varies within strokes."""
+    within = any(unit_of(rows.values(name), rows) == "sample" for name in term.channels)
+    return within and not term.effect.physical
 
 
 def added_force(proposal: Proposal) -> np.ndarray:

@@ -83,7 +83,7 @@ def test_blocks_of_the_calendar_are_shorter_than_conditions_that_follow_one_anot
 
 # ---------------------------------------------------------------- the decision, on gains given by hand
 SAMPLES = pd.DataFrame({"force_N": np.random.default_rng(0).normal(size=50), "stroke_id": 0})
-FORCE = SimpleNamespace(rows=SimpleNamespace(force=np.full(3, 10.0)))
+FORCE = SimpleNamespace(rows=SimpleNamespace(force=np.full(3, 10.0), values=lambda channel: channel))
 
 
 def proposal(effect="smooth", channels=("run_order",), acts_on="mu", p_value=1e-9, physical=False):
@@ -101,6 +101,9 @@ def decide(monkeypatch):
         monkeypatch.setattr("sealfit.closure.confirm.heldout_gain", lambda before, p, *args: held[id(p)])
         monkeypatch.setattr("sealfit.closure.confirm.gain_between_settings", lambda *args: settings)
         monkeypatch.setattr("sealfit.closure.confirm.added_force", lambda p: np.full(3, added))
+        monkeypatch.setattr(
+            "sealfit.closure.confirm.unit_of", lambda name, rows: "sample" if name == "time_s" else "run"
+        )
         monkeypatch.setattr(
             "sealfit.closure.confirm.rivals", lambda chosen, found: [p for p in found if p != chosen]
         )
@@ -214,6 +217,24 @@ def test_a_free_shape_that_bends_the_curve_wants_more_evidence(
 ):
     made = proposal(effect, channels, acts_on, p_value, physical=effect == "asymmetry")
     found, refused, _ = decide([made], [GOOD])
+    assert (found is not None) == claimed
+    assert [item.weak for item in refused] == ([] if claimed else [True])
+
+
+@pytest.mark.parametrize(
+    ("channels", "p_value", "physical", "claimed"),
+    [
+        (("time_s",), 2e-4, False, False),
+        (("time_s",), 2e-4, True, True),
+        (("time_s",), 1e-5, False, True),
+        (("run_order", "time_s"), 2e-4, False, False),
+        (("run_order",), 2e-4, False, True),
+    ],
+)
+def test_a_shape_along_strokes_without_a_mechanism_wants_more_evidence(
+    decide, channels, p_value, physical, claimed
+):
+    found, refused, _ = decide([proposal("step", channels, "mu", p_value, physical)], [GOOD])
     assert (found is not None) == claimed
     assert [item.weak for item in refused] == ([] if claimed else [True])
 
