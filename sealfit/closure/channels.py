@@ -21,16 +21,19 @@ from sealfit.closure.criteria import (
     MOST_LEVELS,
     MOST_SET_VALUES,
     SAME_VALUE,
+    SHORT_STROKES,
 )
 from sealfit.closure.criteria import LEAST_UNITS_OF_SLOPES as LEAST_SLOPES
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.joint.declared import SAME_SPEED
 from sealfit.fit.joint.rows import LEVELS, POWER, Rows, open_columns
+from sealfit.ingest.quality import STILL_RISING
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 ROUNDING = 1e-9  # Relative rounding error of the mean of equal numbers.
 CALENDAR = ("run_order", "elapsed_h")  # correlated with conditions, which are tested one after the other
+ALONG_STROKES = ("time_s", "distance_mm", "displacement_mm")
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,24 @@ def channels_of(rows: Rows, config: Config) -> list[Channel]:
     """Return the channels that the loop searches by a campaign's config: see `find_channels`."""
     on_rig = config.position_origin == "rig"
     return find_channels(rows, config.loop.ignore_channels, conditions=config.condition, rig_position=on_rig)
+
+
+def searched(channels: Iterable[Channel], rows: Rows) -> list[Channel]:
+    """Return the channels that are searched: all, or those that do not increase along strokes.
+
+    Where strokes end before the friction is steady, a residual along them is an error of the bristle model,
+    by which the rest of the rise is taken out.
+    """
+    return [c for c in channels if c.name not in ALONG_STROKES or not too_short(rows)]
+
+
+def too_short(rows: Rows) -> bool:
+    """Return whether at least half of the strokes end before the friction is steady (`never_steady`)."""
+    if "presliding_N" not in rows.table:
+        return False
+    last = np.r_[rows.groups.starts["stroke"][1:], rows.force.size] - 1
+    left = np.abs(rows.table["presliding_N"].to_numpy(dtype=float)[last])
+    return bool(np.mean(left > STILL_RISING * np.abs(rows.force[last])) >= SHORT_STROKES)
 
 
 def find_channels(

@@ -22,6 +22,13 @@ FINE_DF = 9
 FINE_UNITS = 50
 """Number of units from which the finer shape is tested."""
 
+SHORT_STROKES = 0.5
+"""Share of strokes that end before the friction is steady from which effects along strokes are not searched.
+
+In 68 worlds drawn at random with strokes of three to five bristle lengths no effect along the strokes was
+found except ripples, and in eight one was invented or the verdict was `unexplained`.
+"""
+
 CONSTANT_SHARE = 1e-4
 """A channel is constant within groups if less than this share of its variance (1 % of its SD) lies in them.
 

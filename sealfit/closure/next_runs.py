@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
+from sealfit.closure.channels import too_short
 from sealfit.closure.confirm import AcceptedEffect, added_force
 from sealfit.closure.criteria import IDENTIFIABLE
 from sealfit.closure.forms import describe, grid_of, reference
@@ -114,6 +115,10 @@ def _alias(fitted: Fitted, term: Term, values: Mapping[str, float], column: np.n
 BEYOND = 0.5  # Share of a channel's range by which a run may exceed it.
 SHOWN = 0.5  # Least share of an effect's size that a proposed run must show.
 TIE = 1e-9  # Relative difference below which two runs differ by rounding only.
+LONGER_STROKES = (
+    "would show effects along the strokes, which end before the friction is steady: slide at least three "
+    "times as far"
+)
 ROWS = 4  # Rows per stroke at which forces are compared.
 
 
@@ -162,6 +167,8 @@ def next_runs(
         wanted.append(_replicate_of(selection.inconclusive, config))
     if selection.after.rows.has_aging and not selection.after.scatter.estimates("specimen"):
         wanted.append(_second_specimen(selection.after.rows, config))
+    if too_short(selection.after.rows):
+        wanted.append({"why": LONGER_STROKES, "conditions": {}})
     return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import Channel
+from sealfit.closure.channels import ALONG_STROKES, Channel
 from sealfit.closure.confirm import AcceptedEffect, Context, confirmed
 from sealfit.closure.criteria import EQUAL_BIC, RIVAL_BIC
 from sealfit.closure.linearised import Linearised, Proposal
@@ -22,7 +22,6 @@ from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import channel_candidates, search_pairs
 from sealfit.fit.joint.estimate import Fitted, fit
 
-ALONG_STROKES = ("time_s", "distance_mm", "displacement_mm")
 """Channels that are proportional to one another along every stroke at a steady speed."""
 
 

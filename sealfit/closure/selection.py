@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, Channel, channels_of
+from sealfit.closure.channels import CALENDAR, Channel, channels_of, searched
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
 from sealfit.closure.criteria import HALF_OF_CALENDAR, MOST_PROPOSALS, PAIRS_FROM_P, WEAK_P
 from sealfit.closure.forms import AGING, richer_laws
@@ -111,7 +111,8 @@ class _Loop:
         self.rng = np.random.default_rng(self.context.config.loop.seed)
         ripples = Ripples(samples, context)
         self.before = fit_declared(rows) if start is None else fit(start.model, rows, start.scatter, turns=1)
-        self.channels = {c.name: c for c in channels_of(rows, self.context.config)}
+        self.all_channels = {c.name: c for c in channels_of(rows, self.context.config)}
+        self.channels = {c.name: c for c in searched(self.all_channels.values(), rows)}
         self.tests = ScoreTests(self.before)
         self.last = self.first = self.search_single()
         self.fitted = ripples.added_to(self.before, fine)
@@ -246,7 +247,7 @@ class _Loop:
         """Return the result of the loop; for a fold, without what is left."""
         added = tuple(self.added)
         after = self.fitted if added else self.before
-        found = Selection(self.before, after, added, self.first, self.last, None, None, self.channels)
+        found = Selection(self.before, after, added, self.first, self.last, None, None, self.all_channels)
         if not whole:
             return found
         left, inconclusive = self.left, None

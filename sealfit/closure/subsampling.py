@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import channels_of
+from sealfit.closure.channels import channels_of, searched
 from sealfit.closure.confirm import AcceptedEffect, heldout_gain
 from sealfit.closure.criteria import MOST_RIVALS, RIVAL_BIC
 from sealfit.closure.forms import describe
@@ -287,9 +287,8 @@ def missed_by_subsample(fitted: Fitted, selection: Selection, config: Config) ->
         Error rate, channels.
     """
     alpha = config.loop.family_error
-    found = search(
-        ScoreTests(fitted), channels_of(fitted.rows, config), np.random.default_rng(config.loop.seed)
-    )
+    channels = searched(channels_of(fitted.rows, config), fitted.rows)
+    found = search(ScoreTests(fitted), channels, np.random.default_rng(config.loop.seed))
     known = {c.channels for c in selection.last if c.p_value <= alpha}
     new = (c for c in found if c.p_value <= alpha and c.claimable and c.channels not in known)
     return ", ".join(next((c.channels for c in new), ()))

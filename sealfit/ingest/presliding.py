@@ -21,8 +21,10 @@ ENOUGH = np.log(100.0)
 LATEST = 0.5
 # Share of its level above which a force that begins there comes up, if at all, over a short distance.
 HALF_WAY = 0.75
-# That distance, as a share of the stroke. A longer climb is an effect (run-in, warming) and stays inside the
-# window.
+# Share of its level below which a force begins far from it: only a rise comes up from there, however long.
+FAR_BELOW = 0.25
+# Distance of `HALF_WAY`, as a share of the stroke. A longer climb is an effect (run-in, warming) and stays
+# inside the window.
 SHORT = 0.01
 # Share of the stroke in which the fall of an overshoot comes down by 63 %, at most.
 SOON = 0.03
@@ -281,11 +283,13 @@ def _shape(x_mm: np.ndarray, length_mm: np.ndarray | float, power: int | None = 
 def _level_N(start: Start) -> float | None:
     """Return the level of the plateau that the force comes up to; None where it does not come up."""
     distance, force = start.distance_mm, start.force_N
-    low, high = (int(distance.searchsorted(share * distance[-1])) for share in EARLY)
+    low, high, *late = (int(distance.searchsorted(share * distance[-1])) for share in (*EARLY, *LATE))
     plateau = force[max(low, start.ramp_end) : high]
     if len(plateau) < 8:
         return None
     level, begin = median(plateau), float(force[0])
+    if begin < FAR_BELOW * level:
+        plateau = force[slice(*late)]
     return level if level - begin > 0.02 * abs(level) and _below(plateau, begin) else None
 
 

@@ -6,7 +6,7 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.next_runs import find_aliases, largest_difference, next_runs
+from sealfit.closure.next_runs import LONGER_STROKES, find_aliases, largest_difference, next_runs
 from sealfit.closure.outlier_files import OutlierFile
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -97,3 +97,12 @@ def test_the_run_of_an_outlying_file_comes_first():
     first, *_ = next_runs(selection, Config(), {}, [outlier])
     assert first["why"].startswith("file a.csv is 12% below what all others predict and was left out")
     assert first["conditions"] == known
+
+
+def test_longer_strokes_are_wanted_where_the_friction_is_not_steady_at_their_end():
+    bins = make_bins(bins=4, repeats=1)
+    bins["presliding_N"] = -0.05 * bins["force_N"]
+    selection = SimpleNamespace(
+        added=(), inconclusive=None, after=fit_declared(make_rows(bins, has_aging=True))
+    )
+    assert {"why": LONGER_STROKES, "conditions": {}} in next_runs(selection, Config(), {})

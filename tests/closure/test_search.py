@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.channels import find_channels, flip_level, free_columns, unit_of
+from sealfit.closure.channels import ALONG_STROKES, find_channels, flip_level, free_columns, searched, unit_of
 from sealfit.closure.score_test import ScoreTests, log_p_of
 from sealfit.closure.search import search
 from sealfit.fit.joint.estimate import fit_declared
@@ -27,6 +27,22 @@ def test_units_of_evidence():
     assert units["repeat"] == "file"
     assert units["lab_temperature_C"] == units["batch"] == "run"
     assert units["aging_days"] == "specimen"
+
+
+@pytest.mark.parametrize(
+    ("left", "share", "along"), [(0.005, 1.0, True), (0.03, 0.4, True), (0.03, 0.6, False)]
+)
+def test_effects_along_strokes_are_not_searched_where_strokes_end_before_the_friction_is_steady(
+    left, share, along
+):
+    bins = make_bins(repeats=2, bins=4)
+    short = bins["file"].factorize()[0] < share * bins["file"].nunique()
+    bins["presliding_N"] = np.where(short, -left * bins["force_N"], 0.0)
+    rows = make_rows(bins, has_aging=True)
+    names = {c.name for c in find_channels(rows)}
+    assert names - {c.name for c in searched(find_channels(rows), rows)} == (
+        set() if along else names & set(ALONG_STROKES)
+    )
 
 
 def test_a_text_of_more_than_a_hundred_values_is_no_channel():

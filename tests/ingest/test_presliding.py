@@ -14,7 +14,17 @@ LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
 
 
 def bristle_trace(
-    ratio, *, hertz=100.0, ramp=0.2, blur=0.002, begin=0.0, damping=0.0, seed=1, shape="straight", drift=0.0
+    ratio,
+    *,
+    hertz=100.0,
+    ramp=0.2,
+    blur=0.002,
+    begin=0.0,
+    damping=0.0,
+    seed=1,
+    shape="straight",
+    drift=0.0,
+    ripple=0.0,
 ):
     """Return time, displacement and force of a stroke `ratio` bristle lengths long, after a rest of a second.
 
@@ -29,7 +39,7 @@ def bristle_trace(
         slid = SPEED * (since - ramp * -np.expm1(-since / ramp))
     bent = np.exp(-slid / LENGTH)  # damping: sigma_1 dz/dt, in N at the stroke's speed
     force = LEVEL + (begin - LEVEL) * bent + damping * np.gradient(slid, time) / SPEED * bent
-    noise = random.normal(0.0, NOISE, time.size)
+    noise = random.normal(0.0, NOISE, time.size) + ripple * np.cos(2 * np.pi * slid / (0.2 * LENGTH))
     if drift:
         noise += uniform_filter1d(random.normal(0.0, drift, time.size), 8) * 8**0.5
     return time, slid + random.normal(0.0, blur, time.size), force + noise
@@ -66,6 +76,12 @@ def test_the_steady_force_does_not_depend_on_where_the_window_begins(ratio, more
     assert steady.std() < 0.002 * LEVEL
     if ratio <= 6:
         assert measured.mean() < LEVEL - 0.2
+
+
+@pytest.mark.parametrize("ratio", [4.0, 6.0, 11.0])
+def test_a_ripple_does_not_hide_the_rise_of_a_reversed_stroke(ratio):
+    _, steady = steady_forces(ratio, begin=-LEVEL, ripple=0.15 * LEVEL, hertz=50.0)
+    assert steady == pytest.approx(LEVEL, rel=0.04)  # the rise begins 90 N below
 
 
 @pytest.mark.parametrize("ratio", [6.0, 11.0, 30.0])
