@@ -10,10 +10,11 @@ import re
 import tomllib
 from datetime import UTC, datetime
 from importlib.resources import files
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, get_args
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -142,10 +143,18 @@ class TraceFormat(Strict):
         return {ours: column.name for ours, column in self.columns.items()}
 
 
+def _glob(pattern: str | None) -> str | None:
+    """Raise ValueError for a pattern that pathlib refuses."""
+    parts = PurePosixPath(pattern or "*").parts
+    if not parts or any("**" in part and part != "**" for part in parts):
+        raise ValueError('a pattern for paths is needed, in which "**" stands alone: "traces/**/*.csv"')
+    return pattern
+
+
 class Files(Strict):
     """Where the trace files are when runs.csv does not list them, and what their names say."""
 
-    glob: str | None = None
+    glob: Annotated[str | None, AfterValidator(_glob)] = None
     """E.g. `"raw/**/*.csv"`; then runs.csv is not needed."""
     exclude: list[str] = Field(default_factory=list)
     """Globs of files that are not traces."""
@@ -231,9 +240,9 @@ class Quantity(Strict):
 class Strokes(Strict):
     """How strokes and their steady windows are found."""
 
-    smooth_samples: int = Field(7, ge=1)
+    smooth_samples: int = Field(7, ge=1, le=1001)
     """Displacement is smoothed over this many samples to find where it turns."""
-    min_travel_mm: float | None = None
+    min_travel_mm: float | None = Field(None, gt=0)
     """Shorter strokes are not strokes."""
     min_samples: int = Field(20, ge=4)
     """A steady window with fewer samples is too short."""
@@ -248,7 +257,7 @@ class Strokes(Strict):
 class Bins(Strict):
     """How the steady window is cut along displacement."""
 
-    per_stroke: int = Field(40, ge=1)
+    per_stroke: int = Field(40, ge=1, le=1000)
     """Bins in a stroke."""
     min_samples: int = Field(4, ge=1)
     """Bins with fewer samples are left out."""
@@ -296,11 +305,11 @@ class Loop(Strict):
 
     family_error: float = Field(0.005, gt=0, lt=0.5)
     """Family-wise error rate: probability of any false effect per campaign."""
-    max_rounds: int = Field(12, ge=1)
+    max_rounds: int = Field(12, ge=1, le=100)
     """Effects added at most."""
-    folds: int = Field(5, ge=2)
+    folds: int = Field(5, ge=2, le=100)
     """Folds of the cross-validation."""
-    seed: int = 1
+    seed: int = Field(1, ge=0)
     """Seed of the random numbers."""
     ignore_channels: list[str] = Field(default_factory=list)
     """Channels that are not tested."""

@@ -41,14 +41,33 @@ class Fault:
         if self.column is not None:
             parts.append(f"column '{self.column}'")
         if self.value is not None:
-            parts.append(repr(self.value))
+            parts.append(_short(repr(self.value)))
         head = ": ".join(parts)
         text = f"{head}: {self.reason}" if head else self.reason
-        return f"{text} {self.fix}".strip()
+        return printable(f"{text} {self.fix}".strip())
 
     def as_dict(self) -> dict:
         """Return the fault as plain values, as `--json` prints it."""
         return {name: getattr(self, name) for name in self.__slots__}
+
+
+LONGEST_VALUE = 80  # characters of a cell that a message shows
+
+
+def _short(value: str) -> str:
+    return value if len(value) <= LONGEST_VALUE else f"{value[: LONGEST_VALUE - 3]}..."
+
+
+def printable(text: str) -> str:
+    """Return a text with control characters, and bytes of names that are not UTF-8, as escapes.
+
+    Examples
+    --------
+    >>> printable("caf\\udce9\\x1b[2J")
+    'caf\\\\xe9\\\\x1b[2J'
+    """
+    text = text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 # ---------------------------------------------------------------- groups
@@ -110,7 +129,7 @@ def examples(group: Sequence[Fault]) -> list[str]:
             part
             for part in (
                 f"{fault.file or ''}{'' if fault.line is None else f':{fault.line}'}",
-                "" if fault.value is None or not whole else repr(fault.value),
+                "" if fault.value is None or not whole else _short(repr(fault.value)),
                 "" if whole else fault.reason.rstrip("."),
             )
             if part

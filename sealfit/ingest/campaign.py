@@ -18,7 +18,13 @@ from sealfit.errors import CampaignError, Fault, grouped
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, plan_parts, shaped
 from sealfit.ingest.quality import improbable_loads, incomplete_columns, quality_table
-from sealfit.ingest.repeat_checks import constant_strokes, outlying_files, reversed_strokes
+from sealfit.ingest.repeat_checks import (
+    constant_strokes,
+    copied_strokes,
+    outlying_files,
+    reversed_strokes,
+    turned_sign,
+)
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.stored_parts import (
     Made,
@@ -180,6 +186,8 @@ def ingest_campaign(
     faults += found
     if not strokes["used"].any():
         raise CampaignError(_nothing_left(faults, len(listing)))
+    if turned := turned_sign(strokes):
+        raise CampaignError(turned)
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
     faults += incomplete_columns(steady, config.series_columns if config.aging else ()) + improbable_loads(
@@ -330,7 +338,7 @@ def _worded(part: pa.Table, words: set[str]) -> pa.Table:
 def judged(strokes: pd.DataFrame) -> tuple[pd.DataFrame, list[Fault]]:
     """Return the strokes with `used` false where a comparison with others rules them out, and findings."""
     faults: list[Fault] = []
-    for rule in (constant_strokes, reversed_strokes):
+    for rule in (constant_strokes, copied_strokes, reversed_strokes):
         if strokes["used"].any():
             keep, found = rule(strokes)
             strokes = strokes.assign(used=strokes["used"].to_numpy(bool) & keep)

@@ -111,7 +111,7 @@ def _out_of_order(time_s: np.ndarray) -> np.ndarray:
 OVERLOAD = 1e30  # no rig measures this; instruments write 9.9e37 for overload and 9.91e37 for no value (SCPI)
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
 _CLOCK = re.compile(r"(.*\s)?\d+:\d+(:\d+([.,]\d+)?)?")
-_REMARK = re.compile(r"\s*([-+]?[\d.,]+(?:[eE][-+]?\d+)?)[\s,;]+(?P<remark>.*[^\W\d_].*?)[\s,;]*$")
+_NUMBER = re.compile(r"\s*[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?(?=[\s,;])")
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +176,8 @@ def body_of(text: bytes, layout: Layout, settings: TraceFormat, file: str) -> by
     body = text[layout.start :].rstrip(b"\n \t" if settings.delimiter == "whitespace" else b"\n")
     if not body.strip(b"\n \t,;"):
         place = {"file": file, "action": "file left out"}
-        raise BadFile(Fault("no_rows", "has a header but no data.", fix="Export it again.", **place))
+        reason = "has a header but no data." if len(layout.names) > 1 else "holds no table of numbers."
+        raise BadFile(Fault("no_rows", reason, fix="Export it again.", **place))
     return body
 
 
@@ -389,8 +390,8 @@ def _cell_faults(
         if as_number(cell, column.decimal) is not None:
             fix = "Delete the line."
             return column.fault(i, "not_finite", "is not a finite number.", value=cell.strip(), fix=fix)
-        if match := _REMARK.match(cell):
-            reason = f"a remark stands beside the number: {match['remark']!r}."
+        if remark := _remark(cell):
+            reason = f"a remark stands beside the number: {remark!r}."
             fix = "Put the right number alone in the cell."
             return column.fault(i, "remark", reason, value=cell.strip(), fix=fix)
         if i == 0 and len(at) < len(cells) and not any(char.isdigit() for char in cell):
@@ -405,6 +406,13 @@ def _cell_faults(
         return column.not_a_number(i, cell)
 
     return listed(at, make, column.rest)
+
+
+def _remark(cell: str) -> str:
+    """Return the words beside the number in a cell; "" if there is no number, or there are no words."""
+    number = _NUMBER.match(cell)
+    words = cell[number.end() :].strip(" \t,;") if number else ""
+    return words if any(char.isalpha() for char in words) else ""
 
 
 def decimal_fix(cell: str, decimal: str) -> str:

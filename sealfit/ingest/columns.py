@@ -96,7 +96,7 @@ def suggestion(name: str, known: Sequence[str]) -> str:
     """Return a fix for a missing column: the nearest name, or the names that there are."""
     if close := nearest(name, known):
         case = " (the case of letters matters)" if close.lower() == name.lower() else ""
-        return f"Did you mean '{close}'?{case}"
+        return f"Did you mean {close!r}?{case}"
     return f"The columns are {', '.join(repr(n) for n in known if n)}." if any(known) else ""
 
 

@@ -199,8 +199,11 @@ def in_our_units(columns: Columns, conversions: Mapping[str, Conversion]) -> Col
     }
 
 
+ABSOLUTE_ZERO_C = -273.15
+
+
 def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
-    """Return faults of values that cannot be: negative days, a load that does not press, a speed of zero."""
+    """Return faults of impossible values: negative days, no load, no speed, below absolute zero."""
     rules = (
         ("aging_days", lambda value: value < 0, "is below 0 days.", "Days count from 0, unaged."),
         (
@@ -214,6 +217,16 @@ def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
             lambda value: value == 0,
             "is not a sliding speed.",
             "Leave it empty if it is unknown.",
+        ),
+        *(
+            (
+                name,
+                lambda value: not isinstance(value, str) and value <= ABSOLUTE_ZERO_C,
+                "is not above absolute zero.",
+                "Temperatures are in °C; give another unit in the rig config.",
+            )
+            for name in columns
+            if name.endswith("_C")
         ),
     )
     found = [

@@ -20,7 +20,7 @@ from sealfit.store.manifest import Fingerprint, fingerprint, fingerprint_of
 # Files of a campaign folder as bytes: never one outside it, each opened once for its text and its
 # fingerprint.
 
-_BLANK = b"\xef\xbb\xbf\xff\xfe \t\r\n\0"
+_BLANK = b" \t\r\n\0"
 
 
 class Folder:
@@ -113,12 +113,22 @@ def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, 
         ) from error
     finally:
         os.close(handle)
-    if not raw[:64].strip(_BLANK) and not raw.strip(_BLANK):
+    if not raw[4:64].strip(_BLANK) and not _without_mark(raw).strip(_BLANK):
         raise _bad_path(file, "empty_file", "is empty.", "Export it again, or take it out of runs.csv.")
     return raw, status
 
 
+def _without_mark(raw: bytes) -> bytes:
+    """Return the bytes without a byte-order mark."""
+    return raw[max((len(mark) for mark, _ in _BOMS if raw.startswith(mark)), default=0) :]
+
+
 def _not_opened(path: str, file: str, error: OSError) -> BadFile:
+    if isinstance(error, FileNotFoundError) and os.path.islink(path):
+        fix = "Copy the file itself into the campaign."
+        return _bad_path(
+            file, "missing_file", f"is a link to '{os.readlink(path)}', which does not exist.", fix
+        )
     if isinstance(error, FileNotFoundError):
         return _bad_path(file, "missing_file", "does not exist.", _similar(Path(path)))
     if os.path.exists(path) and not os.path.isfile(path):  # a folder, where folders cannot be opened
@@ -164,6 +174,13 @@ _PACKED = {
     b"MATLAB 5.0 MAT-file": "a MAT-file",
     b"MATLAB 7.3 MAT-file": "a MAT-file",
 }
+_MARKED_UP = {
+    b"<!doctype html": "a web page",
+    b"<html": "a web page",
+    b"<?xml": "an XML file",
+    b'{"': "a JSON file",
+    b"[{": "a JSON file",
+}
 _ASCII = ("auto", "utf-8", "utf8", "utf_8", "latin-1")  # encodings that are ASCII where the text is
 _CONTROL = bytes(set(range(32)) - {9, 10, 12, 13}) + b"\x7f"
 
@@ -197,7 +214,8 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
     if _is_plain(raw) and encoding.lower() in _ASCII:
         return raw
     _refuse_packed(raw, file)
-    if encoding == "auto":
+    automatic = encoding == "auto"
+    if automatic:
         encoding = next((name for mark, name in _BOMS if raw.startswith(mark)), None) or _guess(raw)
     elif encoding.lower().replace("_", "-") in ("utf-8", "utf8"):
         encoding = "utf-8-sig"
@@ -205,13 +223,17 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
         try:
             decoder = codecs.getincrementaldecoder(encoding)()
             text = decoder.decode(raw, final=not head)  # a head may end in the middle of a character
-        except UnicodeDecodeError as error:
+        except UnicodeError as error:
             if encoding == "utf-8":  # guessed
                 text = raw.decode("latin-1")
+            elif not isinstance(error, UnicodeDecodeError):  # UTF-16 or UTF-32 without its mark
+                reason = f"is not {encoding}: there is no byte-order mark."
+                raise _bad(file, "wrong_encoding", reason, 'Set encoding = "auto".') from error
             else:
                 line = raw[: error.start].count(b"\n") + 1
                 reason = f"is not {encoding}: byte {error.start} cannot be read."
-                raise _bad(file, "wrong_encoding", reason, 'Set encoding = "auto".', line) from error
+                fix = "Export it again." if automatic else 'Set encoding = "auto".'
+                raise _bad(file, "wrong_encoding", reason, fix, line) from error
         raw = text.encode("utf-8", "replace").removeprefix(codecs.BOM_UTF8)
     if raw.translate(None, _CONTROL) != raw:
         place = next(i for i, byte in enumerate(raw) if byte in _CONTROL)
@@ -228,6 +250,14 @@ def _refuse_packed(raw: bytes, file: str) -> None:
         if raw.startswith(magic):
             fix = "Export it as CSV, or give the file the ending of its format."
             raise _bad(file, "binary_file", f"is {what}, not text.", fix)
+
+
+def refuse_marked_up(text: bytes, file: str) -> None:
+    """Raise `BadFile` for text of a format that is not a table: HTML, XML or JSON."""
+    begin = text[:256].lstrip().lower()
+    for mark, what in _MARKED_UP.items():
+        if begin.startswith(mark):
+            raise _bad(file, "no_table", f"is {what}, not a table.", "Export the trace as CSV.")
 
 
 def _is_plain(raw: bytes) -> bool:

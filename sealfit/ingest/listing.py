@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from sealfit.config import Config
-from sealfit.errors import BadFile, CampaignError, Fault, nearest
+from sealfit.errors import BadFile, CampaignError, Fault, nearest, printable
 from sealfit.ingest.categorical import Columns, mapped
 from sealfit.ingest.columns import suggestion
 from sealfit.ingest.files import Folder, as_number, split_line
@@ -181,6 +181,10 @@ def _rows(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) ->
     """Return the line of every trace file, and the columns that have a name; adds to `faults`."""
     lines, rows = [], []
     for number, line in islice(_lines(text), 1, None):
+        if line.count('"') % 2:
+            reason = "a quotation mark is left open."
+            faults.append(Fault("open_quote", reason, file=RUNS_CSV, line=number, fix="Close or delete it."))
+            continue
         cells = _cells(line, delimiter)
         if any(cells[len(names) :]):
             reason = f"the line has {len(cells)} cells where {len(names)} are named."
@@ -257,7 +261,9 @@ def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
         raise _stop("missing_file", reason, _nearest_file(campaign, glob))
     faults, kept = [], []
     for file in files:
-        if pattern := next((p for p in config.files.exclude if fnmatchcase(file, p)), None):
+        if not _is_utf8(file):
+            faults.append(_odd_name(file, "error"))
+        elif pattern := next((p for p in config.files.exclude if fnmatchcase(file, p)), None):
             reason = f"excluded by files.exclude = {pattern!r}."
             faults.append(Fault("excluded", reason, file=file, severity="info", action="file left out"))
         else:
@@ -304,19 +310,28 @@ def _unlisted(campaign: Path, entries: Entries, outside: set[str], config: Confi
         found = (p for p in campaign.glob(config.files.glob) if p.is_file())
         there |= {p.relative_to(campaign).as_posix() for p in found}
     files = there - listed - {entries.table}
-    fix = "Add it to runs.csv if it is a trace."
+    reason, fix = f"is not in {entries.table}.", "Add it to runs.csv if it is a trace."
+    place = {"severity": "info", "action": "file left out", "fix": fix}
     return [
-        Fault(
-            "not_listed",
-            f"is not in {entries.table}.",
-            file=f,
-            severity="info",
-            action="file left out",
-            fix=fix,
-        )
+        Fault("not_listed", reason, file=f, **place) if _is_utf8(f) else _odd_name(f, "info")
         for f in sorted(files, key=natural)
         if not any(fnmatchcase(f, pattern) for pattern in config.files.exclude)
     ]
+
+
+def _is_utf8(file: str) -> bool:
+    """Whether the name of a file is text; on Linux it may be any bytes."""
+    try:
+        file.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _odd_name(file: str, severity: str) -> Fault:
+    reason, fix = "the name of the file is not UTF-8.", "Rename it."
+    place = {"file": printable(file), "severity": severity, "action": "file left out"}
+    return Fault("file_name", reason, fix=fix, **place)
 
 
 def files_beside(campaign: Path, files: Collection[str]) -> set[str]:

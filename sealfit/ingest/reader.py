@@ -16,7 +16,16 @@ from sealfit.ingest.cells import Cells, Rows, array_cells, body_of, clean, read_
 from sealfit.ingest.columns import RESERVED, SLOTS, beside, channel_columns, locate, numeric_names, required
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.file_names import TraceRef, name_parts
-from sealfit.ingest.files import Layout, as_utf8, find_layout, header_fields, read_bytes
+from sealfit.ingest.files import (
+    HEAD_BYTES,
+    Layout,
+    as_utf8,
+    find_layout,
+    header_fields,
+    read_bytes,
+    refuse_marked_up,
+    split_line,
+)
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays
 from sealfit.ingest.trace_checks import speed_fault
 from sealfit.ingest.workbooks import read_sheet
@@ -136,7 +145,11 @@ class _Opened:
             body = body_of(text, layout, settings, file)
             width = width_of(body, settings.delimiter)
             arrays, faults = (), ()
-        ours, must = locate(layout, len(layout.names) or width, settings, file), numeric_names(settings)
+        try:
+            ours = locate(layout, len(layout.names) or width, settings, file)
+        except BadFile as error:
+            raise _names_below(error, layout, body, settings) from None
+        must = numeric_names(settings)
         numeric = {i: name for i, name in ours.items() if name in must}
         return cls(layout, body, width, ours, numeric, settings, arrays, faults)
 
@@ -144,6 +157,17 @@ class _Opened:
     def alike(self) -> tuple:
         """Files for which this is equal are parsed in one go."""
         return self.layout, self.width, self.settings.delimiter, bool(self.arrays)
+
+
+def _names_below(error: BadFile, layout: Layout, body: bytes, settings: TraceFormat) -> BadFile:
+    """Return the error, with the line in which the names of the columns stand if it is a later one."""
+    wanted = {name for name in settings.their_columns.values() if isinstance(name, str)}
+    lines = body[:HEAD_BYTES].decode("utf-8", "replace").split("\n")
+    for number, line in enumerate(lines, start=layout.first_line):
+        if wanted <= {cell.strip() for cell in split_line(line, settings.delimiter)}:
+            fix = f"The names stand in line {number}: set header_lines = {number} under [trace]."
+            return BadFile(*(replace(fault, fix=fix) for fault in error.faults))
+    return error
 
 
 def _cells(files: Sequence[str], opened: Sequence[_Opened]) -> list[Cells]:
@@ -165,6 +189,7 @@ def _text(
     """Return a text file or workbook sheet as UTF-8, its layout, and the settings with its delimiter."""
     if kind_of(file, settings) == "csv":
         text = as_utf8(raw, settings.encoding, file, head=head)
+        refuse_marked_up(text, file)
         return text, find_layout(text, settings, file), settings
     sheet = read_sheet(raw, file, settings.sheet, decimal=settings.decimal, head=head)
     settings = settings.model_copy(update={"delimiter": "tab"})

@@ -305,12 +305,12 @@ def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     """
     used = strokes["used"].to_numpy(bool)
     constant = used & (strokes["equal"].to_numpy(float) >= 1.0)
-    keep = np.ones(len(strokes), bool)
     if not constant.any():
-        return keep, []
+        return np.ones(len(strokes), bool), []
     others = strokes["equal"].to_numpy(float)[used & ~constant]
-    dead = bool(len(others) and np.median(others) < FINE)
-    return (~constant if dead else keep), [_constant(row, dead) for _, row in strokes[constant].iterrows()]
+    noisy = bool(len(others) and np.median(others) < FINE)
+    dead = constant & (noisy | (strokes["force_N"].to_numpy(float) == 0.0))
+    return ~dead, [_constant(row, bool(dead[i])) for i, row in strokes[constant].iterrows()]
 
 
 def _constant(row: pd.Series, dead: bool) -> Fault:
@@ -319,6 +319,8 @@ def _constant(row: pd.Series, dead: bool) -> Fault:
     if dead:
         check, reason = "stuck", "unlike in other strokes."
         fix = "Check the cable and the logger, and measure again."
+    if row["force_N"] == 0.0:
+        reason = "so it was not measured."
     if dead and row["extreme"]:
         check = "saturated"
         fix = f"The sensor may be at the end of its range: use a larger one. {fix}"
@@ -333,6 +335,61 @@ def _constant(row: pd.Series, dead: bool) -> Fault:
         action="stroke left out" if dead else "kept",
         fix=fix,
     )
+
+
+def copied_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
+    """Return which strokes to keep, shape (n,), and findings on files that hold the samples of another.
+
+    Two measurements never have the same mean, scatter and positions to the last digit. A copy, or a second
+    link to one file, would count one measurement twice; the first is kept.
+
+    Parameters
+    ----------
+    strokes : DataFrame
+        One row per stroke: file, stroke, several, n, force_N, force_sd_N, displacement_from_mm,
+        displacement_to_mm, used.
+    """
+    samples = ["n", "force_N", "force_sd_N", "displacement_from_mm", "displacement_to_mm"]
+    own = strokes[strokes["used"].to_numpy(bool) & (strokes["force_sd_N"] > 0.0)]
+    first = own.groupby(samples)["file"].transform("first")
+    copied = own[own["file"] != first]
+    keep = ~strokes.index.isin(copied.index)
+    return keep, [_copied(row, first[i]) for i, row in copied.iterrows()]
+
+
+def _copied(row: pd.Series, first: str) -> Fault:
+    return Fault(
+        "copy",
+        f"holds the samples of {first}: a copy is no second measurement.",
+        file=row["file"],
+        stroke=int(row["stroke"]) if row["several"] else None,
+        action="stroke left out",
+        fix="Export the right test, or take the file out of the campaign.",
+    )
+
+
+def turned_sign(strokes: pd.DataFrame) -> list[Fault]:
+    """Return a fault if the friction of a whole campaign has the direction of the motion.
+
+    An offset of the sensor larger than the friction turns the sign in one direction only; with strokes in
+    both, the mean over the directions is the friction.
+
+    Parameters
+    ----------
+    strokes : DataFrame
+        One row per stroke: direction, force_N, used.
+    """
+    used = strokes[strokes["used"].to_numpy(bool)]
+    against = used["force_N"] * used["direction"]
+    friction = float(against.groupby(used["direction"] > 0).median().mean())
+    if not friction < 0.0:
+        return []
+    reason = (
+        f"the mean force has the direction of the motion in {int((against < 0.0).sum())} of {len(used)} "
+        "strokes; friction opposes it."
+    )
+    fix = 'Change its sign in the config: force_N = "-force_N" under [trace.compute].'
+    return [Fault("turned_sign", reason, column="force_N", value=friction, fix=fix)]
 
 
 def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, list[Fault]]:

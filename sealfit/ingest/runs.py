@@ -191,7 +191,7 @@ def _config_faults(config: Config) -> list[Fault]:
 
 def _is_encoding(name: str) -> bool:
     try:
-        return name == "auto" or codecs.lookup(name) is not None
+        return name == "auto" or codecs.lookup(name)._is_text_encoding  # rot13 and hex are codecs of others
     except LookupError:
         return False
 

@@ -315,7 +315,7 @@ def test_the_tables_do_not_depend_on_the_number_of_workers(campaign):
 
 def test_a_channel_that_only_some_files_have_is_null_in_the_others(tmp_path):
     write_trace(tmp_path / "1.csv", warmth_C=np.linspace(20, 25, 500))
-    write_trace(tmp_path / "2.csv")
+    write_trace(tmp_path / "2.csv", seed=1)
     write_campaign(tmp_path, [row("1.csv", "r", 1), row("2.csv", "r", 2)])
     tables = ingest_campaign(tmp_path, Config()).tables
     for name in ("steady", "bins", "traces"):

@@ -79,7 +79,9 @@ def write(folder, day, repeat, rows=60, level=30.0, **columns):
     name = f"day{day}_r{repeat}.csv"
     x = [0.05 * 5.0 * i for i in range(rows)]
     table = pd.DataFrame({"time_s": [0.05 * i for i in range(rows)], "displacement_mm": x})
-    table["force_N"] = [level + repeat + 0.1 * ((7 * i * i + 3 * repeat) % 11) for i in range(rows)]
+    table["force_N"] = [
+        level + repeat + 0.01 * day + 0.1 * ((7 * i * i + 3 * repeat) % 11) for i in range(rows)
+    ]
     table.assign(**columns).to_csv(folder / name, index=False)
     return f"{name},day{day},{repeat},60,80,{day},49.03,5"
 

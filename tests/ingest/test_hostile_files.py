@@ -1,0 +1,168 @@
+"""Files and configs that no rig should write: each is answered by one fault that says what to do."""
+
+import os
+import time
+
+import pytest
+from trace_helpers import HEADER, ROWS, campaign, channels, config, csv_of, read, refused, trace
+
+from sealfit.errors import CampaignError, ConfigError, Fault
+from sealfit.ingest.campaign import ingest_campaign
+from sealfit.ingest.runs import list_traces
+
+RUNS = """
+file,aging_days,speed_mm_s
+a.csv,0,5
+b.csv,1,5
+c.csv,2,5
+"""
+
+
+@pytest.mark.parametrize(
+    ("content", "reason", "fix"),
+    [
+        (b"\xff\xfea", "is not utf-16: byte 2 cannot be read", "Export it again."),
+        (b"\xff" * 5000, "holds no table of numbers", "Export it again."),
+        (b"\xff\xfe", "is empty", "Export it again"),
+        (b"<!DOCTYPE html><p>no</p>", "is a web page, not a table", "as CSV"),
+        (b'{"time_s": [0, 1]}', "is a JSON file, not a table", "as CSV"),
+        (f"Rig 7, oil 3\n{csv_of(ROWS)}", "no such column", "in line 2: set header_lines = 2"),
+        (csv_of(ROWS).replace("time_s", "'time_s'"), "no such column", "Did you mean \"'time_s'\"?"),
+    ],
+)
+def test_what_is_not_a_table_is_called_what_it_is(tmp_path, content, reason, fix):
+    fault = refused(tmp_path, content)
+    assert reason in fault.reason
+    assert fix in fault.fix
+
+
+def test_utf_16_without_its_mark_is_refused(tmp_path):
+    fault = refused(tmp_path, csv_of(ROWS), '[trace]\nencoding = "utf-16"\n')
+    assert (fault.check, fault.fix) == ("wrong_encoding", 'Set encoding = "auto".')
+
+
+def test_a_cell_of_thousands_of_separators_is_read_in_no_time(tmp_path):
+    began = time.monotonic()
+    read(tmp_path, csv_of([*ROWS, '"1' + ",," * 20_000 + '"']))
+    assert time.monotonic() - began < 10  # with a pattern of cubic time it took minutes
+
+
+def test_a_remark_beside_a_number_is_quoted(tmp_path):
+    found = read(tmp_path, csv_of([*ROWS, '10.0,50.0,"2.5, seal slipped"']))
+    assert [fault.reason for fault in found.faults] == ["a remark stands beside the number: 'seal slipped'."]
+
+
+def test_long_cells_and_control_characters_are_shortened_and_escaped_in_messages():
+    said = str(Fault("odd", "\x1b[2J is odd.", file=os.fsdecode(b"caf\xe9.csv"), value="x" * 1_000_000))
+    assert len(said) < 200
+    assert said.startswith("caf\\xe9.csv: 'xxx")
+    assert "\\x1b[2J" in said
+
+
+def test_a_pipe_is_no_trace_and_is_not_waited_for(tmp_path):
+    campaign(tmp_path, RUNS)
+    (tmp_path / "a.csv").unlink()
+    os.mkfifo(tmp_path / "a.csv")
+    faults = ingest_campaign(tmp_path, config('condition = ["aging_days"]')).faults
+    assert [(fault.file, fault.reason) for fault in faults] == [("a.csv", "is not a file.")]
+
+
+def test_a_link_to_nowhere_says_so(tmp_path):
+    campaign(tmp_path, RUNS)
+    (tmp_path / "a.csv").unlink()
+    (tmp_path / "a.csv").symlink_to("gone.csv")
+    (fault,) = ingest_campaign(tmp_path, config('condition = ["aging_days"]')).faults
+    assert fault.reason == "is a link to 'gone.csv', which does not exist."
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names are text there")
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_name_that_is_not_utf_8_is_one_finding(tmp_path, listed):
+    campaign(tmp_path, RUNS)
+    try:
+        trace(tmp_path, os.fsdecode(b"caf\xe9.csv"))
+    except OSError:
+        pytest.skip("this file system has names in UTF-8 only")
+    text = 'condition = ["aging_days"]\n'
+    if not listed:
+        (tmp_path / "runs.csv").unlink()
+        text += '[files]\nglob = "*.csv"\n[runs]\nconstants = {aging_days = 1}\n'
+    refs, faults = list_traces(tmp_path, config(text))
+    assert len(refs) == 3
+    (fault,) = [fault for fault in faults if fault.check == "file_name"]
+    assert (fault.file, fault.reason) == ("caf\\xe9.csv", "the name of the file is not UTF-8.")
+
+
+def test_a_quotation_mark_left_open_in_runs_csv_is_said(tmp_path):
+    campaign(tmp_path, RUNS.replace("b.csv", '"b.csv'))
+    with pytest.raises(CampaignError, match=r"runs.csv:3: a quotation mark is left open"):
+        channels(tmp_path)
+
+
+@pytest.mark.parametrize("value", [-300, -273.15])
+def test_no_temperature_is_below_absolute_zero(tmp_path, value):
+    campaign(tmp_path, f"file,aging_days,speed_mm_s,oven_C\na.csv,0,5,{value}\n", files=("a.csv",))
+    with pytest.raises(CampaignError, match="is not above absolute zero"):
+        channels(tmp_path, 'condition = ["aging_days"]\n')
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[strokes]\nmin_travel_mm = -1\n",
+        "[strokes]\nsmooth_samples = 1000000\n",
+        "[loop]\nseed = -1\n",
+        '[files]\nglob = "a**b"\n',
+        '[files]\nglob = "."\n',
+    ],
+)
+def test_settings_have_bounds(text):
+    with pytest.raises(ConfigError):
+        config(text)
+
+
+@pytest.mark.parametrize("encoding", ["rot13", "hex", "no-such"])
+def test_codecs_that_are_no_text_are_no_encodings(tmp_path, encoding):
+    campaign(tmp_path, RUNS)
+    with pytest.raises(CampaignError, match="is not an encoding"):
+        channels(tmp_path, f'condition = ["aging_days"]\n[trace]\nencoding = "{encoding}"\n')
+
+
+def test_forces_that_are_zero_everywhere_were_not_measured(tmp_path):
+    campaign(tmp_path, RUNS)
+    for name in "abc":
+        rows = [row.rpartition(",")[0] + ",0" for row in ROWS]
+        (tmp_path / f"{name}.csv").write_text("\n".join([HEADER, *rows]))
+    with pytest.raises(CampaignError, match="so it was not measured"):
+        ingest_campaign(tmp_path, config('condition = ["aging_days"]'))
+
+
+def test_a_friction_that_pushes_along_stops_with_the_line_for_the_config(tmp_path):
+    campaign(tmp_path, RUNS)
+    for name in "abc":
+        rows = [row.rpartition(",")[0] + f",-{2 + 0.1 * (i % 7)}" for i, row in enumerate(ROWS)]
+        (tmp_path / f"{name}.csv").write_text("\n".join([HEADER, *rows]))
+    with pytest.raises(CampaignError, match=r'force_N = "-force_N" under \[trace.compute\]'):
+        ingest_campaign(tmp_path, config('condition = ["aging_days"]'))
+    text = 'condition = ["aging_days"]\n[trace.compute]\nforce_N = "-force_N"\n'
+    assert ingest_campaign(tmp_path, config(text)).tables["steady"]["force_N"].min() > 0
+
+
+@pytest.mark.parametrize("how", ["copy", "link", "rewritten"])
+def test_a_copy_is_no_second_measurement(tmp_path, how):
+    campaign(tmp_path, RUNS)
+    rows = [row.rpartition(",")[0] + f",{2 + 0.1 * (i % 7)}" for i, row in enumerate(ROWS)]
+    (tmp_path / "a.csv").write_text("\n".join([HEADER, *rows]))
+    (tmp_path / "c.csv").write_text("\n".join([HEADER, *(f"{row}1" for row in rows)]))
+    (tmp_path / "b.csv").unlink()
+    if how == "link":
+        (tmp_path / "b.csv").symlink_to("a.csv")
+    else:
+        other = rows if how == "copy" else [f"{row}0" for row in rows]
+        (tmp_path / "b.csv").write_text("\n".join([HEADER, *other]))
+    made = ingest_campaign(tmp_path, config('condition = ["aging_days"]'))
+    (fault,) = [fault for fault in made.faults if fault.check == "copy"]
+    assert (fault.file, fault.action) == ("b.csv", "stroke left out")
+    assert fault.reason.startswith("holds the samples of a.csv")
+    used = made.tables["steady"].loc[lambda t: t["used"], "file"].tolist()
+    assert used == ["a.csv", "c.csv"]
