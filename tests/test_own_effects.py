@@ -15,6 +15,7 @@ from sealfit.pipeline import run, single
 from sealfit.simulation import load_spec, simulate
 from sealfit.store.manifest import ConfigCopy
 from sealfit.store.paths import own_effects_folder
+from sealfit.store.staged_writes import checksum
 
 SPEC = """
 name = "plain"
@@ -69,7 +70,9 @@ def keep(out: Path, **documents: dict) -> None:
     for name, document in documents.items():
         if name != "state":
             (out / f"{name}.json").write_text(json.dumps(document))
-            state["steps"]["close-loop"]["files"][f"{name}.json"] = (out / f"{name}.json").stat().st_size
+            done = state["steps"]["close-loop"]
+            done["files"][f"{name}.json"] = (out / f"{name}.json").stat().st_size
+            done["checksums"][f"{name}.json"] = checksum(out / f"{name}.json")
     (out / "state.json").write_text(json.dumps({**state, **documents.get("state", {})}))
 
 

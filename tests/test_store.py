@@ -309,6 +309,33 @@ def test_a_table_that_is_missing_or_was_cut_makes_its_step_stale(out, campaign):
         Store.open(out).require("close-loop")
 
 
+@pytest.mark.parametrize("name", ["aging_fit.parquet", "closure.json"])
+def test_a_file_with_one_changed_bit_makes_its_step_stale(out, campaign, name):
+    with Store.writing(out, campaign, ConfigCopy.at(None)) as store:
+        for step in STEPS:
+            with store.step(step) as staged:
+                staged.table(OUTPUTS[step], small(OUTPUTS[step], 2))
+                if step == "close-loop":
+                    staged.json("closure", {"rmse_N": 0.90})
+    raw = bytearray((out / name).read_bytes())
+    raw[len(raw) // 2] ^= 1
+    (out / name).write_bytes(raw)
+    with pytest.raises(StaleError, match=f"its {name} is missing or was changed. Run: sealfit"):
+        Store.open(out).require("close-loop")
+
+
+def test_a_table_in_parts_with_a_changed_bit_is_not_read_as_other_data(tmp_path):
+    path = tmp_path / "part.parquet"
+    parquet.write_arrow(pa.table({"force_N": np.random.default_rng(0).normal(size=5000)}), path)
+    raw = bytearray(path.read_bytes())
+    raw[len(raw) // 2] ^= 1
+    path.write_bytes(raw)
+    with pytest.raises(
+        OutError, match=r"is missing or damaged. Make all results again: sealfit run .*--force"
+    ):
+        parquet.read(path)
+
+
 def test_a_missing_predecessor_names_the_command_to_run(out, campaign):
     with Store.writing(out, campaign, rig(campaign.parent, "")) as store:
         do(store, "ingest")

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import platform
+import stat
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatch
@@ -51,14 +52,16 @@ Fingerprints = dict[str, Fingerprint]  # by file name
 
 
 def fingerprint(path: Path | str) -> Fingerprint:
-    """Return the fingerprint of the file at `path`."""
+    """Return the fingerprint of the file at `path`; an empty one if it cannot be read, or is no file."""
     try:
-        stat = os.stat(path)
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode):  # reading a pipe would wait for ever
+            return Fingerprint()
         with open(path, "rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return Fingerprint()
-    return Fingerprint(stat.st_size, stat.st_mtime_ns, digest)
+    return Fingerprint(status.st_size, status.st_mtime_ns, digest)
 
 
 def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
@@ -162,7 +165,7 @@ def _version(package: str) -> str | None:
 # The content of state.json: campaign, config, inputs, and the key of each step.
 
 STATE = "state.json"
-FORMAT = 6
+FORMAT = 7
 DEFAULT = "default"
 
 
@@ -223,6 +226,7 @@ class Done:
     finished_at: str  # ISO 8601, UTC
     seconds: float
     files: dict[str, int]  # its files, relative to OUT, with their sizes in bytes
+    checksums: dict[str, str]  # SHA-256 of those that are not parts of a table
 
 
 @dataclass(frozen=True, slots=True)

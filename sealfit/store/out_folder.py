@@ -30,7 +30,7 @@ from sealfit.store.manifest import (
     to_json,
 )
 from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
-from sealfit.store.staged_writes import PARQUET, Staged, disk, file_size, sync
+from sealfit.store.staged_writes import PARQUET, Staged, checksum, disk, file_size, sync
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,6 +58,7 @@ class Store:
         own = {"effects_folder": None if effects is None else str(effects)}
         self.config: Config = config.model_copy(update={"loop": config.loop.model_copy(update=own)})
         self.warnings: list[str] = []
+        self._checksums: dict[str, str] = {}  # of files that this process has read
         self._keys: dict[str, str] | None = None  # of every step for the present campaign
         self.anew = False  # whether stored results are to be recomputed
         self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new or changed since the stored state
@@ -185,9 +186,18 @@ class Store:
             if done.key != keys[name]:
                 return f"{name} is stale: {self._what_changed(name, done)}"
             for file, size in done.files.items():
-                if file_size(f"{self.out}/{file}") != size:
+                if file_size(f"{self.out}/{file}") != size or self._damaged(file, done):
                     return f"{name} is stale: its {file} is missing or was changed"
         return ""
+
+    def _damaged(self, file: str, done: Done) -> bool:
+        """Whether a file is not what its step wrote; it is read once by this process."""
+        if file not in done.checksums:
+            return False
+        if file not in self._checksums:
+            with disk(self.out):
+                self._checksums[file] = checksum(self.out / file)
+        return self._checksums[file] != done.checksums[file]
 
     def _what_changed(self, step: str, done: Done) -> str:
         if done.version != __version__:
@@ -296,6 +306,7 @@ class Store:
             datetime.now(UTC).isoformat(timespec="seconds"),
             round(seconds, 3),
             files,
+            dict(staged.checksums),
         )
         # The step counts as not done until every file is moved, so that a killed run leaves no mixture of old
         # and new tables as current. All is on the disk before the first move, so a full disk changes nothing
@@ -322,6 +333,7 @@ class Store:
             staged.move("ended.json", STATE)
             sync(self.out)
             self.state = ended
+        self._checksums |= done.checksums
         if staged.inputs is not None:
             self.marks, self._changed, self._keys = inputs, {}, None
 

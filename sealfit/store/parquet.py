@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from sealfit import __version__
+from sealfit.errors import OutError
 from sealfit.tables import TEXT, Column, Schema
 from sealfit.units import Units
 
@@ -120,6 +122,7 @@ def write_arrow(table: pa.Table, path: Path) -> None:
         "use_byte_stream_split": measured or False,
         # Whoever reads it is told of words, as they are in a table without dictionaries.
         "store_schema": False,
+        "write_page_checksum": True,
     }
     about = {**(schema.metadata or {}), b"ARROW:schema": base64.b64encode(schema.serialize())}
     # A file of Python's, so that a full disk is an OSError with its number.
@@ -154,14 +157,24 @@ def read(
     paths = [path] if isinstance(path, Path) else path
     parts = []
     for one in paths:
-        with pq.ParquetFile(
-            one, read_dictionary=list(coded)
-        ) as file:  # a tenth of what read_table takes for a small file
-            part = file.read(columns=columns)
-        for name, values in (where or {}).items():
-            part = part.filter(pc.is_in(part[name], pa.array(values, TEXT)))
+        with _readable(one):
+            # A tenth of what read_table takes for a small file.
+            with pq.ParquetFile(one, read_dictionary=list(coded), page_checksum_verification=True) as file:
+                part = file.read(columns=columns)
+            for name, values in (where or {}).items():
+                part = part.filter(pc.is_in(part[name], pa.array(values, TEXT)))
         parts.append(part)
     return pa.concat_tables(parts).to_pandas(self_destruct=True)
+
+
+@contextlib.contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Raise OutError for a damaged or missing file."""
+    try:
+        yield
+    except (OSError, KeyError, pa.ArrowException) as error:
+        fix = "Make all results again: sealfit run CAMPAIGN --out OUT --force"
+        raise OutError("is missing or damaged.", file=path, fix=fix) from error
 
 
 def _array(values: pd.Series | np.ndarray | pa.Array, column: Column, table: str) -> pa.Array:

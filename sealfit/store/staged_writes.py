@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import os
 import shutil
 import stat
@@ -32,6 +33,7 @@ class Staged:
         self._out, self._units = out, units
         self._folder = out / f"{STAGING}{os.getpid()}-{step}"
         self.files: dict[str, int] = {}
+        self.checksums: dict[str, str] = {}
         self.inputs: Fingerprints | None = None  # set by ingest: the files read
 
     def table(self, name: str, frame: pd.DataFrame) -> None:
@@ -62,6 +64,9 @@ class Staged:
     def adopt(self, files: Mapping[str, int]) -> None:
         """Add files with sizes to this step: those other processes wrote into `folder`, and those in OUT."""
         self.files |= files
+        for file in (file for file in files if not file.endswith(PARQUET)):  # whose pages have checksums
+            here = self._folder / file
+            self.checksums[file] = checksum(here if here.exists() else self._out / file)
 
     def _write(self, name: str, write: Callable[[Path], object]) -> None:
         path = self._folder / name
@@ -70,6 +75,7 @@ class Staged:
             write(path)
             sync(path)
             self.files[name] = path.stat().st_size
+            self.checksums[name] = checksum(path)
 
     def move(self, name: str, to: str | None = None) -> None:
         """Move a staged file to its final place atomically; a file that is already in OUT stays."""
@@ -106,6 +112,12 @@ def file_size(path: str) -> int | None:
     except OSError:
         return None
     return status.st_size if stat.S_ISREG(status.st_mode) else None
+
+
+def checksum(path: Path) -> str:
+    """Return the SHA-256 of a file. Raises OSError if it cannot be read."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sync(path: Path) -> None:
