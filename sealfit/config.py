@@ -465,6 +465,8 @@ def read_config(path: ConfigPath = None) -> str:
     if path is None:
         return files("sealfit").joinpath("configs/default.toml").read_text("utf-8")
     try:
+        if Path(path).exists() and not Path(path).is_file():  # a pipe would be waited for
+            raise ConfigError("is not a file.", file=path, fix="Check --config.")
         return Path(path).read_text("utf-8-sig")  # Windows editors begin with a byte-order mark
     except OSError as error:
         fix = did_you_mean(Path(path), Path.is_file) or "Check --config."

@@ -1,5 +1,7 @@
 import json
+import os
 import re
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -499,6 +501,12 @@ def test_predict_never_overwrites_the_points(sealfit, done, tmp_path):
         in sealfit("predict", done, "--points", points, "--output", tmp_path / "n/q.csv").stderr
     )
     assert "is a folder" in sealfit("predict", done, "--points", points, "--output", tmp_path).stderr
+    os.mkfifo(tmp_path / "pipe")
+    assert (
+        "pipe is no file"
+        in sealfit("predict", done, "--points", points, "--output", tmp_path / "pipe").stderr
+    )
+    assert stat.S_ISFIFO(os.stat(tmp_path / "pipe").st_mode)  # and so for a device: it is not replaced
 
 
 # ---------------------------------------------------------------- simulate

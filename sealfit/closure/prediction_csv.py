@@ -138,8 +138,9 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
         raise RequestError(f"--output {output} is the table of points.", fix="Give another name.")
     if not output.absolute().parent.is_dir():
         raise RequestError(f"there is no folder {output.parent} for --output.", fix="Make it first.")
-    if output.is_dir():
-        raise RequestError(f"--output {output} is a folder.", fix="Give a file name.")
+    if output.exists() and not output.is_file():  # a device would be replaced by a file
+        what = "a folder" if output.is_dir() else "no file"
+        raise RequestError(f"--output {output} is {what}.", fix="Give a file name.")
     # `answers` has the same rows in the same order; the cells of the points are written unchanged.
     table = pd.concat([points.text, answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
     staged = output.with_name(f".{output.name}.{os.getpid()}")

@@ -6,6 +6,7 @@ import time
 import pytest
 from trace_helpers import HEADER, ROWS, campaign, channels, config, csv_of, read, refused, trace
 
+from sealfit.config import load_config
 from sealfit.errors import CampaignError, ConfigError, Fault
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.runs import list_traces
@@ -119,6 +120,12 @@ def test_no_temperature_is_below_absolute_zero(tmp_path, value):
 def test_settings_have_bounds(text):
     with pytest.raises(ConfigError):
         config(text)
+
+
+def test_a_pipe_is_no_config(tmp_path):
+    os.mkfifo(tmp_path / "rig.toml")
+    with pytest.raises(ConfigError, match=r"is not a file. Check --config."):
+        load_config(tmp_path / "rig.toml")
 
 
 @pytest.mark.parametrize("encoding", ["rot13", "hex", "no-such"])
