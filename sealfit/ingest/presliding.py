@@ -62,8 +62,8 @@ UNLIKELY = 10.0
 # Factor by which the rise on the plateau of the speed must be longer than that from rest to be the bristles'.
 # The lengths that are tried reach three times as far as the force's arrival.
 LONGER = 3.0
-# Rise lengths beyond which an exponential overflows.
-FAR = 500.0
+# Rise lengths after which nothing is left of a rise.
+FAR = 200.0
 
 
 class Start(NamedTuple):
@@ -137,7 +137,7 @@ def rise_of(start: Start) -> Rise:
         if _by_damping(start, turned, fall):
             left_N, length = _left_over(turned, fall.length_mm)
             if left_N < 0.0:  # it follows the law
-                unsettled = -left_N * math.exp(min(peak_mm / length, FAR)) if fall.left_N else 0.0
+                unsettled = _before(-left_N, peak_mm / length) if fall.left_N else 0.0
                 return Rise(peak_mm + fall.end_mm, unsettled, length)
     return _rise(start)
 
@@ -192,8 +192,7 @@ def _rise(start: Start) -> Rise:
     later = _rise_from_rest(plateau)
     if not (later.length_mm > LONGER * rise.length_mm and _explained(plateau, later.length_mm) > EXPLAINED):
         return rise
-    unsettled = later.left_N * math.exp(min(ramp / later.length_mm, FAR)) if later.left_N else 0.0
-    return Rise(ramp + later.end_mm, unsettled, later.length_mm)
+    return Rise(ramp + later.end_mm, _before(later.left_N, ramp / later.length_mm), later.length_mm)
 
 
 def _explained(start: Start, length_mm: float) -> float:
@@ -251,7 +250,12 @@ def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
     )
     if n * math.log(max(squares, 1e-300) / max(rival, 1e-300)) > UNLIKELY:
         left = 0.0
-    return left * math.exp(min(start.plateau_mm / length, FAR)), length
+    return _before(left, start.plateau_mm / length), length
+
+
+def _before(left_N: float, lengths: float) -> float:
+    """Return what is left of a rise so many rise lengths earlier; 0 if nothing can be known of it there."""
+    return left_N * math.exp(lengths) if lengths < FAR else 0.0
 
 
 class _Beside:

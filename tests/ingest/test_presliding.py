@@ -7,7 +7,7 @@ from scipy.ndimage import uniform_filter1d
 
 from sealfit.config import Config, Strokes
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.ingest.presliding import Start, rise_of
+from sealfit.ingest.presliding import Start, _before, rise_of
 from sealfit.ingest.strokes import find_strokes
 
 LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
@@ -152,3 +152,9 @@ def test_noise_does_not_hide_the_rise_after_a_jump():
     """The force jumps to 25 N, and follows the bristles from there under correlated noise of 2 N."""
     _, steady = steady_forces(4.0, damping=25.0, ramp=0.02, hertz=400.0, drift=2.0)
     assert steady.mean() == pytest.approx(LEVEL, abs=3 * steady.std() / np.sqrt(steady.size) + 0.1)
+
+
+def test_a_rise_far_shorter_than_the_ramp_of_the_speed_leaves_nothing():
+    rise = _before(-1e-3, 1e4)
+    assert rise == 0.0
+    assert _before(-1.0, np.log(2.0)) == pytest.approx(-2.0)
