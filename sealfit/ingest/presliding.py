@@ -292,9 +292,8 @@ def _level_N(start: Start) -> float | None:
     if len(plateau) < 8:
         return None
     level, begin = median(plateau), float(force[0])
-    if begin < FAR_BELOW * level:
-        plateau = force[slice(*late)]
-    return level if level - begin > 0.02 * abs(level) and _below(plateau, begin) else None
+    below = _below(plateau, begin) or (begin < FAR_BELOW * level and _below(force[slice(*late)], begin))
+    return level if level - begin > 0.02 * abs(level) and below else None
 
 
 def _slow(start: Start, level_N: float, scale_mm: float) -> bool:
