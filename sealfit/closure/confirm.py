@@ -11,6 +11,7 @@ import pandas as pd
 from sealfit.closure.channels import CALENDAR, level_values, settings, unit_of, varies
 from sealfit.closure.criteria import (
     CURVE_P,
+    HALVED,
     LEAST_FALL,
     LEAST_GAIN,
     LEAST_SIZE,
@@ -357,7 +358,8 @@ def _reason_refused(
         return NEGLIGIBLE
     if proposal.p_value > CURVE_P and _changes_the_curve(proposal):
         return f"its p-value is above {CURVE_P:g}, and the scatter of such a coefficient is not known"
-    if proposal.p_value > WITHIN_P and _shape_along_strokes(proposal.term, fitted.rows):
+    halved = gain.share > 1 - HALVED
+    if proposal.p_value > WITHIN_P and not halved and _shape_along_strokes(proposal.term, fitted.rows):
         return f"its p-value is above {WITHIN_P:g}, and it is a shape along strokes without a mechanism"
     if proposal.p_value > WEAK_P and gain.share < LEAST_FALL:
         return (

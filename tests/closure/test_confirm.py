@@ -222,19 +222,21 @@ def test_a_free_shape_that_bends_the_curve_wants_more_evidence(
 
 
 @pytest.mark.parametrize(
-    ("channels", "p_value", "physical", "claimed"),
+    ("channels", "p_value", "physical", "share", "claimed"),
     [
-        (("time_s",), 2e-4, False, False),
-        (("time_s",), 2e-4, True, True),
-        (("time_s",), 1e-5, False, True),
-        (("run_order", "time_s"), 2e-4, False, False),
-        (("run_order",), 2e-4, False, True),
+        (("time_s",), 2e-4, False, 0.4, False),
+        (("time_s",), 2e-4, False, 0.6, True),
+        (("time_s",), 2e-4, True, 0.4, True),
+        (("time_s",), 1e-5, False, 0.4, True),
+        (("run_order", "time_s"), 2e-4, False, 0.4, False),
+        (("run_order",), 2e-4, False, 0.4, True),
     ],
 )
 def test_a_shape_along_strokes_without_a_mechanism_wants_more_evidence(
-    decide, channels, p_value, physical, claimed
+    decide, channels, p_value, physical, share, claimed
 ):
-    found, refused, _ = decide([proposal("step", channels, "mu", p_value, physical)], [GOOD])
+    gain = Gain(share, 1 - share, 10.0)
+    found, refused, _ = decide([proposal("step", channels, "mu", p_value, physical)], [gain])
     assert (found is not None) == claimed
     assert [item.weak for item in refused] == ([] if claimed else [True])
 
