@@ -13,9 +13,8 @@ from sealfit import commands
 from sealfit.errors import ConfigError, RequestError, StaleError
 from sealfit.pipeline import run, single
 from sealfit.simulation import load_spec, simulate
-from sealfit.store.manifest import ConfigCopy
+from sealfit.store.manifest import ConfigCopy, fingerprint
 from sealfit.store.paths import own_effects_folder
-from sealfit.store.staged_writes import checksum
 
 SPEC = """
 name = "plain"
@@ -72,7 +71,7 @@ def keep(out: Path, **documents: dict) -> None:
             (out / f"{name}.json").write_text(json.dumps(document))
             done = state["steps"]["close-loop"]
             done["files"][f"{name}.json"] = (out / f"{name}.json").stat().st_size
-            done["checksums"][f"{name}.json"] = checksum(out / f"{name}.json")
+            done["checksums"][f"{name}.json"] = fingerprint(out / f"{name}.json").sha256
     (out / "state.json").write_text(json.dumps({**state, **documents.get("state", {})}))
 
 

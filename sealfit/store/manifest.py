@@ -226,7 +226,7 @@ class Done:
     finished_at: str  # ISO 8601, UTC
     seconds: float
     files: dict[str, int]  # its files, relative to OUT, with their sizes in bytes
-    checksums: dict[str, str]  # SHA-256 of those that are not parts of a table
+    checksums: dict[str, str | None]  # SHA-256 of those that are not parts of a table
 
 
 @dataclass(frozen=True, slots=True)

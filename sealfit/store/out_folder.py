@@ -30,7 +30,7 @@ from sealfit.store.manifest import (
     to_json,
 )
 from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
-from sealfit.store.staged_writes import PARQUET, Staged, checksum, disk, file_size, sync
+from sealfit.store.staged_writes import PARQUET, Staged, disk, file_size, sync
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,7 +58,7 @@ class Store:
         own = {"effects_folder": None if effects is None else str(effects)}
         self.config: Config = config.model_copy(update={"loop": config.loop.model_copy(update=own)})
         self.warnings: list[str] = []
-        self._checksums: dict[str, str] = {}  # of files that this process has read
+        self._checksums: dict[str, str | None] = {}  # of files that this process has read
         self._keys: dict[str, str] | None = None  # of every step for the present campaign
         self.anew = False  # whether stored results are to be recomputed
         self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new or changed since the stored state
@@ -195,8 +195,7 @@ class Store:
         if file not in done.checksums:
             return False
         if file not in self._checksums:
-            with disk(self.out):
-                self._checksums[file] = checksum(self.out / file)
+            self._checksums[file] = fingerprint(self.out / file).sha256
         return self._checksums[file] != done.checksums[file]
 
     def _what_changed(self, step: str, done: Done) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import os
 import shutil
 import stat
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sealfit.errors import OutError
-from sealfit.store.manifest import Fingerprints, to_json
+from sealfit.store.manifest import Fingerprints, fingerprint, to_json
 from sealfit.tables import SCHEMAS
 from sealfit.units import Units
 
@@ -33,7 +32,7 @@ class Staged:
         self._out, self._units = out, units
         self._folder = out / f"{STAGING}{os.getpid()}-{step}"
         self.files: dict[str, int] = {}
-        self.checksums: dict[str, str] = {}
+        self.checksums: dict[str, str | None] = {}
         self.inputs: Fingerprints | None = None  # set by ingest: the files read
 
     def table(self, name: str, frame: pd.DataFrame) -> None:
@@ -66,7 +65,7 @@ class Staged:
         self.files |= files
         for file in (file for file in files if not file.endswith(PARQUET)):  # whose pages have checksums
             here = self._folder / file
-            self.checksums[file] = checksum(here if here.exists() else self._out / file)
+            self.checksums[file] = fingerprint(here if here.exists() else self._out / file).sha256
 
     def _write(self, name: str, write: Callable[[Path], object]) -> None:
         path = self._folder / name
@@ -75,7 +74,7 @@ class Staged:
             write(path)
             sync(path)
             self.files[name] = path.stat().st_size
-            self.checksums[name] = checksum(path)
+            self.checksums[name] = fingerprint(path).sha256
 
     def move(self, name: str, to: str | None = None) -> None:
         """Move a staged file to its final place atomically; a file that is already in OUT stays."""
@@ -112,12 +111,6 @@ def file_size(path: str) -> int | None:
     except OSError:
         return None
     return status.st_size if stat.S_ISREG(status.st_mode) else None
-
-
-def checksum(path: Path) -> str:
-    """Return the SHA-256 of a file. Raises OSError if it cannot be read."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sync(path: Path) -> None:
