@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import os
 import re
@@ -181,7 +182,7 @@ def _rows(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) ->
     """Return the line of every trace file, and the columns that have a name; adds to `faults`."""
     lines, rows = [], []
     for number, line in islice(_lines(text), 1, None):
-        if line.count('"') % 2:
+        if _left_open(line, delimiter):
             reason = "a quotation mark is left open."
             faults.append(Fault("open_quote", reason, file=RUNS_CSV, line=number, fix="Close or delete it."))
             continue
@@ -202,6 +203,11 @@ def _rows(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) ->
         lines.append(number)
         rows.append(row)
     return lines, {name: [row.get(name) for row in rows] for name in names if name}
+
+
+def _left_open(line: str, delimiter: str) -> bool:
+    """Whether a cell begins with a quotation mark that is not closed: it then holds the end of the line."""
+    return '"' in line and next(csv.reader([f"{line}\n"], delimiter=delimiter))[-1].endswith("\n")
 
 
 def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault]]:

@@ -162,7 +162,7 @@ class _Opened:
 def _names_below(error: BadFile, layout: Layout, body: bytes, settings: TraceFormat) -> BadFile:
     """Return the error, with the line in which the names of the columns stand if it is a later one."""
     wanted = {name for name in settings.their_columns.values() if isinstance(name, str)}
-    lines = body[:HEAD_BYTES].decode("utf-8", "replace").split("\n")
+    lines = body[:HEAD_BYTES].decode("utf-8", "replace").split("\n") if wanted else []
     for number, line in enumerate(lines, start=layout.first_line):
         if wanted <= {cell.strip() for cell in split_line(line, settings.delimiter)}:
             fix = f"The names stand in line {number}: set header_lines = {number} under [trace]."

@@ -37,6 +37,13 @@ def test_what_is_not_a_table_is_called_what_it_is(tmp_path, content, reason, fix
     assert fix in fault.fix
 
 
+def test_columns_by_their_positions_have_no_names_to_look_for(tmp_path):
+    text = '[trace]\nnames = "none"\n[trace.columns]\ntime_s = 1\ndisplacement_mm = 2\nforce_N = 5\n'
+    fault = refused(tmp_path, "\n".join(ROWS), text)
+    assert fault.reason == "there is no column 5: the lines have 3."
+    assert fault.fix == "Check delimiter and positions in the rig config."
+
+
 def test_utf_16_without_its_mark_is_refused(tmp_path):
     fault = refused(tmp_path, csv_of(ROWS), '[trace]\nencoding = "utf-16"\n')
     assert (fault.check, fault.fix) == ("wrong_encoding", 'Set encoding = "auto".')
@@ -98,6 +105,14 @@ def test_a_quotation_mark_left_open_in_runs_csv_is_said(tmp_path):
     campaign(tmp_path, RUNS.replace("b.csv", '"b.csv'))
     with pytest.raises(CampaignError, match=r"runs.csv:3: a quotation mark is left open"):
         channels(tmp_path)
+
+
+def test_a_quotation_mark_within_a_cell_is_a_mark_like_any_other(tmp_path):
+    campaign(tmp_path, 'file,aging_days,speed_mm_s,hose\na.csv,0,5,1/2" wide\nb.csv,1,5,"1"" wide"\n')
+    assert [c["hose"] for c in channels(tmp_path, 'condition = ["aging_days"]\n').values()] == [
+        '1/2" wide',
+        '1" wide',
+    ]
 
 
 @pytest.mark.parametrize("value", [-300, -273.15])
