@@ -41,7 +41,7 @@ class Fault:
         if self.column is not None:
             parts.append(f"column '{self.column}'")
         if self.value is not None:
-            parts.append(_short(repr(self.value)))
+            parts.append(shortened(repr(self.value)))
         head = ": ".join(parts)
         text = f"{head}: {self.reason}" if head else self.reason
         return printable(f"{text} {self.fix}".strip())
@@ -54,8 +54,9 @@ class Fault:
 LONGEST_VALUE = 80  # characters of a cell that a message shows
 
 
-def _short(value: str) -> str:
-    return value if len(value) <= LONGEST_VALUE else f"{value[: LONGEST_VALUE - 3]}..."
+def shortened(text: str, most: int = LONGEST_VALUE) -> str:
+    """Return a text, or its beginning and three dots where it is longer than so many characters."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def printable(text: str) -> str:
@@ -129,7 +130,7 @@ def examples(group: Sequence[Fault]) -> list[str]:
             part
             for part in (
                 f"{fault.file or ''}{'' if fault.line is None else f':{fault.line}'}",
-                "" if fault.value is None or not whole else _short(repr(fault.value)),
+                "" if fault.value is None or not whole else shortened(repr(fault.value)),
                 "" if whole else fault.reason.rstrip("."),
             )
             if part

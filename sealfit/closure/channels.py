@@ -68,7 +68,8 @@ def searched(channels: Iterable[Channel], rows: Rows) -> list[Channel]:
     Where strokes end before the friction is steady, a residual along them is an error of the bristle model,
     by which the rest of the rise is taken out.
     """
-    return [c for c in channels if c.name not in ALONG_STROKES or not too_short(rows)]
+    left_out = ALONG_STROKES if too_short(rows) else ()
+    return [c for c in channels if c.name not in left_out]
 
 
 def too_short(rows: Rows) -> bool:

@@ -116,8 +116,8 @@ BEYOND = 0.5  # Share of a channel's range by which a run may exceed it.
 SHOWN = 0.5  # Least share of an effect's size that a proposed run must show.
 TIE = 1e-9  # Relative difference below which two runs differ by rounding only.
 LONGER_STROKES = (
-    "would show effects along the strokes, which end before the friction is steady: slide at least three "
-    "times as far"
+    "would show effects along the strokes, which end before the friction is steady: slide eleven times the "
+    "length of the rise to 63 %"
 )
 ROWS = 4  # Rows per stroke at which forces are compared.
 

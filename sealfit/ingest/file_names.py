@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from sealfit.config import Files
-from sealfit.errors import ConfigError
+from sealfit.errors import ConfigError, shortened
 from sealfit.ingest.categorical import Columns, taken
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.files import as_number
@@ -184,8 +184,7 @@ def unmatched(file: str, pattern: str) -> tuple[str, str]:
 
 
 def _short(text: str) -> str:
-    shown = text if len(text) <= 30 else f"{text[:27]}..."
-    return f"'{shown}'" if text else "nothing"
+    return f"'{shortened(text, 30)}'" if text else "nothing"
 
 
 def _convert(name: str, texts: dict[str, str], values: dict, conversions: Mapping[str, Conversion]) -> None:

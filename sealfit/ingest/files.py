@@ -113,7 +113,7 @@ def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, 
         ) from error
     finally:
         os.close(handle)
-    if not raw[4:64].strip(_BLANK) and not _without_mark(raw).strip(_BLANK):
+    if not _without_mark(raw[:64]).strip(_BLANK) and not _without_mark(raw).strip(_BLANK):
         raise _bad_path(file, "empty_file", "is empty.", "Export it again, or take it out of runs.csv.")
     return raw, status
 

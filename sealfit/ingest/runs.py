@@ -7,7 +7,6 @@ not given.
 
 from __future__ import annotations
 
-import codecs
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -191,8 +190,8 @@ def _config_faults(config: Config) -> list[Fault]:
 
 def _is_encoding(name: str) -> bool:
     try:
-        return name == "auto" or codecs.lookup(name)._is_text_encoding  # rot13 and hex are codecs of others
-    except LookupError:
+        return name == "auto" or bool("a".encode(name))
+    except (LookupError, UnicodeError):  # rot13 and hex are codecs, but of no text
         return False
 
 

@@ -155,6 +155,5 @@ def test_noise_does_not_hide_the_rise_after_a_jump():
 
 
 def test_a_rise_far_shorter_than_the_ramp_of_the_speed_leaves_nothing():
-    rise = _before(-1e-3, 1e4)
-    assert rise == 0.0
+    assert _before(-1e-3, 1e4) == 0.0
     assert _before(-1.0, np.log(2.0)) == pytest.approx(-2.0)
