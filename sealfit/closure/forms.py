@@ -135,15 +135,15 @@ def _may_follow(effect: Effect, channel: Channel, fitted: Fitted) -> bool:
 def _all_read(
     effect: Effect, channels: Mapping[str, Channel], rows: Rows, effects: Mapping[str, Effect]
 ) -> bool:
-    """Whether the campaign has the channels that an effect reads.
+    """Whether the campaign has the channels that an effect reads, and its values can show it.
 
-    Some of them may be constant (the one load of a campaign), unless the effect is then the same as another
-    one.
+    Some of the channels may be constant (the one load of a campaign), unless the effect is then the same as
+    another one.
     """
     varying = {name for name in effect.reads if name in channels or name == CHANNEL}
     still = set(effect.reads) - varying
     if not still:
-        return True
+        return not effect.shown_by or effect.shown_by(rows.values(effect.reads[0]))
     constant = all(name in rows.channels and rows.values(name).dtype.kind == "f" for name in still)
     return bool(varying) and constant and not any(set(other.reads) == varying for other in effects.values())
 

@@ -78,6 +78,8 @@ def _at_grid(
     values = {name: rows.values(name) for name in effect.reads}
     if any(v.dtype.kind != "f" or (np.ptp(v) == 0 and name != "direction") for name, v in values.items()):
         return  # a constant has no effect here
+    if effect.shown_by and not effect.shown_by(values[effect.reads[0]]):
+        return
     slope = fitted.slope(*target)
     if np.abs(slope).max() <= 0:
         return

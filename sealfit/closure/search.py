@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sealfit.closure.channels import (
-    CALENDAR,
     FINER,
     Channel,
     even_knots,
@@ -39,6 +38,7 @@ from sealfit.closure.multiplicity import adjust_all
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.small_sample_test import log_p_of
 from sealfit.effects.free import BENDS, evenly
+from sealfit.effects.sensors import DAY_AND_NIGHT, DAY_H
 from sealfit.fit.joint.estimate import Fitted
 from sealfit.fit.joint.rows import POWER, Rows
 from sealfit.fit.joint.variance_components import orthonormal
@@ -92,9 +92,12 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
         for kink in kinks(channel).T:
             yield from _shape_candidates(tests, channel, kink[:, None], MAIN_TARGETS)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
-    fine = channel.numeric and channel.name not in CALENDAR and units >= FINE_UNITS
+    fine = channel.numeric and units >= FINE_UNITS
     if fine and np.unique(channel.values).size > 2 * FINE_DF:
         yield from _shape_candidates(tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
+    if channel.name == "elapsed_h" and DAY_AND_NIGHT.shown_by(channel.values):
+        angle = 2 * np.pi * channel.values[:, None] / DAY_H
+        yield from _shape_candidates(tests, channel, np.hstack([np.cos(angle), np.sin(angle)]), MAIN_TARGETS)
 
 
 def _shape_candidates(

@@ -112,6 +112,8 @@ class Effect:
     periodic: bool = False  # searched in the spectrum; its mean over a bin has a closed form
     narrow: bool = False  # may be as narrow as a bin; its mean over a bin needs more quadrature nodes
     along_calendar: bool = True  # false for a form that can imitate any order of tests
+    # whether a campaign with these values of the first channel can show it; None: any campaign can
+    shown_by: Callable[[np.ndarray], bool] | None = None
 
     def __post_init__(self) -> None:
         for target, operation in self.acts_on:

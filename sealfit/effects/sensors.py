@@ -208,3 +208,56 @@ CAMPAIGN_DRIFT = Effect(
     # By hand: 200 h at 0.05 % per hour.
     worked=({"elapsed_h": 200.0}, {"A": 5e-4}, 0.1),
 )
+
+
+# Period of day and night, in h.
+DAY_H = 24.0
+# Days of tests, and the part of each that its tests must span, from which a daily change is looked for.
+LEAST_DAYS, LEAST_PART = 2, 0.25
+
+
+def _shows_days(hours: np.ndarray) -> bool:
+    day = np.floor((hours - hours.min()) / DAY_H).astype(int)
+    spans = [np.ptp(hours[day == k]) for k in np.unique(day)]
+    return sum(span >= LEAST_PART * DAY_H for span in spans) >= LEAST_DAYS
+
+
+def day_and_night_shape(inputs, *, A, t_0):
+    r"""Change with the time of day: laboratory, drive and oil are warmer in the afternoon than at night.
+
+    The first Fourier term of anything that repeats every 24 h,
+
+    .. math:: h = A \cos\big(2 \pi (t - t_0) / 24\,\mathrm{h}\big)
+
+    with t the time since the campaign's first file. With files in working hours only it describes the change
+    within them and must not be used for the night.
+    """
+    hours = np.asarray(inputs["elapsed_h"], dtype=float) - t_0
+    return A * np.cos(2 * np.pi * hours / DAY_H)
+
+
+DAY_AND_NIGHT = Effect(
+    id="day_and_night",
+    label="change with the time of day",
+    equation=r"h = A \cos(2 \pi (t - t_0) / 24\,\mathrm{h})",
+    form="A cos(2 pi (t - t_0) / 24 h)",
+    reference="mean over a day",
+    reads=("elapsed_h",),
+    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
+    parameters=(
+        Parameter("A", "{y}", 0.02, AMPLITUDE, "amplitude", linear=True),
+        Parameter(
+            "t_0",
+            "{x}",
+            6.0,
+            (-DAY_H, 2 * DAY_H),
+            "a time of day at which it is largest, since the campaign's first file",
+            search=(0.0, 3.0, 6.0, 9.0),
+        ),
+    ),
+    shape=day_and_night_shape,
+    source="Form: ours. The first Fourier term of anything that repeats every day.",
+    # By hand: 4 h from the largest value is a sixth of a day, and cos 60 degrees = 1/2.
+    worked=({"elapsed_h": 58.0}, {"A": 0.04, "t_0": 6.0}, 0.02),
+    shown_by=_shows_days,
+)

@@ -5,6 +5,7 @@ from bins_helpers import make_bins
 from sealfit.closure.channels import ALONG_STROKES, find_channels, flip_level, free_columns, searched, unit_of
 from sealfit.closure.score_test import ScoreTests, log_p_of
 from sealfit.closure.search import search
+from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
@@ -155,3 +156,43 @@ def test_three_speeds_show_no_effect_of_speed_beside_the_stribeck_curve_they_can
     rows = make_rows(bins.assign(load_N=np.where(bins["aging_days"] > 4, 25.0, 50.0)), has_aging=True)
     found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     assert not any({"speed_mm_s", "power"} & set(c.channels) for c in found)
+
+
+WEEK = {"elapsed_h": lambda rng: rng.uniform(0.0, 120.0)}
+
+
+@pytest.mark.parametrize("hours", [24.0, 17.0])
+def test_a_wave_with_the_time_of_day_has_a_test_of_its_own(hours):
+    def wave(table, force):
+        return force + 0.4 * np.sin(2 * np.pi * table["elapsed_h"].to_numpy() / hours)
+
+    rows = make_rows(make_bins(bins=4, setup=0.005, run_channels=WEEK, effect=wave), has_aging=True)
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    significant = [c for c in found if c.channels == ("elapsed_h",) and c.p_value < 0.005]
+    assert {c.columns.shape[1] for c in significant} == ({2} if hours == 24.0 else set())
+
+
+@pytest.mark.parametrize(
+    ("hours", "shown"),
+    [
+        (np.arange(0.0, 50.0, 2.0), True),  # around the clock
+        (np.add.outer(24.0 * np.arange(3), np.arange(0.0, 9.0, 3.0)).ravel(), True),  # three working days
+        (np.r_[np.linspace(0.0, 2.0, 20), np.linspace(53.0, 54.0, 20)], False),  # two short visits
+        (np.linspace(0.0, 24.0, 40), False),  # one day
+    ],
+)
+def test_a_change_with_the_time_of_day_needs_two_days_of_tests(hours, shown):
+    assert EFFECTS["day_and_night"].shown_by(hours) == shown
+
+
+def test_a_short_part_of_the_campaign_is_found_by_the_finer_shape():
+    def hours_off(table, force):
+        return force - 1.5 * table["elapsed_h"].between(70.0, 84.0).to_numpy()
+
+    four = (50.0, 60.0, 70.0, 80.0)
+    bins = make_bins(bins=4, setup=0.005, temperatures=four, run_channels=WEEK, effect=hours_off)
+    rows = make_rows(bins, has_aging=True)
+    best = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))[0]
+    assert best.channels == ("elapsed_h",)
+    assert best.p_value < 0.001
+    assert best.columns.shape[1] > 6
